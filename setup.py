@@ -12,7 +12,9 @@ class BuildWithConfiguration(build_py):
         super().run()
         if not self.editable_mode:
             inside = Path(self.build_lib) / "mosa" / "conf"
-            rmtree(inside, ignore_errors=True)  # of an earlier build, with what has been removed since
+            rmtree(
+                inside, ignore_errors=True
+            )  # of an earlier build, with what has been removed since
             copytree("conf", inside)
 
 

@@ -19,7 +19,11 @@ from mosa.twin.twin import Twin
 
 ROOT = Path(__file__).parents[1]
 Attack = tuple[str, Callable[[], object]]
-WORLD = {"gravity": [0, -9.8, 0], "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]], "ground": {"height": 0.0}}
+WORLD = {
+    "gravity": [0, -9.8, 0],
+    "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]],
+    "ground": {"height": 0.0},
+}
 
 
 def put(tree, path: str, value):
@@ -39,7 +43,9 @@ def put(tree, path: str, value):
 @cache
 def composed(*overrides: str) -> dict:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return OmegaConf.to_container(compose("train", overrides=["debug=default", *overrides]), resolve=True)
+        return OmegaConf.to_container(
+            compose("train", overrides=["debug=default", *overrides]), resolve=True
+        )
 
 
 @cache
@@ -49,9 +55,23 @@ def stored() -> dict:
     tensors = {"rest": torch.cartesian_prod(axis, axis + 0.3, axis), "volume": torch.full((n,), 1.25e-4),
                "colors": torch.full((n, 3), 0.25), "opacities": torch.full((n,), 0.9),
                "covariances": 1e-4 * torch.eye(3).expand(n, 3, 3).clone()}  # fmt: skip
-    world = {"ground": {"height": 0.0}, "gravity": [0, -9.8, 0], "up": [0, 1, 0], "box": [[-1, -0.1, -1], [1, 1, 1]]}
-    start = Start(torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)).written()
-    config = {"cfg": cfg, "world": world, "density": 1000.0, "dx": 0.1, "frame_dt": 1 / 60, "starts": {"train": start}}
+    world = {
+        "ground": {"height": 0.0},
+        "gravity": [0, -9.8, 0],
+        "up": [0, 1, 0],
+        "box": [[-1, -0.1, -1], [1, 1, 1]],
+    }
+    start = Start(
+        torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)
+    ).written()
+    config = {
+        "cfg": cfg,
+        "world": world,
+        "density": 1000.0,
+        "dx": 0.1,
+        "frame_dt": 1 / 60,
+        "starts": {"train": start},
+    }
     state = {f"body.{k}": v for k, v in build_body(config, tensors).state_dict().items()}
     return {"state_dict": state, "mosa": {"config": config, "start": start, "stage": 3, "losses": [], "steps_done": 1,
                                           "particles": n}}  # fmt: skip

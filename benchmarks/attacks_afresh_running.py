@@ -34,10 +34,16 @@ def afresh_keys(folder: Path) -> Iterator[Attack]:
                        wanted=None, seconds=150.0)  # fmt: skip
         if (run / "metrics.json").is_file():
             found = json.loads((run / "metrics.json").read_text())
-            if bad := [key for key, value in found.items() if isinstance(value, float) and not math.isfinite(value)]:
+            if bad := [
+                key
+                for key, value in found.items()
+                if isinstance(value, float) and not math.isfinite(value)
+            ]:
                 raise AssertionError(f"figures that are not finite: {', '.join(bad[:5])}")
             refuse("to its end, with finite figures")
-        said = [line for line in told.splitlines() if "Error: " in line or "HYDRA_FULL_ERROR" in line]  # or Hydra's own
+        said = [
+            line for line in told.splitlines() if "Error: " in line or "HYDRA_FULL_ERROR" in line
+        ]  # or Hydra's own
         log = (run / "train.log").read_text() if (run / "train.log").is_file() else ""
         if expected := re.search(r"this run takes about [^:]* (min|h)\b", log):
             refuse(f"said before: {expected[0]}")
@@ -83,7 +89,9 @@ def afresh_running(folder: Path) -> Iterator[Attack]:
         equal(whole, run)
 
     def message(*given: str, **told) -> None:
-        said = [line for line in program(*given, wanted=2, **told).splitlines() if "Error: " in line]
+        said = [
+            line for line in program(*given, wanted=2, **told).splitlines() if "Error: " in line
+        ]
         if len(said) != 1:
             raise AssertionError(f"{len(said)} messages: {said}")
         refuse(said[0])
@@ -114,10 +122,15 @@ def stopped_at_stages(folder: Path, words: Callable, whole: dict) -> Iterator[At
 
     for stage, line in STAGES.items():
         for sign in (signal.SIGINT, signal.SIGKILL):
-            yield f"{sign.name} as the {stage} begins", lambda s=stage, x=line, n=sign: stopped(s, x, n)
+            yield (
+                f"{sign.name} as the {stage} begins",
+                lambda s=stage, x=line, n=sign: stopped(s, x, n),
+            )
 
 
-def changed_files(fitted: Callable, words: Callable, message: Callable, same: Callable) -> Iterator[Attack]:
+def changed_files(
+    fitted: Callable, words: Callable, message: Callable, same: Callable
+) -> Iterator[Attack]:
     """In the place of a run's files."""
 
     def put(name: str, place: str, make: Callable[[Path], object]) -> Path:
@@ -134,16 +147,35 @@ def changed_files(fitted: Callable, words: Callable, message: Callable, same: Ca
         for kind, make in {"a pipe": os.mkfifo, "a folder": Path.mkdir, "a link to /dev/zero": lambda p: p.symlink_to("/dev/zero"),
                            "a link to itself": lambda p: p.symlink_to(p)}.items():  # fmt: skip
             name = f"{place.replace('/', '_')}_{kind.replace(' ', '_').replace('/', '_')}"
-            yield f"{place} is {kind}", lambda n=name, p=place, m=make: message(*words(put(n, p, m)))
+            yield (
+                f"{place} is {kind}",
+                lambda n=name, p=place, m=make: message(*words(put(n, p, m))),
+            )
     for place in ("results.md", "rollout.npz", "strip.png"):
-        yield f"{place} is a folder", lambda p=place: message(*words(put(f"folder_{p}", p, Path.mkdir)))
+        yield (
+            f"{place} is a folder",
+            lambda p=place: message(*words(put(f"folder_{p}", p, Path.mkdir))),
+        )
     for place in ("checkpoints", ".hydra"):
-        yield f"{place} is a file", lambda p=place: message(*words(put(f"file_{p}", p, lambda f: f.write_text("x"))))
-    yield "metrics.json is empty", lambda: message(*words(put("empty", "metrics.json", lambda p: p.write_text(""))))
-    yield "last.ckpt is empty", lambda: message(*words(put("empty_ckpt", "checkpoints/last.ckpt", lambda p: p.write_text(""))))
+        yield (
+            f"{place} is a file",
+            lambda p=place: message(*words(put(f"file_{p}", p, lambda f: f.write_text("x")))),
+        )
+    yield (
+        "metrics.json is empty",
+        lambda: message(*words(put("empty", "metrics.json", lambda p: p.write_text("")))),
+    )
+    yield (
+        "last.ckpt is empty",
+        lambda: message(
+            *words(put("empty_ckpt", "checkpoints/last.ckpt", lambda p: p.write_text("")))
+        ),
+    )
 
 
-def changed_keys(fitted: Callable, words: Callable, message: Callable, same: Callable) -> Iterator[Attack]:
+def changed_keys(
+    fitted: Callable, words: Callable, message: Callable, same: Callable
+) -> Iterator[Attack]:
     """A fit that goes on with another configuration."""
     for number, key in enumerate(("simulation.particles=120", "fit.joint.newton_iterations=2", "scene.scale=0.4", "scene=rabbit",
                                   "reconstruction.points=2000", "identification.count=20", "adapter=none",
@@ -156,14 +188,23 @@ def changed_keys(fitted: Callable, words: Callable, message: Callable, same: Cal
         f"ckpt_path={fitted('another')}/checkpoints/last.ckpt")  # fmt: skip
 
 
-def other_folders(folder: Path, fitted: Callable, words: Callable, same: Callable) -> Iterator[Attack]:
-    for number, name in enumerate(("-x", "a b", "x" * 200, "ü\u0308", "a,b", "#1", "~", "a'b", "100%")):
+def other_folders(
+    folder: Path, fitted: Callable, words: Callable, same: Callable
+) -> Iterator[Attack]:
+    for number, name in enumerate(
+        ("-x", "a b", "x" * 200, "ü\u0308", "a,b", "#1", "~", "a'b", "100%")
+    ):
         run = f"{folder}/named_{number}/{name}"
 
         def named(run=run, number=number):
             shutil.copytree(fitted(f"source_{number}") / "checkpoints", Path(run) / "checkpoints")
             quoted = "'" + run.replace("'", "\\'") + "'"
-            program(*[word if not word.startswith("hydra.run.dir") else f"hydra.run.dir={quoted}" for word in words(run)])
+            program(
+                *[
+                    word if not word.startswith("hydra.run.dir") else f"hydra.run.dir={quoted}"
+                    for word in words(run)
+                ]
+            )
             if not (Path(run) / "metrics.json").is_file():
                 raise AssertionError("its files are elsewhere")
             refuse("the same")
@@ -184,7 +225,9 @@ def other_folders(folder: Path, fitted: Callable, words: Callable, same: Callabl
         yield f"goes on: {name}", lambda n=name, s=shell: same(fitted(n), shell=s)
 
 
-def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict) -> Iterator[Attack]:
+def damaged_kernels(
+    folder: Path, fitted: Callable, words: Callable, whole: dict
+) -> Iterator[Attack]:
     """The cache of compiled kernels, as a killed compiler, a full disk or another user leave it."""
 
     def with_cache(name: str, change: Callable[[Path], object]) -> None:
@@ -196,7 +239,11 @@ def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict
                 change(file)
         given = {"shell": f"XDG_CACHE_HOME='{home}' {{}}"}
         if name != "gone":
-            found = [line for line in program(*words(run), **given, wanted=2).splitlines() if "Error: " in line]
+            found = [
+                line
+                for line in program(*words(run), **given, wanted=2).splitlines()
+                if "Error: " in line
+            ]
             if len(found) != 1 or str(home) not in found[0]:
                 raise AssertionError(f"not said: {found}")
             shutil.rmtree(home / "warp")
@@ -211,7 +258,10 @@ def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict
                "zeros": compiled(lambda f: f.write_bytes(bytes(f.stat().st_size))),
                "without descriptions": lambda f: f.write_bytes(b"") if f.suffix == ".meta" else None}  # fmt: skip
     for name, change in changes.items():
-        yield f"compiled kernels: {name}", lambda n=name, c=change: with_cache(n.replace(" ", "_"), c)
+        yield (
+            f"compiled kernels: {name}",
+            lambda n=name, c=change: with_cache(n.replace(" ", "_"), c),
+        )
 
 
 def sweeps(folder: Path, cache: Path) -> Iterator[Attack]:
@@ -223,7 +273,12 @@ def sweeps(folder: Path, cache: Path) -> Iterator[Attack]:
             raise AssertionError(f"{made} complete: {told[-400:]}")
         refuse(f"{made} complete, exit code {code}")
 
-    yield "the same job twice", lambda: sweep("twice", "seed=0,0", "hydra.sweep.subdir=${hydra.job.num}", code=0, complete=2)
+    yield (
+        "the same job twice",
+        lambda: sweep(
+            "twice", "seed=0,0", "hydra.sweep.subdir=${hydra.job.num}", code=0, complete=2
+        ),
+    )
     yield "all jobs in one folder", lambda: sweep("one", "seed=0,1", "hydra.sweep.subdir=here", code=2, complete=0,
                                                   message="hydra.sweep.subdir")  # fmt: skip
     (folder / "taken").write_text("x")

@@ -41,10 +41,14 @@ def habits_data(folder: Path) -> Iterator[Attack]:
         for name, allowed in (("mattes", mattes), ("images", colors)):
             ours, theirs = getattr(found, name), getattr(scene, name)
             if ours.shape != theirs.shape or float((ours - theirs).abs().max()) > allowed + 1e-6:
-                raise AssertionError(f"loaded, with other {name}: {float((ours - theirs).abs().max()):.3g}")
+                raise AssertionError(
+                    f"loaded, with other {name}: {float((ours - theirs).abs().max()):.3g}"
+                )
         refuse("the same")
 
-    def copied(change: Callable[[Path], object], source: Path = good, name: str = "", **told) -> Callable[[], object]:
+    def copied(
+        change: Callable[[Path], object], source: Path = good, name: str = "", **told
+    ) -> Callable[[], object]:
         def attack():
             place = folder / (name or f"c{next(count)}")
             shutil.copytree(source, place)
@@ -80,51 +84,163 @@ def habits_data(folder: Path) -> Iterator[Attack]:
 
         return attack
 
-    yield "a folder with blanks, umlauts and a bracket", copied(lambda p: None, name="My capture ü [1] (final)")
+    yield (
+        "a folder with blanks, umlauts and a bracket",
+        copied(lambda p: None, name="My capture ü [1] (final)"),
+    )
     yield "a name in another normal form", copied(lambda p: None, name="ho\u0308hle")
-    yield "a link to the folder", lambda: ((folder / "link").symlink_to(good), load(folder / "link"))
+    yield (
+        "a link to the folder",
+        lambda: ((folder / "link").symlink_to(good), load(folder / "link")),
+    )
     yield "a path with .. in it", lambda: load(good / ".." / good.name)
-    yield "Finder's files beside the pictures", copied(lambda p: ((p / "images" / "._a.png").write_bytes(b"\0\5\x16\7"),
-                                                                  (p / ".DS_Store").write_bytes(b"\0")))
-    yield "a byte order mark", copied(lambda p: (p / "transforms.json").write_text(
-        (p / "transforms.json").read_text(), encoding="utf-8-sig"))
-    yield "UTF-16", copied(lambda p: (p / "transforms.json").write_text((p / "transforms.json").read_text(), encoding="utf-16"))
-    yield "backslashes", copied(listed(lambda e: e.update(file_path=e["file_path"].replace("/", "\\"))))
-    yield "paths of another machine", copied(listed(lambda e: e.update(file_path=f"D:/{e['file_path']}")))
+    yield (
+        "Finder's files beside the pictures",
+        copied(
+            lambda p: (
+                (p / "images" / "._a.png").write_bytes(b"\0\5\x16\7"),
+                (p / ".DS_Store").write_bytes(b"\0"),
+            )
+        ),
+    )
+    yield (
+        "a byte order mark",
+        copied(
+            lambda p: (p / "transforms.json").write_text(
+                (p / "transforms.json").read_text(), encoding="utf-8-sig"
+            )
+        ),
+    )
+    yield (
+        "UTF-16",
+        copied(
+            lambda p: (p / "transforms.json").write_text(
+                (p / "transforms.json").read_text(), encoding="utf-16"
+            )
+        ),
+    )
+    yield (
+        "backslashes",
+        copied(listed(lambda e: e.update(file_path=e["file_path"].replace("/", "\\")))),
+    )
+    yield (
+        "paths of another machine",
+        copied(listed(lambda e: e.update(file_path=f"D:/{e['file_path']}"))),
+    )
     yield "capitals at the end of names", copied(every(lambda f: f.rename(f.with_suffix(".PNG"))))
-    yield "a listing by another name", copied(lambda p: (p / "transforms.json").rename(p / "transforms_train.json"))
+    yield (
+        "a listing by another name",
+        copied(lambda p: (p / "transforms.json").rename(p / "transforms_train.json")),
+    )
     yield "16 bits", copied(every(lambda f: deep(f)), colors=ROUNDED, mattes=ROUNDED)
-    yield "a palette with transparency", copied(every(lambda f: Image.open(f).quantize(256).save(f)), colors=0.2, mattes=0.2)
+    yield (
+        "a palette with transparency",
+        copied(every(lambda f: Image.open(f).quantize(256).save(f)), colors=0.2, mattes=0.2),
+    )
     yield "WebP", copied(renamed(".webp", lossless=True, exact=True), colors=ROUNDED)
     yield "TIFF of 8 bits", copied(renamed(".tiff"))
-    yield "JPEG beside masks", copied(renamed(".jpg", quality=98, subsampling=0), masked, colors=0.5)
+    yield (
+        "JPEG beside masks",
+        copied(renamed(".jpg", quality=98, subsampling=0), masked, colors=0.5),
+    )
     yield "floats of 0 to 255", copied(every(lambda f: floats(f)), masked)
     for turn in (3, 6, 8):
         yield f"EXIF orientation {turn}", copied(every(lambda f, t=turn: turned(f, t)))
     yield "EXIF orientation 1", copied(every(lambda f: turned(f, 1)))
-    yield "masks of 0 and 1", copied(masks(lambda m: Image.fromarray((m > 127).astype(np.uint8))), masked)
+    yield (
+        "masks of 0 and 1",
+        copied(masks(lambda m: Image.fromarray((m > 127).astype(np.uint8))), masked),
+    )
     yield "masks inverted", copied(masks(lambda m: Image.fromarray(255 - m)), masked)
-    yield "masks of another size", copied(masks(lambda m: Image.fromarray(m).resize((m.shape[1] // 2, m.shape[0] // 2))), masked)
-    yield "masks in three equal channels", copied(masks(lambda m: Image.fromarray(np.stack([m] * 3, -1))), masked)
-    yield "masks of a green label", copied(masks(lambda m: Image.fromarray(np.stack([0 * m, m, 0 * m], -1))), masked)
+    yield (
+        "masks of another size",
+        copied(
+            masks(lambda m: Image.fromarray(m).resize((m.shape[1] // 2, m.shape[0] // 2))), masked
+        ),
+    )
+    yield (
+        "masks in three equal channels",
+        copied(masks(lambda m: Image.fromarray(np.stack([m] * 3, -1))), masked),
+    )
+    yield (
+        "masks of a green label",
+        copied(masks(lambda m: Image.fromarray(np.stack([0 * m, m, 0 * m], -1))), masked),
+    )
     yield "masks of a label's palette", copied(masks(lambda m: labels(m)), masked)
-    yield "masks in an alpha channel", copied(masks(lambda m: Image.fromarray(np.stack([m // 3, m // 2, 0 * m, m], -1))), masked)
-    yield "masks in the alpha of black", copied(masks(lambda m: Image.fromarray(np.stack([0 * m, 0 * m, 0 * m, m], -1))), masked)
-    yield "the pictures as their masks", copied(listed(lambda e: e.update(mask_path=e["file_path"])), masked)
-    yield "one mask for all", copied(listed(lambda e: e.update(mask_path="images/" + sorted(
-        f.name for f in (masked / "images").glob("*_mask.png"))[0])), masked)
-    yield "a mask missing", copied(lambda p: next((p / "images").glob("*_mask.png")).unlink(), masked)
+    yield (
+        "masks in an alpha channel",
+        copied(masks(lambda m: Image.fromarray(np.stack([m // 3, m // 2, 0 * m, m], -1))), masked),
+    )
+    yield (
+        "masks in the alpha of black",
+        copied(masks(lambda m: Image.fromarray(np.stack([0 * m, 0 * m, 0 * m, m], -1))), masked),
+    )
+    yield (
+        "the pictures as their masks",
+        copied(listed(lambda e: e.update(mask_path=e["file_path"])), masked),
+    )
+    yield (
+        "one mask for all",
+        copied(
+            listed(
+                lambda e: e.update(
+                    mask_path="images/"
+                    + sorted(f.name for f in (masked / "images").glob("*_mask.png"))[0]
+                )
+            ),
+            masked,
+        ),
+    )
+    yield (
+        "a mask missing",
+        copied(lambda p: next((p / "images").glob("*_mask.png")).unlink(), masked),
+    )
     yield "further frames of one camera", copied(lambda p: longer(p))
-    yield "poses from the world to the camera", copied(listed(lambda e: e.update(
-        transform_matrix=np.linalg.inv(np.array(e["transform_matrix"])).tolist())))
-    yield "poses in OpenCV's axes", copied(listed(lambda e: e.update(
-        transform_matrix=(np.array(e["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])).tolist())))
-    yield "poses in millimetres", copied(listed(lambda e: [row.__setitem__(3, 1000 * row[3]) for row in e["transform_matrix"][:3]]))
-    yield "poses in feet", copied(listed(lambda e: [row.__setitem__(3, 3.281 * row[3]) for row in e["transform_matrix"][:3]]))
+    yield (
+        "poses from the world to the camera",
+        copied(
+            listed(
+                lambda e: e.update(
+                    transform_matrix=np.linalg.inv(np.array(e["transform_matrix"])).tolist()
+                )
+            )
+        ),
+    )
+    yield (
+        "poses in OpenCV's axes",
+        copied(
+            listed(
+                lambda e: e.update(
+                    transform_matrix=(
+                        np.array(e["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
+                    ).tolist()
+                )
+            )
+        ),
+    )
+    yield (
+        "poses in millimetres",
+        copied(
+            listed(
+                lambda e: [row.__setitem__(3, 1000 * row[3]) for row in e["transform_matrix"][:3]]
+            )
+        ),
+    )
+    yield (
+        "poses in feet",
+        copied(
+            listed(
+                lambda e: [row.__setitem__(3, 3.281 * row[3]) for row in e["transform_matrix"][:3]]
+            )
+        ),
+    )
     yield "times in milliseconds", copied(listed(lambda e: e.update(time=1000 * e["time"])))
     yield "times as frame numbers", copied(listed(lambda e: e.update(time=round(60 * e["time"]))))
     yield "focal lengths in millimetres", copied(listed(lambda e: e.update(fl_x=35.0, fl_y=35.0)))
-    yield "focal lengths over the width", copied(listed(lambda e: e.update(fl_x=e["fl_x"] / 80, fl_y=e["fl_y"] / 80)))
+    yield (
+        "focal lengths over the width",
+        copied(listed(lambda e: e.update(fl_x=e["fl_x"] / 80, fl_y=e["fl_y"] / 80))),
+    )
     yield from nested_meshes(folder)
 
 
@@ -171,7 +287,14 @@ def nested_meshes(folder: Path) -> Iterator[Attack]:
                                          for z in (0, 1)])  # fmt: skip
     again = "\n".join("f " + " ".join(str(int(i) + 8) for i in line.split()[1:]) if line[0] == "f" else line
                       for line in inner.splitlines())  # fmt: skip
-    large = cube_obj([(1000.0 * (x - 0.5), 1000.0 * (y - 0.5), 1000.0 * (z - 0.5)) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    large = cube_obj(
+        [
+            (1000.0 * (x - 0.5), 1000.0 * (y - 0.5), 1000.0 * (z - 0.5))
+            for x in (0, 1)
+            for y in (0, 1)
+            for z in (0, 1)
+        ]
+    )
     for name, text in {"a solid in a solid": outer + again,
                        "a solid twice": outer + again.replace("0.25", "0").replace("0.75", "1"),
                        "a cube of millimetres around all": large}.items():  # fmt: skip
@@ -179,7 +302,12 @@ def nested_meshes(folder: Path) -> Iterator[Attack]:
         def attack(name=name, text=text):
             (folder / "n.obj").write_text(text)
             field_of_mesh(folder / "n.obj")
-            cube().simulate(frames=2, colliders=[{"type": "mesh", "path": str(folder / "n.obj"), "position": [0, -0.5, 0]}])
+            cube().simulate(
+                frames=2,
+                colliders=[
+                    {"type": "mesh", "path": str(folder / "n.obj"), "position": [0, -0.5, 0]}
+                ],
+            )
 
         yield f"mesh: {name}", attack
 
@@ -197,7 +325,11 @@ def habits_keys(folder: Path) -> Iterator[Attack]:
         return ["--config-dir", str(folder / "conf"), f"experiment={name}"]
 
     def one_message(*words: str) -> None:
-        told = program(*([] if "hydra.run.dir=" in words else [f"hydra.run.dir={folder}/run"]), *words, wanted=2)
+        told = program(
+            *([] if "hydra.run.dir=" in words else [f"hydra.run.dir={folder}/run"]),
+            *words,
+            wanted=2,
+        )
         if not told.strip():
             raise AssertionError("nothing said")
         refuse("one message")
@@ -220,14 +352,28 @@ def habits_keys(folder: Path) -> Iterator[Attack]:
         yield words, lambda w=words: one_message("debug=default", w)
     yield "a tab in YAML", lambda: one_message(*yaml("tab", b"simulation:\n\tparticles: 200\n"))
     yield "a key twice in YAML", lambda: one_message(*yaml("twice", b"seed: 1\nseed: 2\n"))
-    yield "no blank after a colon", lambda: one_message(*yaml("colon", b"simulation:\n  particles:200\n"))
-    yield "YAML in Latin-1", lambda: one_message(*yaml("latin", "scene:\n  path: /höhle\n".encode("latin-1")))
+    yield (
+        "no blank after a colon",
+        lambda: one_message(*yaml("colon", b"simulation:\n  particles:200\n")),
+    )
+    yield (
+        "YAML in Latin-1",
+        lambda: one_message(*yaml("latin", "scene:\n  path: /höhle\n".encode("latin-1"))),
+    )
     yield "YAML that is a list", lambda: one_message(*yaml("list", b"- seed: 1\n"))
-    yield "an unknown key in YAML", lambda: one_message(*yaml("unknown", b"simulation:\n  partciles: 200\n"))
+    yield (
+        "an unknown key in YAML",
+        lambda: one_message(*yaml("unknown", b"simulation:\n  partciles: 200\n")),
+    )
     yield "a config that is none", lambda: one_message("--config-name", "nothing")
     yield "eval's config in train", lambda: one_message("--config-name", "eval")
-    yield "a sweep over nothing", lambda: (program("-m", "seed=", f"hydra.sweep.dir={folder}/sweep", wanted=1),
-                                           refuse("one message, and a sweep's exit code"))
+    yield (
+        "a sweep over nothing",
+        lambda: (
+            program("-m", "seed=", f"hydra.sweep.dir={folder}/sweep", wanted=1),
+            refuse("one message, and a sweep's exit code"),
+        ),
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------------------- running
@@ -289,7 +435,10 @@ def habits_running(folder: Path) -> Iterator[Attack]:
         equal(whole, run)
 
     for pause in (0.01, 0.3):
-        yield f"Ctrl-C twice, {pause} s apart, in the fit", lambda p=pause: stopped_twice(f"twice_{p}", p)
+        yield (
+            f"Ctrl-C twice, {pause} s apart, in the fit",
+            lambda p=pause: stopped_twice(f"twice_{p}", p),
+        )
     for name in ("SIGHUP", "SIGUSR1", "SIGQUIT"):
 
         def hung_up(name=name):
@@ -319,7 +468,10 @@ def habits_running(folder: Path) -> Iterator[Attack]:
         """The second one finds folders that are being written, or are complete."""
         sweep = ["-m", *SMALL, "evaluation.video=false", f"scene.cache={cache}", f"hydra.sweep.dir={folder}/sweeps", "resume=auto",
                  "hydra.sweep.subdir=${hydra.job.num}", "identification.count=30.0,20.0"]  # fmt: skip
-        environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+        }
         first = subprocess.Popen([python, str(ROOT / "train.py"), *sweep], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL,
                                  stderr=subprocess.PIPE, text=True)  # fmt: skip
         while first.poll() is None and not (folder / "sweeps" / "0" / "train.log").is_file():
@@ -329,7 +481,10 @@ def habits_running(folder: Path) -> Iterator[Attack]:
         if "Traceback" in told + second:
             raise AssertionError(told[-300:] + second[-300:])
         program(*sweep)
-        made = [json.loads((folder / "sweeps" / str(k) / "metrics.json").read_text())["id/E"] for k in range(2)]
+        made = [
+            json.loads((folder / "sweeps" / str(k) / "metrics.json").read_text())["id/E"]
+            for k in range(2)
+        ]
         if len(set(made)) != 2 or not np.isfinite(made).all():
             raise AssertionError(f"{made}")
         refuse("both complete, the second said which was taken")

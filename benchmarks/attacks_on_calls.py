@@ -53,7 +53,17 @@ def overrides(_: Path) -> Iterator[Attack]:
     for plus, each in wrong.items():
         for override in each:
             yield plus + override, lambda o=plus + override: configured(composed(o))
-    for key in ("seed", "fit", "world", "simulation.stride", "fit.views", "scene", "losses", "trainer", "evaluation"):
+    for key in (
+        "seed",
+        "fit",
+        "world",
+        "simulation.stride",
+        "fit.views",
+        "scene",
+        "losses",
+        "trainer",
+        "evaluation",
+    ):
         yield f"~{key}", lambda k=key: configured(put(composed(), k, ...))
 
 
@@ -70,13 +80,39 @@ def colliders(_: Path) -> Iterator[Attack]:
         "size": [1], "name": [5], "path": ["x"],
     }.items():  # fmt: skip
         for value in values:
-            yield f"{key}={value}", lambda k=key, v=value: body.simulate(frames=2, colliders=[ball | {k: v}])
-    for item in ({"type": "box", "size": [1, 1]}, {"type": "box", "size": [9, 9, 9]}, {"type": "sphere", "radius": 5}, 5, "ball",
-                 {"type": "plane", "normal": [0, 1, 0], "position": [0, 9, 0]}, {"type": "mesh", "path": "none.obj"}):
+            yield (
+                f"{key}={value}",
+                lambda k=key, v=value: body.simulate(frames=2, colliders=[ball | {k: v}]),
+            )
+    for item in (
+        {"type": "box", "size": [1, 1]},
+        {"type": "box", "size": [9, 9, 9]},
+        {"type": "sphere", "radius": 5},
+        5,
+        "ball",
+        {"type": "plane", "normal": [0, 1, 0], "position": [0, 9, 0]},
+        {"type": "mesh", "path": "none.obj"},
+    ):
         yield f"{item}", lambda i=item: body.simulate(frames=2, colliders=[i])
-    for walls in ({}, {"friction": math.inf, "mode": "separate"}, {"mode": 5}, {"foo": 1}, {"friction": True}):
-        yield f"walls {walls}", lambda w=walls: build_world({"ground": None, "gravity": [0, -9.8, 0], "up": [0, 1, 0],
-                                                              "box": [[-1] * 3, [1] * 3], "walls": w})
+    for walls in (
+        {},
+        {"friction": math.inf, "mode": "separate"},
+        {"mode": 5},
+        {"foo": 1},
+        {"friction": True},
+    ):
+        yield (
+            f"walls {walls}",
+            lambda w=walls: build_world(
+                {
+                    "ground": None,
+                    "gravity": [0, -9.8, 0],
+                    "up": [0, 1, 0],
+                    "box": [[-1] * 3, [1] * 3],
+                    "walls": w,
+                }
+            ),
+        )
 
 
 def calls(_: Path) -> Iterator[Attack]:
@@ -94,16 +130,33 @@ def calls(_: Path) -> Iterator[Attack]:
 
 def runs(folder: Path) -> Iterator[Attack]:
     """Whole processes: an exit code of 2 with one message counts as one."""
+
     def train(*arguments: str, code: int = 2):
         flags = [argument for argument in arguments if argument.startswith("-")]
-        keys = [f"hydra.run.dir={folder}/run", "debug=default", *(argument for argument in arguments if argument not in flags)]
-        found = subprocess.run([sys.executable, "train.py", *flags, *keys], cwd=ROOT, capture_output=True, text=True)
+        keys = [
+            f"hydra.run.dir={folder}/run",
+            "debug=default",
+            *(argument for argument in arguments if argument not in flags),
+        ]
+        found = subprocess.run(
+            [sys.executable, "train.py", *flags, *keys], cwd=ROOT, capture_output=True, text=True
+        )
         if found.returncode != code or "Traceback" in found.stderr:
             raise AssertionError(f"{found.returncode}: {found.stderr[-300:]}")
         refuse("one message")
 
     (folder / "text.ckpt").write_text("hello")
-    for override in ("+foo=1", "adapter=null", "fit.prior=5", f"ckpt_path={folder}/text.ckpt", "simulation.dx=1e-6",
-                     "world.colliders=[{type: box, size: [9,9,9]}]", "simulation.particles=100000000"):
+    for override in (
+        "+foo=1",
+        "adapter=null",
+        "fit.prior=5",
+        f"ckpt_path={folder}/text.ckpt",
+        "simulation.dx=1e-6",
+        "world.colliders=[{type: box, size: [9,9,9]}]",
+        "simulation.particles=100000000",
+    ):
         yield override, lambda o=override: train(o)
-    yield "a sweep of failures", lambda: train("-m", f"hydra.sweep.dir={folder}/sweep", "seed=-1,-2", code=1)
+    yield (
+        "a sweep of failures",
+        lambda: train("-m", f"hydra.sweep.dir={folder}/sweep", "seed=-1,-2", code=1),
+    )

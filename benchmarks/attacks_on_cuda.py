@@ -65,7 +65,9 @@ def out_of_memory_later(folder: Path, line: str) -> None:
     """Another program takes the GPU once the run's log has the line. What torch holds already may be enough for the run; where it
     is not, one message names the checkpoint that the fit has written, and the same command goes on from there."""
     words = [sys.executable, "train.py", f"hydra.run.dir={folder}", *RUN, "resume=auto"]
-    process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     log = folder / "train.log"
     while process.poll() is None and not (log.is_file() and line in log.read_text()):
         time.sleep(0.02)
@@ -94,9 +96,15 @@ def gpu_memory(folder: Path) -> Iterator[Attack]:
     if not torch.cuda.is_available():
         return
     for number, left in enumerate(LEFT):
-        yield f"{left / 1e9:g} GB of the GPU left", lambda f=left, n=number: without_memory(folder / f"full_{n}", f)
+        yield (
+            f"{left / 1e9:g} GB of the GPU left",
+            lambda f=left, n=number: without_memory(folder / f"full_{n}", f),
+        )
     for number, line in enumerate(MOMENTS):
-        yield f"none left after {line!r}", lambda x=line, n=number: out_of_memory_later(folder / f"later_{n}", x)
+        yield (
+            f"none left after {line!r}",
+            lambda x=line, n=number: out_of_memory_later(folder / f"later_{n}", x),
+        )
 
 
 def equal_runs(folder: Path) -> None:
@@ -107,7 +115,9 @@ def equal_runs(folder: Path) -> None:
         found = json.loads((folder / name / "metrics.json").read_text())
         figures.append({key: value for key, value in found.items() if not key.startswith("time/")})
     if different := sorted(key for key in figures[0] if figures[0][key] != figures[1].get(key)):
-        raise AssertionError(f"{len(different)} of {len(figures[0])} figures differ: {', '.join(different[:5])}")
+        raise AssertionError(
+            f"{len(different)} of {len(figures[0])} figures differ: {', '.join(different[:5])}"
+        )
     refuse("the same figures")
 
 
@@ -126,11 +136,23 @@ def cuda(folder: Path) -> Iterator[Attack]:
     file, start = folder / "good.ckpt", {"height": 0.02, "velocity": (0, -2, 0), "frames": 20}
     for device in ("cuda:99", "cuda:-1", "cuda:a", "cuda:0:0", "CUDA"):
         yield f"device={device}", lambda d=device: Twin.load(file, d)
-        yield f"truth device={device}", lambda d=device: simulator_named("truth", scene="tiny", spacing=0.05, device=d)
-    yield "a twin on the GPU and on the CPU", lambda: near(Twin.load(file, "cuda").simulate(**start).x, cube().simulate(**start).x)
-    yield "two twins on the GPU", lambda: near(*(Twin.load(file, "cuda").simulate(**start).x for _ in range(2)))
+        yield (
+            f"truth device={device}",
+            lambda d=device: simulator_named("truth", scene="tiny", spacing=0.05, device=d),
+        )
+    yield (
+        "a twin on the GPU and on the CPU",
+        lambda: near(Twin.load(file, "cuda").simulate(**start).x, cube().simulate(**start).x),
+    )
+    yield (
+        "two twins on the GPU",
+        lambda: near(*(Twin.load(file, "cuda").simulate(**start).x for _ in range(2))),
+    )
     for number, override in enumerate(("trainer.devices=99", "trainer.devices=[0,0]", "trainer.devices=[-1]",
                                        "simulation.particles=100000000")):  # fmt: skip
-        yield override, lambda o=override, n=number: (program(folder / f"wrong_{n}", o), refuse("one message"))
+        yield (
+            override,
+            lambda o=override, n=number: (program(folder / f"wrong_{n}", o), refuse("one message")),
+        )
     if "deterministic:" in (ROOT / "conf" / "train.yaml").read_text():
         yield "two runs with deterministic=true", lambda: equal_runs(folder)

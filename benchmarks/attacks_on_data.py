@@ -50,7 +50,9 @@ def data(folder: Path) -> Iterator[Attack]:
         return attack
 
     def retimed(order: dict[float, float]):
-        return listing(lambda d: [e.update(time=order.get(e["time"], e["time"])) for e in d["frames"]])
+        return listing(
+            lambda d: [e.update(time=order.get(e["time"], e["time"])) for e in d["frames"]]
+        )
 
     def painted(change: Callable[[np.ndarray], np.ndarray], *chosen: tuple[str, float]):
         def attack():
@@ -59,7 +61,11 @@ def data(folder: Path) -> Iterator[Attack]:
             shutil.copytree(good, copied)
             for entry in document["frames"]:
                 if not chosen or (entry["camera"], entry["time"]) in chosen:
-                    file = next((copied / Path(entry["file_path"]).parent).glob(Path(entry["file_path"]).name + "*"))
+                    file = next(
+                        (copied / Path(entry["file_path"]).parent).glob(
+                            Path(entry["file_path"]).name + "*"
+                        )
+                    )
                     cv2.imwrite(str(file), change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
             load(copied)
 
@@ -73,6 +79,7 @@ def data(folder: Path) -> Iterator[Attack]:
     for fps in (5, 12, 200, 500, 1e9):
         yield f"fps={fps:g}", lambda f=fps: load(fps=f)
     for unit in (1e-6, 1e-3, 0.1, 10, 1e3, 1e6):
+
         def scaled(d, unit=unit):
             for entry in d["frames"]:
                 for row in entry["transform_matrix"][:3]:
@@ -84,12 +91,21 @@ def data(folder: Path) -> Iterator[Attack]:
     yield "one opaque matte", painted(opaque, (cameras[1], times[3]))
     yield "one opaque matte in frame 0", painted(opaque, (cameras[1], times[0]))
     yield "all opaque", painted(opaque)
-    yield "cut by the border", painted(lambda p: np.roll(p, p.shape[0] // 2 + 8, 0)[: p.shape[0]] * 0 + np.roll(p, 40, 1))
+    yield (
+        "cut by the border",
+        painted(lambda p: np.roll(p, p.shape[0] // 2 + 8, 0)[: p.shape[0]] * 0 + np.roll(p, 40, 1)),
+    )
     for value in ("1.0", True, None, [1], {}, math.nan, 1e300):
-        yield f"pose {value}", listing(lambda d, v=value: d["frames"][3]["transform_matrix"][0].__setitem__(1, v))
+        yield (
+            f"pose {value}",
+            listing(lambda d, v=value: d["frames"][3]["transform_matrix"][0].__setitem__(1, v)),
+        )
     for key in ("file_path", "transform_matrix", "time"):
         for value in (5, "x" * 5000, "a\0b", [], None, True, "../../../etc/passwd"):
-            yield f"{key}={str(value)[:20]}", listing(lambda d, k=key, v=value: d["frames"][2].__setitem__(k, v))
+            yield (
+                f"{key}={str(value)[:20]}",
+                listing(lambda d, k=key, v=value: d["frames"][2].__setitem__(k, v)),
+            )
     for raw in ("[" * 100_000, "{}", "", "null", '{"frames": 5}', '{"frames": [5]}', "1" * 10_000):
         yield f"listing {raw[:12]}", listing(lambda d: None, raw)
     for key, value in (("density", 1e30), ("density", True), ("density", "a"), ("box", [[-1e6] * 3, [1e6] * 3]), ("box", 5),
@@ -102,7 +118,9 @@ def data(folder: Path) -> Iterator[Attack]:
     yield from more_data(listing, painted, load, document)
 
 
-def more_data(listing: Callable, painted: Callable, load: Callable, document: dict) -> Iterator[Attack]:
+def more_data(
+    listing: Callable, painted: Callable, load: Callable, document: dict
+) -> Iterator[Attack]:
     """Files of pictures, mattes, lenses, poses, times and lists that are wrong in other ways."""
     entries = document["frames"]
     fourth = (entries[3]["camera"], entries[3]["time"])
@@ -121,8 +139,16 @@ def more_data(listing: Callable, painted: Callable, load: Callable, document: di
         return attack
 
     for share in (0.0, 0.05, 0.3, 0.7, 0.95):
-        yield f"picture cut at {share:.0%}", spoiled(lambda f, s=share: f.write_bytes(f.read_bytes()[: int(s * f.stat().st_size)]))
-    for name, content in (("text", b"hello"), ("zeros", bytes(5000)), ("gif header", b"GIF89a" + bytes(20)), ("svg", b"<svg/>")):
+        yield (
+            f"picture cut at {share:.0%}",
+            spoiled(lambda f, s=share: f.write_bytes(f.read_bytes()[: int(s * f.stat().st_size)])),
+        )
+    for name, content in (
+        ("text", b"hello"),
+        ("zeros", bytes(5000)),
+        ("gif header", b"GIF89a" + bytes(20)),
+        ("svg", b"<svg/>"),
+    ):
         yield f"picture is {name}", spoiled(lambda f, c=content: f.write_bytes(c))
     yield "picture is gone", spoiled(Path.unlink)
     yield "picture is a folder", spoiled(lambda f: (f.unlink(), f.mkdir()))
@@ -141,11 +167,27 @@ def more_data(listing: Callable, painted: Callable, load: Callable, document: di
     yield "one empty matte in frame 0", painted(empty, (entries[0]["camera"], 0.0))
     yield "all mattes empty", painted(empty)
     yield "all mattes one pixel", painted(dot)
-    yield "all mattes inverted", painted(lambda p: np.concatenate([p[..., :3], 255 - p[..., 3:]], -1))
-    yield "frame 0 without the object", painted(empty, *[(e["camera"], e["time"]) for e in entries if e["time"] == 0])
+    yield (
+        "all mattes inverted",
+        painted(lambda p: np.concatenate([p[..., :3], 255 - p[..., 3:]], -1)),
+    )
+    yield (
+        "frame 0 without the object",
+        painted(empty, *[(e["camera"], e["time"]) for e in entries if e["time"] == 0]),
+    )
     yield "all pictures upside down", painted(lambda p: p[::-1])
-    yield "mattes of noise", painted(lambda p: np.concatenate(
-        [p[..., :3], np.random.default_rng(0).integers(0, 256, p[..., 3:].shape, dtype=np.uint8)], -1))
+    yield (
+        "mattes of noise",
+        painted(
+            lambda p: np.concatenate(
+                [
+                    p[..., :3],
+                    np.random.default_rng(0).integers(0, 256, p[..., 3:].shape, dtype=np.uint8),
+                ],
+                -1,
+            )
+        ),
+    )
 
     def every(key, value):
         return listing(lambda d: [e.update({key: value}) for e in d["frames"]])
@@ -163,16 +205,28 @@ def more_data(listing: Callable, painted: Callable, load: Callable, document: di
         yield f"poses: {name}", every("transform_matrix", matrix.tolist())
     for name, times in (("all alike", lambda t: 0.0), ("squared", lambda t: t**2), ("from 1e9 on", lambda t: t + 1e9),
                         ("infinite", lambda t: math.inf), ("words", str), ("of a microsecond", lambda t: t * 1e-6)):  # fmt: skip
-        yield f"times {name}", listing(lambda d, f=times: [e.update(time=f(e["time"])) for e in d["frames"]])
+        yield (
+            f"times {name}",
+            listing(lambda d, f=times: [e.update(time=f(e["time"])) for e in d["frames"]]),
+        )
     first = entries[0]["camera"]
-    yield "one camera", listing(lambda d: d.update(frames=[e for e in d["frames"] if e["camera"] == first]))
-    yield "one frame", listing(lambda d: d.update(frames=[e for e in d["frames"] if e["time"] == 0]))
+    yield (
+        "one camera",
+        listing(lambda d: d.update(frames=[e for e in d["frames"] if e["camera"] == first])),
+    )
+    yield (
+        "one frame",
+        listing(lambda d: d.update(frames=[e for e in d["frames"] if e["time"] == 0])),
+    )
     yield "no frame", listing(lambda d: d.update(frames=[]))
     yield "a frame twice", listing(lambda d: d["frames"].append(d["frames"][5]))
     yield "one picture missing in the list", listing(lambda d: d["frames"].pop(17))
     yield "without times", listing(lambda d: [e.pop("time") for e in d["frames"]])
     yield "without cameras", listing(lambda d: [e.pop("camera") for e in d["frames"]])
-    yield "all one picture", listing(lambda d: [e.update(file_path=d["frames"][0]["file_path"]) for e in d["frames"]])
+    yield (
+        "all one picture",
+        listing(lambda d: [e.update(file_path=d["frames"][0]["file_path"]) for e in d["frames"]]),
+    )
     wrong = {"frames": ([5, 2], [0, 10**9], [0.5, 3]), "last_free_frame": (99,), "fill_holes": (-1,), "scale": (2, "a"),
              "holdout_cameras": (list(range(12)), [99]), "holdout_frames": (list(range(15)),), "density": (-1, 0)}  # fmt: skip
     for key, value in ((key, value) for key, values in wrong.items() for value in values):
@@ -191,16 +245,38 @@ def at_scale(attack: Callable, unit: float):
 
 def meshes(folder: Path) -> Iterator[Attack]:
     head = "ply\nformat ascii 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-    texts = {"empty": "", "no face": "v 0 0 0\n", "open": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN": "v nan 0 0\nf 1 1 1\n",
-             "index": "v 0 0 0\nf 1 2 9\n", "text": "v a b c\n", "huge": "v 1e300 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 3 2 1\n"}
+    texts = {
+        "empty": "",
+        "no face": "v 0 0 0\n",
+        "open": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "NaN": "v nan 0 0\nf 1 1 1\n",
+        "index": "v 0 0 0\nf 1 2 9\n",
+        "text": "v a b c\n",
+        "huge": "v 1e300 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 3 2 1\n",
+    }
     for name, text in texts.items():
-        yield f"obj {name}", lambda t=text: ((folder / "m.obj").write_text(t), field_of_mesh(folder / "m.obj"))
+        yield (
+            f"obj {name}",
+            lambda t=text: ((folder / "m.obj").write_text(t), field_of_mesh(folder / "m.obj")),
+        )
     yield from more_meshes(folder)
-    for name, text in {"empty": "", "text": "hello", "4e12 vertices": head.format(n=4 * 10**12) + "0 0 0\n",
-                       "-1": head.format(n=-1),
-                       "cut": head.format(n=9) + "0 0 0\n"}.items():
-        yield f"ply {name}", lambda t=text: ((folder / "m.ply").write_text(t), field_of_mesh(folder / "m.ply"))
-        yield f"splats {name}", lambda t=text: ((folder / "s.ply").write_text(t), load_ply(folder / "s.ply"))
+    for name, text in {
+        "empty": "",
+        "text": "hello",
+        "4e12 vertices": head.format(n=4 * 10**12) + "0 0 0\n",
+        "-1": head.format(n=-1),
+        "cut": head.format(n=9) + "0 0 0\n",
+    }.items():
+        yield (
+            f"ply {name}",
+            lambda t=text: ((folder / "m.ply").write_text(t), field_of_mesh(folder / "m.ply")),
+        )
+        yield (
+            f"splats {name}",
+            lambda t=text: ((folder / "s.ply").write_text(t), load_ply(folder / "s.ply")),
+        )
+
+
 CUBE = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
@@ -224,15 +300,28 @@ def more_meshes(folder: Path) -> Iterator[Attack]:
         "one line of 1e6": "v " + "1 " * 10**6,
     }  # fmt: skip
     for name, text in texts.items():
-        yield f"obj {name}", lambda t=text: ((folder / "m.obj").write_text(t), field_of_mesh(folder / "m.obj"))
+        yield (
+            f"obj {name}",
+            lambda t=text: ((folder / "m.obj").write_text(t), field_of_mesh(folder / "m.obj")),
+        )
     (folder / "good.obj").write_text(cube_obj())
-    for key, values in {"spacing": (0, -1, math.nan, 1e-9, "a"), "scale": (0, -1, math.nan, 1e30, "a"), "margin": (math.inf, 1e9,
-                                                                                                            "a")}.items():
+    for key, values in {
+        "spacing": (0, -1, math.nan, 1e-9, "a"),
+        "scale": (0, -1, math.nan, 1e30, "a"),
+        "margin": (math.inf, 1e9, "a"),
+    }.items():
         for value in values:
-            yield f"mesh {key}={value}", lambda k=key, v=value: cube().simulate(frames=2, colliders=[
-                {"type": "mesh", "path": str(folder / "good.obj"), k: v}])
+            yield (
+                f"mesh {key}={value}",
+                lambda k=key, v=value: cube().simulate(
+                    frames=2, colliders=[{"type": "mesh", "path": str(folder / "good.obj"), k: v}]
+                ),
+            )
     yield "mesh path is a folder", lambda: field_of_mesh(folder)
-    yield "mesh of another ending", lambda: ((folder / "m.stl").write_text("solid"), field_of_mesh(folder / "m.stl"))
+    yield (
+        "mesh of another ending",
+        lambda: ((folder / "m.stl").write_text("solid"), field_of_mesh(folder / "m.stl")),
+    )
     yield "mesh is gone", lambda: field_of_mesh(folder / "nothing.obj")
     head = "ply\nformat {form} 1.0\nelement vertex {n}\nproperty {kind} x\nproperty float y\nproperty float z\n{more}end_header\n"
     faces = "element face {m}\nproperty list uchar int vertex_indices\n"
@@ -245,8 +334,14 @@ def more_meshes(folder: Path) -> Iterator[Attack]:
     }  # fmt: skip
     for name, fields in lies.items():
         text = head.format(**whole | fields) + "0 0 0\n"
-        yield f"ply {name}", lambda t=text: ((folder / "m.ply").write_text(t), field_of_mesh(folder / "m.ply"))
-        yield f"splats {name}", lambda t=text: ((folder / "s.ply").write_text(t), load_ply(folder / "s.ply"))
+        yield (
+            f"ply {name}",
+            lambda t=text: ((folder / "m.ply").write_text(t), field_of_mesh(folder / "m.ply")),
+        )
+        yield (
+            f"splats {name}",
+            lambda t=text: ((folder / "s.ply").write_text(t), load_ply(folder / "s.ply")),
+        )
 
 
 def poses(folder: Path) -> Iterator[Attack]:
@@ -269,11 +364,21 @@ def poses(folder: Path) -> Iterator[Attack]:
         for column in columns:
             for value in ("nan", "inf", "1e400", "abc") if name != "points3D" else ("abc",):
                 yield f"{name} {column}={value}", lambda n=name, c=column, v=value: model(n, c, v)
-    entry = {"transform_matrix": np.eye(4).tolist(), "fl_x": 200.0, "fl_y": 200.0, "cx": 80.0, "cy": 60.0, "w": 160, "h": 120}
+    entry = {
+        "transform_matrix": np.eye(4).tolist(),
+        "fl_x": 200.0,
+        "fl_y": 200.0,
+        "cx": 80.0,
+        "cy": 60.0,
+        "w": 160,
+        "h": 120,
+    }
 
     def listing(key: str, value):
         (folder / "t").mkdir(exist_ok=True)
-        frames = [entry | {"file_path": f"p{i}.jpg"} | ({key: value} if i == 1 else {}) for i in range(3)]
+        frames = [
+            entry | {"file_path": f"p{i}.jpg"} | ({key: value} if i == 1 else {}) for i in range(3)
+        ]
         (folder / "t" / "transforms.json").write_text(json.dumps({"frames": frames}))
         read_phones(folder, folder / "t", sizes)
 
@@ -289,5 +394,14 @@ def poses(folder: Path) -> Iterator[Attack]:
         read_world(folder)
 
     for key in good:
-        for value in (0, -1, math.nan, "a", None, [1], np.diag([1, 1, -1]).tolist(), np.diag([2, 1, 1]).tolist()):
+        for value in (
+            0,
+            -1,
+            math.nan,
+            "a",
+            None,
+            [1],
+            np.diag([1, 1, -1]).tolist(),
+            np.diag([2, 1, 1]).tolist(),
+        ):
             yield f"like: {key}={value}", lambda k=key, v=value: record(k, v)

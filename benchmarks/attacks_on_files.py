@@ -49,19 +49,58 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
 
     bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.twin.rollout_file.save_parts", "mosa.modules.body.body.Body",
            5, ("a",)}  # fmt: skip
-    changes = [(f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]}) for name in bad]
-    changes += [(f"{config}.cfg.{key}", "${oc.env:HOME}/x") for key in ("scene.cache", "scene.path", "prior.law", "seed")]
-    changes += [(f"{config}.{key}", ...) for key in ("cfg", "world", "density", "dx", "frame_dt", "cfg.prior", "cfg.adapter",
-                                                     "cfg.simulation", "cfg.heterogeneity", "world.gravity", "world.box")]
-    changes += [(key, ...) for key in ("mosa", "state_dict", "mosa.config", "mosa.start", "mosa.start.rotation")]
-    changes += [(f"{config}.{key}", value) for key in ("density", "dx", "frame_dt", "world.ground.height")
-                for value in (math.nan, math.inf, "a", True, [1])]
-    changes += [("mosa.losses", Touch(target)), ("mosa.losses", bytearray(9)), ("mosa.losses", {1, 2})]
+    changes = [
+        (f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]})
+        for name in bad
+    ]
+    changes += [
+        (f"{config}.cfg.{key}", "${oc.env:HOME}/x")
+        for key in ("scene.cache", "scene.path", "prior.law", "seed")
+    ]
+    changes += [
+        (f"{config}.{key}", ...)
+        for key in (
+            "cfg",
+            "world",
+            "density",
+            "dx",
+            "frame_dt",
+            "cfg.prior",
+            "cfg.adapter",
+            "cfg.simulation",
+            "cfg.heterogeneity",
+            "world.gravity",
+            "world.box",
+        )
+    ]
+    changes += [
+        (key, ...)
+        for key in ("mosa", "state_dict", "mosa.config", "mosa.start", "mosa.start.rotation")
+    ]
+    changes += [
+        (f"{config}.{key}", value)
+        for key in ("density", "dx", "frame_dt", "world.ground.height")
+        for value in (math.nan, math.inf, "a", True, [1])
+    ]
+    changes += [
+        ("mosa.losses", Touch(target)),
+        ("mosa.losses", bytearray(9)),
+        ("mosa.losses", {1, 2}),
+    ]
     for key, value in changes:
-        yield f"{key}={value if value is not ... else 'deleted'}", lambda k=key, v=value: load(put(stored(), k, v))
+        yield (
+            f"{key}={value if value is not ... else 'deleted'}",
+            lambda k=key, v=value: load(put(stored(), k, v)),
+        )
     for name in [key for key in stored()["state_dict"] if key.count(".") == 1]:
-        for kind, change in {"gone": None, "NaN": lambda x: x * math.nan, "short": lambda x: x[:5], "a list": lambda x: [1],
-                             "expanded": lambda x: x.flatten()[:1].expand(10**10)}.items():
+        for kind, change in {
+            "gone": None,
+            "NaN": lambda x: x * math.nan,
+            "short": lambda x: x[:5],
+            "a list": lambda x: [1],
+            "expanded": lambda x: x.flatten()[:1].expand(10**10),
+        }.items():
+
             def attack(name=name, change=change):
                 state = dict(stored()["state_dict"])
                 state.pop(name) if change is None else state.update({name: change(state[name])})
@@ -71,19 +110,26 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
     torch.save(stored(), folder / "good.ckpt")
     content = (folder / "good.ckpt").read_bytes()
     for share in np.linspace(0, 0.999, 20):
+
         def cut(share=share):
             (folder / "cut.ckpt").write_bytes(content[: int(share * len(content))])
             Twin.load(folder / "cut.ckpt")
 
         yield f"cut at {share:.0%}", cut
     for place in np.random.default_rng(0).integers(0, len(content), 20).tolist():
+
         def flipped(place=place):
-            (folder / "flipped.ckpt").write_bytes(content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :])
+            (folder / "flipped.ckpt").write_bytes(
+                content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
+            )
             same(read_checkpoint(folder / "flipped.ckpt"), read_checkpoint(folder / "good.ckpt"))
             refuse("a byte that holds nothing")
 
         yield f"bit flipped in byte {place}", flipped
-    yield "what was named has run", lambda: None if target.exists() else refuse("nothing was executed or written")
+    yield (
+        "what was named has run",
+        lambda: None if target.exists() else refuse("nothing was executed or written"),
+    )
 
 
 def npz(folder: Path) -> Iterator[Attack]:
@@ -98,6 +144,7 @@ def npz(folder: Path) -> Iterator[Attack]:
     for share in np.linspace(0, 0.99, 15):
         yield f"cut at {share:.0%}", lambda s=share: read(content[: int(s * len(content))])
     for shape in ("(10**9, 3)", "(-1, 3)", "(2, 50, 4)", "(99999999999,)"):
+
         def misshapen(shape=shape):
             with tempfile.TemporaryFile() as plain:
                 np.lib.format.write_array(plain, np.zeros((2, 50, 3)))
@@ -108,7 +155,13 @@ def npz(folder: Path) -> Iterator[Attack]:
             read_npz(file)
 
         yield f"header {shape}", misshapen
-    yield "objects", lambda: (np.savez(file, x=np.array([Touch(folder / "touched")], dtype=object)), read_npz(file))
+    yield (
+        "objects",
+        lambda: (
+            np.savez(file, x=np.array([Touch(folder / "touched")], dtype=object)),
+            read_npz(file),
+        ),
+    )
 
 
 def caches(folder: Path) -> Iterator[Attack]:
@@ -123,8 +176,13 @@ def caches(folder: Path) -> Iterator[Attack]:
             raise AssertionError("a wrong cache was used")
         refuse("made again")
 
-    for name, stored_ in {"no keys": {}, "a list": [1], "short": {**good, "means": torch.zeros(3, 3)}, "one gone": {
-            k: v for k, v in good.items() if k != "scales"}, "NaN": {**good, "means": torch.full((9, 3), math.nan)}}.items():
+    for name, stored_ in {
+        "no keys": {},
+        "a list": [1],
+        "short": {**good, "means": torch.zeros(3, 3)},
+        "one gone": {k: v for k, v in good.items() if k != "scales"},
+        "NaN": {**good, "means": torch.full((9, 3), math.nan)},
+    }.items():
         yield name, lambda s=stored_: remade(s)
 
 
@@ -142,4 +200,7 @@ def resumed(_: Path) -> Iterator[Attack]:
                  {"noise": [[5] * 3]}, {"grid": [[nan] * 3]})))}  # fmt: skip
     for key, values in wrong.items():
         for value in values:
-            yield f"{key}={value}", lambda k=key, v=value: check_resumed(whole | {"mosa": own | {k: v}}, "a.ckpt")
+            yield (
+                f"{key}={value}",
+                lambda k=key, v=value: check_resumed(whole | {"mosa": own | {k: v}}, "a.ckpt"),
+            )

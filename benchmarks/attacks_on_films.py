@@ -53,17 +53,30 @@ def by_camera(values: list[float]) -> torch.Tensor:
 def hues(frames: int) -> torch.Tensor:
     """Light whose colour goes once round in a film."""
     t = torch.arange(frames) / frames
-    return torch.stack([1 + 0.35 * torch.cos(2 * math.pi * (t + k / 3)) for k in range(3)], -1).view(1, frames, 1, 1, 3)
+    return torch.stack(
+        [1 + 0.35 * torch.cos(2 * math.pi * (t + k / 3)) for k in range(3)], -1
+    ).view(1, frames, 1, 1, 3)
 
 
 def of_cameras(scene: Scene, chosen: list[int]) -> Scene:
-    return replace(scene, images=scene.images[chosen], mattes=scene.mattes[chosen], cameras=scene.cameras.select(chosen))
+    return replace(
+        scene,
+        images=scene.images[chosen],
+        mattes=scene.mattes[chosen],
+        cameras=scene.cameras.select(chosen),
+    )
 
 
 def of_frames(scene: Scene, chosen: slice) -> Scene:
     truth = replace(scene.truth, positions=scene.truth.positions[chosen])
     times = scene.times[chosen] - scene.times[chosen][0]
-    return replace(scene, images=scene.images[:, chosen], mattes=scene.mattes[:, chosen], times=times, truth=truth)
+    return replace(
+        scene,
+        images=scene.images[:, chosen],
+        mattes=scene.mattes[:, chosen],
+        times=times,
+        truth=truth,
+    )
 
 
 def emptied(scene: Scene, cameras: list[int], frame: int) -> Scene:
@@ -75,21 +88,32 @@ def emptied(scene: Scene, cameras: list[int], frame: int) -> Scene:
 def narrowed(scene: Scene, share: float) -> Scene:
     """What sensors of a part of the width see."""
     width = int(share * scene.cameras.width)
-    return replace(scene, images=scene.images[..., :width, :].contiguous(), mattes=scene.mattes[..., :width].contiguous(),
-                   cameras=replace(scene.cameras, width=width))
+    return replace(
+        scene,
+        images=scene.images[..., :width, :].contiguous(),
+        mattes=scene.mattes[..., :width].contiguous(),
+        cameras=replace(scene.cameras, width=width),
+    )
 
 
 def mirrored(scene: Scene) -> Scene:
     K = scene.cameras.K.clone()
     K[:, 0, 2] = scene.cameras.width - K[:, 0, 2]
-    return replace(scene, images=scene.images.flip(3), mattes=scene.mattes.flip(3), cameras=replace(scene.cameras, K=K))
+    return replace(
+        scene,
+        images=scene.images.flip(3),
+        mattes=scene.mattes.flip(3),
+        cameras=replace(scene.cameras, K=K),
+    )
 
 
 def turned(scene: Scene) -> Scene:
     """The same film in a world turned by a right angle about the vertical."""
     turn = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
     truth = replace(scene.truth, positions=scene.truth.positions @ turn[:3, :3].T)
-    return replace(scene, cameras=replace(scene.cameras, w2c=scene.cameras.w2c @ turn.T), truth=truth)
+    return replace(
+        scene, cameras=replace(scene.cameras, w2c=scene.cameras.w2c @ turn.T), truth=truth
+    )
 
 
 def noisy(scene: Scene, sd: float) -> Scene:
@@ -118,7 +142,9 @@ def films_again(folder: Path) -> Iterator[Attack]:
     frames, count = train.frames, len(train.cameras)
     base: dict[str, float] = {}
 
-    def run(name: str, film: Scene, held_out: Scene, *more: str) -> tuple[dict[str, float], list[str]]:
+    def run(
+        name: str, film: Scene, held_out: Scene, *more: str
+    ) -> tuple[dict[str, float], list[str]]:
         """Figures, and what was said that the undisturbed run does not say."""
         place = folder / re.sub(r"\W+", "_", name)
         for scene, part in ((film, "film"), (held_out, "other")):
@@ -133,17 +159,27 @@ def films_again(folder: Path) -> Iterator[Attack]:
                        f"hydra.run.dir={place}/run", *(word.replace("OTHER", f"{place}/other") for word in more),
                        wanted=None, seconds=250.0)  # fmt: skip
         errors = [line for line in told.splitlines() if "Error: " in line]
-        log = (place / "run" / "train.log").read_text() if (place / "run" / "train.log").is_file() else ""
+        log = (
+            (place / "run" / "train.log").read_text()
+            if (place / "run" / "train.log").is_file()
+            else ""
+        )
         said = [line.partition("warning: ")[2] for line in log.splitlines() if "warning: " in line]
         said = [line for line in said if not any(usual in line for usual in EXPECTED)]
         if errors:
-            raise MosaError(errors[0]) if len(errors) == 1 else AssertionError(f"{len(errors)} messages: {errors}")
+            raise (
+                MosaError(errors[0])
+                if len(errors) == 1
+                else AssertionError(f"{len(errors)} messages: {errors}")
+            )
         figures = place / "run" / "metrics.json"
         if not figures.is_file() and not said:  # what was said before the time was over counts
             raise AssertionError(f"no figures: {told[-400:]}")
         return json.loads(figures.read_text()) if figures.is_file() else {}, said
 
-    def attack(name: str, film: Callable[[], Scene], held_out: Callable[[], Scene], *more: str) -> Attack:
+    def attack(
+        name: str, film: Callable[[], Scene], held_out: Callable[[], Scene], *more: str
+    ) -> Attack:
         def told():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -153,10 +189,14 @@ def films_again(folder: Path) -> Iterator[Attack]:
                 refuse(said[0])
             if not base:
                 base.update(found if name == "undisturbed" else run("undisturbed", train, other)[0])
-            unsure = 2 * math.hypot(*(figures.get("posterior/E_relative_sd", 0.0) for figures in (base, found)))
+            unsure = 2 * math.hypot(
+                *(figures.get("posterior/E_relative_sd", 0.0) for figures in (base, found))
+            )
             for key, far in (("id/E", max(E_FAR, unsure)), ("test/cd_m", CD_FAR)):
                 if key in found and abs(found[key] / base[key] - 1) > far:
-                    raise AssertionError(f"nothing said, {key} {found[key]:.4g} for {base[key]:.4g}")
+                    raise AssertionError(
+                        f"nothing said, {key} {found[key]:.4g} for {base[key]:.4g}"
+                    )
             refuse("near")
 
         return name, told
@@ -164,7 +204,10 @@ def films_again(folder: Path) -> Iterator[Attack]:
     yield attack("undisturbed", lambda: train, lambda: other)
     dim = torch.tensor(0.5)
     flicker = by_frame([1.0 if t % 2 else 0.5 for t in range(frames)])
-    first_black, last_black = by_frame([0.0] + [1.0] * (frames - 1)), by_frame([1.0] * (frames - 1) + [0.0])
+    first_black, last_black = (
+        by_frame([0.0] + [1.0] * (frames - 1)),
+        by_frame([1.0] * (frames - 1) + [0.0]),
+    )
     for name, factor in {"a strobe": flicker, "an exposure that falls": by_frame([1 - 0.15 * t for t in range(frames)]),
                          "a first frame that is black": first_black, "a last frame that is black": last_black,
                          "a coloured light that turns": hues(frames), "one camera at half the exposure":
@@ -172,10 +215,21 @@ def films_again(folder: Path) -> Iterator[Attack]:
                          by_camera([0.6 + 0.15 * v for v in range(count)]), "all of it dark": torch.tensor(0.1),
                          "all of it burnt out": torch.tensor(3.0)}.items():  # fmt: skip
         yield attack(f"training film: {name}", lambda f=factor: colored(train, f), lambda: other)
-    yield attack("training film: one camera in another white balance", lambda: colored(train, torch.cat(
-        [torch.tensor([0.6, 0.9, 1.3]).expand(1, 3), torch.ones(count - 1, 3)]).view(count, 1, 1, 1, 3)), lambda: other)
-    yield attack("training film: a strobe in one camera", lambda: colored(train, torch.cat(
-        [flicker, torch.ones(count - 1, frames, 1, 1, 1)])), lambda: other)
+    yield attack(
+        "training film: one camera in another white balance",
+        lambda: colored(
+            train,
+            torch.cat([torch.tensor([0.6, 0.9, 1.3]).expand(1, 3), torch.ones(count - 1, 3)]).view(
+                count, 1, 1, 1, 3
+            ),
+        ),
+        lambda: other,
+    )
+    yield attack(
+        "training film: a strobe in one camera",
+        lambda: colored(train, torch.cat([flicker, torch.ones(count - 1, frames, 1, 1, 1)])),
+        lambda: other,
+    )
     for name, change in {"two cameras": lambda s: of_cameras(s, [0, 2]), "three cameras": lambda s: of_cameras(s, [0, 2, 4]),
                          "three frames": lambda s: of_frames(s, slice(0, 3)), "one camera": lambda s: of_cameras(s, [0]),
                          "nothing in one frame of a camera": lambda s: emptied(s, [2], 1),
@@ -209,5 +263,10 @@ def films_again(folder: Path) -> Iterator[Attack]:
         yield attack(f"other film: {name}", lambda: train, lambda c=change: c(other))
     for name, change in {"at half the exposure": lambda s: colored(s, dim), "two cameras": lambda s: of_cameras(s, [0, 3]),
                          "a chick": lambda s: tiny("test_45", "chick2", 0.2)}.items():  # fmt: skip
-        yield attack(f"also learned from: {name}", lambda: train, lambda c=change: c(other), "scene.also_train=[OTHER]",
-                     "scene.test=[]")
+        yield attack(
+            f"also learned from: {name}",
+            lambda: train,
+            lambda c=change: c(other),
+            "scene.also_train=[OTHER]",
+            "scene.test=[]",
+        )

@@ -35,7 +35,12 @@ from mosa.data.scene import load_scene
 from mosa.data.sequences import load_sequences
 from mosa.environments.arena import simulator_named
 from mosa.environments.tasks import TASKS, task_named
-from mosa.training.preflight import check_capture, check_environments, check_evaluation, check_splats
+from mosa.training.preflight import (
+    check_capture,
+    check_environments,
+    check_evaluation,
+    check_splats,
+)
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.twin import Twin
 from mosa.viewer.clips import read_run
@@ -82,7 +87,9 @@ def films(folder: Path) -> Iterator[Attack]:
         return place
 
     def load(change: Callable[[dict], object] = lambda _: None, **keys):
-        return said(lambda: load_scene(format="transforms", path=str(listing(change)), **WORLD | keys))
+        return said(
+            lambda: load_scene(format="transforms", path=str(listing(change)), **WORLD | keys)
+        )
 
     def each(change: Callable[[dict], object], *chosen: str):
         return lambda d: [change(e) for e in d["frames"] if not chosen or e["camera"] in chosen]
@@ -91,38 +98,62 @@ def films(folder: Path) -> Iterator[Attack]:
         return each(lambda e: e.update({key: e[key] * factor for key in keys}), *chosen)
 
     def poses(change: Callable[[np.ndarray], np.ndarray]):
-        return each(lambda e: e.update(transform_matrix=change(np.array(e["transform_matrix"])).tolist()))
+        return each(
+            lambda e: e.update(transform_matrix=change(np.array(e["transform_matrix"])).tolist())
+        )
 
     for factor in (0.3, 0.5, 0.7, 0.85, 1.5, 2, 4):
         yield f"all focal lengths x {factor}", load(times_(("fl_x", "fl_y"), factor))
     for factor in (0.2, 0.5, 0.8, 1.2, 2, 5):
         yield f"fl_x x {factor}", load(times_(("fl_x",), factor))
     for factor in (0.5, 0.8, 1.2, 2):
-        yield f"one camera's focal lengths x {factor}", load(times_(("fl_x", "fl_y"), factor, cameras[2]))
+        yield (
+            f"one camera's focal lengths x {factor}",
+            load(times_(("fl_x", "fl_y"), factor, cameras[2])),
+        )
     for a, b in itertools.islice(itertools.combinations(range(len(cameras)), 2), 0, 66, 4):
         other = {cameras[a]: cameras[b], cameras[b]: cameras[a]}
         yield (
             f"pictures of cameras {a} and {b} exchanged",
-            load(each(lambda e, o=other: e.update(file_path=files[o.get(e["camera"], e["camera"]), e["time"]]))),
+            load(
+                each(
+                    lambda e, o=other: e.update(
+                        file_path=files[o.get(e["camera"], e["camera"]), e["time"]]
+                    )
+                )
+            ),
         )
     for late in (1, 2, 3):
         yield (
             f"one camera late by {late}",
             load(
                 each(
-                    lambda e, n=late: e.update(file_path=files[e["camera"], times[max(0, times.index(e["time"]) - n)]]), cameras[3]
+                    lambda e, n=late: e.update(
+                        file_path=files[e["camera"], times[max(0, times.index(e["time"]) - n)]]
+                    ),
+                    cameras[3],
                 )
             ),
         )
     for shift in (2, 4, 8):
-        yield f"principal points off by {shift} px", load(each(lambda e, s=shift: e.update(cx=e["cx"] + s)))
+        yield (
+            f"principal points off by {shift} px",
+            load(each(lambda e, s=shift: e.update(cx=e["cx"] + s))),
+        )
     for shift in (4, 8):
-        yield f"one principal point off by {shift} px", load(each(lambda e, s=shift: e.update(cx=e["cx"] + s), cameras[3]))
+        yield (
+            f"one principal point off by {shift} px",
+            load(each(lambda e, s=shift: e.update(cx=e["cx"] + s), cameras[3])),
+        )
     for axis in range(3):
         flip = np.eye(4)
         flip[axis, axis] = -1
         yield f"mirrored along {'xyz'[axis]}", load(poses(lambda m, f=flip: f @ m @ f))
-    for turned in ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[1, 0, 0], [0, 0, 1], [0, -1, 0]], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]):
+    for turned in (
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+        [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+    ):
         matrix = np.eye(4)
         matrix[:3, :3] = turned
         yield f"another axis is up {turned}", load(poses(lambda m, T=matrix: T @ m))
@@ -163,7 +194,10 @@ def films(folder: Path) -> Iterator[Attack]:
     ):
         yield f"{keys}", load(**keys)
     for path in ("~nobody_here/x", "x" * 5000, "a\0b", "\ud800", ""):
-        yield f"path {ascii(path)[:20]}", said(lambda p=path: load_scene(format="transforms", path=p, **WORLD))
+        yield (
+            f"path {ascii(path)[:20]}",
+            said(lambda p=path: load_scene(format="transforms", path=p, **WORLD)),
+        )
     yield from particles(folder, load)
     yield from recordings(folder, good, listing)
     yield from pacnerf(folder)
@@ -200,7 +234,14 @@ def recordings(folder: Path, good: Path, listing: Callable) -> Iterator[Attack]:
     def sequences(test: list, also: Sequence = (), **keys):
         return said(
             lambda: load_sequences(
-                {"format": "transforms", "path": str(good), **WORLD, "test": test, "also_train": list(also), **keys}
+                {
+                    "format": "transforms",
+                    "path": str(good),
+                    **WORLD,
+                    "test": test,
+                    "also_train": list(also),
+                    **keys,
+                }
             )
         )
 
@@ -208,17 +249,27 @@ def recordings(folder: Path, good: Path, listing: Callable) -> Iterator[Attack]:
     shutil.copytree(good, folder / "copy")
     copied = str(folder / "copy")
     yield "test is a copy", sequences([copied])
-    yield "test is a listing of the same pictures", sequences([str(listing(lambda d: d["frames"].reverse()))])
+    yield (
+        "test is a listing of the same pictures",
+        sequences([str(listing(lambda d: d["frames"].reverse()))]),
+    )
     yield "test shares frames", sequences([{"path": copied, "frames": [3, 12]}], frames=[0, 10])
     yield "also_train is a copy", sequences([], [copied])
     yield "test is also_train", sequences([copied], [copied])
-    for entry in (5, {"path": 5}, {"path": copied, "name": "../x"}, {"path": copied, "ground": None}):
+    for entry in (
+        5,
+        {"path": 5},
+        {"path": copied, "name": "../x"},
+        {"path": copied, "ground": None},
+    ):
         yield f"test {str(entry)[-30:]}", sequences([entry])
 
 
 def pacnerf(folder: Path) -> Iterator[Attack]:
     """The same mistakes in PAC-NeRF's layout."""
-    good = export_pacnerf(load_scene(format="transforms", path=str(capture()), **WORLD), folder / "pacnerf")
+    good = export_pacnerf(
+        load_scene(format="transforms", path=str(capture()), **WORLD), folder / "pacnerf"
+    )
     entries = json.loads((good / "all_data.json").read_text())
 
     def changed(change: Callable[[dict], object], **keys):
@@ -235,15 +286,39 @@ def pacnerf(folder: Path) -> Iterator[Attack]:
 
         return said(attack)
 
-    for i, j, value in ((0, 1, 30.0), (2, 2, 2.0), (2, 0, 0.5), (0, 0, 100.0), (1, 0, 9.0), (0, 0, -200.0), (0, 2, 500.0)):
-        yield f"intrinsic[{i}][{j}]={value}", changed(lambda e, i=i, j=j, v=value: e["intrinsic"][i].__setitem__(j, v))
-    yield "intrinsics transposed", changed(lambda e: e.update(intrinsic=np.array(e["intrinsic"]).T.tolist()))
+    for i, j, value in (
+        (0, 1, 30.0),
+        (2, 2, 2.0),
+        (2, 0, 0.5),
+        (0, 0, 100.0),
+        (1, 0, 9.0),
+        (0, 0, -200.0),
+        (0, 2, 500.0),
+    ):
+        yield (
+            f"intrinsic[{i}][{j}]={value}",
+            changed(lambda e, i=i, j=j, v=value: e["intrinsic"][i].__setitem__(j, v)),
+        )
+    yield (
+        "intrinsics transposed",
+        changed(lambda e: e.update(intrinsic=np.array(e["intrinsic"]).T.tolist())),
+    )
     yield "fourth row of a pose", changed(lambda e: e.update(c2w=[*e["c2w"], [0, 0, 0, 2]]))
     yield "poses scaled", changed(lambda e: e.update(c2w=(2 * np.array(e["c2w"])).tolist()))
-    yield "OpenCV's axes", changed(lambda e: e.update(c2w=(np.array(e["c2w"]) * [1, -1, -1, 1]).tolist()))
+    yield (
+        "OpenCV's axes",
+        changed(lambda e: e.update(c2w=(np.array(e["c2w"]) * [1, -1, -1, 1]).tolist())),
+    )
     for factor in (0.25, 0.5, 2, 4):
         yield f"times x {factor}", changed(lambda e, f=factor: e.update(time=f * e["time"]))
-    for key, value in (("time", "0"), ("time", None), ("file_path", 5), ("file_path", "x.png"), ("c2w", None), ("intrinsic", [1])):
+    for key, value in (
+        ("time", "0"),
+        ("time", None),
+        ("file_path", 5),
+        ("file_path", "x.png"),
+        ("c2w", None),
+        ("intrinsic", [1]),
+    ):
         yield f"{key}={value}", changed(lambda e, k=key, v=value: e.update({k: v}))
 
 
@@ -290,15 +365,26 @@ def senseless(folder: Path) -> Iterator[Attack]:
         for kind, change in changes.items():
             yield (
                 f"{name} {kind}",
-                lambda n=f"body.{name}", c=change: load({**stored(), "state_dict": {**state, n: c(state[n].clone())}}),
+                lambda n=f"body.{name}", c=change: load(
+                    {**stored(), "state_dict": {**state, n: c(state[n].clone())}}
+                ),
             )
-    for name in [name for name in state if state[name].is_floating_point() and name.count(".") > 1][:20]:
+    for name in [name for name in state if state[name].is_floating_point() and name.count(".") > 1][
+        :20
+    ]:
         for kind in ("complex", "whole", "half", "flags"):
             yield (
                 f"{name} {kind}",
-                lambda n=name, c=changes[kind]: load({**stored(), "state_dict": {**state, n: c(state[n].clone())}}),
+                lambda n=name, c=changes[kind]: load(
+                    {**stored(), "state_dict": {**state, n: c(state[n].clone())}}
+                ),
             )
-    yield "colours of 1e6", lambda: load({**stored(), "state_dict": {**state, "body.colors": 1e6 * state["body.colors"]}})
+    yield (
+        "colours of 1e6",
+        lambda: load(
+            {**stored(), "state_dict": {**state, "body.colors": 1e6 * state["body.colors"]}}
+        ),
+    )
     torch.save(stored(), folder / "good.ckpt")
     for device in ("nope", "meta", "cpu:7", "cuda:99", 5, None, ""):
         yield f"device={device}", lambda d=device: Twin.load(folder / "good.ckpt", d)
@@ -329,7 +415,10 @@ def environments(folder: Path) -> Iterator[Attack]:
         {"format": ["builtin"]},
         {"format": "transforms", "path": "/etc"},
     ):
-        yield f"stored scene {scene}", lambda s=scene: truth(put(stored(), "mosa.config.cfg.scene", s))
+        yield (
+            f"stored scene {scene}",
+            lambda s=scene: truth(put(stored(), "mosa.config.cfg.scene", s)),
+        )
     for key, values in {
         "spacing": (0, -1, NAN, "a", 1e9, True, 0.5, 1e-9),
         "scene": ("nope", 5, "../x"),
@@ -338,7 +427,9 @@ def environments(folder: Path) -> Iterator[Attack]:
         for value in values:
             yield (
                 f"truth {key}={value}",
-                lambda k=key, v=value: simulator_named("truth", **{"scene": "tiny", "spacing": 0.05} | {k: v}),
+                lambda k=key, v=value: simulator_named(
+                    "truth", **{"scene": "tiny", "spacing": 0.05} | {k: v}
+                ),
             )
     for name in (5, None, ["learned"], "Learned", ""):
         yield f"simulator {name}", lambda n=name: simulator_named(n, "a.ckpt")
@@ -350,7 +441,10 @@ def environments(folder: Path) -> Iterator[Attack]:
             if "ClassVar" in str(field.type) or field.name == "extents":
                 continue
             for value in (-1, NAN, 1e9, "a", None, [1]):
-                yield f"{name}.{field.name}={value}", lambda n=name, f=field.name, v=value: task_named(n, rest, **{f: v})
+                yield (
+                    f"{name}.{field.name}={value}",
+                    lambda n=name, f=field.name, v=value: task_named(n, rest, **{f: v}),
+                )
         yield f"{name}.foo", lambda n=name: task_named(n, rest, foo=1)
     yield "low above high", lambda: task_named("hanging", rest, low=0.5, high=0.2)
     yield "close above far", lambda: task_named("hanging", rest, close=0.5, far=0.2)
@@ -368,7 +462,18 @@ def stepping(folder: Path) -> Iterator[Attack]:
         twin.reset(**{"height": 0.05, "colliders": [pad], "control_dt": 0.02} | keys)
         twin.step(action)
 
-    for position in ((0, -0.05, 0), (0, 0, 0), (0, 0.02, 0), (0, -1, 0), (NAN, 0, 0), (1e9, 0, 0), (0, 1), "abc", 5, {}):
+    for position in (
+        (0, -0.05, 0),
+        (0, 0, 0),
+        (0, 0.02, 0),
+        (0, -1, 0),
+        (NAN, 0, 0),
+        (1e9, 0, 0),
+        (0, 1),
+        "abc",
+        5,
+        {},
+    ):
         yield f"position={position}", lambda p=position: twin.simulate(frames=2, position=p)
     for key, values in {
         "control_dt": (0, -1, NAN, INF, "a", 1e9, True),
@@ -413,7 +518,9 @@ def stepping(folder: Path) -> Iterator[Attack]:
     for starts in (5, "a", [5, 5], [{}] * 3, [{"foo": 1}, {}], [{"height": -1}, {}]):
         yield (
             f"worlds' starts {starts}",
-            lambda s=starts: TwinWorlds(twin.body, twin.world, twin.frame_dt, twin.training_start, 2).reset(s),
+            lambda s=starts: TwinWorlds(
+                twin.body, twin.world, twin.frame_dt, twin.training_start, 2
+            ).reset(s),
         )
     for which in (5, [5], [-1], ["a"]):
 
@@ -434,7 +541,10 @@ def stepping(folder: Path) -> Iterator[Attack]:
         ("/proc/x", ["ply"]),
         (5, ["ply"]),
     ):
-        yield f"export {str(where)[-5:]} {formats}", lambda w=where, f=formats: twin.export(rollout, w, video=False, formats=f)
+        yield (
+            f"export {str(where)[-5:]} {formats}",
+            lambda w=where, f=formats: twin.export(rollout, w, video=False, formats=f),
+        )
 
 
 # ---------------------------------------------------------------- folders and arguments of the viewer
@@ -491,7 +601,11 @@ def viewer(folder: Path) -> Iterator[Attack]:
                 harmless = (
                     optional
                     or (kind == "gone" and name.endswith("F_tot"))
-                    or (kind == "huge" and name.split("/")[-1] in ("up", "factor", "times", "rest", "x", "F_tot", "volume"))
+                    or (
+                        kind == "huge"
+                        and name.split("/")[-1]
+                        in ("up", "factor", "times", "rest", "x", "F_tot", "volume")
+                    )
                 )
                 if not harmless:
 
@@ -499,7 +613,12 @@ def viewer(folder: Path) -> Iterator[Attack]:
                         p.pop(n) if c is None else p.update({n: c(p[n])})
 
                     yield f"{file}: {name} {kind}", shown(file, changed)
-    for file, content in (("rollout.npz", b""), ("rollout.npz", b"hello"), ("body.npz", b""), ("body.npz", b"PK")):
+    for file, content in (
+        ("rollout.npz", b""),
+        ("rollout.npz", b"hello"),
+        ("body.npz", b""),
+        ("body.npz", b"PK"),
+    ):
 
         def spoiled(file=file, content=content):
             place = folder / "spoiled"
@@ -619,17 +738,31 @@ def commands(_: Path) -> Iterator[Attack]:
             ),
         ),
     }
-    required = {"capture": ("videos=a", "poses=b", "output=c"), "splats": ("ply=a",), "eval": ("ckpt_path=a",), "environments": ()}
+    required = {
+        "capture": ("videos=a", "poses=b", "output=c"),
+        "splats": ("ply=a",),
+        "eval": ("ckpt_path=a",),
+        "environments": (),
+    }
     for name, (check_it, keys) in known.items():
         for key in keys:
             for value in odd:
-                if (value is True and key in ("open_below", "video")) or (key, value) == ("seeds", [1]):
+                if (value is True and key in ("open_below", "video")) or (key, value) == (
+                    "seeds",
+                    [1],
+                ):
                     continue  # which they may be
                 if key in ("phones", "options") and isinstance(value, dict):
                     continue
-                yield f"{name}: {key}={value}", lambda n=name, c=check_it, k=key, v=value: c(put(other(n, *required[n]), k, v))
+                yield (
+                    f"{name}: {key}={value}",
+                    lambda n=name, c=check_it, k=key, v=value: c(put(other(n, *required[n]), k, v)),
+                )
     for name in known:
-        yield f"{name}: foo", lambda n=name: check_known(other(n, *required[n]) | {"foo": 1}, ROOT / "conf", n)
+        yield (
+            f"{name}: foo",
+            lambda n=name: check_known(other(n, *required[n]) | {"foo": 1}, ROOT / "conf", n),
+        )
 
 
 def experiments(folder: Path) -> Iterator[Attack]:
@@ -663,7 +796,9 @@ def experiments(folder: Path) -> Iterator[Attack]:
         for place in ("/proc/x", str(folder / "file" / "x")):
             yield (
                 f"{flag} {place[-6:]}",
-                lambda f=flag, p=place: silently(lambda: run(arguments(["table_time", "--collect", f, p]))),
+                lambda f=flag, p=place: silently(
+                    lambda: run(arguments(["table_time", "--collect", f, p]))
+                ),
             )
 
 
@@ -735,7 +870,12 @@ def sections(_: Path) -> Iterator[Attack]:
     config = composed()
     for path in below({key: value for key, value in config.items() if key != "scene"}):
         for value in (5, "abc", [[{}], 1], True, NAN, {"foo": 1}):
-            if path not in ("ckpt_path", "logger.tensorboard", "logger.csv", "logger") or not isinstance(value, dict):
+            if path not in (
+                "ckpt_path",
+                "logger.tensorboard",
+                "logger.csv",
+                "logger",
+            ) or not isinstance(value, dict):
                 yield f"{path}={value}", lambda p=path, v=value: configured(put(config, p, v))
 
 

@@ -40,10 +40,26 @@ def program(*arguments: str, disturbed: tuple[str, str] | None = None, script: s
     """Run it to its end, or until a signal after some seconds; what was on its screen. An exit code that was not `wanted`, or a
     traceback, is an AssertionError. disturbed: see disturbed.py; shell: around the command."""
     words = [str(ROOT / script), *arguments]
-    words = [sys.executable, *([str(ROOT / "benchmarks" / "disturbed.py"), *disturbed] if disturbed else []), *words]
-    quoted = " ".join(f"'{word.replace(chr(39), chr(39) + chr(92) + chr(39) * 2)}'" for word in words)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    command = ["bash", "-o", "pipefail", "-c", ("exec " if shell == "{}" else "") + shell.format(quoted)]
+    words = [
+        sys.executable,
+        *([str(ROOT / "benchmarks" / "disturbed.py"), *disturbed] if disturbed else []),
+        *words,
+    ]
+    quoted = " ".join(
+        f"'{word.replace(chr(39), chr(39) + chr(92) + chr(39) * 2)}'" for word in words
+    )
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    }
+    command = [
+        "bash",
+        "-o",
+        "pipefail",
+        "-c",
+        ("exec " if shell == "{}" else "") + shell.format(quoted),
+    ]
     process = subprocess.Popen(command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))  # fmt: skip
     if seconds is not None:
@@ -64,7 +80,9 @@ def contents(folder: Path) -> dict[str, object]:
     for file in sorted(folder.glob("*.npz")):
         with np.load(file) as arrays:
             found |= {f"{file.name}:{key}": arrays[key].tobytes() for key in arrays.files}
-    return found | {name: (folder / name).read_bytes() for name in FILES if (folder / name).is_file()}
+    return found | {
+        name: (folder / name).read_bytes() for name in FILES if (folder / name).is_file()
+    }
 
 
 def equal(wanted: dict[str, object], folder: Path, *others: Path) -> None:
@@ -91,9 +109,15 @@ def running(folder: Path) -> Iterator[Attack]:
         return folder / name
 
     def stopped(name: str, sign: int, fresh: bool) -> None:
-        run, used, most = folder / name, folder / f"{name}_cache" if fresh else cache, 25.0 if fresh else 12.0
+        run, used, most = (
+            folder / name,
+            folder / f"{name}_cache" if fresh else cache,
+            25.0 if fresh else 12.0,
+        )
         for _ in range(2 if fresh else 3):
-            program(*arguments(run, used), seconds=generator.uniform(3.0, most), sign=sign, wanted=None)
+            program(
+                *arguments(run, used), seconds=generator.uniform(3.0, most), sign=sign, wanted=None
+            )
         program(*arguments(run, used))
         equal(whole, run, used)
 
@@ -112,12 +136,20 @@ def running(folder: Path) -> Iterator[Attack]:
             yield (f"{sign.name} at drawn moments, {'from' if fresh else 'after'} the reconstruction",
                    lambda s=sign, f=fresh: stopped(f"{s.name}_{f}", s, f))  # fmt: skip
     told = program(*arguments(fitted("listed")), disturbed=("list:0", str(folder / "listed")))
-    writes = [int(line.split()[2]) for line in told.splitlines() if line.startswith("disturbed: list") and ".hydra" not in line
-              and line.split()[3] in ("open", "os.rename")]  # a folder that is there already may fail to be made
+    writes = [
+        int(line.split()[2])
+        for line in told.splitlines()
+        if line.startswith("disturbed: list")
+        and ".hydra" not in line
+        and line.split()[3] in ("open", "os.rename")
+    ]  # a folder that is there already may fail to be made
     writes = [n for n in writes if n > 3]  # Hydra's own first ones are its
     for how, code, share in (("kill", None, 3), ("full", 2, 3), ("term", 143, 6), ("int", 130, 6)):
         for number in writes[::share]:
-            yield f"{how} at write {number} of the evaluation", lambda h=how, n=number, c=code: at_a_file(h, n, c)
+            yield (
+                f"{how} at write {number} of the evaluation",
+                lambda h=how, n=number, c=code: at_a_file(h, n, c),
+            )
 
     def screen(name: str, shell: str) -> None:
         run = fitted(name)
@@ -165,7 +197,9 @@ def running(folder: Path) -> Iterator[Attack]:
             time.sleep(0.05)
         shutil.rmtree(run)
         told = process.communicate()[1]
-        refuse("one message") if process.returncode == 2 and "Traceback" not in told else refuse_not(told)
+        refuse(
+            "one message"
+        ) if process.returncode == 2 and "Traceback" not in told else refuse_not(told)
 
     def refuse_not(told: str) -> None:
         raise AssertionError(told[-500:])
@@ -190,7 +224,10 @@ def running(folder: Path) -> Iterator[Attack]:
         equal(whole, run)
 
     for waits in (False, True):
-        yield f"a second process in the folder{', which waits' if waits else ''}", lambda w=waits: beside(w)
+        yield (
+            f"a second process in the folder{', which waits' if waits else ''}",
+            lambda w=waits: beside(w),
+        )
 
     def limited(name: str, limit: str) -> None:
         run = fitted(name)
@@ -203,7 +240,12 @@ def running(folder: Path) -> Iterator[Attack]:
         else:
             refuse("one message")
 
-    for name, limit in {"memory": "-v 1200000", "more_memory": "-v 1800000", "file_size": "-f 200", "handles": "-n 9"}.items():
+    for name, limit in {
+        "memory": "-v 1200000",
+        "more_memory": "-v 1800000",
+        "file_size": "-f 200",
+        "handles": "-n 9",
+    }.items():
         yield f"ulimit {limit}", lambda n=name, x=limit: limited(n, x)
 
     def sweep() -> None:
@@ -221,7 +263,13 @@ def running(folder: Path) -> Iterator[Attack]:
         program(*words, f"hydra.run.dir={folder}/e", script="eval.py")
         for number in (5, 12, 20):
             run = folder / f"e_{number}"
-            program(*words, f"hydra.run.dir={run}", script="eval.py", disturbed=(f"kill:{number}", str(run)), wanted=None)
+            program(
+                *words,
+                f"hydra.run.dir={run}",
+                script="eval.py",
+                disturbed=(f"kill:{number}", str(run)),
+                wanted=None,
+            )
             program(*words, f"hydra.run.dir={run}", script="eval.py")
             if contents(run) != contents(folder / "e") or leftovers(run):
                 raise AssertionError(f"killed at write {number}: {leftovers(run)}")

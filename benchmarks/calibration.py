@@ -29,7 +29,13 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import mosa
-from mosa.config.build import build_body, build_criterion, build_identification, build_stages, build_world
+from mosa.config.build import (
+    build_body,
+    build_criterion,
+    build_identification,
+    build_stages,
+    build_world,
+)
 from mosa.data.synthetic import BOX
 from mosa.data.synthetic.bodies.objects import BuiltinObject, object_named
 from mosa.data.synthetic.bodies.shapes import SHAPES
@@ -60,7 +66,9 @@ COVERED = 2.0
 
 def overrides_of(name: str) -> list[str]:
     """Of a stand-in, as the table of system identification has them."""
-    stand_ins = options_of("stand-ins", "stand-ins", read_yaml(CONF / "experiment" / "paper" / f"{SHARED}.yaml"))
+    stand_ins = options_of(
+        "stand-ins", "stand-ins", read_yaml(CONF / "experiment" / "paper" / f"{SHARED}.yaml")
+    )
     return list(next(option.overrides for option in stand_ins if option.name == name))
 
 
@@ -74,16 +82,34 @@ def configuration(name: str, more: list[str]) -> dict:
     return composed([*overrides_of(name), "adapter=none", "heterogeneity.enabled=false", *more])
 
 
-def keep(path: Path, body: BuiltinObject, material: Hidden | PublishedMaterial, seed: int, drop: str = "train") -> Path:
+def keep(
+    path: Path,
+    body: BuiltinObject,
+    material: Hidden | PublishedMaterial,
+    seed: int,
+    drop: str = "train",
+) -> Path:
     """The true motion of one of a body's drops: rest (N, 3) as in frame 0 of the training drop, positions (T, N, 3) [m]."""
     began = time.perf_counter()
     surface = extract_surface(SHAPES[body.shape], body.pitch, np.random.default_rng([seed, 1]))
     particles = fill(SHAPES[body.shape], body.spacing, np.random.default_rng([seed, 2]))
-    fall = simulate(body, material, particles, surface.vertices, body.drops[drop], body.drops["train"])
+    fall = simulate(
+        body, material, particles, surface.vertices, body.drops[drop], body.drops["train"]
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, rest=fall.rest, positions=fall.positions.astype(np.float32), velocity=fall.velocity, shape=particles,
-             rotation=fall.rotation, lowest=surface.vertices[:, 1].min())
-    print(f"{path}: {len(particles)} particles, {fall.substeps} substeps a frame, {time.perf_counter() - began:.0f} s", flush=True)
+    np.savez(
+        path,
+        rest=fall.rest,
+        positions=fall.positions.astype(np.float32),
+        velocity=fall.velocity,
+        shape=particles,
+        rotation=fall.rotation,
+        lowest=surface.vertices[:, 1].min(),
+    )
+    print(
+        f"{path}: {len(particles)} particles, {fall.substeps} substeps a frame, {time.perf_counter() - began:.0f} s",
+        flush=True,
+    )
     return path
 
 
@@ -93,13 +119,18 @@ def make(name: str, folder: Path, seed: int) -> Path:
     return keep(folder / f"{name}.npz", body, body.material, seed)
 
 
-def noisy(positions: np.ndarray, rest: np.ndarray, sd: float, rng: np.random.Generator) -> np.ndarray:
+def noisy(
+    positions: np.ndarray, rest: np.ndarray, sd: float, rng: np.random.Generator
+) -> np.ndarray:
     """positions (T, N, 3) with errors of `sd` [m] a component, anew in every frame, alike a tenth of the body around."""
     size = np.ptp(rest, 0).max()
     waves = rng.normal(size=(WAVES, 3)) * 2 * np.pi / (0.5 * size)
     found = positions.copy()
     for frame in found[1:]:
-        phases, weights = rng.uniform(0, 2 * np.pi, WAVES), rng.normal(size=(WAVES, 3)) * math.sqrt(2 / WAVES)
+        phases, weights = (
+            rng.uniform(0, 2 * np.pi, WAVES),
+            rng.normal(size=(WAVES, 3)) * math.sqrt(2 / WAVES),
+        )
         frame += sd * np.cos(rest @ waves.T + phases) @ weights
     return found
 
@@ -137,16 +168,41 @@ def learner_of(
     # made on the CPU, where a new field's waves are, and moved as a whole
     made = build_body(config, {"rest": tensor(rest).cpu(), "volume": torch.full((n,), spacing**3), "colors": torch.zeros(n, 3),
                                "opacities": torch.ones(n), "covariances": torch.eye(3).expand(n, 3, 3)}).to(device)  # fmt: skip
-    start = Start(torch.eye(3, device=device), made.center, tensor(stored["velocity"]), torch.zeros(3, device=device))
-    cues = neighbourhood_cues(tensor(seen), torch.zeros(1, device=device), neighbourhood(tensor(rest)))
+    start = Start(
+        torch.eye(3, device=device),
+        made.center,
+        tensor(stored["velocity"]),
+        torch.zeros(3, device=device),
+    )
+    cues = neighbourhood_cues(
+        tensor(seen), torch.zeros(1, device=device), neighbourhood(tensor(rest))
+    )
     contact = first_contact(truth, spacing)
     take = Take(start, None, cues, config["frame_dt"], contact)
-    return SimpleNamespace(object=body, body=made, world=build_world(world), take=take, cfg=cfg, truth=tensor(truth), config=config)
+    return SimpleNamespace(
+        object=body,
+        body=made,
+        world=build_world(world),
+        take=take,
+        cfg=cfg,
+        truth=tensor(truth),
+        config=config,
+    )
 
 
-def case_of(path: Path, particles: int, more: list[str], seed: int, noise: float, device: str) -> SimpleNamespace:
+def case_of(
+    path: Path, particles: int, more: list[str], seed: int, noise: float, device: str
+) -> SimpleNamespace:
     """The learner of a stand-in."""
-    case = learner_of(path, object_named(path.stem), configuration(path.stem, more), particles, seed, noise, device)
+    case = learner_of(
+        path,
+        object_named(path.stem),
+        configuration(path.stem, more),
+        particles,
+        seed,
+        noise,
+        device,
+    )
     case.name = path.stem
     return case
 
@@ -159,14 +215,27 @@ def fit(
     case = case_of(path, particles, more, seed, noise, device)
     body, contact = case.body, case.take.first_contact
     stage = replace(build_stages(case.cfg["fit"], None, None)[0], name=stages)
-    calibration = Identification(body, [case.take], case.world, stage, build_criterion(case.cfg), build_identification(case.cfg),
-                                 (True, False, False))
+    calibration = Identification(
+        body,
+        [case.take],
+        case.world,
+        stage,
+        build_criterion(case.cfg),
+        build_identification(case.cfg),
+        (True, False, False),
+    )
     calibration.search()
     searched = {name: float(value.detach()) for name, value in body.material.physical().items()}
     for taken in range(1, stage.iterations + 1):
         report = calibration.iterate()
-        now = " ".join(f"{name} {float(value.detach()):.4g}" for name, value in body.material.physical().items())
-        print(f"  {case.name} {taken}: {now} cost {report['after']:.1f} length {report['length']:.2f}", flush=True)
+        now = " ".join(
+            f"{name} {float(value.detach()):.4g}"
+            for name, value in body.material.physical().items()
+        )
+        print(
+            f"  {case.name} {taken}: {now} cost {report['after']:.1f} length {report['length']:.2f}",
+            flush=True,
+        )
         if calibration.converged:
             break
     alone, known = determined(body, calibration.newton.posterior()), case.object.material.known
@@ -216,9 +285,14 @@ def table(records: list[dict]) -> str:
                 f"{off[-1]:.2f}", f"{r['rms_mm']:.1f}", f"{r['seconds']:.0f}")  # fmt: skip
             lines.append(f"| {' | '.join(map(str, shown))} |")
     size = np.sqrt(np.mean(np.square(off)))
-    counted = ", ".join(f"{verdicts.count(each)} {each}" for each in ("met", "not determined", "missed"))
+    counted = ", ".join(
+        f"{verdicts.count(each)} {each}" for each in ("met", "not determined", "missed")
+    )
     lines += ["", f"of {len(off)} numbers {counted}"]
-    lines += ["", f"root mean square of error / posterior sd, 1 where that is honest: {size:.2f} ({len(off)} numbers)"]
+    lines += [
+        "",
+        f"root mean square of error / posterior sd, 1 where that is honest: {size:.2f} ({len(off)} numbers)",
+    ]
     return "\n".join(lines)
 
 
@@ -227,7 +301,9 @@ def draw(records: list[dict], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     stem = folder / "calibration_from_motion"
     stem.with_suffix(".json").write_text(json.dumps(records, indent=1))
-    commits, machines, noises = (", ".join(sorted({str(r[key]) for r in records})) for key in ("commit", "machine", "noise"))
+    commits, machines, noises = (
+        ", ".join(sorted({str(r[key]) for r in records})) for key in ("commit", "machine", "noise")
+    )
     stem.with_suffix(".md").write_text("\n".join([
         "# Calibrations from true motions", "", __doc__.split("\n\n")[2].strip(), "",
         "*As asked*: E, mu and the friction angle within 5 %, nu within 0.03, all others within 10 %; *not determined*: further "
@@ -241,17 +317,36 @@ def draw(records: list[dict], folder: Path) -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Of fits to true motions."""
     parser.add_argument("--particles", type=int, default=1500, help="fit: of the learner, about")
-    parser.add_argument("--noise", type=float, default=NOISE, help="fit: error of the cues over the body's height")
+    parser.add_argument(
+        "--noise", type=float, default=NOISE, help="fit: error of the cues over the body's height"
+    )
     parser.add_argument("--seed", type=int, default=0)
 
 
 def main() -> None:
     parser = fits.parser_of(__doc__, "names of stand-ins", "motions", pictures=True)
     add_options(parser)
-    parser.add_argument("--stage", default="prior", help="fit: prior; prior_eta: under the criterion, with the second grid")
+    parser.add_argument(
+        "--stage",
+        default="prior",
+        help="fit: prior; prior_eta: under the criterion, with the second grid",
+    )
     options = parser.parse_args()
-    given = (options.particles, options.set, options.seed, options.noise, options.device, options.stage)
-    fits.run(options, lambda name: make(name, options.out, options.seed), lambda path: fit(path, *given), table, draw)
+    given = (
+        options.particles,
+        options.set,
+        options.seed,
+        options.noise,
+        options.device,
+        options.stage,
+    )
+    fits.run(
+        options,
+        lambda name: make(name, options.out, options.seed),
+        lambda path: fit(path, *given),
+        table,
+        draw,
+    )
 
 
 if __name__ == "__main__":

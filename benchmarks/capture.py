@@ -66,7 +66,9 @@ def errors(truth: dict, found: dict) -> dict[str, float]:
     """What was found minus what is true."""
     begins = np.array([p["begin"] for p in truth["phones"]])
     offsets = 1e3 * (np.array([p["offset"] for p in found["phones"]]) - (begins - begins[0]))
-    readouts = 1e3 * (np.array([p["readout"] for p in found["phones"]]) - [p["readout"] for p in truth["phones"]])
+    readouts = 1e3 * (
+        np.array([p["readout"] for p in found["phones"]]) - [p["readout"] for p in truth["phones"]]
+    )
     A, b = to_found(truth, found_world(found))
     up = A[:, 1] / np.linalg.norm(A[:, 1])
     return {
@@ -86,13 +88,15 @@ def pictures_errors(seen: Path, right: Path) -> dict[str, float]:
     overlap, apart, squares = [], [], []
     for file in sorted((right / "images").glob("*.png")):
         a, b = (
-            cv2.imread(str(folder / "images" / file.name), cv2.IMREAD_UNCHANGED).astype(np.float32) / 255
+            cv2.imread(str(folder / "images" / file.name), cv2.IMREAD_UNCHANGED).astype(np.float32)
+            / 255
             for folder in (seen, right)
         )
         both, either = (a[..., 3] > 0.5) & (b[..., 3] > 0.5), (a[..., 3] > 0.5) | (b[..., 3] > 0.5)
         overlap.append(both.sum() / either.sum())
         centres = [
-            np.array([(m.sum(0) @ np.arange(m.shape[1])), (m.sum(1) @ np.arange(m.shape[0]))]) / m.sum()
+            np.array([(m.sum(0) @ np.arange(m.shape[1])), (m.sum(1) @ np.arange(m.shape[0]))])
+            / m.sum()
             for m in (a[..., 3], b[..., 3])
         ]
         apart.append(np.linalg.norm(centres[0] - centres[1]))
@@ -115,12 +119,25 @@ def compare(folder: Path, kinds: list[str], rate: float | None = None) -> dict:
         if kind == kinds[0]:
             said |= errors(truth, found)
             perfect(
-                folder / "perfect", truth, sequence="train", times=times, world=gauge(truth, found_world(found)), particles=True
+                folder / "perfect",
+                truth,
+                sequence="train",
+                times=times,
+                world=gauge(truth, found_world(found)),
+                particles=True,
             )
         said[kind] = pictures_errors(folder / "scene", folder / "perfect")
     print("\n| | error | said |\n|---|---|---|")
-    for name, unit in (("clock_rms", "ms"), ("readout_rms", "ms"), ("scale", "percent"), ("up", "degrees"), ("ground", "mm")):
-        print(f"| {name} [{unit}] | {said[f'{name}_{unit}']:.3g} | {said[name.removesuffix('_rms') + f'_said_{unit}']:.3g} |")
+    for name, unit in (
+        ("clock_rms", "ms"),
+        ("readout_rms", "ms"),
+        ("scale", "percent"),
+        ("up", "degrees"),
+        ("ground", "mm"),
+    ):
+        print(
+            f"| {name} [{unit}] | {said[f'{name}_{unit}']:.3g} | {said[name.removesuffix('_rms') + f'_said_{unit}']:.3g} |"
+        )
     print(
         "\n| frames at common times | overlap of mattes | worst | centres apart [px] | worst | PSNR inside [dB] |\n"
         "|---|---|---|---|---|---|"
@@ -137,11 +154,22 @@ def compare(folder: Path, kinds: list[str], rate: float | None = None) -> dict:
 
 def footage(folder: Path, held: list[str]) -> None:
     """Held-out drops by perfect cameras with true particles, and the commands that learn from the phones and perfectly."""
-    truth, found = (json.loads((folder / name).read_text()) for name in ("truth.json", "scene/capture.json"))
+    truth, found = (
+        json.loads((folder / name).read_text()) for name in ("truth.json", "scene/capture.json")
+    )
     world = gauge(truth, found_world(found))
     for sequence in held:
-        perfect(folder / "held_out" / sequence, truth, sequence=sequence, times=np.arange(15) * STEP, world=world, particles=True)
-    tests = ",".join(f"{{path: {folder.resolve()}/held_out/{sequence}, particles: truth}}" for sequence in held)
+        perfect(
+            folder / "held_out" / sequence,
+            truth,
+            sequence=sequence,
+            times=np.arange(15) * STEP,
+            world=world,
+            particles=True,
+        )
+    tests = ",".join(
+        f"{{path: {folder.resolve()}/held_out/{sequence}, particles: truth}}" for sequence in held
+    )
     box = json.dumps(found["box"], separators=(",", ":"))
     for name in ("scene", "perfect"):
         print(
@@ -151,16 +179,22 @@ def footage(folder: Path, held: list[str]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=["film", "compare", "footage"])
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--name", default="rabbit")
     parser.add_argument("--material", default="isotropic", choices=["isotropic", "anisotropic"])
     parser.add_argument("--size", default="960x720")
     parser.add_argument("--fps", type=float, default=60.0)
-    parser.add_argument("--rate", type=float, default=None, help="frames per second that mosa-capture writes")
+    parser.add_argument(
+        "--rate", type=float, default=None, help="frames per second that mosa-capture writes"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="phones filmed at a time, each in a process")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="phones filmed at a time, each in a process"
+    )
     parser.add_argument("--kinds", default=",".join(reversed(KINDS)))
     parser.add_argument("--held", default="test_60,test_40")
     options = parser.parse_args()

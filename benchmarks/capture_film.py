@@ -62,10 +62,16 @@ class Fall:
         body, drop = object_named(name), drop_named(name, sequence)
         self.hidden = body.material.variant(material)
         self.surface, self.particles, self.skin = built(body.shape, body.pitch, body.spacing, seed)
-        finer = replace(body, footage=replace(body.footage, fps=FINE, frames=int(seconds * FINE) + 2))
-        found = simulate(finer, self.hidden, self.particles, self.surface.vertices, drop, body.drops["train"])
+        finer = replace(
+            body, footage=replace(body.footage, fps=FINE, frames=int(seconds * FINE) + 2)
+        )
+        found = simulate(
+            finer, self.hidden, self.particles, self.surface.vertices, drop, body.drops["train"]
+        )
         self.positions, self.velocity, self.g = found.positions, found.velocity, np.array(GRAVITY)
-        self.released = float(self.velocity[1] / -self.g[1])  # before 0: it hangs, then falls from rest
+        self.released = float(
+            self.velocity[1] / -self.g[1]
+        )  # before 0: it hangs, then falls from rest
 
     def shift(self, t: float) -> np.ndarray | None:
         """(3,) [m] by which the body of time 0 is displaced while it is rigid; None later."""
@@ -88,7 +94,9 @@ class Shown:
 
     def __init__(self, fall: Fall):
         self.fall = fall
-        self.colors = wp.array(np.clip(fall.surface.colors, 0, 1).astype(np.float32), dtype=wp.vec3, device="cpu")
+        self.colors = wp.array(
+            np.clip(fall.surface.colors, 0, 1).astype(np.float32), dtype=wp.vec3, device="cpu"
+        )
         self.when: float | None = None
         self.move_to(0.0)
 
@@ -100,9 +108,14 @@ class Shown:
             self.vertices = self.fall.skin.follow(self.fall.at(key)).astype(np.float32)
             triangles = self.fall.surface.triangles
             self.mesh = wp.Mesh(
-                wp.array(self.vertices, dtype=wp.vec3, device="cpu"), wp.array(triangles.ravel(), dtype=wp.int32, device="cpu")
+                wp.array(self.vertices, dtype=wp.vec3, device="cpu"),
+                wp.array(triangles.ravel(), dtype=wp.int32, device="cpu"),
             )
-            self.normals = wp.array(vertex_normals(self.vertices, triangles).astype(np.float32), dtype=wp.vec3, device="cpu")
+            self.normals = wp.array(
+                vertex_normals(self.vertices, triangles).astype(np.float32),
+                dtype=wp.vec3,
+                device="cpu",
+            )
             self.when = key
         return np.zeros(3) if shift is None else shift
 
@@ -126,20 +139,33 @@ class Shown:
         found[y0 - rows[0] : y1 - rows[0]] = part.numpy()
         return x0, np.clip(found, 0, 1)
 
-    def picture(self, t: float, K: np.ndarray, w2c: np.ndarray, size: tuple[int, int], readout: float = 0.0) -> np.ndarray:
+    def picture(
+        self, t: float, K: np.ndarray, w2c: np.ndarray, size: tuple[int, int], readout: float = 0.0
+    ) -> np.ndarray:
         """RGBA (H, W, 4) in [0, 1]; t [s]: of the middle row; readout [s] from the first row to the last."""
         width, height = size
         picture = np.zeros((height, width, 4), np.float32)
         shift = self.move_to(t)
         low, high = (self.vertices + shift).min(0), (self.vertices + shift).max(0)
-        spare = 4.0 * readout  # [m] on both sides: what falls no faster stays in there while the sensor is read
+        spare = (
+            4.0 * readout
+        )  # [m] on both sides: what falls no faster stays in there while the sensor is read
         corners = np.array(np.meshgrid(*zip(low - spare, high + spare))).reshape(3, -1).T
         _, top, _, bottom = window(corners, K, w2c, width, height)
-        bands = max(1, int(np.ceil(readout / (BAND if self.fall.shift(t + 0.5 * readout) is not None else 2 * BAND))))
+        bands = max(
+            1,
+            int(
+                np.ceil(
+                    readout / (BAND if self.fall.shift(t + 0.5 * readout) is not None else 2 * BAND)
+                )
+            ),
+        )
         edges = np.linspace(0, height, bands + 1).round().astype(int)
         for r0, r1 in pairwise(edges):
             if r1 > top and r0 < bottom:
-                x0, part = self.rows(t + readout * (0.5 * (r0 + r1) / height - 0.5), K, w2c, size, (r0, r1))
+                x0, part = self.rows(
+                    t + readout * (0.5 * (r0 + r1) / height - 0.5), K, w2c, size, (r0, r1)
+                )
                 picture[r0:r1, x0 : x0 + part.shape[1]] = part
         return picture
 
@@ -150,9 +176,18 @@ def phones(
     """(K, w2c) of phones on tripods around; field: half the height they see at the target [m]."""
     found = []
     for i in range(count):
-        azimuth, elevation = 2 * np.pi * (i + rng.uniform(-0.15, 0.15)) / count, (0.12, 0.5)[i % 2] + rng.uniform(-0.05, 0.05)
+        azimuth, elevation = (
+            2 * np.pi * (i + rng.uniform(-0.15, 0.15)) / count,
+            (0.12, 0.5)[i % 2] + rng.uniform(-0.05, 0.05),
+        )
         distance = 1.8 * rng.uniform(0.95, 1.1)
-        back = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(elevation), np.sin(azimuth) * np.cos(elevation)])
+        back = np.array(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+            ]
+        )
         right = np.cross(-back, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         roll = Rotation.from_rotvec([0, 0, np.radians(rng.uniform(-2, 2))]).as_matrix()
@@ -179,12 +214,20 @@ class Room:
 
     def __init__(self, K: np.ndarray, w2c: np.ndarray, size: tuple[int, int]):
         x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-        rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1) @ w2c[:3, :3]
+        rays = (
+            np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+            @ w2c[:3, :3]
+        )
         eye = -w2c[:3, :3].T @ w2c[:3, 3]
         way = np.where(rays[..., 1] < -1e-6, -eye[1] / np.minimum(rays[..., 1], -1e-6), np.inf)
         self.floor_points = eye + np.where(np.isfinite(way), way, 0)[..., None] * rays
-        self.is_floor = np.isfinite(way) & (np.linalg.norm(self.floor_points[..., [0, 2]], axis=-1) < 2.5)
-        angle, height = np.arctan2(rays[..., 2], rays[..., 0]), rays[..., 1] / np.linalg.norm(rays, axis=-1)
+        self.is_floor = np.isfinite(way) & (
+            np.linalg.norm(self.floor_points[..., [0, 2]], axis=-1) < 2.5
+        )
+        angle, height = (
+            np.arctan2(rays[..., 2], rays[..., 0]),
+            rays[..., 1] / np.linalg.norm(rays, axis=-1),
+        )
         floor = 0.05 * smooth_noise(3 * self.floor_points[..., 0], 3 * self.floor_points[..., 2], 1)
         wall = 0.05 * smooth_noise(2 * angle, 2 * height, 2)
         tone = np.where(self.is_floor, floor, wall)[..., None]
@@ -198,13 +241,20 @@ class Room:
         return self.picture * np.where(self.is_floor, 1 - dark, 1)[..., None].astype(np.float32)
 
 
-def floor_points(rng: np.random.Generator, turn: Rotation, scale: float, move: np.ndarray) -> list[str]:
+def floor_points(
+    rng: np.random.Generator, turn: Rotation, scale: float, move: np.ndarray
+) -> list[str]:
     """Lines of points3D.txt: what COLMAP finds on a textured floor, to 2 mm, on the wall, and some mistakes."""
-    floor = np.stack([rng.uniform(-1.2, 1.2, 300), np.zeros(300), rng.uniform(-1.2, 1.2, 300)], 1) + rng.normal(0, 0.002, (300, 3))
+    floor = np.stack(
+        [rng.uniform(-1.2, 1.2, 300), np.zeros(300), rng.uniform(-1.2, 1.2, 300)], 1
+    ) + rng.normal(0, 0.002, (300, 3))
     angle = rng.uniform(0, 2 * np.pi, 200)
     wall = np.stack([2.5 * np.cos(angle), rng.uniform(0, 2, 200), 2.5 * np.sin(angle)], 1)
     points = turn.apply(np.concatenate([floor, wall, rng.uniform(-1, 1, (40, 3))])) / scale + move
-    return [f"{i + 1} {x:.9g} {y:.9g} {z:.9g} 90 110 130 0.6 1 1 2 1" for i, (x, y, z) in enumerate(points)]
+    return [
+        f"{i + 1} {x:.9g} {y:.9g} {z:.9g} 90 110 130 0.6 1 1 2 1"
+        for i, (x, y, z) in enumerate(points)
+    ]
 
 
 @dataclass(frozen=True)
@@ -224,7 +274,9 @@ class Take:
 
     def camera(self, phone: int) -> tuple[np.ndarray, np.ndarray]:
         rng = np.random.default_rng([self.seed, 11])
-        return phones(self.phone_count, self.size, target=0.5 * self.top, field=0.56 * self.top, rng=rng)[phone]
+        return phones(
+            self.phone_count, self.size, target=0.5 * self.top, field=0.56 * self.top, rng=rng
+        )[phone]
 
 
 def film_phone(take: Take, v: int) -> dict:
@@ -237,9 +289,13 @@ def film_phone(take: Take, v: int) -> dict:
     phone = f"phone{v}"
     begin = fall.released - REST - rng.uniform(0, faults.offset)
     readout = rng.uniform(*faults.readout)
-    gain = 2 ** rng.uniform(-faults.exposure, faults.exposure) * (1 + rng.normal(0, faults.balance, 3))
+    gain = 2 ** rng.uniform(-faults.exposure, faults.exposure) * (
+        1 + rng.normal(0, faults.balance, 3)
+    )
     # a pose that is a little wrong
-    wrong = Rotation.from_rotvec(np.radians(rng.normal(0, faults.pose, 3))).as_matrix() @ w2c[:3, :3]
+    wrong = (
+        Rotation.from_rotvec(np.radians(rng.normal(0, faults.pose, 3))).as_matrix() @ w2c[:3, :3]
+    )
     centre = -w2c[:3, :3].T @ w2c[:3, 3] + rng.normal(0, faults.place, 3)
     focal = K[0, 0] * (1 + rng.normal(0, faults.focal))
     room = Room(K, w2c, size)
@@ -248,7 +304,10 @@ def film_phone(take: Take, v: int) -> dict:
         seen = np.clip(picture * gain + rng.normal(0, faults.noise, picture.shape), 0, 1)
         return np.round(255 * seen).astype(np.uint8)
 
-    iio.imwrite(take.folder / "plates" / f"{phone}.png", developed(room.picture, gain * (1 + rng.normal(0, faults.plate))))
+    iio.imwrite(
+        take.folder / "plates" / f"{phone}.png",
+        developed(room.picture, gain * (1 + rng.normal(0, faults.plate))),
+    )
     count = int((take.seconds - begin) * take.fps)
     with iio.get_writer(
         take.folder / "videos" / f"{phone}.mp4",
@@ -263,7 +322,9 @@ def film_phone(take: Take, v: int) -> dict:
             t = begin + k / take.fps
             seen = shown.picture(t, K, w2c, size, readout)
             behind = room.with_shadow(fall.at(t).mean(0))
-            writer.append_data(developed(seen[..., :3] * seen[..., 3:] + (1 - seen[..., 3:]) * behind))
+            writer.append_data(
+                developed(seen[..., :3] * seen[..., 3:] + (1 - seen[..., 3:]) * behind)
+            )
     said = {"phone": phone, "begin": begin, "readout": readout, "K": K.tolist(), "w2c": w2c.tolist(), "gain": gain.tolist(),
             "frames": count}  # fmt: skip
     return {"said": said, "rotation": wrong, "centre": centre, "focal": focal}
@@ -289,23 +350,38 @@ def film(
     top = float((fall.skin.follow(fall.at(0.0))[:, 1] + fall.shift(-10.0)[1]).max())
     for sub in ("videos", "plates", "sparse"):
         (folder / sub).mkdir(parents=True, exist_ok=True)
-    take = Take(folder, name, material, size, fps, seconds, faults or Faults(), seed, top, phone_count)
+    take = Take(
+        folder, name, material, size, fps, seconds, faults or Faults(), seed, top, phone_count
+    )
     if jobs == 1:
         filmed = [film_phone(take, v) for v in range(phone_count)]
     else:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
             filmed = list(pool.map(film_phone, [take] * phone_count, range(phone_count)))
     # what COLMAP says: a world of its own
-    scale, turn, move = rng.uniform(0.4, 2.5), Rotation.random(random_state=int(rng.integers(1 << 30))), rng.normal(0, 3, 3)
+    scale, turn, move = (
+        rng.uniform(0.4, 2.5),
+        Rotation.random(random_state=int(rng.integers(1 << 30))),
+        rng.normal(0, 3, 3),
+    )
     cameras_text, images_text = ["# Camera list"], ["# Image list"]
     for v, found in enumerate(filmed):
         rotation = found["rotation"] @ turn.as_matrix().T
         quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
         shift = -rotation @ (turn.apply(found["centre"]) / scale + move)
         K = found["said"]["K"]
-        cameras_text.append(f"{v + 1} SIMPLE_PINHOLE {size[0]} {size[1]} {found['focal']:.6f} {K[0][2]} {K[1][2]}")
-        images_text += [f"{v + 1} " + " ".join(f"{x:.12g}" for x in [*quaternion, *shift]) + f" {v + 1} phone{v}.jpg", ""]
-    (folder / "sparse" / "points3D.txt").write_text("\n".join(["# 3D point list", *floor_points(rng, turn, scale, move)]) + "\n")
+        cameras_text.append(
+            f"{v + 1} SIMPLE_PINHOLE {size[0]} {size[1]} {found['focal']:.6f} {K[0][2]} {K[1][2]}"
+        )
+        images_text += [
+            f"{v + 1} "
+            + " ".join(f"{x:.12g}" for x in [*quaternion, *shift])
+            + f" {v + 1} phone{v}.jpg",
+            "",
+        ]
+    (folder / "sparse" / "points3D.txt").write_text(
+        "\n".join(["# 3D point list", *floor_points(rng, turn, scale, move)]) + "\n"
+    )
     (folder / "sparse" / "cameras.txt").write_text("\n".join(cameras_text) + "\n")
     (folder / "sparse" / "images.txt").write_text("\n".join(images_text) + "\n")
     truth = {"name": name, "material": material, "size": list(size), "fps": fps, "scale": scale, "turn": turn.as_matrix().tolist(),
@@ -315,7 +391,15 @@ def film(
     return truth
 
 
-def perfect(folder: Path, truth: dict, *, sequence: str, times: np.ndarray, world: np.ndarray, particles: bool = False) -> Path:
+def perfect(
+    folder: Path,
+    truth: dict,
+    *,
+    sequence: str,
+    times: np.ndarray,
+    world: np.ndarray,
+    particles: bool = False,
+) -> Path:
     """The same phones without any fault, at common times [s]: transforms.json with RGBA images, in the world that `world` (4, 4)
     takes the true one to; particles: with the true positions as PLY files."""
     fall = Fall(truth["name"], sequence, truth["material"], float(times[-1]) + 0.02)
@@ -327,14 +411,22 @@ def perfect(folder: Path, truth: dict, *, sequence: str, times: np.ndarray, worl
         pose = world @ np.linalg.inv(w2c)
         for k, t in enumerate(times):
             file = f"images/{record['phone']}_{k:03d}.png"
-            seen = np.round(255 * shown.picture(float(t), K, w2c, tuple(truth["size"]))).astype(np.uint8)
+            seen = np.round(255 * shown.picture(float(t), K, w2c, tuple(truth["size"]))).astype(
+                np.uint8
+            )
             cv2.imwrite(str(folder / file), cv2.cvtColor(seen, cv2.COLOR_RGBA2BGRA))
             entries.append({"file_path": file, "time": float(t - times[0]), "camera": record["phone"],
                             "transform_matrix": (pose @ OPENGL_TO_OPENCV).tolist(),
                             "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]})  # fmt: skip
     width, height = truth["size"]
-    (folder / "transforms.json").write_text(json.dumps({"w": width, "h": height, "frames": entries}))
+    (folder / "transforms.json").write_text(
+        json.dumps({"w": width, "h": height, "frames": entries})
+    )
     if particles:
-        positions = np.stack([fall.at(float(t)) for t in times])[:, :: max(1, len(fall.particles) // 8000)]
-        export_particles(torch.from_numpy(positions @ world[:3, :3].T + world[:3, 3]).float(), folder / "truth")
+        positions = np.stack([fall.at(float(t)) for t in times])[
+            :, :: max(1, len(fall.particles) // 8000)
+        ]
+        export_particles(
+            torch.from_numpy(positions @ world[:3, :3].T + world[:3, 3]).float(), folder / "truth"
+        )
     return folder

@@ -26,15 +26,30 @@ from mosa.types import ParticleState, Rollout
 DENSITY, G = 1000.0, 9.8
 
 
-def simulate(x, colliders, *, dx, E, frame_dt, frames, gravity=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0), C=None) -> Rollout:
+def simulate(
+    x, colliders, *, dx, E, frame_dt, frames, gravity=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0), C=None
+) -> Rollout:
     mu, lam = lame(torch.tensor(E), torch.tensor(0.3))
     substeps = required_substeps(float(lam + 2 * mu), DENSITY, frame_dt, dx, 3.0)
-    simulator = Simulator("neo_hookean", dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=gravity, colliders=colliders)
+    simulator = Simulator(
+        "neo_hookean",
+        dx=dx,
+        substeps=substeps,
+        frame_dt=frame_dt,
+        gravity=gravity,
+        colliders=colliders,
+    )
     eye = torch.eye(3).expand(len(x), 3, 3).contiguous()
     C = torch.zeros_like(eye) if C is None else C.expand_as(eye).contiguous()
     velocity = torch.as_tensor(v, dtype=torch.float32).expand_as(x).contiguous()
     volume = torch.full((len(x),), (dx / 2) ** 3)
-    return simulator.rollout(ParticleState(x.contiguous(), velocity, C, eye, eye), {"mu": mu, "lam": lam}, volume, DENSITY, frames)
+    return simulator.rollout(
+        ParticleState(x.contiguous(), velocity, C, eye, eye),
+        {"mu": mu, "lam": lam},
+        volume,
+        DENSITY,
+        frames,
+    )
 
 
 def lattice(size: tuple, spacing: float) -> torch.Tensor:
@@ -70,9 +85,22 @@ def squeeze(edge=0.2, cells=12, stroke=0.3, duration=1.2, frames=60):
     dx, rate = edge / cells, stroke / duration
     rest = lattice((edge,) * 3, dx / 2)
     gradient = torch.diag(torch.tensor([0.3, 0.3, -1.0])) * rate
-    motions = [Motion((0.0, 0.0, s * edge), velocity=(0.0, 0.0, -s * rate * edge / 2)) for s in (-1, 1)]
-    plates = [Collider(Box((4 * edge, 4 * edge, edge)), "slip", motion=motion) for motion in motions]
-    result = simulate(rest, plates, dx=dx, E=1e5, frame_dt=duration / frames, frames=frames + 1, v=rest @ gradient, C=gradient)
+    motions = [
+        Motion((0.0, 0.0, s * edge), velocity=(0.0, 0.0, -s * rate * edge / 2)) for s in (-1, 1)
+    ]
+    plates = [
+        Collider(Box((4 * edge, 4 * edge, edge)), "slip", motion=motion) for motion in motions
+    ]
+    result = simulate(
+        rest,
+        plates,
+        dx=dx,
+        E=1e5,
+        frame_dt=duration / frames,
+        frames=frames + 1,
+        v=rest @ gradient,
+        C=gradient,
+    )
     return result, rest, edge / 2 * (1 - rate * result.times)
 
 
@@ -81,7 +109,9 @@ def uniaxial_force(stretch: torch.Tensor, area: float, E=1e5) -> torch.Tensor:
     mu, lam = (float(v) for v in lame(torch.tensor(E), torch.tensor(0.3)))
     side = torch.ones_like(stretch)
     for _ in range(30):
-        side = side - (mu * (side**2 - 1) + lam * torch.log(side**2 * stretch)) / (2 * mu * side + 2 * lam / side)
+        side = side - (mu * (side**2 - 1) + lam * torch.log(side**2 * stretch)) / (
+            2 * mu * side + 2 * lam / side
+        )
     return -(mu * (stretch**2 - 1) + lam * torch.log(side**2 * stretch)) / stretch * area
 
 
@@ -91,7 +121,13 @@ def snapshots(axis, rollout: Rollout, rest: torch.Tensor, frames: list[int]) -> 
     colour = ((rest[:, 0] * rest[:, 2]) > 0)[middle].numpy()
     for frame in frames:
         p = rollout.x[frame][middle]
-        axis.scatter(p[:, 0], p[:, 2], c=[("#c44e52", "#4c72b0")[int(c)] for c in colour], s=1.5, linewidths=0)
+        axis.scatter(
+            p[:, 0],
+            p[:, 2],
+            c=[("#c44e52", "#4c72b0")[int(c)] for c in colour],
+            s=1.5,
+            linewidths=0,
+        )
     axis.set_aspect("equal")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("z [m]")
@@ -124,7 +160,10 @@ def draw(path: Path) -> None:
         closed = s[5] + v * (t - t[5]) + 0.5 * factor * G * sine * (t - t[5]) ** 2
         axis.plot(t, s, style + ".", label=title)
         axis.plot(t[5:], closed[5:], style, label=f"{'5/7 ' if factor < 1 else ''}g sin(20 deg)")
-        gone, expected = float(s[-1] - s[5] - v * (t[-1] - t[5])), float(closed[-1] - s[5] - v * (t[-1] - t[5]))
+        gone, expected = (
+            float(s[-1] - s[5] - v * (t[-1] - t[5])),
+            float(closed[-1] - s[5] - v * (t[-1] - t[5])),
+        )
         print(f"sphere {title}: acceleration {gone / expected:.3f} of the closed form")
     axis.set(xlabel="t [s]", ylabel="distance down [m]", title="down the incline")
     axis.legend()
@@ -153,7 +192,9 @@ def draw(path: Path) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     picture = Path(__file__).parents[1] / "docs" / "images" / "colliders.png"
     parser.add_argument("output", type=Path, nargs="?", default=picture, help="PNG")
     draw(parser.parse_args().output)

@@ -63,16 +63,22 @@ def main(edge: int = 21, repeats: int = 5) -> None:
     for _ in range(repeats + 1):  # the first one loads the kernels
         for name, simulator in simulators.items():
             best[name] = [min(a, b) for a, b in zip(best[name], run(simulator, state, volume))]
-    print(f"{len(x)} particles, dx {dx:.4f} m, float32, {torch.get_num_threads()} thread(s), ms per substep")
+    print(
+        f"{len(x)} particles, dx {dx:.4f} m, float32, {torch.get_num_threads()} thread(s), ms per substep"
+    )
     base = best["planes only"]
     for name, (forward, backward) in best.items():
         ratios = forward / base[0], backward / base[1]
-        print(f"{name:26s} forward {1e3 * forward:6.2f} ({ratios[0]:.3f})   backward {1e3 * backward:6.2f} ({ratios[1]:.3f})")
+        print(
+            f"{name:26s} forward {1e3 * forward:6.2f} ({ratios[0]:.3f})   backward {1e3 * backward:6.2f} ({ratios[1]:.3f})"
+        )
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--edge", type=int, default=21, help="particles along an edge of the body")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()

@@ -46,7 +46,12 @@ def published(aspect: float) -> float:
 
 
 def run_out(
-    aspect: float, angle: float, cells: int, young: float = E, width: float | None = None, rubbing: float = 0.0
+    aspect: float,
+    angle: float,
+    cells: int,
+    young: float = E,
+    width: float | None = None,
+    rubbing: float = 0.0,
 ) -> tuple[float, float, float]:
     """(run-out of 99 % of the mass, slope of the heap's middle [degrees], speed left [m/s]) after 6 sqrt(height/g). young [Pa]: of
     the grains; width: of the channel over the base, None for two cells; rubbing: friction of its side walls."""
@@ -64,36 +69,67 @@ def run_out(
     planes = [Plane((0, 0, 0), (0, 1, 0)), Plane((0, 0, 0), (1, 0, 0), "slip"), Plane((0, 0, 0), (0, 0, 1), *side),
               Plane((0, 0, depth * dx), (0, 0, -1), *side)]  # fmt: skip
     substeps = math.ceil(frame_dt * (math.sqrt((lam + 2 * mu) / DENSITY) + 3) / (0.5 * dx))
-    simulator = Simulator("drucker_prager", dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, -GRAVITY, 0), planes=planes)
+    simulator = Simulator(
+        "drucker_prager",
+        dx=dx,
+        substeps=substeps,
+        frame_dt=frame_dt,
+        gravity=(0, -GRAVITY, 0),
+        planes=planes,
+    )
     parameters = {"mu": mu, "lam": lam, "friction_alpha": alpha, "cohesion": 0.0}
     with torch.no_grad():
-        out = simulator.rollout(state, parameters, torch.full((len(x),), h**3), DENSITY, round(duration / frame_dt) + 1)
+        out = simulator.rollout(
+            state, parameters, torch.full((len(x),), h**3), DENSITY, round(duration / frame_dt) + 1
+        )
     last = out.x[-1]
     front = float(last[:, 0].quantile(0.99))
-    there = [last[(last[:, 0] > a) & (last[:, 0] < a + dx), 1] for a in (0.5 * BASE, front - 2 * dx)]
-    columns = [float(heights.max()) if len(heights) else 0.0 for heights in there]  # grains may have flown on
+    there = [
+        last[(last[:, 0] > a) & (last[:, 0] < a + dx), 1] for a in (0.5 * BASE, front - 2 * dx)
+    ]
+    columns = [
+        float(heights.max()) if len(heights) else 0.0 for heights in there
+    ]  # grains may have flown on
     slope = math.degrees(math.atan2(columns[0] - columns[1], front - 2 * dx - 0.5 * BASE))
     return (front - BASE) / BASE, slope, float(out.v[-1].norm(dim=1).mean())
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--aspects", type=float, nargs="+", default=[0.5, 1, 2, 3, 5])
     angles = [30.0, triaxial_angle(31.0)]
-    parser.add_argument("--angles", type=float, nargs="+", default=angles, help="of the cone [degrees]")
+    parser.add_argument(
+        "--angles", type=float, nargs="+", default=angles, help="of the cone [degrees]"
+    )
     parser.add_argument("--cells", type=int, default=16, help="of the base")
     parser.add_argument("--young", type=float, default=E, help="of the grains [Pa]")
-    parser.add_argument("--width", type=float, default=None, help="of the channel, over the base; default: two cells")
-    parser.add_argument("--rubbing", type=float, default=0.0, help="friction of its side walls; 0: they slip")
+    parser.add_argument(
+        "--width",
+        type=float,
+        default=None,
+        help="of the channel, over the base; default: two cells",
+    )
+    parser.add_argument(
+        "--rubbing", type=float, default=0.0, help="friction of its side walls; 0: they slip"
+    )
     options = parser.parse_args()
-    print("| aspect | published | cone [degrees] | in the channel | run-out | over published | slope [degrees] | speed [m/s] | s |")
+    print(
+        "| aspect | published | cone [degrees] | in the channel | run-out | over published | slope [degrees] | speed [m/s] | s |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for angle in options.angles:
         for aspect in options.aspects:
             began = time.perf_counter()
-            reach, slope, speed = run_out(aspect, angle, options.cells, options.young, options.width, options.rubbing)
-            print(f"| {aspect:g} | {published(aspect):.2f} | {angle:.1f} | {plane_angle(angle):.1f} | {reach:.2f} | "
-                  f"{reach / published(aspect):.2f} | {slope:.0f} | {speed:.3f} | {time.perf_counter() - began:.0f} |", flush=True)
+            reach, slope, speed = run_out(
+                aspect, angle, options.cells, options.young, options.width, options.rubbing
+            )
+            print(
+                f"| {aspect:g} | {published(aspect):.2f} | {angle:.1f} | {plane_angle(angle):.1f} | {reach:.2f} | "
+                f"{reach / published(aspect):.2f} | {slope:.0f} | {speed:.3f} | {time.perf_counter() - began:.0f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

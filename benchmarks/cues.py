@@ -44,7 +44,11 @@ from mosa.rendering.observer import observe
 from mosa.types import MotionCues, Reconstruction, Scene
 
 PRESET = Path(__file__).parents[1] / "conf" / "reconstruction" / "fast.yaml"
-ITERATIONS = {"static": ("iterations",), "appearance": ("iterations",), "dynamic": ("track_iterations", "iterations")}
+ITERATIONS = {
+    "static": ("iterations",),
+    "appearance": ("iterations",),
+    "dynamic": ("track_iterations", "iterations"),
+}
 CONDITIONS = {
     "cameras_12": "12 cameras, 160 px",
     "cameras_6": "6 cameras",
@@ -55,7 +59,11 @@ CONDITIONS = {
     "early": "stopped at 25 %",
 }
 FLOORS = (1e-3, 0.005, 0.01, 0.02, 0.03, 0.05)
-FITS = {"carried": {}, "free": {"free_shape": True}, "network": {"model": "network", "iterations": 600}}
+FITS = {
+    "carried": {},
+    "free": {"free_shape": True},
+    "network": {"model": "network", "iterations": 600},
+}
 COLUMNS = {
     "rotation_deg": ("rotation [deg]", "{:.2f}", 1.0),
     "stretch": ("stretch", "{:.4f}", 1.0),
@@ -68,7 +76,9 @@ def scene_of(shape: str, condition: str) -> Scene:
     """The training sequence of a shape as the condition lets the reconstruction see it."""
     kept = {"cameras_6": range(0, 12, 2), "cameras_3": range(0, 12, 4)}.get(condition, range(12))
     held = [str(v) for v in range(12) if v not in kept]
-    scene = load_builtin(name=shape, scale=0.2 if condition == "half_resolution" else 0.4, holdout_cameras=held)
+    scene = load_builtin(
+        name=shape, scale=0.2 if condition == "half_resolution" else 0.4, holdout_cameras=held
+    )
     if condition not in ("eroded", "dilated"):
         return scene
     V, T, H, W = scene.mattes.shape
@@ -77,8 +87,14 @@ def scene_of(shape: str, condition: str) -> Scene:
     mattes = mattes.reshape(V, T, H, W)
     # what is cut away shows the background, as it would after matting; what is added keeps the pixels that are there
     part = (mattes / scene.mattes.clamp(min=1e-3)).clamp(max=1.0)[..., None]
-    images = part * scene.images + (1 - part) * scene.background if condition == "eroded" else scene.images
-    return replace(scene, images=images, mattes=mattes, fingerprint=f"{scene.fingerprint}-{condition}-2px")
+    images = (
+        part * scene.images + (1 - part) * scene.background
+        if condition == "eroded"
+        else scene.images
+    )
+    return replace(
+        scene, images=images, mattes=mattes, fingerprint=f"{scene.fingerprint}-{condition}-2px"
+    )
 
 
 def settings_of(condition: str, fit: str) -> ReconstructionSettings:
@@ -92,7 +108,9 @@ def settings_of(condition: str, fit: str) -> ReconstructionSettings:
     return build_settings(**keys)
 
 
-def flow_error(found: MotionCues, true: TrueMotion, result: Reconstruction, scene: Scene, first: int) -> dict[str, float]:
+def flow_error(
+    found: MotionCues, true: TrueMotion, result: Reconstruction, scene: Scene, first: int
+) -> dict[str, float]:
     """Median and 90th percentile of the error of Gaussian flow maps [px at a width of 160], over pixels where alpha > 0.5 at the
     frame, of four cameras of the ring; the true maps are those of the same Gaussians in their true motion."""
     rest = covariance_from(result.splats.scales, result.splats.rotations)
@@ -102,22 +120,30 @@ def flow_error(found: MotionCues, true: TrueMotion, result: Reconstruction, scen
     maps, alpha = [], None
     with torch.no_grad():
         for x, A in ((found.positions, found.covariances), (true.positions, moved)):
-            seen = observe(x, A, splats.opacities, splats.colors, views, scene.background, flow=True)
+            seen = observe(
+                x, A, splats.opacities, splats.colors, views, scene.background, flow=True
+            )
             maps.append(seen.flow[:, first - 1 :])
             alpha = seen.mattes[:, first - 1 : -1]
     error = (maps[0] - maps[1]).norm(dim=-1)[alpha > 0.5].double() * 160 / scene.cameras.width
     return {"flow_px_median": float(error.quantile(0.5)), "flow_px_p90": float(error.quantile(0.9))}
 
 
-def reconstructed(shape: str, condition: str, fit: str, out: Path, particles: int, seed: int) -> tuple[Scene, Reconstruction, int]:
+def reconstructed(
+    shape: str, condition: str, fit: str, out: Path, particles: int, seed: int
+) -> tuple[Scene, Reconstruction, int]:
     """The scene, its reconstruction (from the cache where it lies there) and the number of neighbours of its cues."""
     scene, settings = scene_of(shape, condition), settings_of(condition, fit)
     spacing = spacing_for(scene, particles, settings)
-    result = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=out / "cache", seed=seed)
+    result = reconstruct(
+        scene, settings=settings, spacing=spacing, cache_dir=out / "cache", seed=seed
+    )
     return scene, result, settings.neighbours
 
 
-def measure(shape: str, condition: str, fit: str, out: Path, particles: int, seed: int) -> list[dict]:
+def measure(
+    shape: str, condition: str, fit: str, out: Path, particles: int, seed: int
+) -> list[dict]:
     """Reconstruct and compare. One dictionary per form."""
     started = time.perf_counter()
     scene, result, neighbours = reconstructed(shape, condition, fit, out, particles, seed)
@@ -131,8 +157,12 @@ def measure(shape: str, condition: str, fit: str, out: Path, particles: int, see
     if fit != "carried":
         forms["gaussian"] = result.cues
     if fit == "carried" and condition == "cameras_12":
-        forms["motionless"] = replace(motionless(true), covariances=covariances[:1].expand_as(covariances))
-        forms["constant"] = replace(forms["motionless"], stretch=torch.tensor(USUAL_STRETCH).expand_as(true.stretch))
+        forms["motionless"] = replace(
+            motionless(true), covariances=covariances[:1].expand_as(covariances)
+        )
+        forms["constant"] = replace(
+            forms["motionless"], stretch=torch.tensor(USUAL_STRETCH).expand_as(true.stretch)
+        )
         rest = covariance_from(result.splats.scales, result.splats.rotations)
         floor = neighbourhood_cues(true.positions, covariances, around)
         F = around.deformation(true.positions)
@@ -141,12 +171,16 @@ def measure(shape: str, condition: str, fit: str, out: Path, particles: int, see
               "frames": [first, scene.frames - 1], "seed": seed}  # fmt: skip
     lines = []
     for form, cues in forms.items():
-        errors = cue_errors(cues, true, scene.times, first=first) | flow_error(cues, true, result, scene, first)
+        errors = cue_errors(cues, true, scene.times, first=first) | flow_error(
+            cues, true, result, scene, first
+        )
         floors = [strain_direction_error(cues, true, floor, first=first) for floor in FLOORS]
         lines.append(common | {"form": form, "seconds": seconds, "floors": floors} | errors)
     if fit == "carried":
         for count in (8, 12, 30, 50, 80):
-            wider = neighbourhood_cues(positions, covariances, neighbourhood(result.splats.means, neighbours=count))
+            wider = neighbourhood_cues(
+                positions, covariances, neighbourhood(result.splats.means, neighbours=count)
+            )
             errors = cue_errors(wider, true, scene.times, first=first)
             lines.append(common | {"form": f"neighbourhood, {count}", "seconds": 0.0} | errors)
     return lines
@@ -173,7 +207,9 @@ def table(lines: list[dict], neighbours: bool) -> str:
             cells[1:3] = ["-", "-"]
         for name, (_, pattern, unit) in COLUMNS.items():
             pair = [line.get(f"{name}_{part}") for part in ("median", "p90")]
-            cells.append("-" if pair[0] is None else " / ".join(pattern.format(x * unit) for x in pair))
+            cells.append(
+                "-" if pair[0] is None else " / ".join(pattern.format(x * unit) for x in pair)
+            )
         cells.append(f"{line['stretch_rms'] / line['stretch_signal_rms']:.2f}")
         cells += [f"{1e3 * line['position_rms_m']:.1f}", f"{line['outside']:.1%}"]
         rows.append("| " + " | ".join(cells) + " |")
@@ -189,23 +225,36 @@ def floor_table(lines: list[dict]) -> str:
             continue
         cells = [line["shape"], CONDITIONS[line["condition"]], line["fit"], line["form"]]
         for x in line["floors"]:
-            found = x["share"] and f"{x['median_deg']:.0f} / {x['p90_deg']:.0f}; {x['constant_median_deg']:.0f} ({x['share']:.0%})"
+            found = (
+                x["share"]
+                and f"{x['median_deg']:.0f} / {x['p90_deg']:.0f}; {x['constant_median_deg']:.0f} ({x['share']:.0%})"
+            )
             cells.append(found or "-")
         rows.append("| " + " | ".join(cells) + " |")
     return "\n".join(rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--shapes", nargs="+", default=["rabbit", "chick1"])
     parser.add_argument("--conditions", nargs="+", default=list(CONDITIONS), choices=CONDITIONS)
     parser.add_argument("--fits", nargs="+", default=["carried", "free"], choices=FITS)
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("outputs/cues"), help="results and cached stages")
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/cues"), help="results and cached stages"
+    )
     parser.add_argument("--table", action="store_true", help="only print what has been measured")
-    parser.add_argument("--neighbours", action="store_true", help="also other numbers of neighbours")
-    parser.add_argument("--floors", action="store_true", help="also the direction of the strain against the cue's floor")
+    parser.add_argument(
+        "--neighbours", action="store_true", help="also other numbers of neighbours"
+    )
+    parser.add_argument(
+        "--floors",
+        action="store_true",
+        help="also the direction of the strain against the cue's floor",
+    )
     args = parser.parse_args()
     lines = []
     for shape in args.shapes:

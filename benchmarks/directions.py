@@ -80,8 +80,15 @@ def further(case: SimpleNamespace, path: Path, noise: float, rng: np.random.Gene
     rest = body.rest.cpu().double().numpy()
     truth = calibration.carried(stored, rest, case.object.spacing)
     seen = tensor(calibration.noisy(truth, rest, noise * np.ptp(rest[:, 1]), rng))
-    start = Start(tensor(stored["rotation"]), tensor(truth[0].mean(0)), tensor(stored["velocity"]), torch.zeros(3).to(body.rest))
-    cues = neighbourhood_cues(seen, body.rest.new_zeros(1), neighbourhood(tensor(truth[0])))  # their rotations are from frame 0 on
+    start = Start(
+        tensor(stored["rotation"]),
+        tensor(truth[0].mean(0)),
+        tensor(stored["velocity"]),
+        torch.zeros(3).to(body.rest),
+    )
+    cues = neighbourhood_cues(
+        seen, body.rest.new_zeros(1), neighbourhood(tensor(truth[0]))
+    )  # their rotations are from frame 0 on
     spacing = float(body.volume.mean()) ** (1 / 3)
     return Take(start, None, cues, case.take.frame_dt, calibration.first_contact(truth, spacing))
 
@@ -95,7 +102,10 @@ def in_plane(material: HiddenMaterial, count: int) -> tuple[Tensor, Tensor]:
 
 def pressed_truth(material: HiddenMaterial, directions: Tensor) -> list[Pressed]:
     """A specimen of the true law, without its variation over the body."""
-    one = {key: value[0] for key, value in replace(material, amplitude=0.0).parameters(torch.zeros(1, 3)).items()}
+    one = {
+        key: value[0]
+        for key, value in replace(material, amplitude=0.0).parameters(torch.zeros(1, 3)).items()
+    }
     return [press(material.law, one, n, modulus=material.wave_modulus(), poisson=material.known["nu"], density=material.density,
                   stiffening=1.0) for n in directions]  # fmt: skip
 
@@ -105,7 +115,12 @@ def compared(found: list[Pressed], true: list[Pressed]) -> dict:
     E = [each.modulus for each in found]
     off = [abs(a.modulus / b.modulus - 1) for a, b in zip(found, true)]
     forces = [abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(found, true)]
-    return {"E": E, "E_off_mean": sum(off) / len(off), "E_off_largest": max(off), "force_off_largest": max(forces)}
+    return {
+        "E": E,
+        "E_off_mean": sum(off) / len(off),
+        "E_off_largest": max(off),
+        "force_off_largest": max(forces),
+    }
 
 
 def level_and_shape(found: Tensor, true: Tensor) -> dict[str, float]:
@@ -135,8 +150,12 @@ def on_own_grid(case: SimpleNamespace, path: Path, noise: float, seed: int) -> N
     case.truth = true_law_here(case, path)
     rest = case.body.rest
     true, points = case.truth.cpu().double().numpy(), rest.cpu().double().numpy()
-    seen = calibration.noisy(true, points, noise * np.ptp(points[:, 1]), np.random.default_rng([seed, 12]))
-    cues = neighbourhood_cues(torch.as_tensor(seen).to(rest), rest.new_zeros(1), neighbourhood(rest))
+    seen = calibration.noisy(
+        true, points, noise * np.ptp(points[:, 1]), np.random.default_rng([seed, 12])
+    )
+    cues = neighbourhood_cues(
+        torch.as_tensor(seen).to(rest), rest.new_zeros(1), neighbourhood(rest)
+    )
     case.take = Take(case.take.start, None, cues, case.take.frame_dt, case.take.first_contact)
 
 
@@ -155,15 +174,28 @@ def learn_black_box(module: LitMosa, body: Body) -> None:
     stage = module.stages[-1]
     module.stage_index = len(module.stages) - 1
     module.begin(stage)
-    module.weights = {name: value for name, value in module.weights.items() if name not in ("image", "mask", "flow")}
+    module.weights = {
+        name: value
+        for name, value in module.weights.items()
+        if name not in ("image", "mask", "flow")
+    }
     made = module.adam(stage)
     optimizer, schedule = made["optimizer"], made["lr_scheduler"]["scheduler"]
     for iteration in range(stage.iterations):
         optimizer.zero_grad()
         take = module.takes[iteration % len(module.takes)]
         for gain in module.criterion.gains:
-            terms, _ = module.terms(stage, take.observations, module.active_frames(stage, iteration, take), take, gain=gain)
-            (sum(module.weights[name] * value for name, value in terms.items()) / len(module.criterion.gains)).backward()
+            terms, _ = module.terms(
+                stage,
+                take.observations,
+                module.active_frames(stage, iteration, take),
+                take,
+                gain=gain,
+            )
+            (
+                sum(module.weights[name] * value for name, value in terms.items())
+                / len(module.criterion.gains)
+            ).backward()
         module.clip_networks(optimizer)
         optimizer.step()
         schedule.step()
@@ -176,14 +208,23 @@ def fit(
 ) -> dict:  # fmt: skip
     """Of one body: calibration, joint stage, and what its laws are, along the directions of a plane."""
     began, truth = time.perf_counter(), object_of(path.stem)
-    words = [f"scene={path.stem.removesuffix(TWIN)}", "prior=neo_hookean", *(["adapter=direct"] if black_box else []), *more]
-    case = calibration.learner_of(path, truth, calibration.composed(words), particles, seed, noise, device)
+    words = [
+        f"scene={path.stem.removesuffix(TWIN)}",
+        "prior=neo_hookean",
+        *(["adapter=direct"] if black_box else []),
+        *more,
+    ]
+    case = calibration.learner_of(
+        path, truth, calibration.composed(words), particles, seed, noise, device
+    )
     if own_grid:
         on_own_grid(case, path, noise, seed)
     body, take = case.body, case.take
     takes = [take, *(further(case, motion_of(path, drop), noise, np.random.default_rng([seed, 12, i]))
                      for i, drop in enumerate(drops) if drop != "train")]  # fmt: skip
-    module = LitMosa.from_config(case.config, body, takes=takes, background=torch.ones(3, device=device))
+    module = LitMosa.from_config(
+        case.config, body, takes=takes, background=torch.ones(3, device=device)
+    )
     calibrated = module.identifying(module.stages[0])
     calibrated.search()
     fits.iterated(calibrated, module.stages[0].iterations)
@@ -231,8 +272,11 @@ def fit(
         record["plates"] = {"degrees": torch.rad2deg(angles).tolist(), "true": compared(reference, reference)["E"],
                             "prior": compared(pressed_modulus(body, "prior", n), reference),
                             "learned": compared(pressed_modulus(body, "adapted", n), reference)}  # fmt: skip
-    return record | {"seconds": time.perf_counter() - began, "commit": commit(),
-                     "machine": device_label(device)}
+    return record | {
+        "seconds": time.perf_counter() - began,
+        "commit": commit(),
+        "machine": device_label(device),
+    }
 
 
 HEADS = ("body", "law", "set", "drops", "particles", "cells of height", "noise [%]", "rms [mm]", "true law here [mm]",
@@ -243,7 +287,9 @@ HEADS = ("body", "law", "set", "drops", "particles", "cells of height", "noise [
 
 def settings(record: dict) -> str:
     """Overrides that the law was learned with, but for those that change no figure."""
-    return " ".join(word for word in record["set"] if not word.startswith("identification.threads="))
+    return " ".join(
+        word for word in record["set"] if not word.startswith("identification.threads=")
+    )
 
 
 def shown(value: float | None, digits: int, scale: float = 1.0) -> str:
@@ -254,7 +300,10 @@ def off(plates: dict | None) -> list[str]:
     """Of one law's specimens from the true one's."""
     if plates is None:
         return ["", ""]
-    return [f"{100 * plates['E_off_mean']:.1f}, {100 * plates['E_off_largest']:.1f}", shown(plates["force_off_largest"], 1, 100)]
+    return [
+        f"{100 * plates['E_off_mean']:.1f}, {100 * plates['E_off_largest']:.1f}",
+        shown(plates["force_off_largest"], 1, 100),
+    ]
 
 
 def two(record: dict, name: str) -> str:
@@ -265,10 +314,26 @@ def table(records: list[dict]) -> str:
     rows = []
     for r in records:
         plates = r.get("plates") or {}
-        where = [settings(r), len(r["drops"]), r["particles"], shown(r["cells"], 1),
-                 shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"]]
+        where = [
+            settings(r),
+            len(r["drops"]),
+            r["particles"],
+            shown(r["cells"], 1),
+            shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"],
+        ]
         floor = shown(r["floor_mm"], 1)
-        rows.append([r["body"], "isotropic", *where, shown(r["prior_mm"], 1), floor, *[""] * 7, *off(plates.get("prior")), ""])
+        rows.append(
+            [
+                r["body"],
+                "isotropic",
+                *where,
+                shown(r["prior_mm"], 1),
+                floor,
+                *[""] * 7,
+                *off(plates.get("prior")),
+                "",
+            ]
+        )
         rows.append([r["body"], r["method"], *where, shown(r["learned_mm"], 1), floor, two(r, "E_off"), shown(r["E_level"], 3),
                      two(r, "E_shape_off"), shown(r["w_range"], 3), shown(r.get("stiffness_ratio"), 3), shown(r["fibre_deg"], 0),
                      shown(r["cone_deg"], 0), *off(plates.get("learned")), shown(r["seconds"], 0)])  # fmt: skip
@@ -287,14 +352,25 @@ def draw(records: list[dict], folder: Path) -> None:
         for r in own:
             plates, same = r.get("plates"), [s for s in own if s["method"] == r["method"]]
             degrees = plates["degrees"] if plates else r["degrees"]
-            label = r["method"] + (f", {r['particles']} particles" if len({s["particles"] for s in same}) > 1 else "")
+            label = r["method"] + (
+                f", {r['particles']} particles" if len({s["particles"] for s in same}) > 1 else ""
+            )
             label += f", {len(r['drops'])} drops" if len(r["drops"]) > 1 else ""
             label += f"\n{settings(r)}" if settings(r) else ""
             if not above.lines:
-                above.plot(degrees, [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])], "k--", label="truth")
+                above.plot(
+                    degrees,
+                    [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])],
+                    "k--",
+                    label="truth",
+                )
                 if plates:
                     above.plot(degrees, [e / 1e3 for e in plates["prior"]["E"]], label="isotropic")
-            (line,) = above.plot(degrees, [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])], label=label)
+            (line,) = above.plot(
+                degrees,
+                [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])],
+                label=label,
+            )
             below.plot(r["degrees"], r["w"], label=label, color=line.get_color())
             above.set_ylabel("E between plates [kPa]" if plates else "E [kPa]")
         above.set_ylim(0, 1.05 * above.get_ylim()[1])
@@ -307,7 +383,9 @@ def draw(records: list[dict], folder: Path) -> None:
     stem = folder / "directions_from_motion"
     picture = save(canvas, stem)
     stem.with_suffix(".json").write_text(json.dumps(records, indent=1))
-    commits, machines, seeds = (", ".join(sorted({str(r[key]) for r in records})) for key in ("commit", "machine", "seed"))
+    commits, machines, seeds = (
+        ", ".join(sorted({str(r[key]) for r in records})) for key in ("commit", "machine", "seed")
+    )
     stem.with_suffix(".md").write_text("\n".join([
         "# Directions from true motions", "", __doc__.split("\n\n")[2].strip(), "", table(records), "",
         f"![E and w over the angle from the fibre]({picture.name})", "",
@@ -317,18 +395,45 @@ def draw(records: list[dict], folder: Path) -> None:
 
 
 def main() -> None:
-    parser = fits.parser_of(__doc__, "names of built-in bodies with fibres, _twin behind those without", "motions", pictures=True)
+    parser = fits.parser_of(
+        __doc__,
+        "names of built-in bodies with fibres, _twin behind those without",
+        "motions",
+        pictures=True,
+    )
     calibration.add_options(parser)
-    parser.add_argument("--plates", action="store_true", help="fit: press specimens between plates too")
-    parser.add_argument("--black-box", action="store_true", help="fit: adapter=direct in place of ours")
-    parser.add_argument("--own-grid", action="store_true", help="fit: the true law's motion on the learner's particles and grid")
+    parser.add_argument(
+        "--plates", action="store_true", help="fit: press specimens between plates too"
+    )
+    parser.add_argument(
+        "--black-box", action="store_true", help="fit: adapter=direct in place of ours"
+    )
+    parser.add_argument(
+        "--own-grid",
+        action="store_true",
+        help="fit: the true law's motion on the learner's particles and grid",
+    )
     parser.set_defaults(particles=4000)
-    parser.add_argument("--drops", nargs="+", default=["train"], help="make, fit: drops to learn from, train among them")
+    parser.add_argument(
+        "--drops",
+        nargs="+",
+        default=["train"],
+        help="make, fit: drops to learn from, train among them",
+    )
     options = parser.parse_args()
     if "train" not in options.drops or (options.own_grid and len(options.drops) > 1):
         parser.error("--drops: expected train among them, and train alone with --own-grid")
-    given = (options.particles, options.set, options.seed, options.noise, options.device, options.plates, options.black_box,
-             options.own_grid, options.drops)
+    given = (
+        options.particles,
+        options.set,
+        options.seed,
+        options.noise,
+        options.device,
+        options.plates,
+        options.black_box,
+        options.own_grid,
+        options.drops,
+    )
     fits.run(options, lambda name: make(name, options.out, options.seed, options.drops), lambda path: fit(path, *given),
              table, draw)  # fmt: skip
 

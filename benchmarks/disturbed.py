@@ -52,7 +52,9 @@ def disturb(how: str, number: int, folders: list[str]) -> None:
 
 if __name__ == "__main__":
     kind, _, count = sys.argv[1].partition(":")
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that put this into the background had it ignored
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell that put this into the background had it ignored
     disturb(kind, int(count), [os.path.abspath(folder) for folder in sys.argv[2].split(":")])
     sys.argv = sys.argv[3:]
     sys.path[0] = os.path.dirname(os.path.abspath(sys.argv[0]))

@@ -42,7 +42,10 @@ class Row(NamedTuple):
 
 
 def told(row: Row) -> Row:
-    print(f"[{time.strftime('%H:%M:%S')}] {row.what}: {row.found}{'' if row.met else '   <- NOT AS ASKED'}", flush=True)
+    print(
+        f"[{time.strftime('%H:%M:%S')}] {row.what}: {row.found}{'' if row.met else '   <- NOT AS ASKED'}",
+        flush=True,
+    )
     return row
 
 
@@ -75,7 +78,11 @@ def figures(folder: Path) -> dict:
     path = folder / "metrics.json"
     if not path.is_file():
         return {"metrics.json": "none"}
-    return {key: value for key, value in json.loads(path.read_text()).items() if not key.startswith("time/")}
+    return {
+        key: value
+        for key, value in json.loads(path.read_text()).items()
+        if not key.startswith("time/")
+    }
 
 
 def processes_with(text: str) -> list[int]:
@@ -102,7 +109,9 @@ def ended(numbers: Iterable[int]) -> None:
 
 
 def leftovers(*folders: Path) -> list[str]:
-    return [str(file) for folder in folders for file in folder.rglob("*") if file.name.endswith(MARKS)]
+    return [
+        str(file) for folder in folders for file in folder.rglob("*") if file.name.endswith(MARKS)
+    ]
 
 
 def version() -> str:
@@ -125,11 +134,15 @@ class Record:
         if path is not None and path.is_file():
             self.content = json.loads(path.read_text())
             if self.content["of"] != of:
-                raise SystemExit(f"{path}: expected a record of {of}, found one of {self.content['of']}")
+                raise SystemExit(
+                    f"{path}: expected a record of {of}, found one of {self.content['of']}"
+                )
 
     def put(self, kind: str, number: int, found: dict) -> None:
         with self.lock:
-            self.content["figures"].setdefault(self.version, {}).setdefault(kind, {})[str(number)] = found
+            self.content["figures"].setdefault(self.version, {}).setdefault(kind, {})[
+                str(number)
+            ] = found
             self.write()
 
     def note(self, part: str, what: object) -> None:
@@ -145,14 +158,29 @@ class Record:
 
     def of_kind(self, kind: str) -> dict[int, dict]:
         """Of this version."""
-        return {int(k): v for k, v in self.content["figures"].get(self.version, {}).get(kind, {}).items()}
+        return {
+            int(k): v
+            for k, v in self.content["figures"].get(self.version, {}).get(kind, {}).items()
+        }
 
     def complete(self) -> list[int]:
         """Runs by themselves that came to their end, of any version."""
-        return sorted({int(k) for kinds in self.content["figures"].values() for k, v in kinds.get("alone", {}).items() if good(v)})
+        return sorted(
+            {
+                int(k)
+                for kinds in self.content["figures"].values()
+                for k, v in kinds.get("alone", {}).items()
+                if good(v)
+            }
+        )
 
     def wrong(self) -> list[tuple[int, dict]]:
-        return [(int(k), v) for kinds in self.content["figures"].values() for k, v in kinds.get("alone", {}).items() if not good(v)]
+        return [
+            (int(k), v)
+            for kinds in self.content["figures"].values()
+            for k, v in kinds.get("alone", {}).items()
+            if not good(v)
+        ]
 
     def compared(self, kind: str) -> dict[int, list[str]]:
         """Number of a run that a sweep has made too, by the same version -> names of the figures that differ."""
@@ -162,7 +190,9 @@ class Record:
             for k, again in kinds.get(kind, {}).items():
                 if k in alone:
                     names = {*alone[k], *again}
-                    found[int(k)] = sorted(name for name in names if alone[k].get(name) != again.get(name))
+                    found[int(k)] = sorted(
+                        name for name in names if alone[k].get(name) != again.get(name)
+                    )
         return found
 
 
@@ -192,7 +222,10 @@ def by_themselves(sets: list[list[str]], numbers: list[int], folder: Path, commo
         record.put("alone", k, {"exit code": code} if code else figures(folder / str(k)))
 
     # the first of each law first, alone with the kernels that it compiles
-    laws = [next(k for k in numbers if sets[k][0] == law) for law in sorted({sets[k][0] for k in numbers})]
+    laws = [
+        next(k for k in numbers if sets[k][0] == law)
+        for law in sorted({sets[k][0] for k in numbers})
+    ]
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(one, laws))
         list(pool.map(one, [k for k in numbers if k not in laws]))
@@ -204,7 +237,11 @@ def experiments(sets: list[list[str]], folder: Path) -> str:
     conf.mkdir(parents=True)
     for k, overrides in enumerate(sets):
         pairs = [override.split("=") for override in overrides]
-        groups = [f"  - override /{key}: {value}" for key, value in pairs if "." not in key and key != "seed"]
+        groups = [
+            f"  - override /{key}: {value}"
+            for key, value in pairs
+            if "." not in key and key != "seed"
+        ]
         tree: dict = {}
         for key, value in pairs:
             if "." in key or key == "seed":
@@ -213,7 +250,12 @@ def experiments(sets: list[list[str]], folder: Path) -> str:
                 for part in path:
                     at = at.setdefault(part, {})
                 at[last] = json.loads(value)
-        lines = ["# @package _global_", "defaults:", *groups, *(f"{key}: {json.dumps(value)}" for key, value in tree.items())]
+        lines = [
+            "# @package _global_",
+            "defaults:",
+            *groups,
+            *(f"{key}: {json.dumps(value)}" for key, value in tree.items()),
+        ]
         (conf / f"drawn_{k}.yaml").write_text("\n".join(lines) + "\n")
     return "experiment=" + ",".join(f"drawn_{k}" for k in range(len(sets)))
 
@@ -245,14 +287,19 @@ def killed_sweep(sets: list[list[str]], numbers: list[int], folder: Path, common
         except subprocess.TimeoutExpired:
             done = len(list((folder / "sweep").glob("*/metrics.json")))
             # as when the machine goes down: submitit's jobs are no children of the process that launched them
-            os.killpg(process.pid, signal.SIGKILL)  # joblib's workers, which name no folder and would end their jobs first
+            os.killpg(
+                process.pid, signal.SIGKILL
+            )  # joblib's workers, which name no folder and would end their jobs first
             ended(processes_with(str(folder)))
             process.wait()
             time.sleep(0.5)
             if time.perf_counter() > until:
                 break
             met.append(len(numbers) - done)
-            print(f"{launcher}: kill {len(met)} with {done} of {len(numbers)} jobs complete", flush=True)
+            print(
+                f"{launcher}: kill {len(met)} with {done} of {len(numbers)} jobs complete",
+                flush=True,
+            )
     logs = [(folder / "sweep" / str(k) / "train.log") for k in range(len(numbers))]
     texts = [log.read_text() if log.is_file() else "" for log in logs]
     resumed = {name: sum(line in text for text in texts) for name, line in RESUMED.items()}
@@ -279,28 +326,40 @@ def runs(options: argparse.Namespace, folder: Path) -> list[Row]:
     generator = random.Random(f"{options.seed} {len(record.content['sweeps'])}")
     portion, place = options.portion or len(sets), 0
     while time.perf_counter() < until:
-        asked = {"joblib": range(len(sets)), "submitit_local": range(min(options.launched, len(sets)))}
-        missing = {kind: [k for k in asked[kind] if k not in record.compared(kind)] for kind in SWEEPS}
+        asked = {
+            "joblib": range(len(sets)),
+            "submitit_local": range(min(options.launched, len(sets))),
+        }
+        missing = {
+            kind: [k for k in asked[kind] if k not in record.compared(kind)] for kind in SWEEPS
+        }
         if not any(missing.values()):
             break
         # the one whose runs by themselves are there
         launcher = min((kind for kind in SWEEPS if missing[kind]),
                        key=lambda kind: len(set(missing[kind]) - set(record.of_kind("alone"))))  # fmt: skip
         # submitit's local executor starts all of its jobs at once
-        numbers = missing[launcher][: portion if launcher == "joblib" else min(portion, options.workers)]
+        numbers = missing[launcher][
+            : portion if launcher == "joblib" else min(portion, options.workers)
+        ]
         by_themselves(sets, [k for k in numbers if k not in record.of_kind("alone")], folder / "alone", common, options.workers,
                       until, record)  # fmt: skip
         numbers = [k for k in numbers if k in record.of_kind("alone")]
         if numbers and time.perf_counter() < until:
             kills = Kills(options.kills, tuple(options.between), generator)
-            if launcher == "submitit_local" and record.seconds:  # and so is at its end when one run is
+            if (
+                launcher == "submitit_local" and record.seconds
+            ):  # and so is at its end when one run is
                 kills = Kills(1, (0.3 * min(record.seconds), 0.9 * min(record.seconds)), generator)
             killed_sweep(sets, numbers, folder / f"{launcher}_{place}", common, launcher, options.workers, kills, until,
                          record)  # fmt: skip
         place += 1
     time.sleep(2.0)  # for what ends by itself: joblib's trackers
     # at a stop nobody has had the time to clear up
-    alive, left = processes_with(str(folder)), leftovers(folder) if time.perf_counter() < until else []
+    alive, left = (
+        processes_with(str(folder)),
+        leftovers(folder) if time.perf_counter() < until else [],
+    )
     print("\n".join(left))
     record.note("left", [len(alive), len(left)])
     return [told(row) for row in rows_of(record, options)]

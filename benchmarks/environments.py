@@ -39,12 +39,20 @@ SPREAD = 0.5
 """Of random actions, in the actions' range."""
 
 
-def measured(name: str, options: argparse.Namespace, values: dict[str, float]) -> tuple[str, float, float]:
+def measured(
+    name: str, options: argparse.Namespace, values: dict[str, float]
+) -> tuple[str, float, float]:
     """A row of the table, share of plain success, and how much farther the law moves the end than chance does."""
     began = time.perf_counter()
     made = {"device": options.device, "spacing": options.spacing}
-    truth, isotropic = (Simulator("truth", true_twin(options.scene, material=m, **made)) for m in ("anisotropic", "isotropic"))
-    task, drawing = task_named(name, truth.twin.body.rest, **values), torch.Generator().manual_seed(1)
+    truth, isotropic = (
+        Simulator("truth", true_twin(options.scene, material=m, **made))
+        for m in ("anisotropic", "isotropic")
+    )
+    task, drawing = (
+        task_named(name, truth.twin.body.rest, **values),
+        torch.Generator().manual_seed(1),
+    )
     trials = task.draw(options.trials, drawing)
     anew = Trials(trials.observed, task.draw(options.trials, drawing).hidden)
 
@@ -53,17 +61,32 @@ def measured(name: str, options: argparse.Namespace, values: dict[str, float]) -
         return play(arena, trials, policy), arena.view.center.cpu()
 
     plain = LinearPolicy(task)
-    (played, there), (_, other), (_, again) = ends(truth, trials, plain), ends(isotropic, trials, plain), ends(truth, anew, plain)
+    (played, there), (_, other), (_, again) = (
+        ends(truth, trials, plain),
+        ends(isotropic, trials, plain),
+        ends(truth, anew, plain),
+    )
     law, noise = (float(1e3 * (there - end).norm(dim=1).median()) for end in (other, again))
     best = ["", ""]
     if task.once and options.candidates:
         count = options.candidates
-        many = Trials(trials.observed.repeat_interleave(count, 0), task.draw(options.trials * count, drawing).hidden)
-        actions = SPREAD * (2 * torch.rand(options.trials, count, len(task.actions), generator=drawing) - 1)
+        many = Trials(
+            trials.observed.repeat_interleave(count, 0),
+            task.draw(options.trials * count, drawing).hidden,
+        )
+        actions = SPREAD * (
+            2 * torch.rand(options.trials, count, len(task.actions), generator=drawing) - 1
+        )
         for k, simulator in enumerate((truth, isotropic)):
-            loss = ends(simulator, many, lambda _: actions.flatten(0, 1))[0].loss.cpu().view(options.trials, count)
+            loss = (
+                ends(simulator, many, lambda _: actions.flatten(0, 1))[0]
+                .loss.cpu()
+                .view(options.trials, count)
+            )
             action = actions[torch.arange(options.trials), loss.argmin(1)]
-            best[k] = f"{100 * ends(truth, anew, lambda _, action=action: action)[0].success.float().mean():.0f} %"
+            best[k] = (
+                f"{100 * ends(truth, anew, lambda _, action=action: action)[0].success.float().mean():.0f} %"
+            )
     succeeded = float(played.success.float().mean())
     heights = f"{task.low:g} to {task.high:g}" if isinstance(task, Release) else ""
     row = (f"| {name} | {heights} | {100 * succeeded:.0f} % | {law:.0f} | {noise:.0f} | {best[0]} | {best[1]} | "
@@ -78,28 +101,46 @@ def chosen(found: list[tuple[tuple[float, float], float, float]]) -> tuple[float
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", nargs="+", choices=list(TASKS), default=list(TASKS))
     parser.add_argument("--scene", default="rabbit")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu"
+    )
     parser.add_argument("--trials", type=int, default=64)
     parser.add_argument("--candidates", type=int, default=32)
     parser.add_argument("--spacing", type=float)
     parser.add_argument("--set", nargs="+", default=[], metavar="FIELD=NUMBER", help="of the tasks")
-    parser.add_argument("--heights", nargs="+", metavar="LOW:HIGH", help="[m] of placement and hanging")
-    parser.add_argument("--choose", type=Path, metavar="FILE", help="of one task: write the chosen heights")
+    parser.add_argument(
+        "--heights", nargs="+", metavar="LOW:HIGH", help="[m] of placement and hanging"
+    )
+    parser.add_argument(
+        "--choose", type=Path, metavar="FILE", help="of one task: write the chosen heights"
+    )
     options = parser.parse_args()
-    if options.choose and (not options.heights or len(options.task) != 1 or not issubclass(TASKS[options.task[0]], Release)):
+    if options.choose and (
+        not options.heights
+        or len(options.task) != 1
+        or not issubclass(TASKS[options.task[0]], Release)
+    ):
         parser.error("--choose: expected --heights, and one of placement, hanging as --task")
     torch.set_num_threads(1)
-    values = {key: json.loads(value) for key, value in (item.split("=") for item in options.set)}  # a count stays whole
+    values = {
+        key: json.loads(value) for key, value in (item.split("=") for item in options.set)
+    }  # a count stays whole
     ranges = [tuple(map(float, item.split(":"))) for item in options.heights or ()]
-    print("| task | heights [m] | plain | law [mm] | noise [mm] | best of truth | best of isotropic | s |")
+    print(
+        "| task | heights [m] | plain | law [mm] | noise [mm] | best of truth | best of isotropic | s |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for name in options.task:
         found = []
         for low, high in ranges if ranges and issubclass(TASKS[name], Release) else [(None, None)]:
-            row, plain, ratio = measured(name, options, values | ({} if low is None else {"low": low, "high": high}))
+            row, plain, ratio = measured(
+                name, options, values | ({} if low is None else {"low": low, "high": high})
+            )
             found.append(((low, high), plain, ratio))
             print(row, flush=True)
         if options.choose:

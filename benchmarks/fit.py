@@ -96,7 +96,11 @@ class Steps:
         module = self.module
         module.stage_index, stage = index, module.stages[index]
         module.begin(stage)
-        self.optimizer = module.adam(stage)["optimizer"] if hasattr(module, "adam") else module.configure_optimizers()[index]
+        self.optimizer = (
+            module.adam(stage)["optimizer"]
+            if hasattr(module, "adam")
+            else module.configure_optimizers()[index]
+        )
 
     def step(self, index: int) -> dict[str, float]:
         module, optimizer = self.module, self.optimizer
@@ -115,10 +119,14 @@ class Steps:
         module.body.contact.project()
         times.append(self.clock())
         forward, backward, update = (b - a for a, b in pairwise(times))
-        return dict(zip(PARTS, (self.rollout, forward - self.rollout, backward, update), strict=True))
+        return dict(
+            zip(PARTS, (self.rollout, forward - self.rollout, backward, update), strict=True)
+        )
 
 
-def measure(overrides: list[str], device: str, repeats: int, kernels: int = 0) -> tuple[Figures, str]:
+def measure(
+    overrides: list[str], device: str, repeats: int, kernels: int = 0
+) -> tuple[Figures, str]:
     """(seconds of the repeats, one line on what was measured) of the program that is imported as `mosa`."""
     import torch
 
@@ -150,7 +158,9 @@ def print_kernels(steps: Steps, index: int, count: int) -> None:
         if event.device_type.name == "CUDA":
             kernels.setdefault(event.name, []).append(event.device_time / 1e3)
     total = sum(map(sum, kernels.values()))
-    print(f"\nkernels of a {steps.module.stages[index].name} step: {total:.1f} ms in {sum(map(len, kernels.values()))} launches")
+    print(
+        f"\nkernels of a {steps.module.stages[index].name} step: {total:.1f} ms in {sum(map(len, kernels.values()))} launches"
+    )
     print("| ms | launches | kernel |\n|---|---|---|")
     for name, each in sorted(kernels.items(), key=lambda item: -sum(item[1]))[:count]:
         print(f"| {sum(each):.2f} | {len(each)} | {name[:80]} |")
@@ -165,9 +175,13 @@ def checkout(which: str):
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder, "tree")
         git = ["git", "-C", str(ROOT), "worktree"]
-        added = subprocess.run([*git, "add", "--detach", str(tree), which], capture_output=True, text=True)
+        added = subprocess.run(
+            [*git, "add", "--detach", str(tree), which], capture_output=True, text=True
+        )
         if added.returncode:
-            raise SystemExit(f"--against: expected a folder with train.py or a commit, found {which!r} ({added.stderr.strip()})")
+            raise SystemExit(
+                f"--against: expected a folder with train.py or a commit, found {which!r} ({added.stderr.strip()})"
+            )
         try:
             yield tree
         finally:
@@ -178,52 +192,91 @@ def measured_in(folder: Path, options: argparse.Namespace) -> tuple[Figures, str
     """`measure` of the program in `folder`, in a process of its own."""
     with tempfile.TemporaryDirectory() as place:
         out = Path(place, "figures.json")
-        command = [sys.executable, str(HERE), "--write", str(out), "--device", options.device, "--repeats", str(options.repeats)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
+        command = [
+            sys.executable,
+            str(HERE),
+            "--write",
+            str(out),
+            "--device",
+            options.device,
+            "--repeats",
+            str(options.repeats),
+        ]
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]),
+        }
         result = subprocess.run([*command, *options.overrides], cwd=folder, env=environment)
         if result.returncode:
-            raise SystemExit(f"the program in {folder} could not be measured (exit code {result.returncode})")
+            raise SystemExit(
+                f"the program in {folder} could not be measured (exit code {result.returncode})"
+            )
         return tuple(json.loads(out.read_text()))
 
 
 def merged(parts: list[Figures]) -> Figures:
-    return {stage: {part: [s for each in parts for s in each[stage][part]] for part in PARTS} for stage in parts[0]}
+    return {
+        stage: {part: [s for each in parts for s in each[stage][part]] for part in PARTS}
+        for stage in parts[0]
+    }
 
 
 def print_table(named: dict[str, Figures], device: str) -> None:
     unit = "CPU-seconds" if device == "cpu" else "seconds"
-    print(f"\n{unit} per step, median (least to most)\n| stage | program | step | {' | '.join(PARTS)} |")
+    print(
+        f"\n{unit} per step, median (least to most)\n| stage | program | step | {' | '.join(PARTS)} |"
+    )
     print("|---|---|---|" + "---|" * len(PARTS))
     for stage in next(iter(named.values())):
         for name, figures in named.items():
             parts = figures[stage]
             whole = [sum(each) for each in zip(*parts.values(), strict=True)]
             medians = " | ".join(f"{statistics.median(parts[part]):.3f}" for part in PARTS)
-            print(f"| {stage} | {name} | {statistics.median(whole):.3f} ({min(whole):.3f} to {max(whole):.3f}) | {medians} |")
+            print(
+                f"| {stage} | {name} | {statistics.median(whole):.3f} ({min(whole):.3f} to {max(whole):.3f}) | {medians} |"
+            )
 
 
 def versions(device: str) -> str:
     import torch
     import warp
 
-    what = torch.cuda.get_device_name() if device == "cuda" else platform.processor() or platform.machine()
+    what = (
+        torch.cuda.get_device_name()
+        if device == "cuda"
+        else platform.processor() or platform.machine()
+    )
     return f"{what}, torch {torch.__version__}, warp {warp.__version__}"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--repeats", type=int, default=5, help="steps of each stage, in each round")
-    parser.add_argument("--against", metavar="COMMIT|FOLDER", help="another version, measured in turns with this one")
+    parser.add_argument(
+        "--against",
+        metavar="COMMIT|FOLDER",
+        help="another version, measured in turns with this one",
+    )
     parser.add_argument("--rounds", type=int, default=2, help="turns of each version")
     parser.add_argument("--kernels", type=int, default=0, help="CUDA kernels to list")
     parser.add_argument("--write", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    options.overrides = [*(d for d in DEFAULTS if not any(o.startswith(d.split("=")[0] + "=") for o in options.overrides)),
-                         *options.overrides]
+    options.overrides = [
+        *(
+            d
+            for d in DEFAULTS
+            if not any(o.startswith(d.split("=")[0] + "=") for o in options.overrides)
+        ),
+        *options.overrides,
+    ]
     if options.write is not None:
-        options.write.write_text(json.dumps(measure(options.overrides, options.device, options.repeats)))
+        options.write.write_text(
+            json.dumps(measure(options.overrides, options.device, options.repeats))
+        )
         return
     os.chdir(ROOT)
     sys.path.insert(0, str(ROOT))
@@ -234,7 +287,9 @@ def main() -> None:
             raise SystemExit("--device cuda: torch finds no CUDA device; --device cpu runs without")
     print(f"{versions(options.device)}\n{' '.join(options.overrides)}, {options.repeats} repeats")
     if options.against is None:
-        figures, about = measure(options.overrides, options.device, options.repeats, options.kernels)
+        figures, about = measure(
+            options.overrides, options.device, options.repeats, options.kernels
+        )
         print(about)
         print_table({"this one": figures}, options.device)
         return

@@ -13,15 +13,25 @@ from mosa.errors import MosaError
 from mosa.modules.fitting.identification import Identification
 
 
-def parser_of(description: str, inputs: str, folder: str, pictures: bool = False) -> argparse.ArgumentParser:
+def parser_of(
+    description: str, inputs: str, folder: str, pictures: bool = False
+) -> argparse.ArgumentParser:
     """inputs: what `make` takes one of each for; folder: where it puts them by default; pictures: whether results can be drawn."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("make", "fit", "table", *(["draw"] if pictures else [])))
-    parser.add_argument("inputs", nargs="+", help=f"make: {inputs}; fit: what make wrote; others: results")
+    parser.add_argument(
+        "inputs", nargs="+", help=f"make: {inputs}; fit: what make wrote; others: results"
+    )
     parser.add_argument("--out", type=Path, default=Path(folder), help="make, draw: the folder")
-    parser.add_argument("--results", type=Path, default=Path("fits.jsonl"), help="fit: a line is added for each")
+    parser.add_argument(
+        "--results", type=Path, default=Path("fits.jsonl"), help="fit: a line is added for each"
+    )
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--set", nargs="*", default=[], help="fit: overrides of the law and its identification")
+    parser.add_argument(
+        "--set", nargs="*", default=[], help="fit: overrides of the law and its identification"
+    )
     return parser
 
 
@@ -31,7 +41,11 @@ def run(
 ) -> None:  # fmt: skip
     """What `options` ask for; a fit that fails is said, and the others go on."""
     if options.what in ("table", "draw"):
-        records = [json.loads(line) for name in options.inputs for line in Path(name).read_text().splitlines()]
+        records = [
+            json.loads(line)
+            for name in options.inputs
+            for line in Path(name).read_text().splitlines()
+        ]
         if options.what == "draw":
             draw(records, options.out)
         print(table(records))

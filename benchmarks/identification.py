@@ -28,7 +28,15 @@ from mosa.config.build import build_body
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.evaluation.evaluate import true_motion
 from mosa.evaluation.floor import floor_rollout, hidden_of
-from mosa.evaluation.uncertainty import DRAWS, LEAST_DRAWS, among_forms, determined, drawn_motions, rival_motions, total_spread
+from mosa.evaluation.uncertainty import (
+    DRAWS,
+    LEAST_DRAWS,
+    among_forms,
+    determined,
+    drawn_motions,
+    rival_motions,
+    total_spread,
+)
 from mosa.modules.body.body import Start
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.residuals import sampled
@@ -58,7 +66,10 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
     made = assemble(cfg, device)
     scene, body, chosen = made.scene, made.body, sampled(len(made.body.rest), torch.device("cpu"))
     # of the contact height that a run starts from, which a calibration under the wrong law may leave
-    floors = {each.prefix: floor_rollout(body, each.scene, made.world)[:, chosen].cpu() for each in made.sequences}
+    floors = {
+        each.prefix: floor_rollout(body, each.scene, made.world)[:, chosen].cpu()
+        for each in made.sequences
+    }
     # as a run does before its joint stage: the cues once more, about the calibrated backbone's motion
     module = made.module
     calibration = module.identifying(module.stages[0])
@@ -77,26 +88,38 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
         if each.prefix.startswith("train"):
             take, T = next(takes), len(s.training_frames)
             sequences[each.prefix]["cues"] = {
-                name: getattr(take.cues, name)[:T].cpu() for name in ("positions", "rotation", "stretch", "weight")}
+                name: getattr(take.cues, name)[:T].cpu()
+                for name in ("positions", "rotation", "stretch", "weight")
+            }
             sequences[each.prefix]["response"] = take.response and {
-                part.name: getattr(take.response, part.name).cpu() for part in dataclasses.fields(Response)}
+                part.name: getattr(take.response, part.name).cpu()
+                for part in dataclasses.fields(Response)
+            }
     problem = {
         "config": made.data.measured, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
         "factor": hidden.factor(body.rest.cpu().float()),
     }  # fmt: skip
     name = scene.name + ("_twin" if cfg.scene.get("material") == "isotropic" else "")
-    name += f"_{len(module.takes)}drops" * (len(module.takes) > 1) + f"_seed{cfg.seed}" * (cfg.seed != 0)
+    name += f"_{len(module.takes)}drops" * (len(module.takes) > 1) + f"_seed{cfg.seed}" * (
+        cfg.seed != 0
+    )
     path = folder / f"{name}_{len(body.rest)}.pt"
     folder.mkdir(parents=True, exist_ok=True)
     torch.save(problem, path)
     for (prefix, s), each in zip(sequences.items(), made.sequences):
         laid = (body.rest - body.center) @ each.start.rotation.T + each.start.center
-        print(f"{path}: start of {prefix} off by {rms_mm(laid[chosen].cpu() - s['truth'][0]):.2f} mm", flush=True)
+        print(
+            f"{path}: start of {prefix} off by {rms_mm(laid[chosen].cpu() - s['truth'][0]):.2f} mm",
+            flush=True,
+        )
         if s["cues"] is not None:
             seen, contact = s["cues"]["positions"][:, chosen], s["contact"]
             off = rms_mm((seen - s["truth"][: len(seen)])[contact:])
-            print(f"{path}: {len(body.rest)} particles, cues of {prefix} off by {off:.2f} mm after contact", flush=True)
+            print(
+                f"{path}: {len(body.rest)} particles, cues of {prefix} off by {off:.2f} mm after contact",
+                flush=True,
+            )
     return path
 
 
@@ -104,7 +127,9 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
     """The module that fits the body of a problem with the law and the settings of `overrides`, and its sequences."""
     problem = torch.load(path, weights_only=True)
     cfg = OmegaConf.to_container(configuration(overrides), resolve=True)
-    config = problem["config"] | {"cfg": problem["config"]["cfg"] | {name: cfg[name] for name in LAW}}
+    config = problem["config"] | {
+        "cfg": problem["config"]["cfg"] | {name: cfg[name] for name in LAW}
+    }
     n = len(problem["rest"])
     tensors = {"rest": problem["rest"], "volume": problem["volume"], "colors": torch.zeros(n, 3), "opacities": torch.ones(n),
                "covariances": torch.eye(3).expand(n, 3, 3).clone()}  # fmt: skip
@@ -115,8 +140,16 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
         if own["cues"] is not None:  # without images
             cues = {k: v.float().to(device) for k, v in own["cues"].items()}
             kept = own.get("response")
-            takes.append(Take(own["start"], None, MotionCues(**cues, covariances=torch.zeros(1, device=device)), own["frame_dt"],
-                              own["contact"], response=kept and Response(**{k: v.to(device) for k, v in kept.items()})))
+            takes.append(
+                Take(
+                    own["start"],
+                    None,
+                    MotionCues(**cues, covariances=torch.zeros(1, device=device)),
+                    own["frame_dt"],
+                    own["contact"],
+                    response=kept and Response(**{k: v.to(device) for k, v in kept.items()}),
+                )
+            )
     module = LitMosa.from_config(config, body, takes=takes, background=torch.ones(3, device=device))
     return SimpleNamespace(problem=problem, module=module, body=body)
 
@@ -124,9 +157,16 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
 @torch.no_grad()
 def motions(case: SimpleNamespace, **switches: bool) -> dict[str, Tensor]:
     """(T, M, 3) [m] of the particles that are compared, by sequence."""
-    chosen, model = sampled(len(case.body.rest), torch.device("cpu")), case.body.model().only(**switches)
+    chosen, model = (
+        sampled(len(case.body.rest), torch.device("cpu")),
+        case.body.model().only(**switches),
+    )
     return {
-        prefix: case.body.simulate(s["start"], case.module.world, s["frames"], s["frame_dt"], model=model).x[:, chosen].cpu()
+        prefix: case.body.simulate(
+            s["start"], case.module.world, s["frames"], s["frame_dt"], model=model
+        )
+        .x[:, chosen]
+        .cpu()
         for prefix, s in case.problem["sequences"].items()
     }
 
@@ -134,25 +174,34 @@ def motions(case: SimpleNamespace, **switches: bool) -> dict[str, Tensor]:
 def errors(case: SimpleNamespace, found: dict[str, Tensor]) -> dict[str, float]:
     """By sequence, [mm]."""
     sequences = case.problem["sequences"]
-    return {prefix: rms_mm((x - sequences[prefix]["truth"])[sequences[prefix]["contact"] :]) for prefix, x in found.items()}
+    return {
+        prefix: rms_mm((x - sequences[prefix]["truth"])[sequences[prefix]["contact"] :])
+        for prefix, x in found.items()
+    }
 
 
 def held_out(by_sequence: dict[str, float]) -> float:
     """Mean over the sequences that were not learned from; over all where none is left."""
-    tests = [value for prefix, value in by_sequence.items() if prefix.startswith("test")] or list(by_sequence.values())
+    tests = [value for prefix, value in by_sequence.items() if prefix.startswith("test")] or list(
+        by_sequence.values()
+    )
     return sum(tests) / len(tests)
 
 
 def coverage(case: SimpleNamespace, found: dict[str, Tensor], posterior: Posterior) -> float | None:
     """Share of held-out particle errors after contact within two predicted standard deviations, as `predicted_spread` has them;
     None without held-out sequences or draws that can be simulated."""
-    drawn = drawn_motions(case.body, posterior.draws(DRAWS, torch.Generator().manual_seed(0)), lambda: motions(case))
+    drawn = drawn_motions(
+        case.body, posterior.draws(DRAWS, torch.Generator().manual_seed(0)), lambda: motions(case)
+    )
     others, within = rival_motions(case.body, posterior, lambda: motions(case)), []
     for prefix in (name for name in found if name.startswith("test") and len(drawn) >= LEAST_DRAWS):
         s = case.problem["sequences"][prefix]
         sd = total_spread(torch.stack([x[prefix] for x in drawn]), posterior.model_error,
                           among_forms(found[prefix], [x[prefix] for x in others]))  # fmt: skip
-        within.append(((found[prefix] - s["truth"]).norm(dim=-1) <= 2 * sd)[s["contact"] :].double().mean())
+        within.append(
+            ((found[prefix] - s["truth"]).norm(dim=-1) <= 2 * sd)[s["contact"] :].double().mean()
+        )
     return float(sum(within) / len(within)) if within else None
 
 
@@ -174,7 +223,10 @@ def fit(path: Path, overrides: list[str], device: str) -> dict:
     """Calibration and joint stage; the figures of both."""
     began = time.perf_counter()
     return figures(identified(path, overrides, device)) | {
-        "problem": path.stem, "set": overrides, "seconds": time.perf_counter() - began}
+        "problem": path.stem,
+        "set": overrides,
+        "seconds": time.perf_counter() - began,
+    }
 
 
 def figures(case: SimpleNamespace) -> dict:
@@ -184,7 +236,11 @@ def figures(case: SimpleNamespace) -> dict:
     floor = errors(case, {prefix: s["floor"] for prefix, s in case.problem["sequences"].items()})
     body.adapter.follow(body.material.poisson())
     axis, ratio = stiffest(body.adapter.stiffness().detach().cpu())
-    fibre, factor, true = case.problem["fibre"], body.factor(body.heterogeneity).detach().cpu(), case.problem["factor"]
+    fibre, factor, true = (
+        case.problem["fibre"],
+        body.factor(body.heterogeneity).detach().cpu(),
+        case.problem["factor"],
+    )
     varies = float(true.std()) > 1e-6 and float(factor.std()) > 1e-6
     return {
         "prior_mm": held_out(prior), "learned_mm": held_out(learned),
@@ -202,6 +258,7 @@ def table(records: list[dict]) -> str:
              "coverage", "mean abs C", "eta", "grid", "s")  # fmt: skip
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for r in sorted(records, key=lambda r: (r["set"], r["problem"])):
+
         def shown(name: str, digits: int, r=r) -> str:
             return "" if r[name] is None else f"{r[name]:.{digits}f}"
 
@@ -216,8 +273,12 @@ def main() -> None:
     parser = fits.parser_of(__doc__, "overrides of one scene each, in quotes", "problems")
     parser.set_defaults(set=["prior=neo_hookean"])
     options = parser.parse_args()
-    fits.run(options, lambda words: make(words.split(), options.out, options.device),
-             lambda path: fit(path, options.set, options.device), table)
+    fits.run(
+        options,
+        lambda words: make(words.split(), options.out, options.device),
+        lambda path: fit(path, options.set, options.device),
+        table,
+    )
 
 
 if __name__ == "__main__":

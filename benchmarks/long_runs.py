@@ -75,7 +75,11 @@ def on_device(device: str) -> float:
 
         pynvml.nvmlInit()
         card = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{torch.cuda.get_device_properties(0).uuid}")
-        own = [each.usedGpuMemory for each in pynvml.nvmlDeviceGetComputeRunningProcesses(card) if each.pid == os.getpid()]
+        own = [
+            each.usedGpuMemory
+            for each in pynvml.nvmlDeviceGetComputeRunningProcesses(card)
+            if each.pid == os.getpid()
+        ]
         if own and own[0] is not None:
             return own[0] / 1e6
     free, total = torch.cuda.mem_get_info()
@@ -85,10 +89,15 @@ def on_device(device: str) -> float:
 def checkpoint(folder: Path, particles: int, device: str, gpu: int | None) -> Path:
     """Of a small run whose body has so many particles."""
     where = [] if device == "cpu" else ["trainer=gpu"]
-    size, places = f"simulation.particles={particles}", [f"scene.cache={folder}/cache", f"hydra.run.dir={folder}/run"]
+    size, places = (
+        f"simulation.particles={particles}",
+        [f"scene.cache={folder}/cache", f"hydra.run.dir={folder}/run"],
+    )
     code = started([*SMALL, *where, size, *places], folder / "run.log", gpu).wait(900)
     if code:
-        raise SystemExit(f"the run that makes the body ended with {code}:\n{(folder / 'run.log').read_text()[-3000:]}")
+        raise SystemExit(
+            f"the run that makes the body ended with {code}:\n{(folder / 'run.log').read_text()[-3000:]}"
+        )
     return folder / "run" / "checkpoints" / "last.ckpt"
 
 
@@ -106,20 +115,29 @@ def rollouts(options: argparse.Namespace, folder: Path) -> list[Row]:
         if k == max(1, options.rollouts // 10):
             early = {name: count() for name, count in counts.items()}
         # one drop in thousands is so fast that it leaves the world's box, and is refused
-        speed, turn = torch.randn(3, generator=generator).clamp(-FASTEST, FASTEST), torch.randn(4, generator=generator)
+        speed, turn = (
+            torch.randn(3, generator=generator).clamp(-FASTEST, FASTEST),
+            torch.randn(4, generator=generator),
+        )
         height = 0.1 + 0.2 * float(torch.rand(1, generator=generator))
         start = {"rotation": [*turn[:3].tolist(), 90 * float(turn[3])], "height": height, "velocity": speed.tolist(),
                  "frames": options.frames}  # fmt: skip
         found = twin.simulate(**start).x
         if k % 100 == 0:
-            distance = float((twin.simulate(**start).x - found).norm(dim=-1).max()) / twin.body.settings.dx
+            distance = (
+                float((twin.simulate(**start).x - found).norm(dim=-1).max()) / twin.body.settings.dx
+            )
             differ, apart = differ + (distance > 0), max(apart, distance)
         made = k + 1
         if time.perf_counter() - began > options.seconds:
             break
     took = time.perf_counter() - began
     grown = {name: count() - early.get(name, count()) for name, count in counts.items()}
-    new = sorted(p.name for p in set(Path(tempfile.gettempdir()).glob("*")) - temporary if p.stat().st_uid == os.getuid())
+    new = sorted(
+        p.name
+        for p in set(Path(tempfile.gettempdir()).glob("*")) - temporary
+        if p.stat().st_uid == os.getuid()
+    )
     what = f"{made} rollouts of {options.frames} frames, {len(twin.body.rest)} particles, one process on {options.device}"
     asked = f"{options.rollouts}; at most {GROWTH:g} MB, 0 handles, 0 threads added"
     rows = [told(Row(what, asked, f"{made / took:.1f} a second; after the first tenth " + ", ".join(
@@ -149,7 +167,9 @@ class Compared(NamedTuple):
 
     @property
     def line(self) -> str:
-        return f"{self.name} {self.values}, {self.far:.3g} {self.unit} apart (bound {self.bound:.2g})"
+        return (
+            f"{self.name} {self.values}, {self.far:.3g} {self.unit} apart (bound {self.bound:.2g})"
+        )
 
 
 def rms(vectors: np.ndarray) -> float:
@@ -173,25 +193,47 @@ def apart(a: Path, b: Path) -> tuple[list[str], list[Compared]]:
     one, other = figures(a), figures(b)
     differ = sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
     found: list[Compared] = []
-    for name, key in {"E": "E_relative_sd", "nu": "nu_sd", "stiffness_ratio": "stiffness_ratio_sd"}.items():
+    for name, key in {
+        "E": "E_relative_sd",
+        "nu": "nu_sd",
+        "stiffness_ratio": "stiffness_ratio_sd",
+    }.items():
         x, y, sd = one.get(f"id/{name}"), other.get(f"id/{name}"), one.get(f"posterior/{key}")
         if x is not None and y is not None and sd is not None:
             sd = sd * x if key == "E_relative_sd" else sd
-            found.append(Compared(name, f"{x:.4g} and {y:.4g}", abs(x - y) / sd, "standard deviations", SPREADS))
+            found.append(
+                Compared(
+                    name, f"{x:.4g} and {y:.4g}", abs(x - y) / sd, "standard deviations", SPREADS
+                )
+            )
     for name in ("train/rms_m", "test/rms_m", "prior/train/rms_m", "prior/test/rms_m"):
         if name in one and name in other:
             x, y = one[name], other[name]
-            found.append(Compared(name, f"{1e3 * x:.2f} and {1e3 * y:.2f} mm", abs(x - y) / x, "of the error", AGREE))
+            found.append(
+                Compared(
+                    name,
+                    f"{1e3 * x:.2f} and {1e3 * y:.2f} mm",
+                    abs(x - y) / x,
+                    "of the error",
+                    AGREE,
+                )
+            )
     for name in ("rollout.npz", "prior.npz"):
         x, y, spread = arrays(a / name), arrays(b / name), arrays(a / "uncertainty.npz")
         same = [key for key in x if key in y and x[key].shape == y[key].shape]
-        differ += [f"{name}:{key}" for key in {*x, *y} if key not in same or not np.array_equal(x[key], y[key])]
+        differ += [
+            f"{name}:{key}"
+            for key in {*x, *y}
+            if key not in same or not np.array_equal(x[key], y[key])
+        ]
         for key in same:
             sd = spread.get(f"{key.removesuffix('/x')}/sd")
             if name == "rollout.npz" and key.endswith("/x") and sd is not None:
                 far, most = x[key].astype(float) - y[key], float(np.sqrt(np.square(sd).mean()))
                 said = f"{1e3 * rms(far):.2f} mm rms, {1e3 * np.linalg.norm(far, axis=-1).max():.2f} at most"
-                found.append(Compared(f"motion {key}", said, rms(far) / most, "standard deviations", SPREADS))
+                found.append(
+                    Compared(f"motion {key}", said, rms(far) / most, "standard deviations", SPREADS)
+                )
     return differ, sorted(found, key=lambda c: -c.far / c.bound)
 
 
@@ -201,7 +243,13 @@ def price(gpu: int | None = None) -> str:
     for exact in (False, True):
         code = (f"import sys; sys.path.insert(0, {str(ROOT / 'benchmarks')!r}); import long_runs; "
                 f"long_runs.timed({exact})")  # fmt: skip
-        made = subprocess.run([sys.executable, "-c", code], env=environment(gpu), cwd=ROOT, capture_output=True, text=True)
+        made = subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment(gpu),
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        )
         if made.returncode:
             return f"not measured: {' '.join(made.stderr.split())[-300:]}"
         seconds[exact] = json.loads(made.stdout.splitlines()[-1])
@@ -246,10 +294,20 @@ def timed(exact: bool, device: str = "cuda") -> None:
 def equality(options: argparse.Namespace, folder: Path) -> list[Row]:
     """Two runs of each kind (`--pairs`), all beside each other so that their times compare."""
     where = ["trainer=gpu"] if options.device != "cpu" else []
-    common = [*(options.equal or ["debug=default"]), *where, "evaluation.video=false", "logger=none"]
+    common = [
+        *(options.equal or ["debug=default"]),
+        *where,
+        "evaluation.video=false",
+        "logger=none",
+    ]
     began, pairs = time.perf_counter(), [(kind, k) for kind in options.pairs for k in (0, 1)]
     if len(options.pairs) > 1:  # kernels: the time to compile them is no price of anything
-        short = ["fit.prior.iterations=1", "fit.joint.iterations=0", "fit.prior_eta.iterations=0", "evaluation.floor=false"]
+        short = [
+            "fit.prior.iterations=1",
+            "fit.joint.iterations=0",
+            "fit.prior_eta.iterations=0",
+            "evaluation.floor=false",
+        ]
         places = [f"scene.cache={folder}/warm_cache", f"hydra.run.dir={folder}/warm"]
         started([*common, *short, *places], folder / "warm.log").wait(900)
 
@@ -272,7 +330,9 @@ def equality(options: argparse.Namespace, folder: Path) -> list[Row]:
         over = [each for each in compared if each.far > each.bound]
         found = (f"{len(over)} of {len(compared)} beyond; nearest to its bound: {compared[0].line if compared else 'nothing'}; "
                  f"{len(differ)} figures and arrays are not bit-equal, {time.perf_counter() - began:.0f} s")  # fmt: skip
-        rows.append(Row(f"two equal runs on {options.device}", asked, found, bool(compared) and not over))
+        rows.append(
+            Row(f"two equal runs on {options.device}", asked, found, bool(compared) and not over)
+        )
     if "exact" in options.pairs:
         differ, _ = apart(folder / "exact_0", folder / "exact_1")
         names = f": {', '.join(differ[:6])}" if differ else ""
@@ -288,7 +348,9 @@ def prices(folder: Path) -> list[Row]:
     stages = ("reconstruction", "starts", "fit", "evaluation")
     spent = {kind: np.mean([[json.loads((folder / f"{kind}_{k}" / "metrics.json").read_text()).get(f"time/{stage}_s", 0.0)
                              for stage in stages] for k in (0, 1)], axis=0) for kind in ("plain", "exact")}  # fmt: skip
-    each = ", ".join(f"{stage} {a:.0f} -> {b:.0f}" for stage, a, b in zip(stages, spent["plain"], spent["exact"]))
+    each = ", ".join(
+        f"{stage} {a:.0f} -> {b:.0f}" for stage, a, b in zip(stages, spent["plain"], spent["exact"])
+    )
     whole = f"{spent['plain'].sum():.0f} -> {spent['exact'].sum():.0f} s {each}"
     return [Row("price of it: a whole run, four beside each other", "reported", whole, True),
             Row("price of it: a frame of 64 substeps", "reported", price(), True)]  # fmt: skip
@@ -308,50 +370,106 @@ def beside(part: str, folder: Path, gpu: int) -> list[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=None, help="default: all, without a GPU runs and rollouts")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--parts",
+        nargs="+",
+        choices=PARTS,
+        default=None,
+        help="default: all, without a GPU runs and rollouts",
+    )
     parser.add_argument("--device", default="cpu", help="of rollouts and equality: cpu | cuda")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=4)
-    parser.add_argument("--until", type=float, default=1e9, help="seconds after which the runs are stopped; fewer fail")
-    parser.add_argument("--record", type=Path, default=None, help="of the runs: where what was found is kept, to go on with it")
-    parser.add_argument("--portion", type=int, default=None, help="runs that are made and then swept; default: all")
-    parser.add_argument("--smaller", nargs="+", default=[], metavar="KEY=VALUE", help="further overrides of the drawn runs")
+    parser.add_argument(
+        "--until",
+        type=float,
+        default=1e9,
+        help="seconds after which the runs are stopped; fewer fail",
+    )
+    parser.add_argument(
+        "--record",
+        type=Path,
+        default=None,
+        help="of the runs: where what was found is kept, to go on with it",
+    )
+    parser.add_argument(
+        "--portion", type=int, default=None, help="runs that are made and then swept; default: all"
+    )
+    parser.add_argument(
+        "--smaller",
+        nargs="+",
+        default=[],
+        metavar="KEY=VALUE",
+        help="further overrides of the drawn runs",
+    )
     parser.add_argument("--workers", type=int, default=2, help="runs beside each other")
-    parser.add_argument("--kills", type=int, default=2, help="of each of joblib's sweeps; submitit's is killed once")
-    parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
-    parser.add_argument("--launched", type=int, default=2, help="of the runs, by submitit's local executor")
+    parser.add_argument(
+        "--kills", type=int, default=2, help="of each of joblib's sweeps; submitit's is killed once"
+    )
+    parser.add_argument(
+        "--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill"
+    )
+    parser.add_argument(
+        "--launched", type=int, default=2, help="of the runs, by submitit's local executor"
+    )
     parser.add_argument("--rollouts", type=int, default=400)
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--particles", type=int, default=100, help="of the body that is rolled out")
-    parser.add_argument("--seconds", type=float, default=1e9, help="for rollouts; fewer than asked fail")
-    parser.add_argument("--equal", nargs="+", default=None, metavar="KEY=VALUE", help="overrides of the runs that are compared")
-    parser.add_argument("--pairs", nargs="+", choices=("plain", "exact"), default=("plain", "exact"),
-                        help="equality: runs without, with deterministic=true; the price is measured where both run")
+    parser.add_argument(
+        "--seconds", type=float, default=1e9, help="for rollouts; fewer than asked fail"
+    )
+    parser.add_argument(
+        "--equal",
+        nargs="+",
+        default=None,
+        metavar="KEY=VALUE",
+        help="overrides of the runs that are compared",
+    )
+    parser.add_argument(
+        "--pairs",
+        nargs="+",
+        choices=("plain", "exact"),
+        default=("plain", "exact"),
+        help="equality: runs without, with deterministic=true; the price is measured where both run",
+    )
     parser.add_argument("--rows", type=Path, default=None, help="write the rows there, as JSON")
     options = parser.parse_args()
     if options.device != "cpu" and not torch.cuda.is_available():
         parser.error(f"--device {options.device}: torch finds no CUDA device on this machine")
-    chosen = options.parts or [part for part in PARTS if part != "equality" or options.device != "cpu"]
+    chosen = options.parts or [
+        part for part in PARTS if part != "equality" or options.device != "cpu"
+    ]
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="mosa_long_", ignore_cleanup_errors=True) as place:
         folders = {part: Path(place) / part for part in chosen}
         for folder in folders.values():
             folder.mkdir()
-        own = [part for part in chosen if part == "runs" or options.device == "cpu" or len(chosen) == 1]
+        own = [
+            part for part in chosen if part == "runs" or options.device == "cpu" or len(chosen) == 1
+        ]
         gpus = max(1, torch.cuda.device_count()) if options.device != "cpu" else 1
         with ThreadPoolExecutor(len(chosen)) as pool:
             elsewhere = [part for part in chosen if part not in own]
-            others = [pool.submit(beside, part, folders[part], i % gpus) for i, part in enumerate(elsewhere)]
+            others = [
+                pool.submit(beside, part, folders[part], i % gpus)
+                for i, part in enumerate(elsewhere)
+            ]
             for part in own:
-                rows += {"runs": runs, "rollouts": rollouts, "equality": equality}[part](options, folders[part])
+                rows += {"runs": runs, "rollouts": rollouts, "equality": equality}[part](
+                    options, folders[part]
+                )
             rows += [row for other in others for row in other.result()]
     if options.rows is not None:  # whoever asked for them prints them
         options.rows.write_text(json.dumps(rows))
         return
     print("\n| what | asked | found |\n|---|---|---|")
     for row in rows:
-        print(f"| {row.what} | {row.asked} | {'' if row.met else '**NOT AS ASKED:** '}{row.found} |")
+        print(
+            f"| {row.what} | {row.asked} | {'' if row.met else '**NOT AS ASKED:** '}{row.found} |"
+        )
     sys.exit(0 if all(row.met for row in rows) else 1)
 
 

@@ -48,12 +48,18 @@ def make(overrides: list[str], folder: Path, device: str, count: int = CANDIDATE
     """The problem of a scene with cues of the training drop and of every candidate."""
     name = next(word.split("=")[1] for word in overrides if word.startswith("scene="))
     drops = film(name, count)
-    return identification.make([*overrides, f"scene.also_train=[{','.join(drops)}]"], folder, device)
+    return identification.make(
+        [*overrides, f"scene.also_train=[{','.join(drops)}]"], folder, device
+    )
 
 
 def with_only(problem: dict, k: int | None) -> dict:
     """The problem of learning from the training drop and candidate k (from 1), None: no candidate."""
-    kept = {name: s for name, s in problem["sequences"].items() if "/plan_" not in name or name.endswith(f"/{named(k)}")}
+    kept = {
+        name: s
+        for name, s in problem["sequences"].items()
+        if "/plan_" not in name or name.endswith(f"/{named(k)}")
+    }
     return problem | {"sequences": kept}
 
 
@@ -75,7 +81,9 @@ def fit(path: Path, overrides: list[str], device: str) -> dict:
     train = problem["sequences"]["train"]
     twin = Twin(case.body, case.module.world, train["frame_dt"], problem["config"], Start.read(train["start"], case.body.rest),
                 case.joint.posterior())  # fmt: skip
-    gains = {each.rotation: each.gain for each in plan(twin, count=count + 1, frames=train["frames"])}
+    gains = {
+        each.rotation: each.gain for each in plan(twin, count=count + 1, frames=train["frames"])
+    }
     alone, prior = off(case), identification.held_out(identification.errors(case, case.prior))
     starts = drawn_starts(count + 1, 0)[1:]
     both = [off(learned(k)) for k in range(1, count + 1)]
@@ -87,11 +95,24 @@ def fit(path: Path, overrides: list[str], device: str) -> dict:
 
 
 def table(records: list[dict]) -> str:
-    heads = ("problem", "prior mm", "one drop mm", "planned mm", "mean of the others mm", "gain of each, nats: error, mm", "s")
+    heads = (
+        "problem",
+        "prior mm",
+        "one drop mm",
+        "planned mm",
+        "mean of the others mm",
+        "gain of each, nats: error, mm",
+        "s",
+    )
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for r in sorted(records, key=lambda r: r["problem"]):
-        each = ", ".join(f"{'-' if g is None else f'{g:.2f}'}: {e:.1f}" for g, e in zip(r["gains"], r["errors_mm"]))
-        errors = " | ".join(f"{r[name]:.1f}" for name in ("prior_mm", "one_drop_mm", "planned_mm", "others_mm"))
+        each = ", ".join(
+            f"{'-' if g is None else f'{g:.2f}'}: {e:.1f}"
+            for g, e in zip(r["gains"], r["errors_mm"])
+        )
+        errors = " | ".join(
+            f"{r[name]:.1f}" for name in ("prior_mm", "one_drop_mm", "planned_mm", "others_mm")
+        )
         lines.append(f"| {r['problem']} | {errors} | {each} | {r['seconds']:.0f} |")
     return "\n".join(lines)
 
@@ -101,8 +122,12 @@ def main() -> None:
     parser.set_defaults(set=["prior=neo_hookean"])
     parser.add_argument("--count", type=int, default=CANDIDATES, help="make: candidates")
     options = parser.parse_args()
-    fits.run(options, lambda words: make(words.split(), options.out, options.device, options.count),
-             lambda path: fit(path, options.set, options.device), table)
+    fits.run(
+        options,
+        lambda words: make(words.split(), options.out, options.device, options.count),
+        lambda path: fit(path, options.set, options.device),
+        table,
+    )
 
 
 if __name__ == "__main__":

@@ -57,11 +57,16 @@ def scene(kind: str, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
     else:
         means = 1.6 * (torch.rand(count, 3, generator=g) - 0.5)
         pixels = 1 + 3 * torch.rand(count, 1, generator=g)
-        scales, opacities = pixels * DISTANCE / FOCAL * stretch, 0.15 + 0.8 * torch.rand(count, generator=g)
+        scales, opacities = (
+            pixels * DISTANCE / FOCAL * stretch,
+            0.15 + 0.8 * torch.rand(count, generator=g),
+        )
     return means[None], covariance_from(scales, rotations)[None], opacities
 
 
-def inputs(kind: str, count: int, views: int, channels: int, device: str) -> tuple[tuple[torch.Tensor, ...], Cameras]:
+def inputs(
+    kind: str, count: int, views: int, channels: int, device: str
+) -> tuple[tuple[torch.Tensor, ...], Cameras]:
     """Means, covariances, opacities and features (three colours, with nine channels the six of flow too), and cameras."""
     means, covariances, opacities = (x.to(device) for x in scene(kind, count))
     cameras = ring(views).to(device)
@@ -81,7 +86,9 @@ def step(kind: str, count: int, views: int, channels: int, device: str, backend:
     values, cameras = inputs(kind, count, views, channels, device)
     leaves = [x.clone().requires_grad_() for x in values]
     index = torch.zeros(views, dtype=torch.long, device=device)
-    weight = torch.rand(views, SIZE, SIZE, channels, generator=torch.Generator().manual_seed(2)).to(device)
+    weight = torch.rand(views, SIZE, SIZE, channels, generator=torch.Generator().manual_seed(2)).to(
+        device
+    )
 
     def run() -> None:
         image, alpha = rasterize(*leaves, cameras, index, backend=backend)
@@ -106,7 +113,9 @@ def spread(values: list[float], unit: str) -> str:
 
 def on_cpu(counts: list[int], repeats: int) -> None:
     torch.set_num_threads(1)
-    print(f"\nCPU, 1 image of {SIZE}x{SIZE}, 3 channels, forward + backward, one thread, median (least to most) of {repeats}")
+    print(
+        f"\nCPU, 1 image of {SIZE}x{SIZE}, 3 channels, forward + backward, one thread, median (least to most) of {repeats}"
+    )
     for kind in ("object", "cloud"):
         for count in counts:
             run = step(kind, count, 1, 3, "cpu", "warp")
@@ -116,7 +125,9 @@ def on_cpu(counts: list[int], repeats: int) -> None:
                 began = time.process_time()
                 run()
                 figures.append(time.process_time() - began)
-            print(f"  {kind:7s} {count:8d}  warp   {spread(figures, 'CPU-s')}  pairs/px {pairs(kind, count):.1f}")
+            print(
+                f"  {kind:7s} {count:8d}  warp   {spread(figures, 'CPU-s')}  pairs/px {pairs(kind, count):.1f}"
+            )
 
 
 def on_cuda(counts: list[int], repeats: int, views: int) -> None:
@@ -164,7 +175,9 @@ def parts(kind: str, count: int, views: int) -> tuple[dict, int]:
         "projection": lambda: splatting.project(*gaussians, g),
         "sorting + lists": lambda: splatting.depth_lists(depths.clone(), records, g),
         "compositing": lambda: splatting.composite(lists, records, features, g),
-        "compositing, backward": lambda: splatting.composite_backward(lists, records, features, *state, g),
+        "compositing, backward": lambda: splatting.composite_backward(
+            lists, records, features, *state, g
+        ),
         "projection, backward": lambda: splatting.project_backward(*gaussians, records, moments, g),
     }, len(lists[0])
 
@@ -185,14 +198,18 @@ def device_time(stage, repeats: int, calls: int = 5) -> float:
 
 
 def print_parts(counts: list[int], repeats: int, views: int) -> None:
-    print(f"\nCUDA, {views} images of {SIZE}x{SIZE}, 9 channels, stage by stage, median of {repeats} [ms]\n")
+    print(
+        f"\nCUDA, {views} images of {SIZE}x{SIZE}, 9 channels, stage by stage, median of {repeats} [ms]\n"
+    )
     names = None
     for kind in ("object", "cloud"):
         for count in counts:
             stages, entries = parts(kind, count, views)
             if names is None:
                 names = list(stages)
-                print(f"| scene | Gaussians | {' | '.join(names)} | entries |\n|{'---|' * (len(names) + 3)}")
+                print(
+                    f"| scene | Gaussians | {' | '.join(names)} | entries |\n|{'---|' * (len(names) + 3)}"
+                )
             figures = [f"{device_time(stage, repeats):.3f}" for stage in stages.values()]
             print(f"| {kind} | {count} | {' | '.join(figures)} | {entries} |")
 
@@ -214,11 +231,16 @@ def print_parity() -> None:
         print(f"gsplat is left out: {reason}")
         ways = {"pixel by pixel": {"scan": "tile"}, "Gaussian by Gaussian": {"scan": "gaussian"}}
     (image, alpha, gradients), (wanted, wanted_alpha, wanted_gradients) = (
-        outcome(drawn, clear, lambda *x, options=options: rasterize(*x, **options)) for options in ways.values()
+        outcome(drawn, clear, lambda *x, options=options: rasterize(*x, **options))
+        for options in ways.values()
     )
     share = float(clear.float().mean())
-    print(f"\n{' against '.join(ways)}, at {share:.1%} of the pixels, those off the rims, where alpha is 1/255\n")
-    print("| what | largest difference | of the largest value | norm of the difference / norm |\n|---|---|---|---|")
+    print(
+        f"\n{' against '.join(ways)}, at {share:.1%} of the pixels, those off the rims, where alpha is 1/255\n"
+    )
+    print(
+        "| what | largest difference | of the largest value | norm of the difference / norm |\n|---|---|---|---|"
+    )
     rows = {"image": (image[clear], wanted[clear]), "alpha": (alpha[clear], wanted_alpha[clear])}
     rows |= {f"gradient, {name}": (gradients[name], wanted_gradients[name]) for name in gradients}
     for name, (ours, theirs) in rows.items():
@@ -232,19 +254,34 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--counts", type=int, nargs="*")
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: both where there is CUDA")
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), help="default: both where there is CUDA"
+    )
     parser.add_argument("--parts", action="store_true", help="the stages on CUDA, nothing else")
-    parser.add_argument("--parity", action="store_true", help="differences from gsplat, nothing else")
+    parser.add_argument(
+        "--parity", action="store_true", help="differences from gsplat, nothing else"
+    )
     options = parser.parse_args()
     cuda = torch.cuda.is_available()
     if not cuda and (options.device == "cuda" or options.parts or options.parity):
-        parser.error("--device cuda, --parts and --parity need a CUDA device, and torch finds none on this machine")
-    print(f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}", end="")
-    print(f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if cuda else ", no CUDA device")
+        parser.error(
+            "--device cuda, --parts and --parity need a CUDA device, and torch finds none on this machine"
+        )
+    print(
+        f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}",
+        end="",
+    )
+    print(
+        f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
+        if cuda
+        else ", no CUDA device"
+    )
     if options.parity:
         return print_parity()
     if options.parts:
-        return print_parts(options.counts or [30_000, 100_000, 1_000_000], options.repeats, options.views)
+        return print_parts(
+            options.counts or [30_000, 100_000, 1_000_000], options.repeats, options.views
+        )
     if options.device != "cuda":
         on_cpu(options.counts or [10_000, 50_000], options.repeats)
     if cuda and options.device != "cpu":

@@ -82,11 +82,17 @@ def outcome(attack: Callable[[], object], patience: int = PATIENCE) -> tuple[str
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default=",".join(name for name in GROUPS if name not in LONGER))
     parser.add_argument("--runs", action="store_true")
-    parser.add_argument("--share", default="0/1", metavar="K/N",
-                        help="every N-th attack of each group, from the K-th on: N processes make all of them beside each other")
+    parser.add_argument(
+        "--share",
+        default="0/1",
+        metavar="K/N",
+        help="every N-th attack of each group, from the K-th on: N processes make all of them beside each other",
+    )
     options = parser.parse_args()
     first, every = map(int, options.share.split("/"))
     rows, said = [], []
@@ -97,10 +103,15 @@ def main() -> None:
                 kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
                 if name in LONGER:  # whole processes: minutes in which nothing would be seen
-                    print(f"  {time.strftime('%H:%M:%S')} {what[:100]}: {kind} {text[:100]}", flush=True)
+                    print(
+                        f"  {time.strftime('%H:%M:%S')} {what[:100]}: {kind} {text[:100]}",
+                        flush=True,
+                    )
                 said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []
-        rows.append(f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "
-                    f"{counts['ran']} |")
+        rows.append(
+            f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "
+            f"{counts['ran']} |"
+        )
         print(rows[-1], flush=True)
     print("\n".join(["", HEAD, *rows, "", *said]))
     sys.exit(1 if any("traceback:" in line or "hang:" in line for line in said) else 0)

@@ -58,8 +58,13 @@ ALLOWED = 1.25
 """Factor by which a ratio may exceed the stored one."""
 DX, DT, DENSITY, MU, LAM = 1 / 32, 1e-4, 1000.0, 4e4, 6e4
 STRIDE = SimulationSettings.stride
-VARIANTS = {"none": (None, 1), "operator": ("operator", None), "constant": ("linear", None), "stride1": ("mosa", 1),
-            "mosa": ("mosa", STRIDE)}
+VARIANTS = {
+    "none": (None, 1),
+    "operator": ("operator", None),
+    "constant": ("linear", None),
+    "stride1": ("mosa", 1),
+    "mosa": ("mosa", STRIDE),
+}
 """Name: (file of conf/adapter, substeps between evaluations, None for one evaluation in all)."""
 ORDERS = ("lattice", "cell", "shuffled")
 """Of the particles in memory: as a filling makes them, by the cell they lie in, by chance."""
@@ -100,20 +105,43 @@ def ordered(x: torch.Tensor, order: str) -> torch.Tensor:
     return torch.arange(len(x))
 
 
-def case(variant: str, particles: int, substeps: int, frames: int, device: str, settings: dict, order: str = ORDERS[0]) -> Case:
+def case(
+    variant: str,
+    particles: int,
+    substeps: int,
+    frames: int,
+    device: str,
+    settings: dict,
+    order: str = ORDERS[0],
+) -> Case:
     name, stride = VARIANTS[variant]
     adapter = adapter_of(name, device, settings)
     arrays = body(particles, DX, torch.float32)
     index = ordered(arrays[0], order)
     state = ParticleState(*(t[index].to(device) for t in arrays))
     volume = torch.full((particles,), (DX / 2) ** 3, device=device)
-    sim = Simulator("corotated", dx=DX, substeps=substeps, frame_dt=substeps * DT, ground=Ground(2 * DX), device=device)
+    sim = Simulator(
+        "corotated",
+        dx=DX,
+        substeps=substeps,
+        frame_dt=substeps * DT,
+        ground=Ground(2 * DX),
+        device=device,
+    )
     leaves = [torch.tensor(MU, device=device), torch.zeros(3, device=device)]
     weights = [] if adapter is None else [p for p in adapter.parameters() if p.requires_grad]
 
     def rollout(mu, velocity):
         start = ParticleState(state.x, state.v + velocity, state.C_affine, state.F, state.F_tot)
-        return sim.rollout(start, {"mu": mu, "lam": LAM}, volume, DENSITY, frames + 1, adapter=adapter, stride=stride)
+        return sim.rollout(
+            start,
+            {"mu": mu, "lam": LAM},
+            volume,
+            DENSITY,
+            frames + 1,
+            adapter=adapter,
+            stride=stride,
+        )
 
     def forward() -> None:
         with torch.no_grad():
@@ -146,7 +174,9 @@ def resident(field: str) -> float:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return float("nan")
-    return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith(field)), float("nan"))
+    return next(
+        (int(line.split()[1]) / 2**20 for line in lines if line.startswith(field)), float("nan")
+    )
 
 
 class PeakMemory:
@@ -203,7 +233,15 @@ def table(options: argparse.Namespace, settings: dict) -> None:
     for particles in options.counts:
         bases: list[float] = []
         for variant in options.variants:
-            run = case(variant, particles, options.substeps, options.frames, options.device, settings, options.order)
+            run = case(
+                variant,
+                particles,
+                options.substeps,
+                options.frames,
+                options.device,
+                settings,
+                options.order,
+            )
             with memory:
                 figures = measured(run, options)
             del run  # with its buffers: the next one's memory is its own
@@ -211,11 +249,16 @@ def table(options: argparse.Namespace, settings: dict) -> None:
             bases = medians if variant == "none" else bases
             over = ", ".join(f"{a / b:.2f}" for a, b in zip(medians, bases)) if bases else "-"
             shown = " | ".join(spread(f, total) for f in figures)
-            print(f"| {particles} | {variant} | {shown} | {over} | {memory.peak:.2f} | {medians[0]:.3f} |", flush=True)
+            print(
+                f"| {particles} | {variant} | {shown} | {over} | {memory.peak:.2f} | {medians[0]:.3f} |",
+                flush=True,
+            )
 
 
 @wp.kernel(enable_backward=False)
-def scatter(base: wp.array(dtype=wp.int32), values: wp.array(dtype=wp.vec4), grid: wp.array(dtype=wp.vec4)):
+def scatter(
+    base: wp.array(dtype=wp.int32), values: wp.array(dtype=wp.vec4), grid: wp.array(dtype=wp.vec4)
+):
     p = wp.tid()
     value, x = values[p], base[p]
     for i in range(27):
@@ -227,7 +270,10 @@ def yardstick(particles: int, substeps: int) -> Callable[[], None]:
     """27 weighted sums of four floats per particle and substep, to nodes beside each other: the work of P2G without an MPM, by the
     same compiler, so that a processor which is faster at one is so at both."""
     base = wp.array((torch.arange(particles) // 4).int().numpy(), dtype=wp.int32, device="cpu")
-    values, grid = wp.ones(particles, dtype=wp.vec4, device="cpu"), wp.zeros(particles + 27, dtype=wp.vec4, device="cpu")
+    values, grid = (
+        wp.ones(particles, dtype=wp.vec4, device="cpu"),
+        wp.zeros(particles + 27, dtype=wp.vec4, device="cpu"),
+    )
 
     def run() -> None:
         for _ in range(YARDSTICK_ROUNDS * substeps):
@@ -241,8 +287,12 @@ def ratios(best: dict[str, float]) -> dict[str, float]:
     result = {"none forward / yardstick": best["none forward"] / best["yardstick"]}
     for variant in VARIANTS:
         if variant != "none":
-            result[f"{variant} forward / none forward"] = best[f"{variant} forward"] / best["none forward"]
-        result[f"{variant} both / {variant} forward"] = best[f"{variant} both"] / best[f"{variant} forward"]
+            result[f"{variant} forward / none forward"] = (
+                best[f"{variant} forward"] / best["none forward"]
+            )
+        result[f"{variant} both / {variant} forward"] = (
+            best[f"{variant} both"] / best[f"{variant} forward"]
+        )
     return result
 
 
@@ -269,7 +319,11 @@ class Check:
 
 def degraded(found: dict[str, float], stored: dict[str, float]) -> list[str]:
     """Names of the stored ratios that are exceeded by more than a quarter, or that were not measured."""
-    return [name for name, value in stored.items() if not found.get(name, float("inf")) <= ALLOWED * value]
+    return [
+        name
+        for name, value in stored.items()
+        if not found.get(name, float("inf")) <= ALLOWED * value
+    ]
 
 
 def check(attempts: int = 8) -> tuple[dict[str, float], dict[str, float], list[str]]:
@@ -285,27 +339,54 @@ def check(attempts: int = 8) -> tuple[dict[str, float], dict[str, float], list[s
 
 
 def versions() -> str:
-    cuda = f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else ", no CUDA device"
+    cuda = (
+        f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
+        if torch.cuda.is_available()
+        else ", no CUDA device"
+    )
     found = importlib.util.find_spec("triton") is not None
     triton = f", triton {importlib.metadata.version('triton')}" if found else ", no triton"
     return f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}{triton}{cuda}"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--counts", type=int, nargs="+", help="particles; 10k to 1M on CUDA, 10k on a CPU where not given")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu"
+    )
+    parser.add_argument(
+        "--counts",
+        type=int,
+        nargs="+",
+        help="particles; 10k to 1M on CUDA, 10k on a CPU where not given",
+    )
     parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--substeps", type=int, default=40)
-    parser.add_argument("--frames", type=int, help="intervals of a rollout; 5 on CUDA, 1 on a CPU where not given")
+    parser.add_argument(
+        "--frames", type=int, help="intervals of a rollout; 5 on CUDA, 1 on a CPU where not given"
+    )
     parser.add_argument("--forward-only", action="store_true", help="no backward pass")
-    parser.add_argument("--block", type=int, default=launching.BLOCK, help="threads of a CUDA block in the substeps")
-    parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="of the particles in memory")
+    parser.add_argument(
+        "--block", type=int, default=launching.BLOCK, help="threads of a CUDA block in the substeps"
+    )
+    parser.add_argument(
+        "--order", choices=ORDERS, default=ORDERS[0], help="of the particles in memory"
+    )
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--store-activations", action="store_true", help="no recomputation of the networks")
-    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the paper's adapter")
-    parser.add_argument("--check", action="store_true", help="small CPU run against the stored ratios")
-    parser.add_argument("--store", action="store_true", help="measure and store the ratios of --check")
+    parser.add_argument(
+        "--store-activations", action="store_true", help="no recomputation of the networks"
+    )
+    parser.add_argument(
+        "--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the paper's adapter"
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="small CPU run against the stored ratios"
+    )
+    parser.add_argument(
+        "--store", action="store_true", help="measure and store the ratios of --check"
+    )
     options = parser.parse_args()
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
@@ -314,16 +395,24 @@ def main() -> None:
     launching.BLOCK = options.block
     print(versions())
     if options.store:
-        found = {name: round(value, 3) for name, value in Check().measure(3 * CHECK["rounds"]).items()}
-        STORED.write_text(json.dumps({"machine": versions(), **CHECK, "ratios": found}, indent=2) + "\n")
+        found = {
+            name: round(value, 3) for name, value in Check().measure(3 * CHECK["rounds"]).items()
+        }
+        STORED.write_text(
+            json.dumps({"machine": versions(), **CHECK, "ratios": found}, indent=2) + "\n"
+        )
         print(STORED.read_text())
     elif options.check:
         found, stored, bad = check()
         print("| ratio of CPU times | stored | found |\n|---|---|---|")
         for name, value in stored.items():
-            print(f"| {name} | {value:.2f} | {found.get(name, float('nan')):.2f}{' DEGRADED' if name in bad else ''} |")
+            print(
+                f"| {name} | {value:.2f} | {found.get(name, float('nan')):.2f}{' DEGRADED' if name in bad else ''} |"
+            )
         if bad:
-            raise SystemExit(f"more than a factor {ALLOWED} above the stored ratios: {', '.join(bad)}")
+            raise SystemExit(
+                f"more than a factor {ALLOWED} above the stored ratios: {', '.join(bad)}"
+            )
     else:
         if options.device == "cpu":
             options.counts = options.counts or [10_000]

@@ -30,25 +30,43 @@ from mosa.errors import MosaError
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("overrides", nargs="*", help="of conf/train.yaml, e.g. scene.scale=0.5 simulation.particles=2000")
-    parser.add_argument("--out", type=Path, default=Path("outputs/seeing"), help="results and cached stages")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        help="of conf/train.yaml, e.g. scene.scale=0.5 simulation.particles=2000",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/seeing"), help="results and cached stages"
+    )
     parser.add_argument("--scene", default=BIRD, help="pictures only, of another scene")
-    parser.add_argument("--table", action="store_true", help="only print what has been measured, all lines")
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="also draw the pictures of this line")
+    parser.add_argument(
+        "--table", action="store_true", help="only print what has been measured, all lines"
+    )
+    parser.add_argument(
+        "--pictures", type=Path, metavar="FOLDER", help="also draw the pictures of this line"
+    )
     args = parser.parse_args()
     if args.table:
         lines = [json.loads(file.read_text()) for file in args.out.glob("*.json")]
         if not lines:
-            parser.error(f"--table: nothing has been measured into {args.out}; run it without --table first")
+            parser.error(
+                f"--table: nothing has been measured into {args.out}; run it without --table first"
+            )
         print(tables(sorted(lines, key=lambda line: (len(line["overrides"]), line["overrides"]))))
         return
     if args.scene != BIRD:  # no figures to compare with, but pictures
-        for picture in pictures(see(configuration(args.overrides, args.out, args.scene)), args.pictures or args.out):
+        for picture in pictures(
+            see(configuration(args.overrides, args.out, args.scene)), args.pictures or args.out
+        ):
             print(picture)
         return
     # the order of overrides matters to hydra: it is kept
-    file = args.out / f"bird-{hashlib.sha256(' '.join(args.overrides).encode()).hexdigest()[:8]}.json"
+    file = (
+        args.out / f"bird-{hashlib.sha256(' '.join(args.overrides).encode()).hexdigest()[:8]}.json"
+    )
     if not file.exists():
         print(f"bird, {' '.join(args.overrides) or 'defaults'}", file=sys.stderr)
         args.out.mkdir(parents=True, exist_ok=True)

@@ -51,7 +51,15 @@ class Seen:
 
 def configuration(overrides: list[str], out: Path, scene: str = BIRD) -> DictConfig:
     with initialize_config_dir(str(CONF.resolve()), version_base=None):
-        return compose("train", [f"scene={scene}", f"scene.holdout_cameras=[{HELD}]", f"scene.cache={out}/cache", *overrides])
+        return compose(
+            "train",
+            [
+                f"scene={scene}",
+                f"scene.holdout_cameras=[{HELD}]",
+                f"scene.cache={out}/cache",
+                *overrides,
+            ],
+        )
 
 
 def see(cfg: DictConfig) -> Seen:
@@ -61,8 +69,24 @@ def see(cfg: DictConfig) -> Seen:
     camera = scene.cameras.names.index(HELD)
     splats, cues, view = result.splats, result.cues, scene.cameras.select([camera])
     with torch.no_grad():
-        views = observe(cues.positions, cues.covariances, splats.opacities, splats.colors, view, scene.background, flow=True)
-    return Seen(run, scene, run.data.reconstruction_settings, result, views, balls(cues.positions, result.volume, view), camera)
+        views = observe(
+            cues.positions,
+            cues.covariances,
+            splats.opacities,
+            splats.colors,
+            view,
+            scene.background,
+            flow=True,
+        )
+    return Seen(
+        run,
+        scene,
+        run.data.reconstruction_settings,
+        result,
+        views,
+        balls(cues.positions, result.volume, view),
+        camera,
+    )
 
 
 def balls(positions: Tensor, volume: Tensor, view: Cameras, finer: int = 8) -> Tensor:
@@ -76,7 +100,13 @@ def balls(positions: Tensor, volume: Tensor, view: Cameras, finer: int = 8) -> T
     places = ((pixels[0] * finer - 0.5) * 16).round().int().tolist()
     for t, place, r in zip(frame, places, (size * finer * 16).round().int().tolist()):
         cv2.circle(pictures[t], place, r, 1, cv2.FILLED, shift=4)
-    return torch.from_numpy(pictures).unflatten(1, (-1, finer)).unflatten(3, (-1, finer)).float().mean((2, 4))
+    return (
+        torch.from_numpy(pictures)
+        .unflatten(1, (-1, finer))
+        .unflatten(3, (-1, finer))
+        .float()
+        .mean((2, 4))
+    )
 
 
 def overlap(alpha: Tensor, mattes: Tensor) -> list[float]:
@@ -96,7 +126,9 @@ def held_out_figures(seen: Seen) -> dict:
     covariances = covariance_from(splats.scales, splats.rotations)[None]
     view = scene.cameras.select(camera)
     with torch.no_grad():
-        static = observe(splats.means[None], covariances, splats.opacities, splats.colors, view, scene.background)
+        static = observe(
+            splats.means[None], covariances, splats.opacities, splats.colors, view, scene.background
+        )
     images, frames = seen.views.images.clamp(0, 1), list(range(scene.frames))
     return {
         "static": image_metrics(static.images.clamp(0, 1), scene, camera, [0]),
@@ -118,13 +150,22 @@ def training_figures(seen: Seen) -> dict:
     views = [view_of(seen, camera) for camera in cameras]
     ious = [overlap(v.mattes[0], scene.mattes[camera]) for v, camera in zip(views, cameras)]
     images = torch.cat([v.images for v in views]).clamp(0, 1)
-    return image_metrics(images, scene, cameras, scene.training_frames) | {"iou": float(np.mean(ious))}
+    return image_metrics(images, scene, cameras, scene.training_frames) | {
+        "iou": float(np.mean(ious))
+    }
 
 
 def view_of(seen: Seen, camera: int) -> Views:
     cues, splats, view = seen.result.cues, seen.result.splats, seen.scene.cameras.select([camera])
     with torch.no_grad():
-        return observe(cues.positions, cues.covariances, splats.opacities, splats.colors, view, seen.scene.background)
+        return observe(
+            cues.positions,
+            cues.covariances,
+            splats.opacities,
+            splats.colors,
+            view,
+            seen.scene.background,
+        )
 
 
 def shadow_figures(seen: Seen) -> dict:
@@ -133,7 +174,10 @@ def shadow_figures(seen: Seen) -> dict:
     scene = seen.scene
     dark = (scene.images.amax(-1) < DARK) & (scene.mattes > 0.5)
     share = dark.sum((2, 3)) / (scene.mattes > 0.5).sum((2, 3))
-    ious = [overlap(view_of(seen, camera).mattes[0], scene.mattes[camera]) for camera in range(len(scene.cameras))]
+    ious = [
+        overlap(view_of(seen, camera).mattes[0], scene.mattes[camera])
+        for camera in range(len(scene.cameras))
+    ]
     return {"cameras": list(scene.cameras.names), "dark": share.tolist(), "iou": ious}
 
 
@@ -142,7 +186,10 @@ def volume_figures(seen: Seen, published: dict) -> dict:
     scene, settings = seen.scene, seen.settings
     result = {"published_hull": published["frames"][0]["volume"], "particles": float(seen.result.volume.sum()),
               "filled_hull": body_volume(object_geometry(scene, settings).body)}  # fmt: skip
-    for name, cameras in (("hull_training_cameras", scene.training_cameras), ("hull_all_cameras", list(range(len(scene.cameras))))):
+    for name, cameras in (
+        ("hull_training_cameras", scene.training_cameras),
+        ("hull_all_cameras", list(range(len(scene.cameras)))),
+    ):
         mattes, views = scene.mattes[cameras, 0], scene.cameras.select(cameras)
         bounds = hull_bounds(mattes, views, scene.box)
         pitch = float((bounds[1] - bounds[0]).max()) / settings.resolution
@@ -176,9 +223,14 @@ def flight_figures(seen: Seen, published: dict) -> dict:
 
 def real_flow(seen: Seen) -> Tensor:
     """Optical flow (T - 1, H, W, 2) [px] of the held-out camera's own images (DIS, Kroeger et al. 2016): an estimate, no truth."""
-    gray = [cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2GRAY) for image in seen.scene.images[seen.camera]]
+    gray = [
+        cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2GRAY)
+        for image in seen.scene.images[seen.camera]
+    ]
     estimate = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return torch.from_numpy(np.stack([estimate.calc(a, b, None) for a, b in itertools.pairwise(gray)]))
+    return torch.from_numpy(
+        np.stack([estimate.calc(a, b, None) for a, b in itertools.pairwise(gray)])
+    )
 
 
 def flow_figures(seen: Seen) -> dict:
@@ -186,14 +238,20 @@ def flow_figures(seen: Seen) -> dict:
     inside = (seen.scene.mattes[seen.camera, :-1] > 0.5) & (seen.views.mattes[0, :-1] > 0.5)
     found, real = seen.views.flow[0][inside], real_flow(seen)[inside]
     error, length = (found - real).norm(dim=-1).double(), real.norm(dim=-1).double()
-    result = {"median_px": error.median(), "p90_px": error.quantile(0.9), "optical_flow_median_px": length.median()}
+    result = {
+        "median_px": error.median(),
+        "p90_px": error.quantile(0.9),
+        "optical_flow_median_px": length.median(),
+    }
     return {name: float(value) for name, value in result.items()}
 
 
 def measure(overrides: list[str], out: Path) -> dict:
     cfg = configuration(overrides, out)
     # before the minutes of the reconstruction: a copy of the scene may have come without it
-    published = read_json(under(cfg.scene.root, cfg.scene.path) / "derived" / "visual_hull_track.json")
+    published = read_json(
+        under(cfg.scene.root, cfg.scene.path) / "derived" / "visual_hull_track.json"
+    )
     seen = see(cfg)
     return {
         "overrides": overrides, "width_px": seen.scene.cameras.width, "particles": len(seen.result.volume),

@@ -24,12 +24,18 @@ import matplotlib.pyplot as plt
 from matplotlib.collections import PolyCollection
 
 
-def write(rows: dict[str, Tensor], file: Path, enlarge: int, legend: np.ndarray | None = None) -> Path:
+def write(
+    rows: dict[str, Tensor], file: Path, enlarge: int, legend: np.ndarray | None = None
+) -> Path:
     """One captioned row per entry (T, h, w, 3), as a PNG; `legend` is put in the upper right, beside them."""
     parts = []
     for name, images in rows.items():
         row = np.concatenate([to_uint8(image) for image in images], 1)
-        row = cv2.resize(row, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC) if enlarge > 1 else row
+        row = (
+            cv2.resize(row, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
+            if enlarge > 1
+            else row
+        )
         parts.append(label(row, name))
     picture = np.concatenate(parts)
     if legend is not None:
@@ -38,7 +44,9 @@ def write(rows: dict[str, Tensor], file: Path, enlarge: int, legend: np.ndarray 
         picture = np.concatenate([picture, column], 1)
     # a colour wheel needs all its colours; photographs do with 256, at a third of the size
     image = Image.fromarray(picture)
-    (image if legend is not None else image.quantize(256, dither=Image.Dither.NONE)).save(file, optimize=True)
+    (image if legend is not None else image.quantize(256, dither=Image.Dither.NONE)).save(
+        file, optimize=True
+    )
     return file
 
 
@@ -46,7 +54,11 @@ def silhouette_errors(alpha: Tensor, mattes: Tensor) -> Tensor:
     """(T, H, W, 3): grey where both are, red where the matte is not covered, blue where the render stands over."""
     a, b = alpha > 0.5, mattes > 0.5
     picture = torch.ones(*a.shape, 3)
-    for where, color in ((a & b, (0.8, 0.8, 0.8)), (b & ~a, (0.85, 0.1, 0.1)), (a & ~b, (0.1, 0.2, 0.9))):
+    for where, color in (
+        (a & b, (0.8, 0.8, 0.8)),
+        (b & ~a, (0.85, 0.1, 0.1)),
+        (a & ~b, (0.1, 0.2, 0.9)),
+    ):
         picture[where] = torch.tensor(color)
     return picture
 
@@ -81,9 +93,13 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
     rows = {
         f"Gaussian flow to the next frame, camera {HELD} (held out), frames {', '.join(map(str, steps))}; "
         f"full colour: {largest:.0f} px or more": cut(flow_colors(found, largest), steps),
-        "optical flow of the real images (DIS), inside the matte": cut(flow_colors(optical, largest), steps),
+        "optical flow of the real images (DIS), inside the matte": cut(
+            flow_colors(optical, largest), steps
+        ),
     }
-    files.append(write(rows, to / f"seeing_{scene.name}_flow.png", enlarge, to_uint8(color_wheel(96))))
+    files.append(
+        write(rows, to / f"seeing_{scene.name}_flow.png", enlarge, to_uint8(color_wheel(96)))
+    )
     return [*files, ellipsoids(seen, to / f"seeing_{scene.name}_ellipsoids.png")]
 
 
@@ -95,7 +111,9 @@ def ellipsoids(seen: Seen, file: Path, exaggeration: float = 2.0) -> Path:
     squashed = int((result.cues.stretch - 1).abs().amax(-1).median(dim=1).values.argmax())
     figure, plots = plt.subplots(2, 2, figsize=(10, 6.4), layout="constrained")
     for row, t in zip(plots, (squashed, len(positions) - 1)):
-        for plot, (axis, seen_axes, title) in zip(row, ((2, (0, 1), "along z"), (1, (0, 2), "along y, from above"))):
+        for plot, (axis, seen_axes, title) in zip(
+            row, ((2, (0, 1), "along z"), (1, (0, 2), "along y, from above"))
+        ):
             layer = (rest[:, axis] - rest[:, axis].median()).abs() < 0.6 * result.spacing
             # stretches exaggerated about 1; the rotation is kept
             U, S, Vh = torch.linalg.svd(F[t, layer].double())
@@ -104,18 +122,30 @@ def ellipsoids(seen: Seen, file: Path, exaggeration: float = 2.0) -> Path:
             axes = np.eye(3)[list(seen_axes)]
             strain, radius = (S - 1).abs().amax(1), 0.42 * result.spacing
             shapes = outlines(drawn, positions[t, layer], axes, radius)
-            balls_drawn = PolyCollection(shapes, array=strain.numpy(), cmap="viridis", clim=(0, 0.2), ec="#333333", lw=0.3)
+            balls_drawn = PolyCollection(
+                shapes, array=strain.numpy(), cmap="viridis", clim=(0, 0.2), ec="#333333", lw=0.3
+            )
             mapped = plot.add_collection(balls_drawn)
             # where the rest x axis points to: shows the rotation
-            line, centre = radius * R[:, :, 0].numpy() @ axes.T, positions[t, layer].numpy() @ axes.T
-            plot.plot(*np.stack([centre - line, centre + line]).transpose(2, 0, 1), color="white", lw=0.7)
-            plot.set_title(f"frame {t}, seen {title}; largest |stretch - 1|: median {float(strain.median()):.3f}", fontsize=7)
+            line, centre = (
+                radius * R[:, :, 0].numpy() @ axes.T,
+                positions[t, layer].numpy() @ axes.T,
+            )
+            plot.plot(
+                *np.stack([centre - line, centre + line]).transpose(2, 0, 1), color="white", lw=0.7
+            )
+            plot.set_title(
+                f"frame {t}, seen {title}; largest |stretch - 1|: median {float(strain.median()):.3f}",
+                fontsize=7,
+            )
             plot.set_xlabel("xyz"[seen_axes[0]] + " [m]", fontsize=7)
             plot.set_ylabel("xyz"[seen_axes[1]] + " [m]", fontsize=7)
             plot.set_aspect("equal")
             plot.tick_params(labelsize=7)
             plot.autoscale_view()
-    figure.colorbar(mapped, ax=plots, shrink=0.6).set_label("largest |stretch - 1| (not exaggerated)", fontsize=8)
+    figure.colorbar(mapped, ax=plots, shrink=0.6).set_label(
+        "largest |stretch - 1| (not exaggerated)", fontsize=8
+    )
     what = "synthetic" if seen.scene.synthetic else "real footage"
     title = f"{seen.scene.name} ({what}), a layer through the middle; stretches drawn {exaggeration:g} times as large"
     figure.suptitle(title, fontsize=9)

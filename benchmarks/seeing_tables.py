@@ -11,7 +11,9 @@ from seeing_figures import ASKED
 
 
 def markdown(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, ["---"] * len(head), *rows])
+    return "\n".join(
+        "| " + " | ".join(cells) + " |" for cells in [head, ["---"] * len(head), *rows]
+    )
 
 
 def name_of(line: dict) -> str:
@@ -66,7 +68,9 @@ def volume_row(line: dict) -> dict[str, str]:
 def flight_row(line: dict) -> dict[str, str]:
     flight = line["flight"]
     off = flight["gravity_m_s2"] / flight["true_gravity_m_s2"] - 1
-    wrong = float(np.linalg.norm(np.subtract(flight["velocity_m_s"], flight["published_velocity_m_s"])))
+    wrong = float(
+        np.linalg.norm(np.subtract(flight["velocity_m_s"], flight["published_velocity_m_s"]))
+    )
     right = verdict(abs(off) <= ASKED["gravity"])
     return {
         "free frames": f"0 to {flight['free_frames'] - 1}",
@@ -89,10 +93,14 @@ def tables(lines: list[dict]) -> str:
     for line in lines:
         held = line["held_out"]
         for key, pattern in (("psnr_crop", "{:.2f}"), ("ssim_crop", "{:.4f}")):
-            frames.append([name_of(line), key, *(pattern.format(f[key]) for f in held["per_frame"])])
+            frames.append(
+                [name_of(line), key, *(pattern.format(f[key]) for f in held["per_frame"])]
+            )
         frames.append([name_of(line), "IoU", *(f"{x:.4f}" for x in held["iou"])])
     blocks.append(shadow_table(lines))
-    return "\n\n".join([*blocks, markdown(["line", "frame", *map(str, range(len(frames[0]) - 2))], frames)])
+    return "\n\n".join(
+        [*blocks, markdown(["line", "frame", *map(str, range(len(frames[0]) - 2))], frames)]
+    )
 
 
 def shadow_table(lines: list[dict]) -> str:
@@ -102,8 +110,23 @@ def shadow_table(lines: list[dict]) -> str:
         dark, iou = np.array(line["shadow"]["dark"]), np.array(line["shadow"]["iou"])
         t = int(dark.mean(0).argmax())
         before = dark[:, : line["flight"]["free_frames"]].max()
-        rows.append([name_of(line), str(t), f"{before:.1%}", *(f"{d:.1%} / {i:.3f}" for d, i in zip(dark[:, t], iou[:, t]))])
-    return markdown(["line", "frame", "most in free flight", *(f"camera {c}" for c in lines[0]["shadow"]["cameras"])], rows)
+        rows.append(
+            [
+                name_of(line),
+                str(t),
+                f"{before:.1%}",
+                *(f"{d:.1%} / {i:.3f}" for d, i in zip(dark[:, t], iou[:, t])),
+            ]
+        )
+    return markdown(
+        [
+            "line",
+            "frame",
+            "most in free flight",
+            *(f"camera {c}" for c in lines[0]["shadow"]["cameras"]),
+        ],
+        rows,
+    )
 
 
 def vector(values: list[float]) -> str:

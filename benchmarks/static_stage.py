@@ -49,13 +49,19 @@ LINES = [
 
 def settings_of(name: str, overrides: list[str]) -> tuple[Scene, ReconstructionSettings]:
     with initialize_config_dir(str(CONF.resolve()), version_base=None):
-        cfg = compose("train", [f"scene={name}", f"scene.holdout_cameras=[{HELD[name]}]", *overrides])
+        cfg = compose(
+            "train", [f"scene={name}", f"scene.holdout_cameras=[{HELD[name]}]", *overrides]
+        )
     return scenes(cfg)[0], build_settings(**plain(cfg.reconstruction))
 
 
-def figures(scene: Scene, camera: int, hull: Volume, settings: ReconstructionSettings, seed: int) -> dict[str, float]:
+def figures(
+    scene: Scene, camera: int, hull: Volume, settings: ReconstructionSettings, seed: int
+) -> dict[str, float]:
     """Fit once, render the camera. Seconds are those of the fit, on the CPU."""
-    still = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).of_frame(0)
+    still = object_windows(
+        scene, scene.training_cameras, scene.training_frames, margin=settings.margin
+    ).of_frame(0)
     start = start_splats(hull, still, settings.static, count=settings.points, seed=seed)
     began = time.process_time()
     splats = fit_splats(start, still, scene.background, settings.static, move=True, seed=seed)
@@ -75,19 +81,26 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    print("| reconstruction. | scene | psnr_full | psnr_crop | ssim_crop | Gaussians | CPU-seconds |")
+    print(
+        "| reconstruction. | scene | psnr_full | psnr_crop | ssim_crop | Gaussians | CPU-seconds |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in args.scenes:
         scene, settings = settings_of(name, args.overrides)
         hull = object_geometry(scene, settings).body
         for line in LINES:
-            _, settings = settings_of(name, [f"reconstruction.{key}" for key in line] + args.overrides)
+            _, settings = settings_of(
+                name, [f"reconstruction.{key}" for key in line] + args.overrides
+            )
             found = [figures(scene, HELD[name], hull, settings, seed) for seed in args.seeds]
             cell = lambda key, digits: " / ".join(f"{f[key]:.{digits}f}" for f in found)  # noqa: B023, E731
             names = " ".join(f"`{key}`" for key in line) or "defaults"
             mean = float(np.mean([f["seconds"] for f in found]))
-            print(f"| {names} | {name} | {cell('psnr_full', 2)} | {cell('psnr_crop', 2)} | {cell('ssim_crop', 4)} | "
-                  f"{cell('count', 0)} | {mean:.1f} |", flush=True)
+            print(
+                f"| {names} | {name} | {cell('psnr_full', 2)} | {cell('psnr_crop', 2)} | {cell('ssim_crop', 4)} | "
+                f"{cell('count', 0)} | {mean:.1f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

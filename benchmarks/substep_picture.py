@@ -50,16 +50,22 @@ class Drawing:
     def line(self, a, b, color: str, width: float = 1.0, arrow: bool = False) -> None:
         (x1, y1), (x2, y2) = self.at(a), self.at(b)
         head = f' marker-end="url(#{"node" if color == NODE else "particle"})"' if arrow else ""
-        self.parts.append(f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{color}" '
-                          f'stroke-width="{width:.2f}"{head}/>')
+        self.parts.append(
+            f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{color}" '
+            f'stroke-width="{width:.2f}"{head}/>'
+        )
 
     def dot(self, point, radius: float, color: str, opacity: float = 1.0) -> None:
         x, y = self.at(point)
-        self.parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{color}" fill-opacity="{opacity:.2f}"/>')
+        self.parts.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{color}" fill-opacity="{opacity:.2f}"/>'
+        )
 
     def text(self, x: float, y: float, words: str, size: int, weight: str = "normal") -> None:
-        self.parts.append(f'<text x="{self.left + x:.1f}" y="{y:.1f}" font-size="{size}" font-weight="{weight}" '
-                          f'fill="{INK}" text-anchor="middle">{words}</text>')
+        self.parts.append(
+            f'<text x="{self.left + x:.1f}" y="{y:.1f}" font-size="{size}" font-weight="{weight}" '
+            f'fill="{INK}" text-anchor="middle">{words}</text>'
+        )
 
     def grid(self) -> None:
         for k in range(SIDE + 1):
@@ -69,10 +75,19 @@ class Drawing:
     def written(self) -> str:
         width, height = len(PANELS) * (CELL * SIDE + 30) + 10, CELL * SIDE + 72
         shape = '<path d="M0,0 L6,3 L0,6 z" fill="{1}"/>'
-        mark = '<marker id="{0}" viewBox="0 0 6 6" refX="5" refY="3" markerWidth="5" markerHeight="5" orient="auto">' + shape
-        marks = "".join(mark.format(*each) + "</marker>" for each in (("node", NODE), ("particle", PARTICLE)))
-        return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif">'
-                f'<rect width="100%" height="100%" fill="white"/><defs>{marks}</defs>\n' + "\n".join(self.parts) + "\n</svg>\n")
+        mark = (
+            '<marker id="{0}" viewBox="0 0 6 6" refX="5" refY="3" markerWidth="5" markerHeight="5" orient="auto">'
+            + shape
+        )
+        marks = "".join(
+            mark.format(*each) + "</marker>" for each in (("node", NODE), ("particle", PARTICLE))
+        )
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif">'
+            f'<rect width="100%" height="100%" fill="white"/><defs>{marks}</defs>\n'
+            + "\n".join(self.parts)
+            + "\n</svg>\n"
+        )
 
 
 def picture() -> str:

@@ -30,10 +30,20 @@ def bump() -> SignedDistanceField:
     """Lattice of distances, as of a mesh: a ball of 0.2 m with a flat top at z = 0."""
     wide, high = 0.01 * torch.arange(-28, 29).double(), 0.01 * torch.arange(-30, 13).double()
     x, y, z = torch.meshgrid(wide, wide, high, indexing="ij")
-    return SignedDistanceField(torch.maximum((x**2 + y**2 + (z + 0.1) ** 2).sqrt() - 0.2, z), (-0.28, -0.28, -0.3), 0.01, 0.08)
+    return SignedDistanceField(
+        torch.maximum((x**2 + y**2 + (z + 0.1) ** 2).sqrt() - 0.2, z),
+        (-0.28, -0.28, -0.3),
+        0.01,
+        0.08,
+    )
 
 
-SOLIDS = {"plane": (HalfSpace(), 0.0), "box": (Box((0.3, 0.3, 0.2)), 0.1), "sphere": (Sphere(0.2), 0.2), "lattice": (bump(), 0.0)}
+SOLIDS = {
+    "plane": (HalfSpace(), 0.0),
+    "box": (Box((0.3, 0.3, 0.2)), 0.1),
+    "sphere": (Sphere(0.2), 0.2),
+    "lattice": (bump(), 0.0),
+}
 """Shapes, and how far their origin is below their top [m]."""
 
 
@@ -46,30 +56,42 @@ def ball(particles: int) -> tuple[torch.Tensor, float]:
     return x + torch.tensor([0.03, 0.01, 0.6 * s - float(x[:, 2].min())]).double(), s
 
 
-def drop(solid: str, mode: str, friction: float, degrees: float, particles: int) -> tuple[torch.Tensor, float, float]:
+def drop(
+    solid: str, mode: str, friction: float, degrees: float, particles: int
+) -> tuple[torch.Tensor, float, float]:
     """(particles at the end, turned back; speed upwards [m/s]; cell [m])."""
     x, s = ball(particles)
     dx, lam, mu = 1.6 * s, E * NU / (1 + NU) / (1 - 2 * NU), E / 2 / (1 + NU)
     R = exponential(math.radians(degrees) * torch.tensor([0.6, 0.8, 0.0]).double())
     shape, below = SOLIDS[solid]
-    collider = Collider(shape, mode, friction, Motion(R @ torch.tensor([0.0, 0.0, -below]).double(), R))
+    collider = Collider(
+        shape, mode, friction, Motion(R @ torch.tensor([0.0, 0.0, -below]).double(), R)
+    )
     eye = torch.eye(3).double().expand(len(x), 3, 3).contiguous()
     v = R @ torch.tensor([0.3, 0.0, -SPEED]).double()
     start = ParticleState((x @ R.T).contiguous(), v.expand_as(x).contiguous(), 0 * eye, eye, eye)
-    substeps = math.ceil(SECONDS / FRAMES * (math.sqrt((lam + 2 * mu) / DENSITY) + SPEED) / (0.4 * dx))
+    substeps = math.ceil(
+        SECONDS / FRAMES * (math.sqrt((lam + 2 * mu) / DENSITY) + SPEED) / (0.4 * dx)
+    )
     simulator = Simulator("neo_hookean", dx=dx, substeps=substeps, frame_dt=SECONDS / FRAMES, colliders=[collider],
                           gravity=R @ torch.tensor([0.0, 0.0, -9.8]).double(), dtype=torch.float64)  # fmt: skip
     with torch.no_grad():
-        end = simulator.rollout(start, {"mu": mu, "lam": lam}, torch.full((len(x),), s**3).double(), DENSITY, FRAMES + 1).final
+        end = simulator.rollout(
+            start, {"mu": mu, "lam": lam}, torch.full((len(x),), s**3).double(), DENSITY, FRAMES + 1
+        ).final
     return end.x @ R, float((end.v @ R)[:, 2].mean()), dx
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--particles", type=int, nargs="+", default=[1000, 4000])
     parser.add_argument("--solids", nargs="+", default=list(SOLIDS), choices=SOLIDS)
     given = parser.parse_args()
-    print(f"| particles | solid, mode | speed after 0.2 s [m/s] | {' | '.join(f'{a} degrees' for a in ANGLES)} |")
+    print(
+        f"| particles | solid, mode | speed after 0.2 s [m/s] | {' | '.join(f'{a} degrees' for a in ANGLES)} |"
+    )
     print("|---" * (3 + len(ANGLES)) + "|")
     for particles in given.particles:
         for solid in given.solids:
@@ -81,7 +103,10 @@ def main() -> None:
                     print(f"| {particles} | {solid}, {mode} | {error} |")
                     continue
                 cells = [f"{float(d.norm(dim=1).square().mean().sqrt()) / dx:.3f}" for d in away]
-                print(f"| {particles} | {solid}, {mode} | {up:.2f} | {' | '.join(cells)} |", flush=True)
+                print(
+                    f"| {particles} | {solid}, {mode} | {up:.2f} | {' | '.join(cells)} |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -73,7 +73,9 @@ def conservation(_):
     axes = panels(2)
     for ax, name, asked in zip(axes, ("linear", "angular"), ((5e-6, 1e-13), (5e-6, 1e-12))):
         for d, limit, color in zip(PRECISIONS, asked, ("tab:orange", "tab:blue")):
-            ax.semilogy(LAWS, [found[law, d][name] for law in LAWS], "o", color=color, label=LABEL[d])
+            ax.semilogy(
+                LAWS, [found[law, d][name] for law in LAWS], "o", color=color, label=LABEL[d]
+            )
             ax.axhline(limit, color=color, ls="--", lw=1)
         ax.set_title(f"{name} momentum, relative change, 1000 substeps, adapter on")
         ax.tick_params(axis="x", rotation=30)
@@ -87,7 +89,15 @@ def conservation(_):
         reached = " / ".join(worst(found[law, d][name] for law in LAWS) for d in PRECISIONS)
         rows.append([check, f"{title}, worst of {len(LAWS)} laws", asked, reached])
     control = closed_systems.asymmetric_control()
-    return [*rows, ["3", "angular momentum with an asymmetric stress (control)", "> 1e-4", f"{control['angular']:.1e}"]]
+    return [
+        *rows,
+        [
+            "3",
+            "angular momentum with an asymmetric stress (control)",
+            "> 1e-4",
+            f"{control['angular']:.1e}",
+        ],
+    ]
 
 
 def stress(_):
@@ -100,12 +110,24 @@ def stress(_):
                  " / ".join(worst(e for k, e in errors if k == d) for d in PRECISIONS)])  # fmt: skip
     objective = [law for law in LAWS if law != "linear"]
     frame = [stresses.frame_error(law, adapted) for law in objective for adapted in (False, True)]
-    rows.append(["5", "frame indifference, 200 rotations, laws and adapted laws", "1e-12", worst(frame)])
-    rows.append(["5", "the same for `linear` (control)", "> 1e-2", f"{stresses.frame_error('linear', False):.1f}"])
+    rows.append(
+        ["5", "frame indifference, 200 rotations, laws and adapted laws", "1e-12", worst(frame)]
+    )
+    rows.append(
+        [
+            "5",
+            "the same for `linear` (control)",
+            "> 1e-2",
+            f"{stresses.frame_error('linear', False):.1f}",
+        ]
+    )
     energies = [law for law in LAWS if law_named(law).energy is not None]
     rows.append(["6", f"tau against the gradient of the energy ({', '.join(energies)})", "1e-12",
                  worst(stresses.energy_error(law) for law in energies)])  # fmt: skip
-    rest = [[float(stresses.stress(law, torch.eye(3, dtype=d)[None]).abs().max()) / E for law in LAWS] for d in PRECISIONS]
+    rest = [
+        [float(stresses.stress(law, torch.eye(3, dtype=d)[None]).abs().max()) / E for law in LAWS]
+        for d in PRECISIONS
+    ]
     small = []
     for law in LAWS:
         e = 1e-5
@@ -115,12 +137,18 @@ def stress(_):
         tau, (c11, c44) = stresses.stress(law, F) / e, stresses.moduli(law)
         small += [abs(float(tau[0, 0, 0]) / c11 - 1), abs(float(tau[1, 1, 2]) - c44) / c11]
     rows.append(["7", "C11 and C44 at a strain of 1e-5", "1e-4", worst(small)])
-    rows.append(["7", "tau(I), f32 / f64", "1e-5 E / 0", f"{max(rest[0]):.0e} E / {max(rest[1]):.0f}"])
+    rows.append(
+        ["7", "tau(I), f32 / f64", "1e-5 E / 0", f"{max(rest[0]):.0e} E / {max(rest[1]):.0f}"]
+    )
     return rows
 
 
 def unit_checks(_):
-    bounds, m, p = units.bounds(), units.plastic_return("von_mises"), units.plastic_return("drucker_prager")
+    bounds, m, p = (
+        units.bounds(),
+        units.plastic_return("von_mises"),
+        units.plastic_return("drucker_prager"),
+    )
     twins = {law: units.twin(law) for law in LAWS}
     known = [law for law, value in twins.items() if value is not None]
     return [
@@ -139,7 +167,9 @@ def unit_checks(_):
 
 
 def elastic(_):
-    affine = {d: [max(elastic_bodies.affine_motion(law, d).values()) for law in LAWS] for d in PRECISIONS}
+    affine = {
+        d: [max(elastic_bodies.affine_motion(law, d).values()) for law in LAWS] for d in PRECISIONS
+    }
     force = {d: [elastic_bodies.interior_force(law, d)[0] for law in LAWS] for d in PRECISIONS}
     fall = {d: [elastic_bodies.free_fall(law, d)[1] for law in LAWS] for d in PRECISIONS}
     y, tau, _ = elastic_bodies.column("corotated")
@@ -156,12 +186,20 @@ def elastic(_):
     axes = panels(2)
     t, mode, _ = elastic_bodies.wave("corotated", 16)
     axes[0].plot(t, mode, ".", ms=4, label="16 cells")
-    axes[0].plot(t, torch.cos(math.pi * math.sqrt(1e6 / DENSITY) / 0.32 * t), "k-", lw=0.8, label="cos(pi c t/L)")
+    axes[0].plot(
+        t,
+        torch.cos(math.pi * math.sqrt(1e6 / DENSITY) / 0.32 * t),
+        "k-",
+        lw=0.8,
+        label="cos(pi c t/L)",
+    )
     axes[0].set(xlabel="s", title="first standing wave of a free rod")
     axes[0].legend()
     for law in SOLIDS:
         axes[1].loglog(cells, errors[law], "o-", ms=3, label=law)
-    axes[1].loglog(cells, [errors["corotated"][0] * (8 / n) ** 2 for n in cells], "k--", lw=1, label="order 2")
+    axes[1].loglog(
+        cells, [errors["corotated"][0] * (8 / n) ** 2 for n in cells], "k--", lw=1, label="order 2"
+    )
     axes[1].set(xlabel="cells", title="relative error of the wave speed, dt with dx")
     axes[1].legend(fontsize=7)
     save("wave", axes)
@@ -172,8 +210,12 @@ def elastic(_):
     deflection, ratio = beams["corotated"]
     axes[0].plot(np.linspace(0, 1, len(deflection)), 1e3 * deflection, label="end of the beam")
     axes[0].axhline(1e3 * float(deflection[1:].mean()), color="tab:blue", ls=":", label="its mean")
-    axes[0].axhline(1e3 * float(deflection[1:].mean()) / ratio, color="k", ls="--", lw=1, label="Timoshenko")
-    axes[0].set(xlabel="periods", ylabel="deflection [mm]", title="cantilever, 6 x 30 cells, own weight")
+    axes[0].axhline(
+        1e3 * float(deflection[1:].mean()) / ratio, color="k", ls="--", lw=1, label="Timoshenko"
+    )
+    axes[0].set(
+        xlabel="periods", ylabel="deflection [mm]", title="cantilever, 6 x 30 cells, own weight"
+    )
     axes[0].legend()
     save("cantilever", axes)
 
@@ -198,15 +240,32 @@ def friction(_):
     for value, color in zip((0.2, 0.5, 0.8), ("tab:blue", "tab:orange", "tab:green")):
         steep = math.degrees(math.atan(value))
         angles = [steep + d for d in (-4, -2, -1, 1, 2, 4, 6)]
-        axes[0].plot(angles, [incline.slide(a, value)[0] for a in angles], "o", color=color, label=f"friction {value}")
+        axes[0].plot(
+            angles,
+            [incline.slide(a, value)[0] for a in angles],
+            "o",
+            color=color,
+            label=f"friction {value}",
+        )
         sliding = np.linspace(steep, steep + 6, 2)
         axes[0].plot(sliding, [incline.point_mass(a, value) for a in sliding], color=color, lw=1)
         axes[0].axvline(steep, color=color, ls=":", lw=1)
         rows.append(abs(incline.slip_angle(value) - steep))
-    axes[0].set(xlabel="incline [degrees]", ylabel="acceleration [m/s^2]", title="block on an incline; lines: point mass")
+    axes[0].set(
+        xlabel="incline [degrees]",
+        ylabel="acceleration [m/s^2]",
+        title="block on an incline; lines: point mass",
+    )
     axes[0].legend()
     save("friction", axes)
-    return [["16", "angle from which a block slips, friction 0.2, 0.5, 0.8", "1 degree", f"{max(rows):.3f} degrees"]]
+    return [
+        [
+            "16",
+            "angle from which a block slips, friction 0.2, 0.5, 0.8",
+            "1 degree",
+            f"{max(rows):.3f} degrees",
+        ]
+    ]
 
 
 def frames(_):
@@ -222,21 +281,42 @@ def gradient(_):
         results = [Case("corotated", n, stride=10, contact=contact).compare(both_steps=True, scale=0.0003 if contact else 0.05)
                    for n in horizons]  # fmt: skip
         for name in results[0]:
-            ax.loglog(horizons, [max(r[name].error, 1e-16) for r in results], "o-", ms=3, label=f"dL/d({name})")
+            ax.loglog(
+                horizons,
+                [max(r[name].error, 1e-16) for r in results],
+                "o-",
+                ms=3,
+                label=f"dL/d({name})",
+            )
         if contact:
             spread = [max(10 * max(c.spread for c in r.values()), 1e-5) for r in results]
             ax.loglog(horizons, spread, "k--", lw=1, label="max(1e-5, 10 x two steps)")
         else:
             ax.axhline(1e-6, color="k", ls="--", lw=1, label="asked")
-        ax.set(xlabel="substeps", title="through contact with friction" if contact else "smooth path")
+        ax.set(
+            xlabel="substeps", title="through contact with friction" if contact else "smooth path"
+        )
         ax.legend(fontsize=7)
         reached = results[-1]
         rows.append(["18", f"full adapter, 1500 substeps, {'through contact' if contact else 'smooth path'}",
                      "1e-3" if contact else "1e-6",
                      ", ".join(f"{k} {c.error:.0e}" for k, c in reached.items())])  # fmt: skip
     save("gradient", axes)
-    smooth = [c.error for law in ELASTIC for n in (1, 50, 200) for c in Case(law, n).compare(both_steps=False).values()]
-    rows.insert(0, ["18", "smooth laws, 1, 50, 200 substeps: E, nu, v0, network weights", "1e-6", worst(smooth)])
+    smooth = [
+        c.error
+        for law in ELASTIC
+        for n in (1, 50, 200)
+        for c in Case(law, n).compare(both_steps=False).values()
+    ]
+    rows.insert(
+        0,
+        [
+            "18",
+            "smooth laws, 1, 50, 200 substeps: E, nu, v0, network weights",
+            "1e-6",
+            worst(smooth),
+        ],
+    )
     for law in (law for law in LAWS if law not in ELASTIC):
         found = Case(law, 200, contact=True).compare(both_steps=True, scale=0.003)
         rows.append(["18", f"{law}, 200 substeps, contact with friction", "max(1e-5, 10 x two steps)",
@@ -245,10 +325,24 @@ def gradient(_):
     for law in ("corotated", "neo_hookean", "von_mises"):
         a, b = (Case(law, 800, dtype=d, stride=20).gradient() for d in PRECISIONS)
         single.append(max(float((a[k].double() - b[k]).abs().max() / b[k].abs().max()) for k in b))
-    rows.append(["19", "float32 against float64 gradient, 800 substeps, full adapter", "1e-3", worst(single)])
+    rows.append(
+        [
+            "19",
+            "float32 against float64 gradient, 800 substeps, full adapter",
+            "1e-3",
+            worst(single),
+        ]
+    )
     a, b = (Case("corotated", 60, recompute=r).gradient() for r in (False, True))
     equal = all(torch.equal(a[k], b[k]) for k in a)
-    rows.append(["19", "recomputed networks against plain backward", "bit-equal", "bit-equal" if equal else "NOT equal"])
+    rows.append(
+        [
+            "19",
+            "recomputed networks against plain backward",
+            "bit-equal",
+            "bit-equal" if equal else "NOT equal",
+        ]
+    )
     return rows
 
 
@@ -259,9 +353,13 @@ def vibration(_):
         for seed in range(8):
             maxima = closed_systems.vibration(seed=seed, major_symmetry=symmetric)
             ratios.append(max(b / a for a, b in itertools.pairwise(maxima)))
-            axes[0].semilogy(np.array(maxima) / maxima[0], color="tab:blue" if symmetric else "tab:red", lw=1)
+            axes[0].semilogy(
+                np.array(maxima) / maxima[0], color="tab:blue" if symmetric else "tab:red", lw=1
+            )
         rows.append(ratios)
-    axes[0].set(xlabel="period", title="kinetic maximum: major symmetry (blue), literal operator (red)")
+    axes[0].set(
+        xlabel="period", title="kinetic maximum: major symmetry (blue), literal operator (red)"
+    )
     save("vibration", axes)
     grown = sum(r > 1 for r in rows[1])
     return [["26", "8 random constant operators with major symmetry: largest growth in a period", "<= 1", f"{max(rows[0]):.3f}"],
@@ -275,12 +373,28 @@ def probes(data):
     for law in units.PROBES:
         errors = units.probe(data, law)
         axes[0].semilogy(torch.sort(errors).values.clamp_min(1e-18), label=law)
-        rows.append(["oracle", f"{units.PROBES[law]}: stress", "1e-13" if law == "neo_hookean" else "1e-9", worst(errors.tolist())])
-    axes[0].set(xlabel="particle, sorted", title="relative error of the stress against the peers' probes")
+        rows.append(
+            [
+                "oracle",
+                f"{units.PROBES[law]}: stress",
+                "1e-13" if law == "neo_hookean" else "1e-9",
+                worst(errors.tolist()),
+            ]
+        )
+    axes[0].set(
+        xlabel="particle, sorted", title="relative error of the stress against the peers' probes"
+    )
     axes[0].legend()
     save("probes", axes)
     for name, (_, _, asked) in units.TRAJECTORIES.items():
-        rows.append(["oracle", f"{name}: x over 8 frames", f"{asked:.0e} m", f"{units.trajectory(data, name):.1e} m"])
+        rows.append(
+            [
+                "oracle",
+                f"{name}: x over 8 frames",
+                f"{asked:.0e} m",
+                f"{units.trajectory(data, name):.1e} m",
+            ]
+        )
     return rows
 
 
@@ -291,15 +405,32 @@ def bar(data, cells: int = 30):
     axes, rows = panels(2), []
     axes[0].plot(*reference, "k-", lw=2, label="finite elements")
     own = lagrangian.elements(16)
-    axes[1].plot(own[0], own[1] - np.interp(own[0], *reference), "k--", lw=1, label="own finite elements, 16 per metre")
+    axes[1].plot(
+        own[0],
+        own[1] - np.interp(own[0], *reference),
+        "k--",
+        lw=1,
+        label="own finite elements, 16 per metre",
+    )
     what = "RMS distance to the finite-element bar"
-    rows.append(["bar", f"{what}, own finite elements, 16 per metre", "-", f"{bars.distance(*own, reference):.4f} m"])
+    rows.append(
+        [
+            "bar",
+            f"{what}, own finite elements, 16 per metre",
+            "-",
+            f"{bars.distance(*own, reference):.4f} m",
+        ]
+    )
     for n in (10, 20, cells):
         times, tip = bars.bar(n)
         rms = bars.distance(times, tip, reference)
         axes[0].plot(times, tip, lw=1, label=f"{n} cells per metre, {rms:.4f} m")
         axes[1].plot(times, tip - np.interp(times, *reference), lw=1)
-        asked = "0.05 m, aim 0.02" if n == 30 else f"{bars.held_face_bound(n, reference):.3f} m (derived)"
+        asked = (
+            "0.05 m, aim 0.02"
+            if n == 30
+            else f"{bars.held_face_bound(n, reference):.3f} m (derived)"
+        )
         reached = f"{rms:.4f} m ({bars.distance(times, tip, own):.4f} m)"
         rows.append(["bar", f"{what}, {n} cells per metre (to own elements)", asked, reached])
     axes[1].legend(fontsize=7)
@@ -310,7 +441,21 @@ def bar(data, cells: int = 30):
     return rows
 
 
-PARTS = {f.__name__: f for f in (conservation, stress, unit_checks, elastic, friction, frames, gradient, vibration, probes, bar)}
+PARTS = {
+    f.__name__: f
+    for f in (
+        conservation,
+        stress,
+        unit_checks,
+        elastic,
+        friction,
+        frames,
+        gradient,
+        vibration,
+        probes,
+        bar,
+    )
+}
 
 
 def number(row: list[str]) -> tuple[int, str]:
@@ -318,8 +463,12 @@ def number(row: list[str]) -> tuple[int, str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(PARTS), help=f"comma-separated parts of {', '.join(PARTS)}")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", default=",".join(PARTS), help=f"comma-separated parts of {', '.join(PARTS)}"
+    )
     parser.add_argument("--bar-cells", type=int, default=30)
     options = parser.parse_args()
     if unknown := [name for name in options.only.split(",") if name not in PARTS]:
@@ -339,13 +488,23 @@ def main() -> None:
 def publish(results: dict[str, list[list[str]]], page: Path) -> None:
     """The table into the page; printed instead where a part has not been measured, whose rows the page would lose."""
     rows = sorted((row for part in results.values() for row in part), key=number)
-    table = "\n".join(["| check | what | asked | reached |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)])
+    table = "\n".join(
+        [
+            "| check | what | asked | reached |",
+            "|---|---|---|---|",
+            *(f"| {' | '.join(row)} |" for row in rows),
+        ]
+    )
     missing = [name for name in PARTS if not results.get(name)]
     if missing or not page.is_file():
-        print(f"{table}\n\n{page} is left as it is: not measured: {', '.join(missing) or 'no such page'}")
+        print(
+            f"{table}\n\n{page} is left as it is: not measured: {', '.join(missing) or 'no such page'}"
+        )
         return
     before, rest = page.read_text().split("<!-- table -->\n")[:2]
-    page.write_text(before + "<!-- table -->\n" + table + "\n<!-- end -->\n" + rest.split("<!-- end -->\n")[1])
+    page.write_text(
+        before + "<!-- table -->\n" + table + "\n<!-- end -->\n" + rest.split("<!-- end -->\n")[1]
+    )
 
 
 if __name__ == "__main__":

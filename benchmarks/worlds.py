@@ -54,7 +54,14 @@ class Case:
     """`worlds` blocks of so many particles, each thrown its own way, with a modulus of its own."""
 
     def __init__(
-        self, worlds: int, particles: int, substeps: int, frames: int, device: str, dtype: torch.dtype, more: bool
+        self,
+        worlds: int,
+        particles: int,
+        substeps: int,
+        frames: int,
+        device: str,
+        dtype: torch.dtype,
+        more: bool,
     ) -> None:
         self.worlds, self.frames, self.more = worlds, frames, more
         solids = [Collider(Sphere(3 * DX), "separate", 0.2)] if more else []
@@ -65,7 +72,9 @@ class Case:
         state = ParticleState(*(t.to(device) for t in block(particles, DX, dtype)))
         self.states = ParticleState.stack([state] * worlds)
         index = torch.arange(worlds, dtype=torch.float64)
-        thrown = torch.stack([0.5 * torch.sin(index), -1.0 - 0.5 * torch.cos(index), 0.3 * torch.cos(2 * index)], 1)
+        thrown = torch.stack(
+            [0.5 * torch.sin(index), -1.0 - 0.5 * torch.cos(index), 0.3 * torch.cos(2 * index)], 1
+        )
         self.velocity = thrown.to(device, dtype)
         self.mu = (MU * (1 + 0.2 * torch.sin(3 * index)))[:, None].to(device, dtype)
         self.volume = torch.full((particles,), (DX / 2) ** 3, dtype=dtype, device=device)
@@ -74,20 +83,40 @@ class Case:
         centre = state.x.mean(0).tolist()
         low = float(state.x[:, 1].min()) - 3.5 * DX
         place = (centre[0], low, centre[2])
-        self.motions = [[Motion(place, velocity=(0.0, 0.1 * (b % 3), 0.0))] for b in range(worlds)] if more else None
+        self.motions = (
+            [[Motion(place, velocity=(0.0, 0.1 * (b % 3), 0.0))] for b in range(worlds)]
+            if more
+            else None
+        )
 
     def together(self, velocity: torch.Tensor, mu: torch.Tensor, together: int | None = None):
         start = ParticleState(self.states.x, self.states.v + velocity[:, None], *self._rest())
         more = {"motions": self.motions, "gravity": self.gravity} if self.more else {}
         return self.simulator.rollout(
-            start, {"mu": mu, "lam": LAM}, self.volume, DENSITY, self.frames + 1, self.adapter, None, together=together, **more
+            start,
+            {"mu": mu, "lam": LAM},
+            self.volume,
+            DENSITY,
+            self.frames + 1,
+            self.adapter,
+            None,
+            together=together,
+            **more,
         )
 
     def alone(self, b: int, velocity: torch.Tensor, mu: torch.Tensor):
         """World b by itself; its gravity is the simulator's only where it is the same in all."""
-        start = ParticleState(self.states.x[b], self.states.v[b] + velocity[b], *(t[b] for t in self._rest()))
+        start = ParticleState(
+            self.states.x[b], self.states.v[b] + velocity[b], *(t[b] for t in self._rest())
+        )
         return self.simulator.rollout(
-            start, {"mu": mu[b, 0], "lam": LAM}, self.volume, DENSITY, self.frames + 1, self.adapter, None
+            start,
+            {"mu": mu[b, 0], "lam": LAM},
+            self.volume,
+            DENSITY,
+            self.frames + 1,
+            self.adapter,
+            None,
         )
 
     def _rest(self) -> tuple[torch.Tensor, ...]:
@@ -146,9 +175,11 @@ def check(device: str, particles: int = 500, worlds: int = 4) -> None:
                 difference = float((part[b] - expected[0]).abs().max() / expected.abs().max())
                 steepest = max(steepest, difference)
     allowed = (CELLS, GRADIENT) if device == "cuda" else (0.0, 1e-12)
-    print(f"check, {worlds} worlds, so many, 2 or 1 in a launch, float64: positions that moved {min(moved):.2f} to "
-          f"{max(moved):.2f} cells differ by at most {worst:.2g} cells (allowed {allowed[0]:g}), gradients by {steepest:.2g} "
-          f"(allowed {allowed[1]:g})")
+    print(
+        f"check, {worlds} worlds, so many, 2 or 1 in a launch, float64: positions that moved {min(moved):.2f} to "
+        f"{max(moved):.2f} cells differ by at most {worst:.2g} cells (allowed {allowed[0]:g}), gradients by {steepest:.2g} "
+        f"(allowed {allowed[1]:g})"
+    )
     if not (worst <= allowed[0] and steepest <= allowed[1] and min(moved) > 0.5):
         raise SystemExit("worlds are not their single rollouts")
 
@@ -170,13 +201,21 @@ def episode(worlds: int | None, particles: int, substeps: int, device: str) -> E
     size = made.size
     paddle = Collider(Box((2 * DX, 4 * DX, 8 * DX)), "separate", 0.3, Motion((float(center[0]) - size, 4 * DX, float(center[2]))),
                       name="paddle")  # fmt: skip
-    world = World(GROUND, torch.tensor([0.0, -9.8, 0.0]), up.cpu(), torch.tensor([[-9.0] * 3, [9.0] * 3]), colliders=(paddle,))
+    world = World(
+        GROUND,
+        torch.tensor([0.0, -9.8, 0.0]),
+        up.cpu(),
+        torch.tensor([[-9.0] * 3, [9.0] * 3]),
+        colliders=(paddle,),
+    )
     low = float(made.rest[:, 1].min())
     starts = []
     for b in range(worlds or 1):
         velocity = torch.tensor([0.1 * (b % 7), -0.2 * (b % 5), 0.1 * (b % 3)], device=device)
         place = center + (GROUND.height + 0.05 - low) * up
-        starts.append(Start(torch.eye(3, device=device), place, velocity, torch.zeros(3, device=device)))
+        starts.append(
+            Start(torch.eye(3, device=device), place, velocity, torch.zeros(3, device=device))
+        )
     return Episode(made, world, STEP, starts[0] if worlds is None else starts, substeps=substeps)
 
 
@@ -202,16 +241,32 @@ def rollouts(options: argparse.Namespace) -> list[str]:
     rows, one, warm = [], None, 3 if options.device == "cuda" else 1
     substeps = options.frames * options.substeps
     for worlds in options.worlds:
-        case = Case(worlds, options.particles, options.substeps, options.frames, options.device, torch.float32, more=False)
+        case = Case(
+            worlds,
+            options.particles,
+            options.substeps,
+            options.frames,
+            options.device,
+            torch.float32,
+            more=False,
+        )
         if options.device == "cuda":
             torch.cuda.reset_peak_memory_stats()
-        times = [best(call, options.device, options.repeats, warm) for call in (case.forward, case.both)]
+        times = [
+            best(call, options.device, options.repeats, warm) for call in (case.forward, case.both)
+        ]
         if options.device == "cuda":
             one = one or times
-            ratios, memory = [t / first for t, first in zip(times, one)], f"{torch.cuda.max_memory_allocated() / 2**30:.2f}"
+            ratios, memory = (
+                [t / first for t, first in zip(times, one)],
+                f"{torch.cuda.max_memory_allocated() / 2**30:.2f}",
+            )
             shown = [f"{r:.2f}" for r in ratios]
         else:
-            after = [best(call, options.device, options.repeats, warm) for call in (case.forward_alone, case.both_alone)]
+            after = [
+                best(call, options.device, options.repeats, warm)
+                for call in (case.forward_alone, case.both_alone)
+            ]
             shown, memory = [f"{a / t:.2f}" for a, t in zip(after, times)], "-"
         each = [f"{1e3 * t / substeps:.3f}" for t in times]
         rows.append(f"| {worlds} | {each[0]} | {shown[0]} | {each[1]} | {shown[1]} | {memory} |")
@@ -227,7 +282,9 @@ def steps(options: argparse.Namespace) -> list[str]:
 
         def go(made=made) -> None:
             for k in range(options.steps):
-                state, _ = made.step({"paddle": {"velocity": (0.3 if k % 20 < 10 else -0.3, 0.0, 0.0)}})
+                state, _ = made.step(
+                    {"paddle": {"velocity": (0.3 if k % 20 < 10 else -0.3, 0.0, 0.0)}}
+                )
             float(state.x.sum())
 
         began = made.state
@@ -241,18 +298,32 @@ def steps(options: argparse.Namespace) -> list[str]:
             go()
             seconds.append(synchronised(options.device) - start)
         each = min(seconds) / options.steps
-        rows.append(f"| {worlds or 1} | {1e3 * each:.2f} | {1 / each:.1f} | {(worlds or 1) / each:.0f} |")
+        rows.append(
+            f"| {worlds or 1} | {1e3 * each:.2f} | {1 / each:.1f} | {(worlds or 1) / each:.0f} |"
+        )
         print("done:", rows[-1], flush=True)
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu"
+    )
     parser.add_argument("--worlds", type=int, nargs="+")
-    for name, value in (("particles", 4040), ("substeps", 48), ("frames", 5), ("steps", 50), ("repeats", 5)):
+    for name, value in (
+        ("particles", 4040),
+        ("substeps", 48),
+        ("frames", 5),
+        ("steps", 50),
+        ("repeats", 5),
+    ):
         parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--parts", nargs="+", choices=("rollouts", "steps"), default=["rollouts", "steps"])
+    parser.add_argument(
+        "--parts", nargs="+", choices=("rollouts", "steps"), default=["rollouts", "steps"]
+    )
     parser.add_argument("--check-only", action="store_true")
     options = parser.parse_args()
     options.worlds = options.worlds or ([1, 32, 256] if options.device == "cuda" else [1, 8])
@@ -260,17 +331,30 @@ def main() -> None:
     check(options.device)
     if options.check_only:
         return
-    where = torch.cuda.get_device_name() if options.device == "cuda" else f"{len(os.sched_getaffinity(0))} cores"
+    where = (
+        torch.cuda.get_device_name()
+        if options.device == "cuda"
+        else f"{len(os.sched_getaffinity(0))} cores"
+    )
     found = {part: {"rollouts": rollouts, "steps": steps}[part](options) for part in options.parts}
-    print(f"\n{where}, float32, {options.particles} particles a world, {options.substeps} substeps in {STEP} s, best of "
-          f"{options.repeats}")
+    print(
+        f"\n{where}, float32, {options.particles} particles a world, {options.substeps} substeps in {STEP} s, best of "
+        f"{options.repeats}"
+    )
     if "rollouts" in found:
-        compared = "over one world" if options.device == "cuda" else "one after another over together"
-        print(f"\nrollouts of {options.frames} intervals, ms per substep of all worlds\n| worlds | forward | {compared} "
-              f"| forward + backward | {compared} | peak GiB |\n|{'---|' * 6}\n" + "\n".join(found["rollouts"]))
+        compared = (
+            "over one world" if options.device == "cuda" else "one after another over together"
+        )
+        print(
+            f"\nrollouts of {options.frames} intervals, ms per substep of all worlds\n| worlds | forward | {compared} "
+            f"| forward + backward | {compared} | peak GiB |\n|{'---|' * 6}\n"
+            + "\n".join(found["rollouts"])
+        )
     if "steps" in found:
-        print(f"\nsteps of {STEP} s with a driven paddle\n| worlds | ms per step | steps per second | in all worlds |\n"
-              f"|{'---|' * 4}\n" + "\n".join(found["steps"]))
+        print(
+            f"\nsteps of {STEP} s with a driven paddle\n| worlds | ms per step | steps per second | in all worlds |\n"
+            f"|{'---|' * 4}\n" + "\n".join(found["steps"])
+        )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,11 @@ class MosaError(Exception):
 
     def __str__(self) -> str:
         message = " ".join(super().__str__().splitlines())  # one line, whatever was found
-        return message if len(message) <= LONGEST else f"{message[: LONGEST - 500]} ... {message[-500:]}"
+        return (
+            message
+            if len(message) <= LONGEST
+            else f"{message[: LONGEST - 500]} ... {message[-500:]}"
+        )
 
 
 class DataError(MosaError):

@@ -28,7 +28,12 @@ class Cameras:
 
     def select(self, indices: list[int]) -> Cameras:
         """The cameras at `indices`, in that order."""
-        return replace(self, K=self.K[indices], w2c=self.w2c[indices], names=tuple(self.names[i] for i in indices))
+        return replace(
+            self,
+            K=self.K[indices],
+            w2c=self.w2c[indices],
+            names=tuple(self.names[i] for i in indices),
+        )
 
     def to(self, device: torch.device | str) -> Cameras:
         return replace(self, K=self.K.to(device), w2c=self.w2c.to(device))
@@ -141,7 +146,9 @@ class Appearance:
     light: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Appearance:
-        normals, light = (None if value is None else value.to(device) for value in (self.normals, self.light))
+        normals, light = (
+            None if value is None else value.to(device) for value in (self.normals, self.light)
+        )
         return Appearance(self.splats.to(device), self.harmonics.to(device), normals, light)
 
 
@@ -209,15 +216,25 @@ class ParticleState:
     @classmethod
     def stack(cls, states: Sequence[ParticleState]) -> ParticleState:
         """The states of equally many particles each, as those of B worlds."""
-        return cls(*(torch.stack([getattr(state, f.name) for state in states]) for f in fields(cls)))
+        return cls(
+            *(torch.stack([getattr(state, f.name) for state in states]) for f in fields(cls))
+        )
 
     def to(self, dtype: torch.dtype) -> ParticleState:
         """In this type, but x in float64 stays so."""
-        return ParticleState(*(t if t is self.x and t.dtype == torch.float64 else t.to(dtype) for t in vars(self).values()))
+        return ParticleState(
+            *(
+                t if t is self.x and t.dtype == torch.float64 else t.to(dtype)
+                for t in vars(self).values()
+            )
+        )
 
     def worlds(self) -> list[ParticleState]:
         """The states of B worlds, one by one."""
-        return [ParticleState(*parts) for parts in zip(*(getattr(self, f.name).unbind(0) for f in fields(self)))]
+        return [
+            ParticleState(*parts)
+            for parts in zip(*(getattr(self, f.name).unbind(0) for f in fields(self)))
+        ]
 
 
 @dataclass(frozen=True)
@@ -243,7 +260,12 @@ class Rollout:
     def to(self, device: torch.device | str) -> Rollout:
         moved = {name: getattr(self, name).to(device) for name in ("x", "v", "F", "F_tot", "times")}
         final = ParticleState(*(getattr(self.final, f.name).to(device) for f in fields(self.final)))
-        return replace(self, **moved, final=final, reactions=None if self.reactions is None else self.reactions.to(device))
+        return replace(
+            self,
+            **moved,
+            final=final,
+            reactions=None if self.reactions is None else self.reactions.to(device),
+        )
 
     def worlds(self) -> list[Rollout]:
         """The rollouts of B worlds, one by one; `inverted` is then of all of them."""

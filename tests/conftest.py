@@ -11,7 +11,9 @@ import torch
 
 torch.set_num_threads(1)
 if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is imported: its kernels then run on CPU tensors
+    os.environ.setdefault(
+        "TRITON_INTERPRET", "1"
+    )  # before Triton is imported: its kernels then run on CPU tensors
 
 
 LONG = ("integration", "experiments", "physics_verification", "analysis")
@@ -31,7 +33,14 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(items):
     """The files in the order in which processes take them: whole runs first, then those of most tests."""
     tests = Counter(item.path for item in items)
-    items.sort(key=lambda item: (item.path.name != FIRST, item.path.parent.name not in LONG, -tests[item.path], str(item.path)))
+    items.sort(
+        key=lambda item: (
+            item.path.name != FIRST,
+            item.path.parent.name not in LONG,
+            -tests[item.path],
+            str(item.path),
+        )
+    )
     if not torch.cuda.is_available():
         skip = pytest.mark.skip(reason="needs a CUDA device")
         for item in items:

@@ -22,8 +22,26 @@ numbers = st.one_of(
                      -float("inf")]),
     st.floats(-2, 2), st.integers(-5, 50),
 )  # fmt: skip
-texts = st.sampled_from(["", "abc", "None", "1.0", "nan", "../../x", "/dev/null", "a\0b", "x" * 3000, "${oc.env:HOME}", "???",
-                         "separate", "sphere", "stress", "train", "os.system"])
+texts = st.sampled_from(
+    [
+        "",
+        "abc",
+        "None",
+        "1.0",
+        "nan",
+        "../../x",
+        "/dev/null",
+        "a\0b",
+        "x" * 3000,
+        "${oc.env:HOME}",
+        "???",
+        "separate",
+        "sphere",
+        "stress",
+        "train",
+        "os.system",
+    ]
+)
 plain = st.one_of(st.none(), st.booleans(), numbers, texts)
 values = st.recursive(plain, lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(texts, inner, max_size=3)),
                       max_leaves=6)  # fmt: skip
@@ -32,7 +50,13 @@ values = st.recursive(plain, lambda inner: st.one_of(st.lists(inner, max_size=4)
 def places(tree, above=()):
     """Paths to every value of nested containers, containers included."""
     found = [above] if above else []
-    inner = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    inner = (
+        tree.items()
+        if isinstance(tree, dict)
+        else enumerate(tree)
+        if isinstance(tree, list)
+        else ()
+    )
     for key, value in inner:
         found += places(value, (*above, key))
     return found

@@ -19,7 +19,12 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).parents[1]
-IMPORTED = ("mosa.training.workflow", "lightning.pytorch.loggers", "torch.utils.tensorboard", "tensorboard.compat.proto.event_pb2")
+IMPORTED = (
+    "mosa.training.workflow",
+    "lightning.pytorch.loggers",
+    "torch.utils.tensorboard",
+    "tensorboard.compat.proto.event_pb2",
+)
 SERVE = "import sys; sys.path.insert(0, sys.argv.pop(1)); import forked; forked.serve()"
 servers: list[subprocess.Popen] = []
 """Of this process, at most one; it ends with its standard input."""
@@ -30,16 +35,35 @@ def call(script: str, *words: str, environment: Mapping[str, str] | None = None,
     """The script, from the repository's folder, with its words on the command line; environment: all of it, default this one."""
     environment = dict(os.environ if environment is None else environment)
     if torch.cuda.is_available() or not hasattr(os, "fork"):
-        return subprocess.run([sys.executable, script, *words], cwd=ROOT, env=environment, capture_output=True, text=True,
-                              timeout=timeout)
+        return subprocess.run(
+            [sys.executable, script, *words],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+        )
     if not servers:
-        given = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-        servers.append(subprocess.Popen([sys.executable, "-c", SERVE, str(Path(__file__).parent)], stdin=subprocess.PIPE,
-                                        stdout=subprocess.PIPE, cwd=ROOT, env=given, text=True, bufsize=1))
+        given = os.environ | {
+            "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+        }
+        servers.append(
+            subprocess.Popen(
+                [sys.executable, "-c", SERVE, str(Path(__file__).parent)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                cwd=ROOT,
+                env=given,
+                text=True,
+                bufsize=1,
+            )
+        )
     (server,) = servers
     with tempfile.TemporaryDirectory() as folder:
         screens = [Path(folder, name) for name in ("out", "err")]
-        server.stdin.write(json.dumps([script, words, environment, [str(screen) for screen in screens]]) + "\n")
+        server.stdin.write(
+            json.dumps([script, words, environment, [str(screen) for screen in screens]]) + "\n"
+        )
         process = int(server.stdout.readline())
         if not select.select([server.stdout], [], [], timeout)[0]:
             os.kill(process, signal.SIGKILL)
@@ -65,11 +89,17 @@ def serve() -> None:
         os._exit(0)
     script, words, environment, screens = json.loads(line)
     nothing = os.open(os.devnull, os.O_RDONLY)
-    for number, source in enumerate([nothing, *(os.open(screen, os.O_WRONLY | os.O_CREAT) for screen in screens)]):
+    for number, source in enumerate(
+        [nothing, *(os.open(screen, os.O_WRONLY | os.O_CREAT) for screen in screens)]
+    ):
         os.dup2(source, number)
     os.environ.clear()
     os.environ.update(environment)
-    sys.path[:0] = [place for place in environment.get("PYTHONPATH", "").split(os.pathsep) if place and place not in sys.path]
+    sys.path[:0] = [
+        place
+        for place in environment.get("PYTHONPATH", "").split(os.pathsep)
+        if place and place not in sys.path
+    ]
     sys.argv = [script, *words]
     code = 0
     try:

@@ -31,15 +31,29 @@ def saved(*overrides: str) -> dict:
 @functools.cache
 def _saved(*overrides: str) -> dict:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = OmegaConf.to_container(compose("train", overrides=["debug=default", *overrides]), resolve=True)
+        cfg = OmegaConf.to_container(
+            compose("train", overrides=["debug=default", *overrides]), resolve=True
+        )
     world = {"ground": {"height": 0.0, "mode": "sticky", "friction": 0.0}, "gravity": [0, -9.8, 0], "up": [0, 1, 0],
              "box": [[-1, -0.1, -1], [1, 1, 1]]}  # fmt: skip
-    start = Start(torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)).written()
+    start = Start(
+        torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)
+    ).written()
     config = {"cfg": cfg, "world": world | cfg["world"], "density": 1000.0, "dx": 0.1, "frame_dt": 1 / 60,
               "starts": {"train": start}}  # fmt: skip
     body = build_body(config, cube())
-    return {"state_dict": {f"body.{k}": v for k, v in body.state_dict().items()},
-            "mosa": {"config": config, "stage": 3, "losses": [], "steps_done": 5, "particles": N, "misfit": 0.01, "start": start}}
+    return {
+        "state_dict": {f"body.{k}": v for k, v in body.state_dict().items()},
+        "mosa": {
+            "config": config,
+            "stage": 3,
+            "losses": [],
+            "steps_done": 5,
+            "particles": N,
+            "misfit": 0.01,
+            "start": start,
+        },
+    }
 
 
 def checkpoint(path: Path, *overrides: str, change=lambda stored: None) -> Path:

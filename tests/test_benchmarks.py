@@ -35,7 +35,9 @@ def test_a_degraded_or_missing_ratio_is_named(rollout):
 def test_the_stored_ratios_cover_every_variant(rollout):
     stored = json.loads(rollout.STORED.read_text())
     assert {key: stored[key] for key in rollout.CHECK} == rollout.CHECK
-    best = {f"{variant} {what}": 1.0 for variant in rollout.VARIANTS for what in ("forward", "both")} | {"yardstick": 1.0}
+    best = {
+        f"{variant} {what}": 1.0 for variant in rollout.VARIANTS for what in ("forward", "both")
+    } | {"yardstick": 1.0}
     assert stored["ratios"].keys() == rollout.ratios(best).keys()
 
 
@@ -50,7 +52,9 @@ def test_a_partial_verification_leaves_the_published_table_alone(monkeypatch, tm
     assert "| old |" in page.read_text() and "not measured: probes" in capsys.readouterr().out
     verification.publish(results, page)
     assert "| old |" not in page.read_text() and "| 1 | probes | a | b |" in page.read_text()
-    assert page.read_text().startswith("text\n") and page.read_text().endswith("<!-- end -->\nmore\n")
+    assert page.read_text().startswith("text\n") and page.read_text().endswith(
+        "<!-- end -->\nmore\n"
+    )
 
 
 def test_an_error_of_the_level_is_told_from_one_of_the_shape(monkeypatch):
@@ -59,10 +63,18 @@ def test_an_error_of_the_level_is_told_from_one_of_the_shape(monkeypatch):
     apart = importlib.import_module("directions").level_and_shape
     true = torch.tensor([1.0, 2.0, 4.0])
     stiffer, exchanged = apart(1.3 * true, true), apart(true.flip(0), true)
-    assert stiffer["E_level"] == pytest.approx(1.3) and stiffer["E_shape_off_largest"] == pytest.approx(0, abs=1e-6)
+    assert stiffer["E_level"] == pytest.approx(1.3) and stiffer[
+        "E_shape_off_largest"
+    ] == pytest.approx(0, abs=1e-6)
     assert stiffer["E_off_mean"] == stiffer["E_off_largest"] == pytest.approx(0.3)
-    assert exchanged["E_level"] == pytest.approx(1.0) and exchanged["E_shape_off_largest"] == pytest.approx(3.0)
-    assert exchanged["E_shape_off_mean"] == exchanged["E_off_mean"] == pytest.approx((3.0 + 0 + 0.75) / 3)
+    assert exchanged["E_level"] == pytest.approx(1.0) and exchanged[
+        "E_shape_off_largest"
+    ] == pytest.approx(3.0)
+    assert (
+        exchanged["E_shape_off_mean"]
+        == exchanged["E_off_mean"]
+        == pytest.approx((3.0 + 0 + 0.75) / 3)
+    )
 
 
 @pytest.mark.parametrize(("name", "arguments"), [("rollout", ["--device", "cuda"]), ("renderer", ["--device", "cuda"]),
@@ -75,7 +87,10 @@ def test_cuda_asked_for_where_there_is_none_is_said(monkeypatch, capsys, name, a
     with pytest.raises(SystemExit) as ended:
         importlib.import_module(name).main()
     assert ended.value.code == 2
-    assert "CUDA device on this machine" in (said := capsys.readouterr().err) or "a CUDA device, and torch finds none" in said
+    assert (
+        "CUDA device on this machine" in (said := capsys.readouterr().err)
+        or "a CUDA device, and torch finds none" in said
+    )
 
 
 def test_the_benchmark_of_worlds_checks_them_first(monkeypatch, capsys):
@@ -100,12 +115,19 @@ def test_fits_of_cues_make_a_table(monkeypatch, tmp_path, capsys):
     identification = importlib.import_module("identification")
     names = ("prior_mm", "learned_mm", "ratio", "floor_mm", "stiffness_ratio", "fibre_deg", "cone_deg", "coverage", "mean_abs_C",
              "eta", "grid", "seconds")  # fmt: skip
-    record = dict.fromkeys(names, 1.26) | {"problem": "ball", "set": ["prior=stvk"], "fibre_deg": None}
+    record = dict.fromkeys(names, 1.26) | {
+        "problem": "ball",
+        "set": ["prior=stvk"],
+        "fibre_deg": None,
+    }
     (tmp_path / "fits.jsonl").write_text(json.dumps(record) + "\n")
     monkeypatch.setattr("sys.argv", ["identification.py", "table", str(tmp_path / "fits.jsonl")])
     identification.main()
     rows = capsys.readouterr().out.splitlines()
-    assert rows[2] == "| ball | prior=stvk | 1.3 | 1.3 | 1.26 | 1.3 | 1.26 |  | 1 | 1.26 | 1.260 | 1.26 | 1.26 | 1 |"
+    assert (
+        rows[2]
+        == "| ball | prior=stvk | 1.3 | 1.3 | 1.26 | 1.3 | 1.26 |  | 1 | 1.26 | 1.260 | 1.26 | 1.26 | 1 |"
+    )
     assert len({row.count("|") for row in rows}) == 1
 
 
@@ -128,8 +150,22 @@ def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatc
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     calibration = importlib.import_module("calibration")
     numbers = {
-        "E": {"true": 1e5, "start": 2e5, "found": 1e5 * np.exp(0.2), "error": 0.22, "sd_of_noise": 0.01, "sd": 0.1},  # relative
-        "nu": {"true": 0.3, "start": 0.2, "found": 0.34, "error": 0.13, "sd_of_noise": 0.002, "sd": 0.04},
+        "E": {
+            "true": 1e5,
+            "start": 2e5,
+            "found": 1e5 * np.exp(0.2),
+            "error": 0.22,
+            "sd_of_noise": 0.01,
+            "sd": 0.1,
+        },  # relative
+        "nu": {
+            "true": 0.3,
+            "start": 0.2,
+            "found": 0.34,
+            "error": 0.13,
+            "sd_of_noise": 0.002,
+            "sd": 0.04,
+        },
     }
     record = {"scene": "ball", "set": [], "particles": 9, "seed": 0, "parameters": numbers, "rms_mm": 1.0, "seconds": 2.0,
               "noise": 0.004, "commit": "1234567", "machine": "a card"}  # fmt: skip
@@ -137,20 +173,37 @@ def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatc
     assert [row.split(" | ")[-3] for row in rows[2:]] == ["2.00", "1.00"] * 2
     assert last.endswith("1.58 (4 numbers)") and len({row.count("|") for row in rows}) == 1
     assert counted == "of 4 numbers 0 met, 4 not determined, 0 missed"
-    assert calibration.verdict("E", numbers["E"] | {"sd": 0.09}) == "missed"  # 2.2 of its standard deviations
-    assert calibration.verdict("nu", numbers["nu"] | {"error": 0.099}) == "met" == calibration.verdict("kappa", {"error": 0.1})
+    assert (
+        calibration.verdict("E", numbers["E"] | {"sd": 0.09}) == "missed"
+    )  # 2.2 of its standard deviations
+    assert (
+        calibration.verdict("nu", numbers["nu"] | {"error": 0.099})
+        == "met"
+        == calibration.verdict("kappa", {"error": 0.1})
+    )
     assert calibration.verdict("mu", numbers["E"] | {"error": 0.06}) == "not determined"
     calibration.draw([record], tmp_path / "results")
     assert "| ball |" in (tmp_path / "results" / "calibration_from_motion.md").read_text()
-    assert json.loads((tmp_path / "results" / "calibration_from_motion.json").read_text()) == [record]
+    assert json.loads((tmp_path / "results" / "calibration_from_motion.json").read_text()) == [
+        record
+    ]
 
 
 def equal_run(folder, *, E: float, nu: float, moved: float, error: float):
     """What a run leaves, as far as two are compared."""
     folder.mkdir()
-    figures = {"id/E": E, "id/nu": nu, "posterior/E_relative_sd": 0.1, "posterior/nu_sd": 0.02, "test/rms_m": error}
+    figures = {
+        "id/E": E,
+        "id/nu": nu,
+        "posterior/E_relative_sd": 0.1,
+        "posterior/nu_sd": 0.02,
+        "test/rms_m": error,
+    }
     (folder / "metrics.json").write_text(json.dumps(figures | {"time/fit_s": 1.0}))
-    np.savez(folder / "rollout.npz", **{"train/x": np.full((3, 10, 3), moved), "train/v": np.zeros((3, 10, 3))})
+    np.savez(
+        folder / "rollout.npz",
+        **{"train/x": np.full((3, 10, 3), moved), "train/v": np.zeros((3, 10, 3))},
+    )
     np.savez(folder / "uncertainty.npz", **{"train/sd": np.full((3, 10), 0.004)})
     return folder
 
@@ -163,14 +216,23 @@ def test_two_equal_runs_are_compared_in_what_they_say_they_do_not_know(monkeypat
     differ, compared = long_runs.apart(one, other)
     assert set(differ) == {"id/E", "id/nu", "test/rms_m", "rollout.npz:train/x"}
     far = {each.name: each.far for each in compared}
-    assert far == pytest.approx({"E": 0.4, "nu": 0.5, "test/rms_m": 0.02, "motion train/x": 0.001 * 3**0.5 / 0.004}, rel=1e-6)
+    assert far == pytest.approx(
+        {"E": 0.4, "nu": 0.5, "test/rms_m": 0.02, "motion train/x": 0.001 * 3**0.5 / 0.004},
+        rel=1e-6,
+    )
     assert [each.name for each in compared if each.far > each.bound] == ["nu"] == [compared[0].name]
-    assert long_runs.apart(one, one)[0] == [] and not any(each.far for each in long_runs.apart(one, one)[1])
-    widened = (1 + long_runs.SPREADS**2 / 2) ** 0.5  # of a standard deviation, by two runs that are so far apart
+    assert long_runs.apart(one, one)[0] == [] and not any(
+        each.far for each in long_runs.apart(one, one)[1]
+    )
+    widened = (
+        1 + long_runs.SPREADS**2 / 2
+    ) ** 0.5  # of a standard deviation, by two runs that are so far apart
     assert widened == pytest.approx(1 + long_runs.AGREE)
 
 
-def test_drawn_runs_are_counted_over_calls_and_compared_where_one_program_made_both(monkeypatch, tmp_path):
+def test_drawn_runs_are_counted_over_calls_and_compared_where_one_program_made_both(
+    monkeypatch, tmp_path
+):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     drawn_runs = importlib.import_module("drawn_runs")
     assert drawn_runs.drawn(4, random.Random(0)) == drawn_runs.drawn(9, random.Random(0))[:4]
@@ -181,20 +243,32 @@ def test_drawn_runs_are_counted_over_calls_and_compared_where_one_program_made_b
         first.put("alone", k, {"E": float(k)})
     first.put("joblib", 0, {"E": 0.0})
     resumed = {"skipped": 1, "went on": 1}
-    first.note("sweeps", {"launcher": "joblib", "jobs": 3, "code": None, "met": [2], "resumed": resumed, "took": 9})
+    first.note(
+        "sweeps",
+        {"launcher": "joblib", "jobs": 3, "code": None, "met": [2], "resumed": resumed, "took": 9},
+    )
     first.note("left", [0, 0])
     assert [row.met for row in drawn_runs.rows_of(first, options)] == [False, False, False, True]
-    monkeypatch.setattr(drawn_runs, "version", lambda: "other")  # the program changed between two calls
+    monkeypatch.setattr(
+        drawn_runs, "version", lambda: "other"
+    )  # the program changed between two calls
     second = drawn_runs.Record(tmp_path / "record.json", {"seed": 0})
     second.put("joblib", 1, {"E": 1.0})
-    assert second.complete() == [0, 1, 2] and second.compared("joblib") == {0: []} and second.of_kind("alone") == {}
+    assert (
+        second.complete() == [0, 1, 2]
+        and second.compared("joblib") == {0: []}
+        and second.of_kind("alone") == {}
+    )
     for k in (1, 2, 3):
         second.put("alone", k, {"E": float(k)})
         second.put("joblib", k, {"E": float(k)})
     second.put("alone", 0, {"E": 0.0})
     second.put("submitit_local", 0, {"E": 0.0})
     for launcher in ("joblib", "submitit_local"):
-        second.note("sweeps", {"launcher": launcher, "jobs": 3, "code": 0, "met": [1], "resumed": resumed, "took": 9})
+        second.note(
+            "sweeps",
+            {"launcher": launcher, "jobs": 3, "code": 0, "met": [1], "resumed": resumed, "took": 9},
+        )
     assert all(row.met for row in drawn_runs.rows_of(second, options))
     second.put("joblib", 2, {"E": 2.5})
     assert second.compared("joblib")[2] == ["E"]
@@ -210,24 +284,39 @@ def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):
     fibre, the specimens of the true law have the law's moduli, and what was fitted makes a figure and a page."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     directions = importlib.import_module("directions")
-    settings = ["heterogeneity.enabled=false", "fit.prior.newton_iterations=1", "fit.joint.newton_iterations=1"]
+    settings = [
+        "heterogeneity.enabled=false",
+        "fit.prior.newton_iterations=1",
+        "fit.joint.newton_iterations=1",
+    ]
     monkeypatch.setattr(directions, "PLATES", 3)
     records = []
     for name, plates in (("tiny", True), ("tiny_twin", False)):
         directions.make(name, tmp_path, 0, ["train"])
         path = tmp_path / f"{name}.npz"
-        records.append(directions.fit(path, 150, settings, 0, 0.004, "cpu", plates, False, False, ["train"]))
+        records.append(
+            directions.fit(path, 150, settings, 0, 0.004, "cpu", plates, False, False, ["train"])
+        )
     body, twin = records
     assert max(body["true_E_along"]) == body["true_E_along"][0] > 1.5 * min(body["true_E_along"])
     assert max(twin["true_E_along"]) == pytest.approx(min(twin["true_E_along"]))
     assert 0 <= body["fibre_deg"] <= 90 and twin["fibre_deg"] is None
     assert body["plates"]["true"][0] == pytest.approx(body["true_E_along"][0], rel=0.05)
-    assert max(body["plates"]["prior"]["E"]) == pytest.approx(min(body["plates"]["prior"]["E"]), rel=0.02)
+    assert max(body["plates"]["prior"]["E"]) == pytest.approx(
+        min(body["plates"]["prior"]["E"]), rel=0.02
+    )
     directions.draw(records, tmp_path / "results")
     page = (tmp_path / "results" / "directions_from_motion.md").read_text()
     assert (tmp_path / "results" / "directions_from_motion.png").stat().st_size > 10_000
-    assert "| tiny " in page and "| tiny_twin " in page and "commit" in page and f"| {' '.join(settings)} |" in page
-    assert directions.settings({"set": [*settings, "identification.threads=1"]}) == " ".join(settings)
+    assert (
+        "| tiny " in page
+        and "| tiny_twin " in page
+        and "commit" in page
+        and f"| {' '.join(settings)} |" in page
+    )
+    assert directions.settings({"set": [*settings, "identification.threads=1"]}) == " ".join(
+        settings
+    )
 
 
 def test_the_planned_drop_is_compared_with_the_others(monkeypatch):
@@ -237,8 +326,23 @@ def test_the_planned_drop_is_compared_with_the_others(monkeypatch):
     names = ("train", "test/test_60", "train/plan_1", "train/plan_10", "train/plan_2")
     problem = {"sequences": {name: {} for name in names}, "config": 5}
     assert list(planned.with_only(problem, None)["sequences"]) == ["train", "test/test_60"]
-    assert list(planned.with_only(problem, 1)["sequences"]) == ["train", "test/test_60", "train/plan_1"]
+    assert list(planned.with_only(problem, 1)["sequences"]) == [
+        "train",
+        "test/test_60",
+        "train/plan_1",
+    ]
     assert planned.with_only(problem, 2)["config"] == 5 and len(problem["sequences"]) == 5
-    record = {"problem": "rabbit", "prior_mm": 24.0, "one_drop_mm": 6.04, "gains": [0.5, None, 2.25], "errors_mm": [5.0, 6.0, 3.96],
-              "planned_mm": 3.96, "others_mm": 5.5, "seconds": 60.0}
-    assert planned.table([record]).splitlines()[-1] == "| rabbit | 24.0 | 6.0 | 4.0 | 5.5 | 0.50: 5.0, -: 6.0, 2.25: 4.0 | 60 |"
+    record = {
+        "problem": "rabbit",
+        "prior_mm": 24.0,
+        "one_drop_mm": 6.04,
+        "gains": [0.5, None, 2.25],
+        "errors_mm": [5.0, 6.0, 3.96],
+        "planned_mm": 3.96,
+        "others_mm": 5.5,
+        "seconds": 60.0,
+    }
+    assert (
+        planned.table([record]).splitlines()[-1]
+        == "| rabbit | 24.0 | 6.0 | 4.0 | 5.5 | 0.50: 5.0, -: 6.0, 2.25: 4.0 | 60 |"
+    )

@@ -14,8 +14,10 @@ class Fit:
     """A module of two stages with one optimiser each, and what a trainer shows of it."""
 
     def __init__(self, first="adam", second="adam"):
-        self.stages = [Stage("prior", iterations=2, lr=0.1, optimizer=first),
-                       Stage("joint", iterations=1, lr=0.01, optimizer=second)]
+        self.stages = [
+            Stage("prior", iterations=2, lr=0.1, optimizer=first),
+            Stage("joint", iterations=1, lr=0.01, optimizer=second),
+        ]
         self.stage_index, self.losses, self.logged, self.stage_over = 0, [], [], False
         self.last = {"loss/total": 0.25, "id/E": 2e5, "gradient_norm/material": 3.0}
         self.trainer = SimpleNamespace(optimizers=[self.optimizer(0.1)])
@@ -53,7 +55,9 @@ def test_a_rate_is_that_of_the_stage_a_step_was_made_in():
 def test_a_step_of_gauss_newton_has_no_rate():
     fit = Fit("gauss_newton", "adam")
     fit.run(Pace(), 3)
-    assert [set(values) for values in fit.logged] == [{"time/step_s"}] * 2 + [{"time/step_s", "lr/material"}]
+    assert [set(values) for values in fit.logged] == [{"time/step_s"}] * 2 + [
+        {"time/step_s", "lr/material"}
+    ]
 
 
 def test_stages_are_noted_when_they_begin_and_end(caplog):
@@ -62,6 +66,11 @@ def test_stages_are_noted_when_they_begin_and_end(caplog):
     fit.losses = [0.0]  # of a run that goes on
     fit.run(StageNotes(), 2)
     said = [record.getMessage() for record in caplog.records]
-    assert said[0] == "stage prior: at most 2 steps, going on after 1" and said[2] == "stage joint: at most 1 steps"
-    assert said[1].startswith("stage prior: ended after 1 steps, ") and said[1].endswith(" s: loss 0.25000, E 2e+05")
+    assert (
+        said[0] == "stage prior: at most 2 steps, going on after 1"
+        and said[2] == "stage joint: at most 1 steps"
+    )
+    assert said[1].startswith("stage prior: ended after 1 steps, ") and said[1].endswith(
+        " s: loss 0.25000, E 2e+05"
+    )
     assert said[3].startswith("stage joint: ended after 1 steps, ") and len(said) == 4

@@ -28,24 +28,43 @@ def built(tmp_path_factory):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "MANIFEST.in"):
         shutil.copy(ROOT / name, source / name)
-    built = subprocess.run([sys.executable, "setup.py", "-q", "build_py", "-d", str(library)], cwd=source, capture_output=True,
-                           text=True)
+    built = subprocess.run(
+        [sys.executable, "setup.py", "-q", "build_py", "-d", str(library)],
+        cwd=source,
+        capture_output=True,
+        text=True,
+    )
     assert built.returncode == 0, built.stderr[-2000:]
     shutil.rmtree(source)
     return library
 
 
 def test_a_wheel_holds_the_whole_configuration(built):
-    inside = {p.relative_to(built / "mosa" / "conf") for p in (built / "mosa" / "conf").rglob("*.yaml")}
-    assert inside == {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")} and len(inside) > 50
+    inside = {
+        p.relative_to(built / "mosa" / "conf") for p in (built / "mosa" / "conf").rglob("*.yaml")
+    }
+    assert (
+        inside == {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")}
+        and len(inside) > 50
+    )
     assert (built / "mosa" / "py.typed").is_file()
 
 
 def call(built, tmp_path, module, *arguments):
     """The command as an installed script runs it, with nothing of the repository in reach."""
-    start = f"import sys; sys.argv[0] = 'mosa'; from mosa.cli.{module} import main; sys.exit(main())"
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PYTHONPATH": str(built)}
-    return subprocess.run([sys.executable, "-c", start, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    start = (
+        f"import sys; sys.argv[0] = 'mosa'; from mosa.cli.{module} import main; sys.exit(main())"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {
+        "PYTHONPATH": str(built)
+    }
+    return subprocess.run(
+        [sys.executable, "-c", start, *arguments],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
 
 
 def configured(built, tmp_path, module, *arguments):
@@ -53,23 +72,32 @@ def configured(built, tmp_path, module, *arguments):
     result = call(built, tmp_path, module, *arguments, "--cfg", "all")
     assert result.returncode == 0, result.stderr[-2000:]
     cfg = OmegaConf.create(result.stdout)
-    sources = [source.path for source in cfg.hydra.runtime.config_sources if source.provider == "main"]
-    assert sources == [str(built / "mosa" / "conf")] and cfg.hydra.job.name == module  # the folder's name: outputs/train/...
+    sources = [
+        source.path for source in cfg.hydra.runtime.config_sources if source.provider == "main"
+    ]
+    assert (
+        sources == [str(built / "mosa" / "conf")] and cfg.hydra.job.name == module
+    )  # the folder's name: outputs/train/...
     return cfg
 
 
 def test_the_commands_find_their_configuration_and_an_experiment_of_ones_own(built, tmp_path):
     (tmp_path / "mine" / "experiment").mkdir(parents=True)
     (tmp_path / "mine" / "experiment" / "duck.yaml").write_text(
-        "# @package _global_\ndefaults:\n  - override /scene: transforms\nsimulation: {particles: 77}\n")
-    cfg = configured(built, tmp_path, "train", "--config-dir", "mine", "experiment=duck", "scene.scale=0.3")
+        "# @package _global_\ndefaults:\n  - override /scene: transforms\nsimulation: {particles: 77}\n"
+    )
+    cfg = configured(
+        built, tmp_path, "train", "--config-dir", "mine", "experiment=duck", "scene.scale=0.3"
+    )
     assert (cfg.simulation.particles, cfg.scene.format, cfg.scene.scale) == (77, "transforms", 0.3)
     assert configured(built, tmp_path, "eval", "ckpt_path=x.ckpt").ckpt_path == "x.ckpt"
 
 
 @pytest.mark.parametrize("name", ["splats", "capture", "environments"])
 def test_a_command_is_the_name_of_its_configuration_and_of_its_runs(built, tmp_path, name):
-    assert set(OmegaConf.load(ROOT / "conf" / f"{name}.yaml")) - {"defaults"} <= set(configured(built, tmp_path, name))
+    assert set(OmegaConf.load(ROOT / "conf" / f"{name}.yaml")) - {"defaults"} <= set(
+        configured(built, tmp_path, name)
+    )
 
 
 def test_the_experiments_are_installed_with_the_paper_s_figures(built, tmp_path):
@@ -86,13 +114,22 @@ def test_in_a_clone_the_configuration_is_where_it_is_edited():
 
 def test_there_is_one_version_and_every_command_has_its_function():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "mosa.__version__"} and mosa.__version__.count(".") == 2
+    assert (
+        project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "mosa.__version__"}
+        and mosa.__version__.count(".") == 2
+    )
     for target in project["project"]["scripts"].values():
         module, function = target.split(":")
         assert callable(getattr(__import__(module, fromlist=[function]), function))
-    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats", "mosa-capture",
-                                               "mosa-environments",
-                                               "mosa-experiment"}
+    assert set(project["project"]["scripts"]) == {
+        "mosa-train",
+        "mosa-eval",
+        "mosa-view",
+        "mosa-splats",
+        "mosa-capture",
+        "mosa-environments",
+        "mosa-experiment",
+    }
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])
@@ -104,7 +141,13 @@ def test_the_viewer_explains_itself(capsys, flag):
 
 def test_a_folder_alone_is_the_run(tmp_path):
     assert viewer.options([str(tmp_path), "port=9000"]) == {
-        "run": str(tmp_path), "checkpoint": None, "live": "false", "host": "127.0.0.1", "port": "9000", "device": "cpu"}
+        "run": str(tmp_path),
+        "checkpoint": None,
+        "live": "false",
+        "host": "127.0.0.1",
+        "port": "9000",
+        "device": "cpu",
+    }
 
 
 def test_a_warning_and_what_ended_a_run_are_in_the_log(tmp_path, capsys, monkeypatch):

@@ -46,7 +46,9 @@ def test_every_scene_with_every_prior_composes(scene):
     """And every pair of them with an adapter: with each scene the adapters go round the priors by one."""
     adapters, first = group("adapter"), group("scene").index(scene)
     for i, prior in enumerate(group("prior")):
-        config = composed(f"scene={scene}", f"prior={prior}", f"adapter={adapters[(first + i) % len(adapters)]}")
+        config = composed(
+            f"scene={scene}", f"prior={prior}", f"adapter={adapters[(first + i) % len(adapters)]}"
+        )
         assert config["prior"] and config["scene"]
 
 
@@ -57,7 +59,9 @@ def test_every_option_of_a_group_composes(name):
         assert composed(f"{name}={option}")
 
 
-@pytest.mark.parametrize("override", ["debug=defualt", "scene=rabit", "prior=jelly", "ablation=no_foo", "trainer=tpu"])
+@pytest.mark.parametrize(
+    "override", ["debug=defualt", "scene=rabit", "prior=jelly", "ablation=no_foo", "trainer=tpu"]
+)
 def test_a_mistyped_option_is_refused(override):
     with pytest.raises(MissingConfigException, match=override.split("=")[1]):
         composed(override)
@@ -81,7 +85,10 @@ def test_a_mistake_in_the_adapter_names_its_key(adapter, message):
         build_adapter(adapter)
 
 
-@pytest.mark.parametrize("key, value", [("precision", 16), ("stride", 0), ("max_substeps", 2.5), ("courant", 0), ("dx", -1.0)])
+@pytest.mark.parametrize(
+    "key, value",
+    [("precision", 16), ("stride", 0), ("max_substeps", 2.5), ("courant", 0), ("dx", -1.0)],
+)
 def test_a_mistake_in_the_simulation_names_its_key(key, value):
     with pytest.raises(ConfigError, match=f"simulation.{key}"):
         SimulationSettings(**{"dx": 0.1, key: value})
@@ -89,24 +96,39 @@ def test_a_mistake_in_the_simulation_names_its_key(key, value):
 
 def test_a_mistake_in_a_stage_names_its_key():
     fit = {name: {"iterations": 2, "lr": 0.1} for name in ("prior", "prior_eta", "joint")}
-    with pytest.raises(ConfigError, match=r"fit\.joint\.lrr: unknown key; expected one of iterations, lr,"):
+    with pytest.raises(
+        ConfigError, match=r"fit\.joint\.lrr: unknown key; expected one of iterations, lr,"
+    ):
         build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=None, adapter=None)
     with pytest.raises(ConfigError, match=r"fit\.joint\.start"):
-        build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=None, adapter=None)
+        build_stages(
+            fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}},
+            heterogeneity=None,
+            adapter=None,
+        )
 
 
-@pytest.mark.parametrize("adapter, expected", [("hyperelastic", "gauss_newton"), (None, None), ("stress", "adam")])
+@pytest.mark.parametrize(
+    "adapter, expected", [("hyperelastic", "gauss_newton"), (None, None), ("stress", "adam")]
+)
 def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter, expected):
     fit = composed()["fit"]
     stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
     found = {stage.name: stage.optimizer for stage in stages}
-    assert found.get("joint") == expected and found["prior"] == "gauss_newton"  # without an adapter there is nothing to join
+    assert (
+        found.get("joint") == expected and found["prior"] == "gauss_newton"
+    )  # without an adapter there is nothing to join
     asked = fit | {"joint": fit["joint"] | {"optimizer": "gauss_newton"}}
     if expected == "adam":
-        with pytest.raises(ConfigError, match=r"fit\.joint\.optimizer: gauss_newton learns few numbers"):
+        with pytest.raises(
+            ConfigError, match=r"fit\.joint\.optimizer: gauss_newton learns few numbers"
+        ):
             build_stages(asked, heterogeneity=None, adapter=build_adapter({"name": adapter}))
     adam = composed("fit=adam")["fit"]
-    assert {s.optimizer for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))} == {"adam"}
+    assert {
+        s.optimizer
+        for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    } == {"adam"}
 
 
 @pytest.mark.parametrize("override, adapter, expected", [(None, None, 3), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
@@ -114,7 +136,9 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
 def test_a_calibration_looks_again_where_it_is_all_there_is(override, adapter, expected):
     fit = composed(*([override] if override else []))["fit"]
     stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
-    assert [stage.name for stage in stages if stage.looks_again] == ["prior"] * expected and not stages[0].looks_again
+    assert [stage.name for stage in stages if stage.looks_again] == [
+        "prior"
+    ] * expected and not stages[0].looks_again
 
 
 @pytest.mark.parametrize("group_name", ["adapter", "ablation", "criterion", "debug", "experiment", "fit", "logger", "prior",
@@ -140,8 +164,12 @@ def test_every_option_passes_the_checks_before_a_run(group_name):
     "evaluation.samples=0",
 ])  # fmt: skip
 def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
-    base = ["adapter=linear"] if override.startswith("adapter.") else []  # it has the keys, and the default has not
-    with pytest.raises(ConfigError, match=rf"^{override.lstrip('+').split('=')[0]}: expected .*, found "):
+    base = (
+        ["adapter=linear"] if override.startswith("adapter.") else []
+    )  # it has the keys, and the default has not
+    with pytest.raises(
+        ConfigError, match=rf"^{override.lstrip('+').split('=')[0]}: expected .*, found "
+    ):
         config = composed(*base, override)
         check(config, TRAINING, EVALUATION, registered_keys(config))
 
@@ -188,7 +216,9 @@ def test_a_new_start_of_the_wrong_kind_is_named(values, key):
 def flat(config, prefix="") -> dict:
     result = {}
     for key, value in config.items():
-        result |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        result |= (
+            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        )
     return result
 
 
@@ -210,7 +240,9 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
     # the parts of the networks exist in the paper's adapter only
     whole = "paper" if any(key.startswith("adapter.") for key in EXPECTED[name]) else "full"
     full, ablated = flat(composed(f"ablation={whole}")), flat(composed(f"ablation={name}"))
-    assert {k for k in full.keys() | ablated.keys() if full.get(k) != ablated.get(k)} == EXPECTED[name]
+    assert {k for k in full.keys() | ablated.keys() if full.get(k) != ablated.get(k)} == EXPECTED[
+        name
+    ]
 
 
 @pytest.mark.parametrize("name, overrides", [
@@ -219,7 +251,10 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
 ])  # fmt: skip
 def test_an_experiment_is_what_its_overrides_are(name, overrides):
     assert composed(f"experiment={name}") == composed(*overrides) != composed()
-    assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]
+    assert (
+        composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"]
+        == composed("prior=stvk")["prior"]["law"]
+    )
 
 
 @pytest.mark.parametrize("settings", [
@@ -228,7 +263,11 @@ def test_an_experiment_is_what_its_overrides_are(name, overrides):
 def test_a_knob_is_written_once(settings):
     """Its default is of its kind, the check of a configuration has the same kind, and the settings refuse what that refuses."""
     given = {"dx": 0.1, "name": "joint", "iterations": 3, "lr": 0.1}
-    given = {name: value for name, value in given.items() if name in {f.name for f in fields(settings) if f.default is MISSING}}
+    given = {
+        name: value
+        for name, value in given.items()
+        if name in {f.name for f in fields(settings) if f.default is MISSING}
+    }
     made, known = settings(**given), set(map(id, (TRAINING | EVALUATION).values()))
     knobs = [f for f in fields(settings) if "kind" in f.metadata]
     assert len(knobs) >= 2
@@ -237,7 +276,9 @@ def test_a_knob_is_written_once(settings):
         assert kind.fits(getattr(made, f.name)) and (id(kind) in known or f.name == "dx"), f.name
         wrong = object()
         assert not kind.fits(wrong)
-        with pytest.raises(ConfigError, match=rf"\.{f.name}: expected {re.escape(kind.described)}, found <object"):
+        with pytest.raises(
+            ConfigError, match=rf"\.{f.name}: expected {re.escape(kind.described)}, found <object"
+        ):
             settings(**{**given, f.name: wrong})
 
 
@@ -252,7 +293,10 @@ def test_an_adapters_knobs_are_its_own(name):
         assert kind.fits(arguments[argument].default) and keys[f"adapter.{argument}"] is kind
         assert f"adapter.{argument}" not in TRAINING
         wrong = object()
-        with pytest.raises(ConfigError, match=rf"^adapter\.{argument}: expected {re.escape(kind.described)}, found <object"):
+        with pytest.raises(
+            ConfigError,
+            match=rf"^adapter\.{argument}: expected {re.escape(kind.described)}, found <object",
+        ):
             build(**{argument: wrong})
         with pytest.raises(ConfigError, match=rf"^adapter\.{argument}: expected "):
             build_adapter({"name": name, argument: wrong})

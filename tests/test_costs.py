@@ -31,7 +31,9 @@ def test_memory_that_is_not_there_is_refused_with_the_most_particles_that_fit(mo
     monkeypatch.setattr(costs, "machine_memory", lambda: wanted)
     assert costs.check_memory(cfg, SIZE) == wanted
     monkeypatch.setattr(costs, "machine_memory", lambda: wanted - 1e7)
-    with pytest.raises(ConfigError, match=r"^simulation\.particles: 4000 take about .* GB.*expected at most (\d+)$") as caught:
+    with pytest.raises(
+        ConfigError, match=r"^simulation\.particles: 4000 take about .* GB.*expected at most (\d+)$"
+    ) as caught:
         costs.check_memory(cfg, SIZE)
     most = int(re.search(r"most (\d+)", str(caught.value))[1])
     assert 3000 < most < 4000
@@ -39,7 +41,9 @@ def test_memory_that_is_not_there_is_refused_with_the_most_particles_that_fit(mo
     with pytest.raises(ConfigError):
         costs.check_memory(cfg, costs.replace(SIZE, particles=most + 1))
     cfg["simulation"]["dx"] = 0.01
-    with pytest.raises(ConfigError, match=r"^simulation\.dx: .*expected at most \d+ particles, a spacing of 0\.01"):
+    with pytest.raises(
+        ConfigError, match=r"^simulation\.dx: .*expected at most \d+ particles, a spacing of 0\.01"
+    ):
         costs.check_memory(cfg, SIZE)
 
 
@@ -54,13 +58,20 @@ def test_memory_of_each_particle_is_named_by_what_takes_it(monkeypatch):
     cfg = configuration()
     cfg["reconstruction"]["neighbours"] = 100_000
     monkeypatch.setattr(costs, "machine_memory", lambda: 25e9)
-    with pytest.raises(ConfigError, match=r"^reconstruction\.neighbours: 100000, .*for each particle, of this machine's 25\.0 GB"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^reconstruction\.neighbours: 100000, .*for each particle, of this machine's 25\.0 GB",
+    ):
         costs.check_memory(cfg, SIZE)
 
 
-@pytest.mark.parametrize(("key", "value"), [("neighbours", 10**5), ("margin", 10**6), ("ridge_passes", 10**9)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("neighbours", 10**5), ("margin", 10**6), ("ridge_passes", 10**9)]
+)
 def test_what_no_machine_computes_is_refused_by_its_key(key, value):
-    with pytest.raises(ConfigError, match=rf"^reconstruction\.{key}: expected a whole number of .* at most"):
+    with pytest.raises(
+        ConfigError, match=rf"^reconstruction\.{key}: expected a whole number of .* at most"
+    ):
         build_settings(**{key: value})
 
 
@@ -70,7 +81,9 @@ def test_a_built_in_scene_is_refused_before_it_is_made(monkeypatch, tmp_path):
     with pytest.raises(ConfigError, match=r"simulation\.particles: 100000 take"):
         costs.before_data(cfg, 4000)
     cfg["simulation"]["particles"] = 200
-    assert "3 sequences, 3 of them to be made" in costs.before_data(cfg, 4000) and not list(tmp_path.iterdir())
+    assert "3 sequences, 3 of them to be made" in costs.before_data(cfg, 4000) and not list(
+        tmp_path.iterdir()
+    )
 
 
 def test_an_estimate_has_every_part_and_leaves_the_random_state_alone(tmp_path, monkeypatch):
@@ -85,8 +98,12 @@ def test_an_estimate_has_every_part_and_leaves_the_random_state_alone(tmp_path, 
     monkeypatch.setattr(costs, "speed_of_rollouts", lambda *_: 0.05)
     monkeypatch.setattr(costs, "speed_of_pictures", lambda *_: 0.01)
     found = costs.estimate(cfg, scene, 2, 1, "cpu")
-    twice = configuration(f"scene.cache={tmp_path}", "fit.joint.newton_iterations=40", "fit.joint.iterations=40",
-                          "reconstruction.dynamic.iterations=3000")
+    twice = configuration(
+        f"scene.cache={tmp_path}",
+        "fit.joint.newton_iterations=40",
+        "fit.joint.iterations=40",
+        "reconstruction.dynamic.iterations=3000",
+    )
     more = costs.estimate(twice, scene, 2, 1, "cpu")
     assert more.parts["fit"] > 2 * found.parts["fit"] - 2 * costs.KERNELS
     assert more.parts["reconstruction"] > 2 * found.parts["reconstruction"]
@@ -98,10 +115,17 @@ def test_parts_that_are_done_correct_the_others():
     one = costs.Costs({"reconstruction": 10.0, "fit": 100.0, "evaluation": 50.0}, 1e9)
     assert "fit 2 min, evaluation 50 s" in one.said()
     text = one.done("reconstruction", 20.0)
-    assert text.startswith("reconstruction took 20.0 s (expected 10 s)") and "fit 3 min, evaluation 2 min" in text
+    assert (
+        text.startswith("reconstruction took 20.0 s (expected 10 s)")
+        and "fit 3 min, evaluation 2 min" in text
+    )
     one.known("fit", 60.0)
-    assert one.rest()["fit"] == pytest.approx(60.0) and one.rest()["evaluation"] == pytest.approx(100.0)
-    assert "what is left takes about" in one.done("evaluation", 1.0) and "what is left" not in one.done("fit", 1.0)
+    assert one.rest()["fit"] == pytest.approx(60.0) and one.rest()["evaluation"] == pytest.approx(
+        100.0
+    )
+    assert "what is left takes about" in one.done(
+        "evaluation", 1.0
+    ) and "what is left" not in one.done("fit", 1.0)
     assert costs.duration(math.inf) == "not known yet"
 
 

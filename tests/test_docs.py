@@ -10,7 +10,12 @@ import yaml
 import mosa
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "SECURITY.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 
 
 def anchor(heading: str) -> str:
@@ -19,7 +24,9 @@ def anchor(heading: str) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    return {anchor(line.lstrip("#")) for line in page.read_text().splitlines() if line.startswith("#")}
+    return {
+        anchor(line.lstrip("#")) for line in page.read_text().splitlines() if line.startswith("#")
+    }
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -52,9 +59,14 @@ def test_the_ten_stops_are_in_the_code():
 def test_the_citation_names_this_version_and_the_authors_of_the_paper():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     (paper,) = citation["references"]
-    authors = " and ".join(f"{each['family-names']}, {each['given-names']}" for each in paper["authors"])
+    authors = " and ".join(
+        f"{each['family-names']}, {each['given-names']}" for each in paper["authors"]
+    )
     readme = (ROOT / "README.md").read_text()
-    assert citation["version"] == mosa.__version__ and f"## {mosa.__version__} " in (ROOT / "CHANGELOG.md").read_text()
+    assert (
+        citation["version"] == mosa.__version__
+        and f"## {mosa.__version__} " in (ROOT / "CHANGELOG.md").read_text()
+    )
     assert f"author = {{{authors}}}" in readme and paper["url"] in readme
     assert paper["title"] in readme.replace("{MoSA}", "MoSA") and str(paper["year"]) in readme
 
@@ -63,4 +75,6 @@ def test_a_change_has_a_fragment_of_a_known_kind():
     with open(ROOT / "pyproject.toml", "rb") as file:
         kinds = {kind["directory"] for kind in tomllib.load(file)["tool"]["towncrier"]["type"]}
     fragments = [path.name for path in (ROOT / "changelog.d").iterdir() if path.name != "README.md"]
-    assert not [name for name in fragments if not re.fullmatch(rf"\+?[\w-]+\.({'|'.join(kinds)})\.md", name)]
+    assert not [
+        name for name in fragments if not re.fullmatch(rf"\+?[\w-]+\.({'|'.join(kinds)})\.md", name)
+    ]

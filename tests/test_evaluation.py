@@ -26,14 +26,18 @@ def test_the_floor_has_the_frames_and_samples_of_the_models(monkeypatch):
     sequences = [Sequence(prefix, scene, None, 2) for prefix in ("train", "test/a")]
     found = floor_figures(body, sequences, None, EvaluationSettings(samples=300, assignment=50))
     for prefix, frames in (("train", [0, 1, 2, 3]), ("test/a", [0, 1, 2, 3, 4])):
-        for name, value in motion_metrics(x, body, sequences[0], frames, EvaluationSettings(samples=300, assignment=50)).items():
+        for name, value in motion_metrics(
+            x, body, sequences[0], frames, EvaluationSettings(samples=300, assignment=50)
+        ).items():
             assert found[f"floor/{prefix}/{name}"] == value
     for name, value in metrics.sampling_floors(rest, 700, 900, samples=300, assignment=50).items():
         assert found[f"floor/sampling/{name}"] == pytest.approx(value)
 
 
 @pytest.mark.parametrize("held_frames, held_cameras", [((3, 4), (1,)), ((), ())])
-def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_worst(monkeypatch, held_frames, held_cameras):
+def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_worst(
+    monkeypatch, held_frames, held_cameras
+):
     """A law that was learned from the first frames may turn an element inside out in the held-out ones."""
     scene = SimpleNamespace(truth=None, holdout_frames=held_frames, holdout_cameras=held_cameras)
     sequences = [Sequence("train", scene, None, 2), Sequence("test/a", scene, None, 2)]
@@ -46,7 +50,11 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
         parts = {sequence.prefix: ("rms_m", "psnr_crop")}
         if sequence.prefix == "train":
             parts |= {"frames": ("rms_m", "psnr_crop")} if held_frames else {}
-            parts |= {"camera": ("psnr_crop",), "camera/frame_01": ("psnr_crop",)} if held_cameras else {}
+            parts |= (
+                {"camera": ("psnr_crop",), "camera/frame_01": ("psnr_crop",)}
+                if held_cameras
+                else {}
+            )
         return {f"{model}{part}/{name}": 1.0 for part, names in parts.items() for name in names}
 
     monkeypatch.setattr(evaluation, "rollouts", rollouts)
@@ -57,7 +65,10 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
                                                      for name in ("rms_m", "psnr_crop"))}  # fmt: skip
     expected |= {"frames/rms_m", "frames/psnr_crop"} if held_frames else set()
     expected |= {"camera/psnr_crop"} if held_cameras else set()
-    assert worst == expected and figures["train/psnr_crop"] == -float("inf") < figures["test/psnr_crop"] == 1.0
+    assert (
+        worst == expected
+        and figures["train/psnr_crop"] == -float("inf") < figures["test/psnr_crop"] == 1.0
+    )
     assert "adapted" not in kept["train"] and "adapted" in kept["test/a"]
     lost |= {prefix: {"adapted", "prior", "prior_eta"} for prefix in lost}
     with pytest.raises(SimulationDiverged, match="train, test/a"):

@@ -38,7 +38,10 @@ def summed(terms: list[float], scalar=wp.float64) -> float:
         functions.add_exactly(sums, 0, values[wp.tid()])
 
     dtype = torch.float64 if scalar is wp.float64 else torch.float32
-    values, sums = torch.tensor(terms, dtype=dtype), torch.zeros(1, exact_sums.COLUMNS, dtype=torch.int64)
+    values, sums = (
+        torch.tensor(terms, dtype=dtype),
+        torch.zeros(1, exact_sums.COLUMNS, dtype=torch.int64),
+    )
     total = torch.zeros(1, dtype=dtype)
     wp.launch(add, len(terms), [wp.from_torch(values), wp.from_torch(sums)], device="cpu")
     wp.launch(functions.settle, 1, [wp.from_torch(sums), wp.from_torch(total)], device="cpu")
@@ -54,18 +57,32 @@ def test_sums_are_exact_and_say_what_they_cannot_hold():
 
 def drawn(order=slice(None), device="cpu", dtype=torch.float32):
     x = 0.02 * torch.cartesian_prod(*[torch.arange(5).double()] * 3) + 0.1
-    x = x + 0.004 * torch.rand(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = x + 0.004 * torch.rand(
+        x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     x = x.to(device, dtype)[order]
     eye = torch.eye(3, dtype=dtype, device=device).expand(len(x), 3, 3).contiguous()
-    return ParticleState(x, torch.tensor([0.3, -2.0, 0.1], dtype=dtype, device=device).expand_as(x).contiguous(), 0 * eye, eye, eye)
+    return ParticleState(
+        x,
+        torch.tensor([0.3, -2.0, 0.1], dtype=dtype, device=device).expand_as(x).contiguous(),
+        0 * eye,
+        eye,
+        eye,
+    )
 
 
 def motion(order=slice(None), device="cpu", dtype=torch.float32):
     """(positions, reactions, gradients of the start, of a modulus and of the solid's velocity) of a drop onto ground and ball."""
     simulator = Simulator("corotated", dx=0.04, substeps=20, frame_dt=8e-3, gravity=(0, -9.8, 0), up=(0, 1, 0), planes=[FLOOR],
                           colliders=[SOLID], dtype=dtype, device=device)  # fmt: skip
-    state, push = drawn(order, device, dtype), torch.tensor([0.0, 0.4, 0.1], dtype=torch.float64, requires_grad=True)
-    v, mu = state.v.requires_grad_(), torch.tensor(4e4, dtype=dtype, device=device, requires_grad=True)
+    state, push = (
+        drawn(order, device, dtype),
+        torch.tensor([0.0, 0.4, 0.1], dtype=torch.float64, requires_grad=True),
+    )
+    v, mu = (
+        state.v.requires_grad_(),
+        torch.tensor(4e4, dtype=dtype, device=device, requires_grad=True),
+    )
     out = simulator.rollout(replace(state, v=v), {"mu": mu, "lam": 5e4}, torch.full_like(state.x[:, 0], 8e-6), 1000.0, 5,
                             motions=[Motion((0.15, -0.02, 0.12), velocity=push)])  # fmt: skip
     ((out.x[1:] ** 2).sum() + 1e-3 * (out.reactions**2).sum()).backward()

@@ -25,11 +25,16 @@ def test_a_package_that_cannot_be_imported_is_named(names):
         load_extensions(names)
 
 
-@pytest.mark.parametrize("text", ["raise ValueError('x')", "import sys; sys.exit(3)", "def (", "import no_such_package"])
+@pytest.mark.parametrize(
+    "text", ["raise ValueError('x')", "import sys; sys.exit(3)", "def (", "import no_such_package"]
+)
 def test_a_package_that_fails_while_it_is_imported_is_named(tmp_path, monkeypatch, text):
     (tmp_path / "fails_at_once.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ConfigError, match=r"extensions: expected a module that can be imported .*found 'fails_at_once'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"extensions: expected a module that can be imported .*found 'fails_at_once'",
+    ):
         load_extensions(["fails_at_once"])
 
 
@@ -40,9 +45,15 @@ def test_what_is_no_name_of_a_module_is_not_imported(name):
 
 
 def test_an_adapter_that_was_registered_and_is_not_there_is_named(monkeypatch):
-    monkeypatch.setattr(adapters, "ADAPTERS", adapters.ADAPTERS | {"gone": "no_such_package:Adapter", "empty": "math:Adapter"})
+    monkeypatch.setattr(
+        adapters,
+        "ADAPTERS",
+        adapters.ADAPTERS | {"gone": "no_such_package:Adapter", "empty": "math:Adapter"},
+    )
     for name in ("gone", "empty"):
-        with pytest.raises(ConfigError, match=rf"adapter\.name: '{name}' is registered as .*cannot be imported"):
+        with pytest.raises(
+            ConfigError, match=rf"adapter\.name: '{name}' is registered as .*cannot be imported"
+        ):
             adapters.adapter_class({"name": name})
 
 
@@ -74,7 +85,11 @@ def test_the_arguments_of_an_adapter_and_the_weights_of_terms_are_keys():
     keys = registered_keys({"adapter": {"name": "nclaw", "hidden": 8}})
     assert {"adapter.start", "adapter.plastic_rate"} <= set(keys) and "adapter.rank" not in keys
     weights = {f"losses.{name}" for name in (*terms.TERMS, *PENALTIES)}
-    assert set(registered_keys({"adapter": {"name": None}})) == weights == set(registered_keys({"adapter": None}))
+    assert (
+        set(registered_keys({"adapter": {"name": None}}))
+        == weights
+        == set(registered_keys({"adapter": None}))
+    )
 
 
 def test_an_adapter_brings_its_penalties(monkeypatch):
@@ -82,14 +97,19 @@ def test_an_adapter_brings_its_penalties(monkeypatch):
         penalties = {**PENALTIES, "cost": lambda found, misfit: found.mean_abs_C + misfit}
 
     monkeypatch.setattr(direct, "Costly", Costly, raising=False)
-    monkeypatch.setattr(adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.baselines.direct:Costly"})
+    monkeypatch.setattr(
+        adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.baselines.direct:Costly"}
+    )
     assert "losses.cost" in registered_keys({"adapter": {"name": "costly"}})
     terms.check_terms({"cost": 1.0}, Costly())
     with pytest.raises(ConfigError, match="cost"):
         terms.check_terms({"cost": 1.0}, DirectAdapter())
     found = OperatorStatistics(torch.tensor(2.0), torch.zeros(3), torch.ones(3))
     step = SimpleNamespace(operator=found, misfit=0.5, body=SimpleNamespace(adapter=Costly()))
-    assert terms.evaluate_terms({"cost": 1.0, "operator_variance": 1.0}, step) == {"operator_variance": 1.0, "cost": 2.5}
+    assert terms.evaluate_terms({"cost": 1.0, "operator_variance": 1.0}, step) == {
+        "operator_variance": 1.0,
+        "cost": 2.5,
+    }
     assert terms.evaluate_terms({"cost": 1.0}, SimpleNamespace(operator=None)) == {}
     with pytest.raises(ConfigError, match="another"):
         register_term("operator", lambda step: None)

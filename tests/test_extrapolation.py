@@ -18,18 +18,26 @@ from mosa.training.extrapolation import Identified, check_can_extrapolate, conti
 
 def test_what_is_linear_in_the_spacing_is_continued_to_its_value_at_0():
     """In the logarithm of E, with the standard deviations of both grids: at 1 and 1.5 mm the finer one counts three times."""
+
     def at(dx: float) -> float:
         return math.log(3e5) + 200.0 * dx
 
-    found = continued(Identified(1e-3, {"E": (at(1e-3), 0.01)}), Identified(1.5e-3, {"E": (at(1.5e-3), 0.02)}))
+    found = continued(
+        Identified(1e-3, {"E": (at(1e-3), 0.01)}), Identified(1.5e-3, {"E": (at(1.5e-3), 0.02)})
+    )
     coarse, limit, sd = found["E"]
-    assert coarse == pytest.approx(3e5 * math.exp(0.3), rel=1e-6) and limit == pytest.approx(3e5, rel=1e-6)
+    assert coarse == pytest.approx(3e5 * math.exp(0.3), rel=1e-6) and limit == pytest.approx(
+        3e5, rel=1e-6
+    )
     assert sd == pytest.approx(3e5 * math.hypot(3 * 0.01, 2 * 0.02), rel=1e-5)
 
 
 def test_a_poisson_number_stays_in_its_range():
     inverse = FORMS["nu"].inverse
-    found = continued(Identified(1e-3, {"nu": (inverse(0.45), 0.1)}), Identified(1.44e-3, {"nu": (inverse(0.3), 0.1)}))
+    found = continued(
+        Identified(1e-3, {"nu": (inverse(0.45), 0.1)}),
+        Identified(1.44e-3, {"nu": (inverse(0.3), 0.1)}),
+    )
     assert 0.45 < found["nu"][1] < 0.49
 
 
@@ -47,19 +55,37 @@ def test_a_calibration_is_continued_from_the_scene_s_own_images(tmp_path):
     check_can_extrapolate(run.module)
     run.module.identify()
     found = extrapolated(cfg, run, {"E": 1e5})
-    assert found["extrapolated/coarse_dx_m"] == pytest.approx(3 ** (1 / 3) * found["extrapolated/dx_m"], rel=0.1)
-    weight = found["extrapolated/dx_m"] / (found["extrapolated/coarse_dx_m"] - found["extrapolated/dx_m"])
-    fine, other = math.log(float(run.body.material.physical()["E"].detach())), math.log(found["extrapolated/E_coarse"])
-    assert math.log(found["extrapolated/E"]) == pytest.approx(fine + weight * (fine - other), abs=1e-4)
+    assert found["extrapolated/coarse_dx_m"] == pytest.approx(
+        3 ** (1 / 3) * found["extrapolated/dx_m"], rel=0.1
+    )
+    weight = found["extrapolated/dx_m"] / (
+        found["extrapolated/coarse_dx_m"] - found["extrapolated/dx_m"]
+    )
+    fine, other = (
+        math.log(float(run.body.material.physical()["E"].detach())),
+        math.log(found["extrapolated/E_coarse"]),
+    )
+    assert math.log(found["extrapolated/E"]) == pytest.approx(
+        fine + weight * (fine - other), abs=1e-4
+    )
     own = INFLATION * float(run.module.posterior.covariance[0, 0]) ** 0.5
     assert found["extrapolated/E_sd"] > (1 + weight) * own * found["extrapolated/E"]
-    assert found["extrapolated/E_relative_error"] == pytest.approx(abs(found["extrapolated/E"] / 1e5 - 1))
+    assert found["extrapolated/E_relative_error"] == pytest.approx(
+        abs(found["extrapolated/E"] / 1e5 - 1)
+    )
     law = run.body.material.law
     lines = continued_text(found | {f"id/{name}": 1.0 for name in ("E", "nu")}, law).splitlines()
-    assert lines[0].startswith("On grids of ") and sum(line.startswith("- ") for line in lines) == 2 and not continued_text({}, law)
+    assert (
+        lines[0].startswith("On grids of ")
+        and sum(line.startswith("- ") for line in lines) == 2
+        and not continued_text({}, law)
+    )
 
 
 def test_a_fit_by_adam_cannot_be_continued():
-    stages = [Stage("prior", 5, 0.1, optimizer="gauss_newton"), Stage("joint", 5, 0.1, optimizer="adam")]
+    stages = [
+        Stage("prior", 5, 0.1, optimizer="gauss_newton"),
+        Stage("joint", 5, 0.1, optimizer="adam"),
+    ]
     with pytest.raises(ConfigError, match=r"extrapolate.*fit\.joint\.optimizer=adam"):
         check_can_extrapolate(SimpleNamespace(stages=stages))

@@ -31,7 +31,12 @@ TWIN = functools.cache(twin)
 
 
 def one_message(error: MosaError) -> None:
-    assert str(error) and "Traceback" not in str(error) and str(error).count("\n") == 0 and len(str(error)) < 4000
+    assert (
+        str(error)
+        and "Traceback" not in str(error)
+        and str(error).count("\n") == 0
+        and len(str(error)) < 4000
+    )
 
 
 def configured(config: dict) -> None:
@@ -60,16 +65,25 @@ SHAPES = [{"type": "sphere", "radius": 0.1}, {"type": "box", "size": [0.2, 0.1, 
           {"type": "capsule", "radius": 0.1, "length": 0.2}, {"type": "cylinder", "radius": 0.1, "length": 0.2}]  # fmt: skip
 MORE = {"mode": "separate", "friction": 0.3, "position": [0.0, -0.4, 0.0], "rotation": [0, 0, 1, 30],
         "motion": {"velocity": [0, 1.0, 0], "angular_velocity": [0, 0, 1.0], "times": [0.0]}}  # fmt: skip
-WAY = {"waypoints": [{"time": 0.0, "position": [0, -0.4, 0]}, {"time": 0.1, "position": [0, -0.3, 0], "rotation": [1, 0, 0, 10]}]}
+WAY = {
+    "waypoints": [
+        {"time": 0.0, "position": [0, -0.4, 0]},
+        {"time": 0.1, "position": [0, -0.3, 0], "rotation": [1, 0, 0, 10]},
+    ]
+}
 
 
 @st.composite
 def colliders(draw):
-    item = dict(draw(st.sampled_from(SHAPES))) | {k: v for k, v in MORE.items() if draw(st.booleans())}
+    item = dict(draw(st.sampled_from(SHAPES))) | {
+        k: v for k, v in MORE.items() if draw(st.booleans())
+    }
     if draw(st.integers(0, 3)) == 0:
         item = {k: v for k, v in item.items() if k != "position"} | {"motion": WAY}
     for _ in range(draw(st.integers(0, 2))):
-        item = changed(item, draw(st.sampled_from(places(item))), draw(st.one_of(plain, values, THREE)))
+        item = changed(
+            item, draw(st.sampled_from(places(item))), draw(st.one_of(plain, values, THREE))
+        )
     return item
 
 
@@ -80,7 +94,12 @@ def simulated(body: Twin, **arguments) -> None:
     except (ConfigError, SimulationDiverged) as error:
         one_message(error)
         return
-    for found in (rollout.x, rollout.v, rollout.F, *([rollout.reactions] if rollout.reactions is not None else [])):
+    for found in (
+        rollout.x,
+        rollout.v,
+        rollout.F,
+        *([rollout.reactions] if rollout.reactions is not None else []),
+    ):
         assert bool(torch.isfinite(found).all())
 
 
@@ -95,10 +114,17 @@ def test_colliders(items):
 def test_calls_of_a_twin(data):
     arguments = {"rotation": [0, 0, 1, 30], "position": [0.1, None, 0.0], "height": 0.01, "velocity": [0, -1.0, 0],
                  "angular_velocity": [0, 0, 1.0], "variant": "prior", "frames": 2}  # fmt: skip
-    for name in data.draw(st.lists(st.sampled_from(sorted(arguments)), min_size=1, max_size=2, unique=True)):
+    for name in data.draw(
+        st.lists(st.sampled_from(sorted(arguments)), min_size=1, max_size=2, unique=True)
+    ):
         drawn = data.draw(st.one_of(values, THREE, st.lists(numbers, min_size=4, max_size=4),
                                     st.lists(THREE, min_size=3, max_size=3)))  # fmt: skip
-        if name == "frames" and isinstance(drawn, int) and not isinstance(drawn, bool) and 100 < drawn < 10**8:
+        if (
+            name == "frames"
+            and isinstance(drawn, int)
+            and not isinstance(drawn, bool)
+            and 100 < drawn < 10**8
+        ):
             drawn = 3  # a long rollout is no mistake
         arguments[name] = drawn
     simulated(TWIN(), **arguments)
@@ -109,7 +135,9 @@ def test_calls_of_a_twin(data):
 def test_actions_of_a_stepped_twin(data):
     """A step that is refused moves nothing; one that is not leaves finite numbers."""
     stepped = TWIN()
-    before = stepped.reset(colliders=[SHAPES[0] | {"position": [0.0, -0.4, 0.0], "name": "ball"}], frames=2)
+    before = stepped.reset(
+        colliders=[SHAPES[0] | {"position": [0.0, -0.4, 0.0], "name": "ball"}], frames=2
+    )
     drawn = st.one_of(values, THREE, st.lists(THREE, min_size=3, max_size=3))
     keys = st.sampled_from(["velocity", "angular_velocity", "position", "rotation", "speed"])
     command = data.draw(st.one_of(drawn, st.dictionaries(keys, drawn, max_size=2)))
@@ -165,7 +193,9 @@ def loaded(**keys) -> None:
     except (ConfigError, DataError) as error:
         one_message(error)
         return
-    assert bool(torch.isfinite(scene.images).all()) and bool(torch.isfinite(scene.cameras.w2c).all())
+    assert bool(torch.isfinite(scene.images).all()) and bool(
+        torch.isfinite(scene.cameras.w2c).all()
+    )
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -181,7 +211,11 @@ def test_listings(folders, data):
                            delete=data.draw(st.integers(0, 4)) == 0)  # fmt: skip
     try:
         (folder / file).write_text(json.dumps(document))
-        loaded(format=name, path=str(folder), **{k: v for k, v in KEYS.items() if k in ("gravity", "box", "ground")})
+        loaded(
+            format=name,
+            path=str(folder),
+            **{k: v for k, v in KEYS.items() if k in ("gravity", "box", "ground")},
+        )
     finally:
         (folder / file).write_text(good)
 
@@ -190,7 +224,13 @@ def test_listings(folders, data):
 @examples(30)
 @given(st.data())
 def test_keys_of_a_scene(folders, data):
-    keys = {"format": "transforms", "path": str(folders["transforms"][0]), "root": None, "cache": None, "particles": None} | KEYS
+    keys = {
+        "format": "transforms",
+        "path": str(folders["transforms"][0]),
+        "root": None,
+        "cache": None,
+        "particles": None,
+    } | KEYS
     for _ in range(data.draw(st.integers(1, 2))):
         keys = changed(keys, data.draw(st.sampled_from(places(keys))), data.draw(values))
     loaded(**keys)
@@ -210,7 +250,9 @@ def test_bytes_of_files(folders, tmp_path_factory, data):
     content = bytearray(file.read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    file.write_bytes(content[: data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))])
+    file.write_bytes(
+        content[: data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))]
+    )
     try:
         (read_npz if kind == "npz" else Twin.load)(Path(file))
     except DataError as error:
@@ -219,4 +261,6 @@ def test_bytes_of_files(folders, tmp_path_factory, data):
 
 
 def test_nothing_was_written_beside_the_tests():
-    assert not any(Path(place).exists() for place in ("../../x", "x" * 200, "abc", "${oc.env:HOME}")) or os.getcwd() != str(ROOT)
+    assert not any(
+        Path(place).exists() for place in ("../../x", "x" * 200, "abc", "${oc.env:HOME}")
+    ) or os.getcwd() != str(ROOT)

@@ -32,22 +32,34 @@ from mosa.types import Ground
 def test_more_particles_than_memory_holds_are_refused_with_the_most_that_fit():
     most = machine_memory() / 5e3
     check_particles("simulation.particles", 0.9 * most)
-    with pytest.raises(ConfigError, match=rf"simulation\.particles: expected at most {int(most)}, found"):
+    with pytest.raises(
+        ConfigError, match=rf"simulation\.particles: expected at most {int(most)}, found"
+    ):
         check_particles("simulation.particles", 1.1 * most)
 
 
 def test_walls_beside_a_ground_that_slopes_are_refused_before_the_reconstruction():
     up = torch.tensor([0.5, 0.75**0.5, 0.0])
-    scene = SimpleNamespace(ground=Ground(0.0, "sticky"), gravity=-9.8 * up, up=up, box=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    scene = SimpleNamespace(
+        ground=Ground(0.0, "sticky"),
+        gravity=-9.8 * up,
+        up=up,
+        box=torch.tensor([[-1.0] * 3, [1.0] * 3]),
+    )
     cfg = OmegaConf.create(composed("debug=default", "world.walls={mode: separate}"))
-    with pytest.raises(ConfigError, match=r"plane 0 .*mode sticky.*right angles.*scene\.ground\.mode=touch"):
+    with pytest.raises(
+        ConfigError, match=r"plane 0 .*mode sticky.*right angles.*scene\.ground\.mode=touch"
+    ):
         check_seen(cfg, scene)
 
 
 def test_a_fit_goes_on_from_its_own_checkpoint_alone(tmp_path):
     cut, whole = tmp_path / "cut.ckpt", checkpoint(tmp_path / "whole.ckpt")
     cut.write_bytes(whole.read_bytes()[:3000])
-    for path, message in ((cut, "cut.ckpt is not a readable"), (whole, "expected the parts epoch, global_step")):
+    for path, message in (
+        (cut, "cut.ckpt is not a readable"),
+        (whole, "expected the parts epoch, global_step"),
+    ):
         with pytest.raises(DataError, match=message) as caught:
             check_begin(OmegaConf.create({"ckpt_path": str(path), "resume": "auto"}))
         assert "remove the file, and resume=auto begins the fit anew" in str(caught.value)
@@ -58,10 +70,19 @@ def going_on(**changes):
     """A checkpoint's content that a fit can go on from, with parts of `mosa` in the place of its own."""
     stored = {"epoch": 0, "global_step": 0, "pytorch-lightning_version": "2", "loops": {}, "callbacks": {}, "optimizer_states": [],
               "lr_schedulers": [], "state_dict": {}}  # fmt: skip
-    return stored | {"mosa": {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7, "misfit": 0.01} | changes}
+    return stored | {
+        "mosa": {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7, "misfit": 0.01}
+        | changes
+    }
 
 
-RUNNING = {"iteration": 1, "factors": [1.0], "multiple": 0.0, "noise": [[torch.ones(4)] * 3], "grid": None}
+RUNNING = {
+    "iteration": 1,
+    "factors": [1.0],
+    "multiple": 0.0,
+    "noise": [[torch.ones(4)] * 3],
+    "grid": None,
+}
 CUES = torch.zeros(5, 7, 3)
 
 
@@ -112,12 +133,18 @@ def test_a_checkpoint_of_another_model_is_named(tmp_path):
         check_same(stored, Model("adapter=direct"), "a.ckpt")
     with pytest.raises(DataError, match="expected a body of 27 particles, found 28"):
         check_same({**stored, "mosa": stored["mosa"] | {"particles": 28}}, Model(), "a.ckpt")
-    with pytest.raises(DataError, match=r"mosa\.stage: expected at most 3, the stages of this fit, found 4"):
+    with pytest.raises(
+        DataError, match=r"mosa\.stage: expected at most 3, the stages of this fit, found 4"
+    ):
         check_same({**stored, "mosa": stored["mosa"] | {"stage": 4}}, Model(), "a.ckpt")
     rest = stored["state_dict"]["body.rest"]
     for wrong, message in ((rest.long(), "of whole numbers"), (rest * math.nan, "finite")):
         with pytest.raises(DataError, match=rf"body\.rest: .*{message}"):
-            check_same({**stored, "state_dict": stored["state_dict"] | {"body.rest": wrong}}, Model(), "a.ckpt")
+            check_same(
+                {**stored, "state_dict": stored["state_dict"] | {"body.rest": wrong}},
+                Model(),
+                "a.ckpt",
+            )
 
 
 @pytest.mark.parametrize("text", ["", '{"a":', "[1]", '{"a": [1]}', "null", "[" * 100_000])
@@ -150,17 +177,26 @@ def test_a_video_without_an_ffmpeg_is_refused_before_anything_long(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ConfigError, match=r"evaluation\.video: expected false, or an ffmpeg"):
         check_configuration(values, Path(__file__).parents[1] / "conf")
-    check_configuration(values | {"evaluation": values["evaluation"] | {"video": False}}, Path(__file__).parents[1] / "conf")
+    check_configuration(
+        values | {"evaluation": values["evaluation"] | {"video": False}},
+        Path(__file__).parents[1] / "conf",
+    )
 
 
 def test_a_cache_whose_bits_have_changed_is_made_again(tmp_path, caplog):
     """torch reads a flipped bit as another number."""
     cache = StageCache(tmp_path, {"scene": "a"})
     cache.stage("static", lambda: SPLATS)
-    content, scales = bytearray((cache.folder / "static.pt").read_bytes()), SPLATS["scales"].numpy().tobytes()
+    content, scales = (
+        bytearray((cache.folder / "static.pt").read_bytes()),
+        SPLATS["scales"].numpy().tobytes(),
+    )
     content[content.index(scales) + 1] ^= 1
     (cache.folder / "static.pt").write_bytes(content)
-    assert cache.stage("static", lambda: SPLATS) is SPLATS and "static.pt: cannot be read (other bytes" in caplog.text
+    assert (
+        cache.stage("static", lambda: SPLATS) is SPLATS
+        and "static.pt: cannot be read (other bytes" in caplog.text
+    )
 
 
 def test_a_cache_that_has_all_may_be_read_only(tmp_path, monkeypatch):
@@ -171,30 +207,49 @@ def test_a_cache_that_has_all_may_be_read_only(tmp_path, monkeypatch):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 
     monkeypatch.setattr("mosa.reconstruction.cache.written_whole", refuse)
-    assert StageCache(tmp_path, {"scene": "a"}).stage("static", lambda: pytest.fail("it is there")).keys() == SPLATS.keys()
+    assert (
+        StageCache(tmp_path, {"scene": "a"})
+        .stage("static", lambda: pytest.fail("it is there"))
+        .keys()
+        == SPLATS.keys()
+    )
     with pytest.raises(OSError, match="Read-only"):
         StageCache(tmp_path, {"scene": "b"})
 
 
 def test_a_scene_cannot_name_a_folder_outside_of_the_cache(tmp_path):
-    assert StageCache(tmp_path / "cache", {"scene": "../../evil"}).folder.parent == tmp_path / "cache" / "reconstruction"
+    assert (
+        StageCache(tmp_path / "cache", {"scene": "../../evil"}).folder.parent
+        == tmp_path / "cache" / "reconstruction"
+    )
 
 
 def test_a_giant_picture_is_refused_from_its_header(tmp_path):
     header = struct.pack(">IIBBBBB", 13_000, 13_000, 8, 6, 0, 0, 0)
-    chunk = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 100) + b"IDAT" + bytes(100))
-    with pytest.raises(DataError, match=r"a\.png: expected at most 67 million pixels, found 13000x13000"):
+    chunk = (
+        struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    )
+    (tmp_path / "a.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 100) + b"IDAT" + bytes(100)
+    )
+    with pytest.raises(
+        DataError, match=r"a\.png: expected at most 67 million pixels, found 13000x13000"
+    ):
         read_image(tmp_path / "a.png")
     check_amount(100, 100, 100)
-    with pytest.raises(ConfigError, match=r"scene\.scale: pixels of all pictures: .*found 1e\+06 x 2000 x 2000: lower it"):
+    with pytest.raises(
+        ConfigError,
+        match=r"scene\.scale: pixels of all pictures: .*found 1e\+06 x 2000 x 2000: lower it",
+    ):
         check_amount(10**6, 2000, 2000)
 
 
 @pytest.mark.parametrize("count", ["4000000000000", "-1", "x", "1" * 400])
 def test_a_ply_that_claims_more_than_it_has_is_named(tmp_path, count):
     axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex {count}\n{axes}end_header\n0 0 0\n")
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {count}\n{axes}end_header\n0 0 0\n"
+    )
     with pytest.raises(DataError, match=r"a\.ply: expected a PLY file whose elements fit into its"):
         read_ply(tmp_path / "a.ply")
     with pytest.raises(ConfigError, match=r"a\.ply: expected a PLY file"):
@@ -203,8 +258,13 @@ def test_a_ply_that_claims_more_than_it_has_is_named(tmp_path, count):
 
 def test_a_ply_has_a_byte_for_each_property_of_its_elements(tmp_path):
     many = "".join(f"property double f_{i}\n" for i in range(2000))
-    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 30000\n{many}end_header\n")
-    with pytest.raises(DataError, match=r"a\.ply: expected a PLY file whose elements fit .* found 'element vertex 30000'"):
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 30000\n{many}end_header\n"
+    )
+    with pytest.raises(
+        DataError,
+        match=r"a\.ply: expected a PLY file whose elements fit .* found 'element vertex 30000'",
+    ):
         load_ply(tmp_path / "a.ply")
 
 

@@ -19,16 +19,30 @@ def imported(source: str, modules: set[str]) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {full if (full := f"{node.module}.{alias.name}") in modules else node.module for alias in node.names}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and (named := NAMED.fullmatch(node.value)):
+            found |= {
+                full if (full := f"{node.module}.{alias.name}") in modules else node.module
+                for alias in node.names
+            }
+        elif (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and (named := NAMED.fullmatch(node.value))
+        ):
             found.add(named[1])
     return found & modules
 
 
 def imports(below: str) -> dict[str, set[str]]:
     """Of every module of mosa in `below`, the modules of mosa it imports."""
-    files = {".".join(p.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): p for p in ROOT.rglob("*.py")}
-    return {name: imported(path.read_text(), set(files)) - {name} for name, path in files.items() if name.startswith(below)}
+    files = {
+        ".".join(p.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): p
+        for p in ROOT.rglob("*.py")
+    }
+    return {
+        name: imported(path.read_text(), set(files)) - {name}
+        for name, path in files.items()
+        if name.startswith(below)
+    }
 
 
 def circles(graph: dict[str, set[str]]) -> list[str]:
@@ -68,7 +82,10 @@ def f():
 
 def test_there_is_no_import_circle():
     graph = imports("mosa")
-    assert "mosa.training.lit_mosa" in graph["mosa.training.assembly"] and "mosa.data.formats.pacnerf" in graph["mosa.data.scene"]
+    assert (
+        "mosa.training.lit_mosa" in graph["mosa.training.assembly"]
+        and "mosa.data.formats.pacnerf" in graph["mosa.data.scene"]
+    )
     assert len(graph) > 150
     assert circles(graph) == []
 
@@ -77,8 +94,17 @@ def test_the_physics_knows_nothing_of_learning():
     everything = imports("mosa.physics.")
     # ply: which files of points are safe to read; schema: kinds of single values; threads, limits: of the machine; exact_sums:
     # of kernels
-    allowed = ("mosa.physics", "mosa.errors", "mosa.types", "mosa.system.ply", "mosa.schema", "mosa.system.threads",
-               "mosa.system.limits", "mosa.physics.exact_sums")
-    outside = {name: {f for f in found if not f.startswith(allowed)}
-               for name, found in everything.items()}
+    allowed = (
+        "mosa.physics",
+        "mosa.errors",
+        "mosa.types",
+        "mosa.system.ply",
+        "mosa.schema",
+        "mosa.system.threads",
+        "mosa.system.limits",
+        "mosa.physics.exact_sums",
+    )
+    outside = {
+        name: {f for f in found if not f.startswith(allowed)} for name, found in everything.items()
+    }
     assert {name: found for name, found in outside.items() if found} == {}

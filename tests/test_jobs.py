@@ -23,7 +23,16 @@ from mosa.errors import ConfigError
 from mosa.system import refused
 from mosa.system.npz import write_npz
 from mosa.training import jobs
-from mosa.training.jobs import LONGEST, Failures, attempt, check_files, check_folders, folder_name, held, quoted
+from mosa.training.jobs import (
+    LONGEST,
+    Failures,
+    attempt,
+    check_files,
+    check_folders,
+    folder_name,
+    held,
+    quoted,
+)
 
 ROOT = Path(__file__).parents[1]
 
@@ -52,7 +61,10 @@ def test_a_sweep_counts_the_jobs_that_failed_in_this_sweep(sweep, tmp_path, caps
     assert Failures.count == 0
     assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
     counter.on_multirun_end(sweep)
-    assert Failures.count == 1 and "1 jobs of the sweep failed:\n  3: ConfigError: seed: wrong" in capsys.readouterr().err
+    assert (
+        Failures.count == 1
+        and "1 jobs of the sweep failed:\n  3: ConfigError: seed: wrong" in capsys.readouterr().err
+    )
     counter.on_multirun_start(sweep)  # the same command again, in which the job succeeds
     counter.on_multirun_end(sweep)
     assert Failures.count == 0
@@ -67,11 +79,18 @@ def test_a_mistake_of_the_program_is_not_swallowed(sweep):
 
 def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
     """Two runs in one folder mixed their checkpoints and figures without a word."""
-    code = (f"import time; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
-            "    time.sleep(60)")
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT) as other:
+    code = (
+        f"import time; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+        "    time.sleep(60)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    ) as other:
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(ConfigError, match=r"hydra\.run\.dir: another process is at work in"), held(tmp_path):
+        with (
+            pytest.raises(ConfigError, match=r"hydra\.run\.dir: another process is at work in"),
+            held(tmp_path),
+        ):
             pass
         other.kill()
         other.wait()
@@ -80,10 +99,14 @@ def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_folder(tmp_path, caplog):
+def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_folder(
+    tmp_path, caplog
+):
     """A worker that outlived its killed sweep made the job of the sweep that was given again fail."""
-    code = (f"import sys; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
-            "    sys.stdin.read()\n    print('ended', flush=True)")
+    code = (
+        f"import sys; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+        "    sys.stdin.read()\n    print('ended', flush=True)"
+    )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], **pipes, text=True, cwd=ROOT) as other:
         assert other.stdout.readline() == "held\n"
@@ -97,7 +120,8 @@ def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_fol
 def test_a_worker_ends_once_its_launcher_is_gone_and_its_job_is_over(tmp_path):
     """Those of a killed sweep of joblib stayed, with a gigabyte each."""
     worker = tmp_path / "worker.py"
-    worker.write_text(textwrap.dedent(f"""
+    worker.write_text(
+        textwrap.dedent(f"""
         import os, pathlib, threading, time
         from mosa.training.jobs import at_work, leave_after
         here = pathlib.Path({str(tmp_path)!r})
@@ -108,20 +132,32 @@ def test_a_worker_ends_once_its_launcher_is_gone_and_its_job_is_over(tmp_path):
         (here / "done").touch()
         at_work.clear()
         time.sleep(60)
-    """))
+    """)
+    )
     code = f"import subprocess, sys, time; subprocess.Popen([sys.executable, {str(worker)!r}]); time.sleep(60)"
-    with subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}) as launcher:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}
+    ) as launcher:
         while not (tmp_path / "started").is_file() or not (tmp_path / "started").read_text():
             time.sleep(0.05)
         launcher.kill()
-    state, until = Path("/proc") / (tmp_path / "started").read_text() / "stat", time.monotonic() + 20
-    while state.is_file() and " Z " not in state.read_text() and time.monotonic() < until:  # Z: nobody asked how it ended
+    state, until = (
+        Path("/proc") / (tmp_path / "started").read_text() / "stat",
+        time.monotonic() + 20,
+    )
+    while (
+        state.is_file() and " Z " not in state.read_text() and time.monotonic() < until
+    ):  # Z: nobody asked how it ended
         time.sleep(0.05)
     assert time.monotonic() < until and (tmp_path / "done").is_file()
 
 
-@pytest.mark.parametrize("run, launched", [(RunMode.RUN, False), (RunMode.MULTIRUN, False), (RunMode.MULTIRUN, True)])
-def test_who_launched_a_sweep_does_not_leave_with_its_own_launcher(sweep, monkeypatch, run, launched):
+@pytest.mark.parametrize(
+    "run, launched", [(RunMode.RUN, False), (RunMode.MULTIRUN, False), (RunMode.MULTIRUN, True)]
+)
+def test_who_launched_a_sweep_does_not_leave_with_its_own_launcher(
+    sweep, monkeypatch, run, launched
+):
     """A shell, say, that nohup outlives: only a launcher's workers do, whose first act is a job of a sweep."""
     HydraConfig.get().mode, left = run, []
     monkeypatch.setattr(HydraConfig, "initialized", staticmethod(lambda: True))
@@ -134,14 +170,19 @@ def test_who_launched_a_sweep_does_not_leave_with_its_own_launcher(sweep, monkey
 
 def test_runs_that_begin_in_the_same_second_have_a_folder_each():
     """Of two commands given in one line the second was refused: another process was at work in its folder."""
-    folder = (ROOT / "conf" / "hydra" / "default.yaml").read_text().split("${now:", 2)[2].split("}")[0]
+    folder = (
+        (ROOT / "conf" / "hydra" / "default.yaml").read_text().split("${now:", 2)[2].split("}")[0]
+    )
     began = datetime(2026, 1, 2, 3, 4, 5, 6)
     assert began.strftime(folder) != (began + timedelta(milliseconds=1)).strftime(folder)
 
 
 def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, capsys):
     attempt(lambda _: write_npz(tmp_path / "gone" / "observed.npz", {}), None)
-    assert "observed.npz" in (said := capsys.readouterr().err) and "its folder has been removed meanwhile" in said
+    assert (
+        "observed.npz" in (said := capsys.readouterr().err)
+        and "its folder has been removed meanwhile" in said
+    )
     with pytest.raises(FileNotFoundError):  # a file that is not there is the program's
         attempt(lambda _: (tmp_path / "none").read_text(), None)
 
@@ -171,9 +212,14 @@ def test_what_the_machine_has_not_is_one_message(sweep, capsys, error):
         attempt(fail(RuntimeError("another one")), None)
 
 
-def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alone(sweep, capsys, monkeypatch):
+def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alone(
+    sweep, capsys, monkeypatch
+):
     """Warp raises a plain Exception for a module that finds no room, cuBLAS says that it is not initialised."""
-    for error in (Exception("Failed to load CUDA module 'p2g'"), RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED")):
+    for error in (
+        Exception("Failed to load CUDA module 'p2g'"),
+        RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED"),
+    ):
         monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
         attempt(fail(error), None)
         assert "the GPU has no memory left" in capsys.readouterr().err
@@ -182,7 +228,9 @@ def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alo
             with pytest.raises(type(error)):
                 attempt(fail(error), None)
     monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
-    with pytest.raises(ZeroDivisionError):  # a mistake of the program stays one, full as the GPU may be
+    with pytest.raises(
+        ZeroDivisionError
+    ):  # a mistake of the program stays one, full as the GPU may be
         attempt(lambda _: 1 / 0, None)
 
 
@@ -190,16 +238,23 @@ def test_a_warning_that_was_made_an_error_is_one_message(sweep, capsys):
     """PYTHONWARNINGS=error, as continuous integrations set it: Python raises it wherever it arises."""
     attempt(fail(UserWarning("simulation.particles: thin parts")), None)
     said = capsys.readouterr().err.strip()
-    assert said.startswith("UserWarning: simulation.particles: thin parts") and "PYTHONWARNINGS" in said
+    assert (
+        said.startswith("UserWarning: simulation.particles: thin parts")
+        and "PYTHONWARNINGS" in said
+    )
 
 
 def test_a_message_about_memory_names_the_checkpoint_that_is_kept(tmp_path):
     assert refused.explained(MemoryError(), tmp_path) == refused.explained(MemoryError())
     (tmp_path / refused.LAST).parent.mkdir()
     (tmp_path / refused.LAST).write_text("")
-    assert f"the fit is kept in {tmp_path / refused.LAST}" in refused.explained(MemoryError(), tmp_path)
+    assert f"the fit is kept in {tmp_path / refused.LAST}" in refused.explained(
+        MemoryError(), tmp_path
+    )
     assert refused.explained(ValueError("x"), tmp_path) is None
-    assert "simulation.particles" in refused.explained(OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)))
+    assert "simulation.particles" in refused.explained(
+        OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+    )
 
 
 def test_a_long_name_is_cut_and_stays_its_own():
@@ -231,13 +286,20 @@ def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, c
     for wrong in ("file", "file/below"):
         with pytest.raises(SystemExit) as ended:
             check_folders(["seed=0", f"hydra.run.dir={tmp_path}/{wrong}"])
-        assert ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+        assert (
+            ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+        )
     if Path("/proc/self").is_dir():  # for root it has all rights
         with pytest.raises(SystemExit):
             check_folders(["hydra.run.dir=/proc/mosa"])
-        assert "hydra.run.dir: expected a folder that can be made, found /proc/mosa: /proc: " in capsys.readouterr().err
+        assert (
+            "hydra.run.dir: expected a folder that can be made, found /proc/mosa: /proc: "
+            in capsys.readouterr().err
+        )
     assert [file.name for file in tmp_path.iterdir()] == ["file"]
-    with pytest.raises(SystemExit):  # a shell's variable that is not set: the run would lie among the program's files
+    with pytest.raises(
+        SystemExit
+    ):  # a shell's variable that is not set: the run would lie among the program's files
         check_folders(["hydra.run.dir="])
     assert "hydra.run.dir: expected a folder, found nothing" in capsys.readouterr().err
 
@@ -248,11 +310,24 @@ def test_jobs_of_a_sweep_have_a_folder_each(capsys):
     check_folders(["hydra.sweep.subdir=here"])
     with pytest.raises(SystemExit) as ended:
         check_folders(["--multirun", "seed=0,1", "hydra.sweep.subdir=here"])
-    assert ended.value.code == 2 and "hydra.sweep.subdir: expected a name that is another one" in capsys.readouterr().err
+    assert (
+        ended.value.code == 2
+        and "hydra.sweep.subdir: expected a name that is another one" in capsys.readouterr().err
+    )
 
 
-@pytest.mark.parametrize("name", ["train.log", "metrics.json", "checkpoints/last.ckpt", "results.md", "rollout.npz", "checkpoints",
-                                  ".hydra"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "train.log",
+        "metrics.json",
+        "checkpoints/last.ckpt",
+        "results.md",
+        "rollout.npz",
+        "checkpoints",
+        ".hydra",
+    ],
+)
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "nothing"])
 def test_what_is_no_file_of_a_run_is_said_before_it_begins(tmp_path, capsys, name, kind):
     """A pipe in the place of the log was waited for without end, a folder in that of a table ended a run when all was done."""
@@ -270,12 +345,21 @@ def test_what_is_no_file_of_a_run_is_said_before_it_begins(tmp_path, capsys, nam
         return
     with pytest.raises(SystemExit) as ended:
         check_folders([f"hydra.run.dir={tmp_path}/run"])
-    assert ended.value.code == 2 and f"{name}: expected what a run has there" in capsys.readouterr().err
+    assert (
+        ended.value.code == 2
+        and f"{name}: expected what a run has there" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("arguments", [["banana"], ["banana=3"], ["scene=banana"]])
 def test_what_hydra_refuses_is_a_mistake_of_the_user_too(arguments):
-    found = subprocess.run([sys.executable, "train.py", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    found = subprocess.run(
+        [sys.executable, "train.py", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert found.returncode == 2 and "Traceback" not in found.stderr
 
 
@@ -291,9 +375,18 @@ PROGRAM = """
 
 @pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
 def test_a_stop_says_how_to_go_on(name, code):
-    found = subprocess.run([sys.executable, "-c", textwrap.dedent(PROGRAM.format(name=name))], cwd=ROOT, capture_output=True,
-                           text=True, timeout=60)
-    assert found.returncode == code and "stopped; resume with" in found.stderr and "Traceback" not in found.stderr
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(PROGRAM.format(name=name))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (
+        found.returncode == code
+        and "stopped; resume with" in found.stderr
+        and "Traceback" not in found.stderr
+    )
 
 
 @pytest.mark.parametrize("name", ["TERM", "INT"])
@@ -308,8 +401,20 @@ def test_a_second_stop_on_the_way_out_is_no_traceback(name):
 
 def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    keys = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}", "debug=default", "seed=-1,-2"]
-    found = subprocess.run([sys.executable, "train.py", "-m", *keys], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    keys = [
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        f"hydra.sweep.dir={tmp_path}",
+        "debug=default",
+        "seed=-1,-2",
+    ]
+    found = subprocess.run(
+        [sys.executable, "train.py", "-m", *keys],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert found.returncode == 1 and "2 jobs of the sweep failed" in found.stderr
 
 
@@ -327,12 +432,19 @@ OUTLIVED = """
 """
 
 
-@pytest.mark.parametrize("shell", ["{} 2>&1 | head -1", "{} | head -1", "{} >&- 2>&-", "{} > /dev/full 2>&1"])
+@pytest.mark.parametrize(
+    "shell", ["{} 2>&1 | head -1", "{} | head -1", "{} >&- 2>&-", "{} > /dev/full 2>&1"]
+)
 def test_a_run_outlives_whoever_reads_its_lines(tmp_path, shell):
     """`| head -1` ended a run without a word, and printed hundreds of tracebacks where the reader of the output alone had gone."""
     done = tmp_path / "done"
     program = f"{sys.executable} -c {shlex.quote(textwrap.dedent(OUTLIVED.format(done=str(done))))}"
-    found = subprocess.run(["bash", "-o", "pipefail", "-c", shell.format(program)], cwd=ROOT, capture_output=True, text=True)
+    found = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", shell.format(program)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert found.returncode == 0 and done.is_file() and "Error" not in found.stderr
     assert found.stdout.count("\n") <= 1
 
@@ -342,7 +454,9 @@ def test_a_working_folder_that_is_gone_is_said(tmp_path):
     command = f"cd {tmp_path}/gone && rmdir ../gone && exec {sys.executable} {ROOT}/train.py debug=default"
     found = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, cwd=ROOT,
                            env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
-    assert found.returncode == 2 and "the folder that this was started in is no more" in found.stderr
+    assert (
+        found.returncode == 2 and "the folder that this was started in is no more" in found.stderr
+    )
     assert "Traceback" not in found.stderr
 
 
@@ -353,13 +467,17 @@ def test_a_stop_before_the_first_job_is_no_traceback():
         signal.signal(signal.SIGINT, signal.default_int_handler)
         run_command(lambda: os.kill(os.getpid(), signal.SIGINT), "conf")
     """)
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
     assert found.returncode == 130 and found.stderr.strip() == "stopped"
 
 
 @pytest.mark.parametrize(("times", "imported"), [(1, True), (2, False)])
 @pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
-def test_a_stop_waits_for_the_imports_and_a_second_one_does_not(tmp_path, name, code, times, imported):
+def test_a_stop_waits_for_the_imports_and_a_second_one_does_not(
+    tmp_path, name, code, times, imported
+):
     """Ctrl-C in the middle of an extension's import aborted the interpreter, with a traceback."""
     (tmp_path / "slow_module.py").write_text(f"""
 import os, signal
@@ -379,12 +497,15 @@ print("imported", flush=True)
     """
     found = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, capture_output=True, text=True,
                            timeout=60, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"})  # fmt: skip
-    assert found.returncode == code and "Traceback" not in found.stderr and "stopped" in found.stderr
+    assert (
+        found.returncode == code and "Traceback" not in found.stderr and "stopped" in found.stderr
+    )
     assert found.stdout == ("imported\n" if imported else "")
 
 
 def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkeypatch):
     """A worker of a launcher whose screen had gone ended in a broken pipe, and the sweep did not say why its job had failed."""
+
     class Gone(io.StringIO):
         def write(self, text):
             raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
@@ -416,7 +537,10 @@ def test_yaml_that_cannot_be_read_is_named_with_its_file(tmp_path, capsys, text,
             check_files([*told, named], ROOT / "conf")
         assert ended.value.code == 2
         said = capsys.readouterr().err.strip()
-        assert said.startswith(f"ConfigError: {tmp_path}/experiment/mine.yaml: expected YAML") and message in said
+        assert (
+            said.startswith(f"ConfigError: {tmp_path}/experiment/mine.yaml: expected YAML")
+            and message in said
+        )
 
 
 @pytest.mark.parametrize(("ending", "damage"), [
@@ -426,7 +550,8 @@ def test_yaml_that_cannot_be_read_is_named_with_its_file(tmp_path, capsys, text,
 ])  # fmt: skip
 def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
     """As a killed compiler or a full disk leave them; in a process of its own, as a kernel that is loaded stays so."""
-    (tmp_path / "kernel.py").write_text(textwrap.dedent("""
+    (tmp_path / "kernel.py").write_text(
+        textwrap.dedent("""
         import warp as wp
         from mosa.system import refused
         wp.config.kernel_cache_dir = "kernels"
@@ -441,11 +566,21 @@ def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
             print(refused.explained(error))
         else:
             print("ran")
-    """))
+    """)
+    )
 
     def launched() -> str:
-        places = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-        told = subprocess.run([sys.executable, "kernel.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120, env=places)
+        places = os.environ | {
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+        }
+        told = subprocess.run(
+            [sys.executable, "kernel.py"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env=places,
+        )
         return told.stdout.strip().splitlines()[-1]
 
     assert launched() == "ran"
@@ -459,4 +594,6 @@ def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
 
 def test_what_a_compiler_refuses_is_no_damaged_kernel():
     """A mistake of the program keeps its traceback."""
-    assert refused.explained(RuntimeError("Failed to load CPU module 'm'")) is None  # not from where Warp loads
+    assert (
+        refused.explained(RuntimeError("Failed to load CPU module 'm'")) is None
+    )  # not from where Warp loads

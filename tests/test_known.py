@@ -37,7 +37,9 @@ def test_every_key_of_every_file_is_known():
         found = {k: v for k, v in (yaml.safe_load(text) or {}).items() if k != "defaults"}
         if file.parent.name == "hydra":
             continue
-        for path in paths(found if "@package _global_" in text.splitlines()[0] else {file.parent.name: found}):
+        for path in paths(
+            found if "@package _global_" in text.splitlines()[0] else {file.parent.name: found}
+        ):
             assert path in known, (file, path)
 
 
@@ -63,13 +65,31 @@ def test_an_unknown_key_is_refused_with_the_nearest(override, nearest):
     values = copy.deepcopy(composed())
     part = functools.reduce(dict.__getitem__, key.split(".")[:-1], values)
     part[key.split(".")[-1]] = 1
-    with pytest.raises(ConfigError, match=rf"^{key}: unknown key; the nearest known one is {nearest}"):
+    with pytest.raises(
+        ConfigError, match=rf"^{key}: unknown key; the nearest known one is {nearest}"
+    ):
         check_known(values, CONF, "train", TRAINING, EVALUATION)
 
 
-@pytest.mark.parametrize("key", ["seed", "scene", "adapter", "fit", "fit.views", "fit.prior", "world.colliders", "losses",
-                                 "trainer", "simulation.stride", "rendering.backend", "identification.tolerance",
-                                 "logger", "resume"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        "seed",
+        "scene",
+        "adapter",
+        "fit",
+        "fit.views",
+        "fit.prior",
+        "world.colliders",
+        "losses",
+        "trainer",
+        "simulation.stride",
+        "rendering.backend",
+        "identification.tolerance",
+        "logger",
+        "resume",
+    ],
+)
 def test_a_key_that_was_deleted_is_named(key):
     values = copy.deepcopy(composed())
     *above, last = key.split(".")
@@ -84,11 +104,26 @@ def test_a_key_that_was_deleted_is_named(key):
 def test_eval_has_its_own_keys():
     values = composed("ckpt_path=a", name="eval")
     check_known(values, CONF, "eval", EVALUATION, SIMULATION)
-    with pytest.raises(ConfigError, match=r"^simulate\.hight: unknown key; the nearest known one is simulate\.height"):
-        check_known(values | {"simulate": values["simulate"] | {"hight": 1}}, CONF, "eval", EVALUATION, SIMULATION)
+    with pytest.raises(
+        ConfigError,
+        match=r"^simulate\.hight: unknown key; the nearest known one is simulate\.height",
+    ):
+        check_known(
+            values | {"simulate": values["simulate"] | {"hight": 1}},
+            CONF,
+            "eval",
+            EVALUATION,
+            SIMULATION,
+        )
 
 
 def test_a_group_without_an_option_is_one_message():
-    found = subprocess.run([sys.executable, "train.py", "adapter=null"], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    found = subprocess.run(
+        [sys.executable, "train.py", "adapter=null"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert found.returncode == 2 and "ConfigError: adapter: expected one of direct" in found.stderr
     assert "Traceback" not in found.stderr

@@ -28,7 +28,9 @@ def block(shape=(0.2, 0.14, 0.1), color=(0.7, 0.4, 0.3), spacing=0.01):
 
 def at(degrees, height=0.4):
     angle = math.radians(degrees)
-    turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    turn = torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    )
     return Start(turn.float(), torch.tensor([0.0, height, 0.0]), torch.zeros(3), torch.zeros(3))
 
 
@@ -45,7 +47,11 @@ def film(scene, body, start, factor=1.0):
     mattes = 1 - (white - black).mean(-1)
     frames = scene.frames
     images = factor * black + (1 - mattes)[..., None] * scene.background
-    return replace(scene, images=images.expand(-1, frames, -1, -1, -1).clone(), mattes=mattes.expand(-1, frames, -1, -1).clone())
+    return replace(
+        scene,
+        images=images.expand(-1, frames, -1, -1, -1).clone(),
+        mattes=mattes.expand(-1, frames, -1, -1).clone(),
+    )
 
 
 def told(*given):
@@ -77,14 +83,18 @@ def test_another_body_light_or_pose_is_said(cameras, change, said):
     assert len(found) == (said is not None), found
     if said:
         with pytest.warns(UserWarning, match=said):
-            warn_of_others(body, {"train": at(0), "test/h": at(change.get("start", 40))}, [own, other])
+            warn_of_others(
+                body, {"train": at(0), "test/h": at(change.get("start", 40))}, [own, other]
+            )
 
 
 def test_without_the_training_film_a_body_is_compared_with_what_is_usual(cameras):
     """eval.py on another scene."""
     body = block()
     assert told(body, {"test/h": at(40)}, [film(cameras, body, at(40))]) == []
-    assert len(told(body, {"test/h": at(40)}, [film(cameras, block((0.16, 0.16, 0.16)), at(40))])) == 1
+    assert (
+        len(told(body, {"test/h": at(40)}, [film(cameras, block((0.16, 0.16, 0.16)), at(40))])) == 1
+    )
 
 
 @pytest.mark.parametrize(("frames", "held_out", "colliders", "said"), [

@@ -39,7 +39,9 @@ def test_sizes_are_compared_before_they_can_wrap(sizes):
 
 
 def test_sizes_that_fit_are_whole_numbers():
-    assert counted("lattice", torch.tensor([3.0, 4.0, 5.0]), "") == (3, 4, 5) and counted("all", (6, 7), "", most=42) == (6, 7)
+    assert counted("lattice", torch.tensor([3.0, 4.0, 5.0]), "") == (3, 4, 5) and counted(
+        "all", (6, 7), "", most=42
+    ) == (6, 7)
     with pytest.raises(ConfigError, match="expected at most 41, found 6 x 7"):
         counted("all", (6, 7), "", most=41)
 
@@ -56,12 +58,25 @@ def pictures(side: int, images: int):
     K = torch.eye(3).expand(images, 3, 3)
     cameras = Cameras(K, torch.eye(4).expand(images, 4, 4), side, side, ("a",) * images)
     one = torch.ones(1, 1, 3)
-    return rasterize(one, torch.eye(3)[None, None], one[0, :, 0], one, cameras, torch.zeros(images, dtype=torch.long))
+    return rasterize(
+        one,
+        torch.eye(3)[None, None],
+        one[0, :, 0],
+        one,
+        cameras,
+        torch.zeros(images, dtype=torch.long),
+    )
 
 
 def far_apart(size: float) -> Splats:
     means = size * torch.linspace(-1, 1, 300).view(100, 3)
-    return Splats(means, torch.ones(100, 3), torch.tensor([[1.0, 0, 0, 0]]).expand(100, 4), torch.ones(100), torch.ones(100, 3))
+    return Splats(
+        means,
+        torch.ones(100, 3),
+        torch.tensor([[1.0, 0, 0, 0]]).expand(100, 4),
+        torch.ones(100),
+        torch.ones(100, 3),
+    )
 
 
 @pytest.mark.parametrize("ask, message", [
@@ -94,7 +109,10 @@ def test_a_window_of_any_speed_is_refused_by_its_nodes(speed, first):
     x = torch.rand(4, 3, generator=torch.Generator().manual_seed(0)).double()
     v = torch.zeros_like(x)
     v[:first] = speed
-    with pytest.raises(SimulationDiverged, match=r"particles spread over .* grid nodes of 0\.01 m, to .* \(speeds to"):
+    with pytest.raises(
+        SimulationDiverged,
+        match=r"particles spread over .* grid nodes of 0\.01 m, to .* \(speeds to",
+    ):
         grid_window(x, v, 0.01, 1.0, 2)
     with pytest.raises(SimulationDiverged, match=r"from the origin|spread over"):
         grid_window(x * speed, 0 * v, 0.01, 1.0, 2, bounds=extent(x * speed, 0 * v).numpy())

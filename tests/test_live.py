@@ -26,10 +26,20 @@ def twin(**settings) -> Twin:
     n = len(rest)
     tensors = {"rest": rest, "volume": torch.full((n,), SPACING**3), "colors": torch.full((n, 3), 0.25),
                "opacities": torch.full((n,), 0.9), "covariances": 1e-4 * torch.eye(3).expand(n, 3, 3).clone()}  # fmt: skip
-    world = {"ground": {"height": 0.0}, "gravity": [0, -9.8, 0], "up": [0, 1, 0], "box": [[-0.6, -0.1, -0.6], [0.6, 1.1, 0.6]]}
+    world = {
+        "ground": {"height": 0.0},
+        "gravity": [0, -9.8, 0],
+        "up": [0, 1, 0],
+        "box": [[-0.6, -0.1, -0.6], [0.6, 1.1, 0.6]],
+    }
     body = Body(**tensors, density=1000.0, material=Material("neo_hookean", {"E": 2e4, "nu": 0.3}), heterogeneity=None,
                 adapter=None, settings=SimulationSettings(dx=DX, **settings))  # fmt: skip
-    start = Start(torch.eye(3), torch.tensor([0.0, 0.04 + START, 0.0]), torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3))
+    start = Start(
+        torch.eye(3),
+        torch.tensor([0.0, 0.04 + START, 0.0]),
+        torch.tensor([0.0, -1.0, 0.0]),
+        torch.zeros(3),
+    )
     return Twin(body.eval(), build_world(world), DT, {}, start)
 
 
@@ -46,7 +56,11 @@ class Drawn:
 
 def test_it_begins_where_the_training_did_and_drops_as_it_is_told():
     live = Live(twin())
-    assert live.drop_as.height == pytest.approx(START, abs=1e-6) and not live.running and live.message == ""
+    assert (
+        live.drop_as.height == pytest.approx(START, abs=1e-6)
+        and not live.running
+        and live.message == ""
+    )
     live.change(height=0.2, tilt=90, speed=0.5, spin=0.25)
     assert live.drop() and live.running
     x = live.positions.numpy()
@@ -101,7 +115,9 @@ def test_a_ball_inside_of_the_body_goes_home():
     live = Live(twin())
     live.target = np.array([0.0, START + 0.04, 0.0])
     assert live.drop() and live.message == ""
-    assert np.linalg.norm(live.positions.numpy() - live.hand_position, axis=1).min() > live.radius + DX
+    assert (
+        np.linalg.norm(live.positions.numpy() - live.hand_position, axis=1).min() > live.radius + DX
+    )
     assert np.allclose(live.hand_position, live.home())
 
 
@@ -114,7 +130,10 @@ def test_a_motion_that_diverges_stops_with_a_message_and_the_next_drop_goes_on()
         shown = live.positions.numpy()
         reached += live.step()
     assert 3 < reached < 60 and not live.running
-    assert live.message.startswith("The simulation diverged at 0.") and "Drop the body again" in live.message
+    assert (
+        live.message.startswith("The simulation diverged at 0.")
+        and "Drop the body again" in live.message
+    )
     assert np.array_equal(live.positions.numpy(), shown) and np.isfinite(shown).all()
     assert not live.step() and "diverged" in live.message
     live.change(speed=0.0)
@@ -124,7 +143,11 @@ def test_a_motion_that_diverges_stops_with_a_message_and_the_next_drop_goes_on()
 def test_a_start_that_cannot_be_is_said_and_what_was_there_stays():
     live = Live(twin())
     live.change(height=float("nan"))
-    assert not live.drop() and live.message.startswith("ConfigError: height: expected") and not live.running
+    assert (
+        not live.drop()
+        and live.message.startswith("ConfigError: height: expected")
+        and not live.running
+    )
     live.change(height=START)
     assert live.drop() and live.message == ""
 
@@ -144,10 +167,14 @@ def test_colours_are_by_stretch_stiffness_and_what_is_known():
     F = torch.eye(3).expand(len(live.arms), 3, 3).clone()
     F[:, 0, 0], F[:10, 1, 1], F[:, 2, 2] = 0.5, 1.3, 1.04
     live.state = SimpleNamespace(F_tot=F, positions=state.positions, time=0.0)
-    assert live.stretch()[:10] == pytest.approx(0.3, abs=1e-6) and live.stretch()[10:] == pytest.approx(0.04, abs=1e-6)
+    assert live.stretch()[:10] == pytest.approx(0.3, abs=1e-6) and live.stretch()[
+        10:
+    ] == pytest.approx(0.04, abs=1e-6)
     colors, scale = live.paint("stretch")
     assert scale.high == 50 and scale.beyond == "max" and not np.allclose(colors[0], colors[-1])
-    live.state = SimpleNamespace(F_tot=torch.eye(3).expand_as(F), positions=state.positions, time=0.0)
+    live.state = SimpleNamespace(
+        F_tot=torch.eye(3).expand_as(F), positions=state.positions, time=0.0
+    )
     assert live.paint("stretch")[1].high == 50  # it does not flicker
     assert live.paint("heterogeneity")[1].low == 0.99  # nothing was learned: no contrast
     colors, scale = live.paint("uncertainty")
@@ -168,7 +195,11 @@ def test_the_uncertainty_is_the_spread_of_drawn_laws_and_grows_from_the_model_s_
     first = live.spread.copy()
     for _ in range(14):
         assert live.step()
-    assert first.shape == (125,) and first.min() >= 1e-3 - 1e-9 and live.spread.max() > 1.2 * first.max()
+    assert (
+        first.shape == (125,)
+        and first.min() >= 1e-3 - 1e-9
+        and live.spread.max() > 1.2 * first.max()
+    )
     colors, scale = live.paint("uncertainty")
     assert scale.label == "predicted standard deviation [mm]" and colors.shape == (125, 3)
     live.others.step = lambda action: (_ for _ in ()).throw(ConfigError("a law of them burst"))
@@ -191,9 +222,15 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         assert shown.server.scene.get_handle_by_name("/ground") is not None
         assert shown.splats.visible and not shown.points.visible
         assert np.allclose(shown.splats.centers * shown.unit, live.positions.numpy(), atol=1e-6)
-        assert shown.uncertain.disabled and shown.sliders["height"].value == pytest.approx(START, abs=1e-6)
+        assert shown.uncertain.disabled and shown.sliders["height"].value == pytest.approx(
+            START, abs=1e-6
+        )
         shown.step()
-        assert live.time == pytest.approx(DT) and not live.running and shown.buttons["pause"].label == "go on"
+        assert (
+            live.time == pytest.approx(DT)
+            and not live.running
+            and shown.buttons["pause"].label == "go on"
+        )
         shown.geometry.value, shown.color.value = "particles", "stretch"
         assert shown.points.visible and not shown.splats.visible and shown.legend.visible
         assert np.allclose(shown.points.points, live.positions.numpy(), atol=1e-6)
@@ -210,15 +247,30 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         time.sleep(0.05)
         assert live.time == at and not live.running
         shown.pushed((0.1, 0.2, 0.3))
-        for place in ((math.nan, 0, 0), (math.inf, 0, 0), (1e300, 0, 0), (1, 2), 3.0, None, ((1, 2, 3),)):
+        for place in (
+            (math.nan, 0, 0),
+            (math.inf, 0, 0),
+            (1e300, 0, 0),
+            (1, 2),
+            3.0,
+            None,
+            ((1, 2, 3),),
+        ):
             shown.pushed(place)  # which no message may make the ball's
         assert live.target == pytest.approx([0.1, 0.2, 0.3])
         assert shown.draggable  # by the viser that the tests ask for
         here = live.hand_position.copy()
-        shown.dragged(SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.003, 0.0, 0.0)))
-        assert live.target == pytest.approx(here + np.array([0.003, 0, 0])) and np.allclose(shown.gizmo.position, live.target)
+        shown.dragged(
+            SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.003, 0.0, 0.0))
+        )
+        assert live.target == pytest.approx(here + np.array([0.003, 0, 0])) and np.allclose(
+            shown.gizmo.position, live.target
+        )
         shown.step()
-        assert np.allclose(shown.ball.position, here + np.array([0.003, 0, 0])) and "on the ball" in shown.caption.content
+        assert (
+            np.allclose(shown.ball.position, here + np.array([0.003, 0, 0]))
+            and "on the ball" in shown.caption.content
+        )
         shown.reset()
         assert live.time == 0 and np.allclose(shown.gizmo.position, live.home())
         shown.sliders["speed"].value = shown.sliders["speed"].max
@@ -266,8 +318,12 @@ def test_it_is_played_with_on_a_gpu_as_on_a_cpu():
         ends[device] = live.positions.cpu().numpy(), live.hand_position
         for by in ("appearance", "stretch", "heterogeneity", "uncertainty"):
             colors, _ = live.paint(by)
-            assert np.isfinite(colors).all() and all(np.isfinite(part).all() for part in live.splats(by, colors))
-        assert live.poses() == [] and "Force on the ball" in live.caption() and live.spread is not None
+            assert np.isfinite(colors).all() and all(
+                np.isfinite(part).all() for part in live.splats(by, colors)
+            )
+        assert (
+            live.poses() == [] and "Force on the ball" in live.caption() and live.spread is not None
+        )
         assert live.reset() and not live.running
         live.state = None
         assert live.positions.shape == (125, 3)

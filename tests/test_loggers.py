@@ -31,7 +31,9 @@ def loggers(folder: Path, *overrides: str) -> list:
 ])  # fmt: skip
 def test_a_group_or_several_name_the_loggers(tmp_path, override, kinds):
     found = loggers(tmp_path, override)
-    assert len(found) == len(kinds) and all(any(isinstance(each, kind) for each in found) for kind in kinds)
+    assert len(found) == len(kinds) and all(
+        any(isinstance(each, kind) for each in found) for kind in kinds
+    )
 
 
 @pytest.mark.parametrize("overrides, message", [
@@ -58,7 +60,9 @@ def test_each_kind_writes_into_the_run_folder(tmp_path):
     again = loggers(tmp_path, "logger=csv")[0]  # of a run that goes on: the table before stays
     again.log_metrics({"loss/total": 0.4}, step=4)
     again.save()
-    assert (tmp_path / "csv" / "version_0" / "metrics.csv").exists() and (tmp_path / "csv" / "version_1" / "metrics.csv").exists()
+    assert (tmp_path / "csv" / "version_0" / "metrics.csv").exists() and (
+        tmp_path / "csv" / "version_1" / "metrics.csv"
+    ).exists()
 
 
 def test_pictures_go_where_they_can_be_seen_and_are_large_enough(tmp_path):
@@ -76,21 +80,32 @@ def scalars_of(folder):
     events = EventAccumulator(str(folder))
     events.Reload()
     tags = events.Tags()["scalars"]
-    return {tag: [(point.step, point.value) for point in events.Scalars(tag)] for tag in tags}, events.summary_metadata
+    return {
+        tag: [(point.step, point.value) for point in events.Scalars(tag)] for tag in tags
+    }, events.summary_metadata
 
 
 def test_curves_carry_their_description(tmp_path):
     (board,) = loggers(tmp_path)
     board.law = "newtonian"
     for step in range(3):
-        board.log_metrics({"id/mu": torch.tensor(200.0 + step), "newton/sd/operator": 0.1, "unheard_of": 1.0}, step=step)
+        board.log_metrics(
+            {"id/mu": torch.tensor(200.0 + step), "newton/sd/operator": 0.1, "unheard_of": 1.0},
+            step=step,
+        )
     board.finalize("success")
     log_outcome([board], {"seed": 4}, {"test/rms_m": 0.01, "id/mu": 210.0, "id/v0_y": -1.0})
     points, about = scalars_of(board.log_dir)
-    assert points["id/mu"] == [(0, 200.0), (1, 201.0), (2, 202.0)]  # the first, which has the description, is one like others
+    assert points["id/mu"] == [
+        (0, 200.0),
+        (1, 201.0),
+        (2, 202.0),
+    ]  # the first, which has the description, is one like others
     assert points["final/id/mu"] == [(0, 210.0)]
     assert about["id/mu"].summary_description == "parameter mu after the step, without eta [Pa s]"
-    assert about["newton/sd/operator"].summary_description.startswith("Gauss-Newton: mean prior standard deviation of the numbers")
+    assert about["newton/sd/operator"].summary_description.startswith(
+        "Gauss-Newton: mean prior standard deviation of the numbers"
+    )
     for figure, unit in (("test/rms_m", "m"), ("id/mu", "Pa s"), ("id/v0_y", "m/s")):
         said = about[f"final/{figure}"].summary_description
         assert said.startswith(f"figure {figure} of `metrics.json`") and said.endswith(f" [{unit}]")

@@ -19,7 +19,11 @@ def rotations(count: int, seed: int) -> torch.Tensor:
 
 def deformations(stretches, count: int = 4, seed: int = 0) -> torch.Tensor:
     """(count, 3, 3) with the given signed singular values and drawn axes."""
-    return rotations(count, seed) @ torch.diag(torch.tensor(stretches, dtype=torch.float64)) @ rotations(count, seed + 1)
+    return (
+        rotations(count, seed)
+        @ torch.diag(torch.tensor(stretches, dtype=torch.float64))
+        @ rotations(count, seed + 1)
+    )
 
 
 def ordered(stretches) -> torch.Tensor:
@@ -55,13 +59,18 @@ def test_flow_does_not_grow_with_resolution():
 def test_weights_select_values():
     values, weight = numbers(2, 5), torch.zeros(2, 5).double()
     weight[1, 3] = 0.7
-    assert losses.weighted_mean(values, weight).item() == pytest.approx(values[1, 3].item(), rel=1e-12)
+    assert losses.weighted_mean(values, weight).item() == pytest.approx(
+        values[1, 3].item(), rel=1e-12
+    )
     assert losses.weighted_mean(values, torch.zeros_like(weight)).item() == 0
 
 
 def test_image_gradients():
     real, flow = numbers(1, 2, 3, 3, 3, seed=1), numbers(1, 2, 3, 3, 2, seed=1)
-    rendered, simulated = numbers(1, 2, 3, 3, 3).requires_grad_(), numbers(1, 2, 3, 3, 2).requires_grad_()
+    rendered, simulated = (
+        numbers(1, 2, 3, 3, 3).requires_grad_(),
+        numbers(1, 2, 3, 3, 2).requires_grad_(),
+    )
     assert gradcheck(lambda x: losses.image_loss(x, real), rendered, **TOLERANCE)
     assert gradcheck(lambda x: losses.mask_loss(x[..., 0], real[..., 0]), rendered, **TOLERANCE)
     assert gradcheck(lambda x: losses.flow_loss(x, flow, 2), simulated, **TOLERANCE)
@@ -91,7 +100,9 @@ def test_polar_rotation(stretches):
 @pytest.mark.parametrize("stretches", [(30.0, 1.0, 1e-3), (1.0, 1e-2, 1e-2), (1e3, 1e3, 1e3)])
 def test_polar_rotation_of_extreme_stretches(stretches):
     U, V = rotations(50, 3), rotations(50, 4)
-    torch.testing.assert_close(losses.polar_rotation(U @ torch.diag(ordered(stretches)) @ V), U @ V, rtol=0, atol=1e-11)
+    torch.testing.assert_close(
+        losses.polar_rotation(U @ torch.diag(ordered(stretches)) @ V), U @ V, rtol=0, atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("stretches", STRETCHES)
@@ -106,21 +117,29 @@ def test_rotation_gradient(stretches):
 def test_rotation_gradient_exactly_at_rest():
     cue = rotations(2, 1).reshape(2, 1, 3, 3)
     F = EYE.expand(2, 1, 3, 3).clone().requires_grad_()
-    assert gradcheck(lambda F: losses.rotation_loss(F, cue, torch.ones(2, 1).double(), EYE), F, **TOLERANCE)
+    assert gradcheck(
+        lambda F: losses.rotation_loss(F, cue, torch.ones(2, 1).double(), EYE), F, **TOLERANCE
+    )
 
 
 def test_rotation_value_is_the_angle_apart_from_the_start():
     angle = 0.4
-    spin = torch.matrix_exp(torch.tensor([[0, -angle, 0], [angle, 0, 0], [0, 0, 0]], dtype=torch.float64))
+    spin = torch.matrix_exp(
+        torch.tensor([[0, -angle, 0], [angle, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    )
     Q = rotations(1, 2)[0]
     W = torch.diag(ordered((1.3, 1.0, 0.8)))
-    F = torch.stack([Q, Q @ W])[:, None]  # the body stretches and does not turn; the cue says it turned by `angle`
+    F = torch.stack([Q, Q @ W])[
+        :, None
+    ]  # the body stretches and does not turn; the cue says it turned by `angle`
     cue = torch.stack([EYE, spin])[:, None]
     loss = losses.rotation_loss(F, cue, torch.ones(2, 1).double(), Q)
     assert loss.item() == pytest.approx(4 * (1 - math.cos(angle)), rel=1e-12)
     aligned = torch.stack([Q, spin @ Q @ W])[:, None]
     assert losses.rotation_loss(aligned, cue, torch.ones(2, 1).double(), Q).item() < 1e-25
-    assert losses.rotation_loss(aligned, cue, torch.ones(2, 1).double(), EYE).item() > 0.1  # the start matters
+    assert (
+        losses.rotation_loss(aligned, cue, torch.ones(2, 1).double(), EYE).item() > 0.1
+    )  # the start matters
 
 
 def test_first_frame_and_inverted_particles_have_no_weight():
@@ -144,7 +163,9 @@ def test_a_broken_particle_is_not_hidden(value):
     F[1, 1, 0, 0] = value
     weight = torch.ones(2, 3).double()
     assert not torch.isfinite(losses.rotation_loss(F, EYE.expand(2, 3, 3, 3), weight, EYE))
-    assert not torch.isfinite(losses.stretch_loss(F, ordered((1.2, 1.0, 0.9)).expand(2, 3, 3), weight))
+    assert not torch.isfinite(
+        losses.stretch_loss(F, ordered((1.2, 1.0, 0.9)).expand(2, 3, 3), weight)
+    )
 
 
 # --- stretch --------------------------------------------------------------------------------------------------------
@@ -153,10 +174,14 @@ def test_a_broken_particle_is_not_hidden(value):
 @pytest.mark.parametrize("stretches", [*STRETCHES, (1.2, 0.8, -0.3), (0.5, 0.5, -0.5)])
 def test_stretches_are_sorted_and_signed(stretches):
     F = deformations(stretches, 30)
-    torch.testing.assert_close(losses.stretches(F), ordered(stretches).expand(30, 3), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        losses.stretches(F), ordered(stretches).expand(30, 3), rtol=0, atol=1e-9
+    )
 
 
-@pytest.mark.parametrize("stretches", [(1.3, 1.0, 0.7), (1.01, 1.005, 0.99), (3.0, 1.0, 0.1), (1.2, 0.8, -0.3)])
+@pytest.mark.parametrize(
+    "stretches", [(1.3, 1.0, 0.7), (1.01, 1.005, 0.99), (3.0, 1.0, 0.1), (1.2, 0.8, -0.3)]
+)
 def test_stretch_gradient(stretches):
     F = deformations(stretches)
     cue = ordered((1.1, 1.02, 0.9)).expand(2, 4, 3)
@@ -186,7 +211,9 @@ def test_stretch_loss_at_rest_is_finite(dtype):
     cue = ordered((1.1, 1.0, 0.9)).to(dtype).expand(2, 50, 3)
     loss = losses.stretch_loss(F, cue, torch.ones(2, 50, dtype=dtype))
     loss.backward()
-    assert loss.item() == pytest.approx(1 / 3, rel=0.02)  # an unstrained body has no direction: |unit|^2/3 of the cue is left
+    assert loss.item() == pytest.approx(
+        1 / 3, rel=0.02
+    )  # an unstrained body has no direction: |unit|^2/3 of the cue is left
     assert torch.isfinite(F.grad).all()
 
 
@@ -220,9 +247,13 @@ def test_cues_without_strain_have_no_weight():
 
 
 def test_heterogeneity_by_hand():
-    assert losses.heterogeneity_loss(torch.tensor([0.4, -0.4])).item() == 0  # mean 0, variance 0.16 < 0.25
+    assert (
+        losses.heterogeneity_loss(torch.tensor([0.4, -0.4])).item() == 0
+    )  # mean 0, variance 0.16 < 0.25
     assert losses.heterogeneity_loss(torch.tensor([1.0, 3.0])).item() == pytest.approx(4 + 0.75)
-    assert losses.heterogeneity_loss(torch.tensor([1.0, 3.0]), lambda_mu=0.5, lambda_var=2.0).item() == pytest.approx(2 + 1.5)
+    assert losses.heterogeneity_loss(
+        torch.tensor([1.0, 3.0]), lambda_mu=0.5, lambda_var=2.0
+    ).item() == pytest.approx(2 + 1.5)
 
 
 def test_heterogeneity_and_position_gradients():
@@ -232,7 +263,9 @@ def test_heterogeneity_and_position_gradients():
     x, seen = numbers(3, 4, 3).requires_grad_(), numbers(3, 4, 3, seed=1)
     assert gradcheck(lambda x: losses.position_loss(x, seen, 0.25), x, **TOLERANCE)
     near = (seen + 1e-5 * x.detach()).requires_grad_()
-    assert gradcheck(lambda x: losses.position_loss(x, seen, 0.25), near, eps=1e-8, rtol=1e-6, atol=1e-6)
+    assert gradcheck(
+        lambda x: losses.position_loss(x, seen, 0.25), near, eps=1e-8, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_position_loss_by_hand():

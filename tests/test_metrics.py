@@ -56,14 +56,18 @@ def test_interpolation_of_bending_is_of_second_order():
         rest = ball(spacing, 0.003)
         return metrics.rms(metrics.interpolate_motion(rest, bending(rest), query), bending(query))
 
-    assert error(0.02) < 0.2e-3  # [m], of a 0.25 m object; a weighted mean alone is 2 mm off where a body has turned
+    assert (
+        error(0.02) < 0.2e-3
+    )  # [m], of a 0.25 m object; a weighted mean alone is 2 mm off where a body has turned
     assert error(0.02) / error(0.01) == pytest.approx(4, rel=0.1)
 
 
 def test_interpolation_at_the_true_points_is_their_motion():
     rest = ball(0.03, 0.004)
     positions = drawn(3, len(rest), 3)
-    torch.testing.assert_close(metrics.interpolate_motion(rest, positions, rest), positions, rtol=0, atol=1e-8)
+    torch.testing.assert_close(
+        metrics.interpolate_motion(rest, positions, rest), positions, rtol=0, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("count", [1, 3, 9])
@@ -83,16 +87,22 @@ def test_chamfer_by_hand():
     a = torch.tensor([[0.0, 0, 0]])
     b = torch.tensor([[3.0, 0, 0], [0, 4, 0]])
     for first, second in ((a, b), (b, a)):
-        assert metrics.chamfer_distances(first, second)["cd_sq_m2"] == pytest.approx(9 + (9 + 16) / 2)
+        assert metrics.chamfer_distances(first, second)["cd_sq_m2"] == pytest.approx(
+            9 + (9 + 16) / 2
+        )
         assert metrics.chamfer(first, second) == pytest.approx(3 + (3 + 4) / 2)
 
 
 def test_chamfer_of_a_cloud_with_itself():
     cloud = drawn(500, 3)
     assert metrics.chamfer(cloud, cloud) == 0
-    assert metrics.chamfer(cloud, cloud, samples=400) > 0  # different subsets: the reason for floors
+    assert (
+        metrics.chamfer(cloud, cloud, samples=400) > 0
+    )  # different subsets: the reason for floors
     assert metrics.chamfer(cloud, cloud, samples=400) == metrics.chamfer(cloud, cloud, samples=400)
-    assert metrics.chamfer(cloud, cloud, samples=400, seed=1) != metrics.chamfer(cloud, cloud, samples=400)
+    assert metrics.chamfer(cloud, cloud, samples=400, seed=1) != metrics.chamfer(
+        cloud, cloud, samples=400
+    )
 
 
 def test_emd_is_the_best_assignment():
@@ -111,7 +121,9 @@ def test_emd_of_unequal_clouds_and_of_subsets():
 
 
 def test_resampling_fills_the_shape_evenly():
-    lattice = drawn(1)[0].item() + 0.01 * (torch.cartesian_prod(*[torch.arange(20.0, dtype=torch.float64)] * 3) + 0.5)
+    lattice = drawn(1)[0].item() + 0.01 * (
+        torch.cartesian_prod(*[torch.arange(20.0, dtype=torch.float64)] * 3) + 0.5
+    )
     points = (metrics.resample_shape(lattice, 40_000, seed=3) - lattice.amin(0) + 0.005) / 0.2
     counts, _ = np.histogramdd(points.clamp(0, 1).numpy(), bins=4, range=[(0, 1)] * 3)
     assert counts.std() / counts.mean() < 1.3 / math.sqrt(40_000 / 64)
@@ -124,7 +136,9 @@ def test_floors_are_those_of_two_random_samplings():
     floors = metrics.sampling_floors(lattice, 3000, 3000, assignment=400)
     a, b = 0.2 * drawn(3000, 3, seed=1), 0.2 * drawn(3000, 3, seed=2)
     assert floors["cd_sq_m2"] == pytest.approx(1.5e-4, rel=0.08)
-    assert floors["cd_sq_m2"] == pytest.approx(metrics.chamfer_distances(a, b)["cd_sq_m2"], rel=0.05)
+    assert floors["cd_sq_m2"] == pytest.approx(
+        metrics.chamfer_distances(a, b)["cd_sq_m2"], rel=0.05
+    )
     assert floors["cd_m"] == pytest.approx(metrics.chamfer(a, b), rel=0.03)
     assert floors["emd_m"] == pytest.approx(metrics.emd(a, b, samples=400), rel=0.15)
 
@@ -132,7 +146,10 @@ def test_floors_are_those_of_two_random_samplings():
 def test_floor_of_a_random_cloud():
     cloud = 0.2 * drawn(8000, 3, seed=5)
     assert metrics.sampling_floors(cloud, 2000, 3000, assignment=100)["cd_sq_m2"] == pytest.approx(
-        metrics.chamfer_distances(0.2 * drawn(2000, 3, seed=6), 0.2 * drawn(3000, 3, seed=7))["cd_sq_m2"], rel=0.12
+        metrics.chamfer_distances(0.2 * drawn(2000, 3, seed=6), 0.2 * drawn(3000, 3, seed=7))[
+            "cd_sq_m2"
+        ],
+        rel=0.12,
     )
 
 
@@ -160,12 +177,19 @@ def reference_ssim(a: np.ndarray, b: np.ndarray) -> float:
     g = np.exp(-(x**2) / (2 * 1.5**2))
     g /= g.sum()
     pad = ((5, 5), (5, 5), (0, 0))
-    windows = lambda u: np.lib.stride_tricks.sliding_window_view(np.pad(u, pad, "reflect"), (11, 11), axis=(0, 1))  # noqa: E731
+
+    def windows(u):
+        return np.lib.stride_tricks.sliding_window_view(
+            np.pad(u, pad, "reflect"), (11, 11), axis=(0, 1)
+        )
+
     mean = lambda u: np.einsum("ijcxy,x,y->ijc", windows(u), g, g)  # noqa: E731
     ma, mb = mean(a), mean(b)
     va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb
     c1, c2 = 0.01**2, 0.03**2
-    return float((((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2))).mean())
+    return float(
+        (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2))).mean()
+    )
 
 
 def test_ssim_against_its_definition_and_averaged_over_images():
@@ -192,5 +216,9 @@ def test_images_on_a_gpu_have_the_figures_of_a_cpu():
 
 
 def test_identification_errors():
-    assert metrics.identification_errors("E", 1.2e5, 1e5) == pytest.approx({"E_relative_error": 0.2, "E_ratio": 1.2})
-    assert metrics.identification_errors("nu", 0.3, 0.4) == pytest.approx({"nu_relative_error": 0.25})
+    assert metrics.identification_errors("E", 1.2e5, 1e5) == pytest.approx(
+        {"E_relative_error": 0.2, "E_ratio": 1.2}
+    )
+    assert metrics.identification_errors("nu", 0.3, 0.4) == pytest.approx(
+        {"nu_relative_error": 0.25}
+    )

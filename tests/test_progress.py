@@ -27,7 +27,11 @@ def test_a_file_gets_a_line_at_the_start_and_one_at_the_end(leave):
     lines = shown(io.StringIO(), leave=leave, dynamic_ncols=True, mininterval=0.0).split("\n")
     assert len(lines) == 3 and lines[2] == ""
     assert lines[0].startswith("fit prior:   0% 0/200 [")
-    assert lines[1].startswith("fit prior: 100% 200/200 [") and "loss=0.005" in lines[1] and "\r" not in lines[1]
+    assert (
+        lines[1].startswith("fit prior: 100% 200/200 [")
+        and "loss=0.005" in lines[1]
+        and "\r" not in lines[1]
+    )
 
 
 def test_a_file_gets_a_line_now_and_then(monkeypatch):

@@ -36,7 +36,9 @@ def test_an_empty_folder_begins_anew(tmp_path):
 def test_a_stopped_run_goes_on_from_its_own_checkpoint(stopped):
     (stopped / "metrics.json.partial").touch()  # killed while it wrote its figures
     assert finished(config("auto"), stopped) is None
-    assert begins_from(config("auto", "other.ckpt"), stopped) == str(stopped / "checkpoints" / "last.ckpt")
+    assert begins_from(config("auto", "other.ckpt"), stopped) == str(
+        stopped / "checkpoints" / "last.ckpt"
+    )
 
 
 def test_a_complete_run_is_not_made_again(stopped):
@@ -61,7 +63,14 @@ def refuse(constant):
 
 def test_figures_are_strict_json_and_come_back_as_they_were(tmp_path):
     """An exact picture has an infinite PSNR, a law that bursts an infinite growth."""
-    figures = {"train/psnr_full": math.inf, "b": -math.inf, "c": math.nan, "test/rms_m": 0.25, "time/device": "cpu", "n": 3}
+    figures = {
+        "train/psnr_full": math.inf,
+        "b": -math.inf,
+        "c": math.nan,
+        "test/rms_m": 0.25,
+        "time/device": "cpu",
+        "n": 3,
+    }
     write_figures(tmp_path, figures)
     text = (tmp_path / "metrics.json").read_text()
     assert json.loads(text, parse_constant=refuse)["train/psnr_full"] == "Infinity"
@@ -69,11 +78,15 @@ def test_figures_are_strict_json_and_come_back_as_they_were(tmp_path):
     found = read_figures(tmp_path / "metrics.json")
     assert list(found) == sorted(figures)
     assert math.isnan(found.pop("c")) and found == {k: v for k, v in figures.items() if k != "c"}
-    assert finished(config("auto"), tmp_path)["train/psnr_full"] == math.inf  # a sweep minimises a number
+    assert (
+        finished(config("auto"), tmp_path)["train/psnr_full"] == math.inf
+    )  # a sweep minimises a number
 
 
 def test_figures_of_runs_before_are_read(tmp_path):
-    (tmp_path / "metrics.json").write_text(json.dumps({"train/psnr_full": math.inf, "id/growth_per_period": math.nan}))
+    (tmp_path / "metrics.json").write_text(
+        json.dumps({"train/psnr_full": math.inf, "id/growth_per_period": math.nan})
+    )
     found = finished(config("auto"), tmp_path)
     assert found["train/psnr_full"] == math.inf and math.isnan(found["id/growth_per_period"])
 
@@ -84,7 +97,10 @@ def trained(folder, figures=True, **changed):
                             "scene": {"path": "/a/duck", "cache": None}, "evaluation": {"video": True}})  # fmt: skip
     (folder / "checkpoints").mkdir()
     stored = OmegaConf.to_container(OmegaConf.merge(cfg, OmegaConf.create(changed)))
-    torch.save({"mosa": {"config": {"cfg": stored}, "compared": changed.get("compared", {})}}, folder / "checkpoints" / "last.ckpt")
+    torch.save(
+        {"mosa": {"config": {"cfg": stored}, "compared": changed.get("compared", {})}},
+        folder / "checkpoints" / "last.ckpt",
+    )
     if figures:
         write_figures(folder, {"test/rms_m": 0.5})
     return cfg
@@ -98,7 +114,9 @@ def trained(folder, figures=True, **changed):
 def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, changed, said, figures):
     """Two sweeps in one folder, whose jobs are numbered alike: the second had the figures of the first, or went on with its fit."""
     cfg = trained(tmp_path, figures, **changed)
-    with pytest.raises(ConfigError, match=f"resume: expected in .* a run of this configuration, .*{said}"):
+    with pytest.raises(
+        ConfigError, match=f"resume: expected in .* a run of this configuration, .*{said}"
+    ):
         finished(cfg, tmp_path)
         begins_from(cfg, tmp_path)
     cfg.resume = None
@@ -111,7 +129,9 @@ def test_a_fit_goes_on_with_the_data_that_it_began_with(tmp_path):
     found, path = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True), "x.ckpt"
     scene = {"path": "/moved/duck", "cache": "/b"}
     check_same_scene(found, {"scene": scene | {"test": ["more"]}, "seed": 5}, path)
-    with pytest.raises(ConfigError, match=r"in x\.ckpt a fit to this scene, .*scene\.path: /a/duck there, /a/goose"):
+    with pytest.raises(
+        ConfigError, match=r"in x\.ckpt a fit to this scene, .*scene\.path: /a/duck there, /a/goose"
+    ):
         check_same_scene(found, {"scene": scene | {"path": "/a/goose"}}, path)
     check_same_scene({"mosa": {}}, {"scene": scene}, path)  # of a program that did not write it
 
@@ -122,7 +142,9 @@ def test_a_fit_goes_on_with_the_data_that_it_began_with(tmp_path):
 ])  # fmt: skip
 def test_what_does_not_say_what_is_learned_may_differ(tmp_path, changed):
     cfg = trained(tmp_path, **changed)
-    assert finished(cfg, tmp_path) == {"test/rms_m": 0.5} and begins_from(cfg, tmp_path).endswith("last.ckpt")
+    assert finished(cfg, tmp_path) == {"test/rms_m": 0.5} and begins_from(cfg, tmp_path).endswith(
+        "last.ckpt"
+    )
 
 
 def test_a_fit_that_begins_takes_away_the_figures_of_the_run_before(tmp_path):
@@ -142,5 +164,8 @@ def test_a_checkpoint_that_is_removed_before_the_fit_reads_it_is_named(tmp_path,
         monkeypatch.setattr(fitting, name, lambda *_: [])
     body = SimpleNamespace(material=SimpleNamespace(law="corotated"), rest=torch.zeros(1))
     trainer = SimpleNamespace(callbacks=[], loggers=[], fit=removed)
-    with pytest.raises(DataError, match=r"ckpt_path: gone/last\.ckpt: the fit cannot go on from it \(FileNotFoundError"):
+    with pytest.raises(
+        DataError,
+        match=r"ckpt_path: gone/last\.ckpt: the fit cannot go on from it \(FileNotFoundError",
+    ):
         fitting.fit(trainer, SimpleNamespace(body=body), None, "gone/last.ckpt")

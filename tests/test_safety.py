@@ -35,12 +35,24 @@ def test_the_checkpoint_of_these_tests_is_a_good_one(tmp_path):
 
 def test_the_adapter_of_an_older_checkpoint_is_still_known(tmp_path):
     older = {"_target_": "mosa.baselines.direct.DirectAdapter", "hidden": 8}
-    stored = checkpoint(tmp_path / "a.ckpt", "adapter=direct", "adapter.hidden=8", change=set_adapter(older))
+    stored = checkpoint(
+        tmp_path / "a.ckpt", "adapter=direct", "adapter.hidden=8", change=set_adapter(older)
+    )
     assert type(Twin.load(stored).body.adapter).__name__ == "DirectAdapter"
 
 
-@pytest.mark.parametrize("target", ["subprocess.Popen", "subprocess.run", "os.system", "builtins.exec",
-                                    "mosa.twin.Twin.load", "mosa.modules.body.body.Body", "strangers.checkpoint"])
+@pytest.mark.parametrize(
+    "target",
+    [
+        "subprocess.Popen",
+        "subprocess.run",
+        "os.system",
+        "builtins.exec",
+        "mosa.twin.Twin.load",
+        "mosa.modules.body.body.Body",
+        "strangers.checkpoint",
+    ],
+)
 def test_what_a_checkpoint_names_is_not_called(tmp_path, target):
     touched = tmp_path / "touched"
     malicious = {"_target_": target, "args": ["touch", str(touched)], "command": f"touch {touched}"}
@@ -129,11 +141,15 @@ def test_a_law_of_the_default_adapter_from_before_its_basis_was_written_out_is_r
     mistake."""
 
     def older(stored, numbers):
-        assert stored["state_dict"]["body.adapter.numbers"].shape == (19,)  # the name by which they are found
+        assert stored["state_dict"]["body.adapter.numbers"].shape == (
+            19,
+        )  # the name by which they are found
         stored["mosa"]["version"] = 1
         stored["state_dict"]["body.adapter.numbers"] = torch.full((19,), numbers)
 
-    with pytest.raises(DataError, match=r"bad\.ckpt: mosa\.version: expected 2 for a law .* learn it again"):
+    with pytest.raises(
+        DataError, match=r"bad\.ckpt: mosa\.version: expected 2 for a law .* learn it again"
+    ):
         Twin.load(checkpoint(tmp_path / "bad.ckpt", change=lambda stored: older(stored, 0.1)))
     Twin.load(checkpoint(tmp_path / "prior.ckpt", change=lambda stored: older(stored, 0.0)))
 
@@ -141,13 +157,18 @@ def test_a_law_of_the_default_adapter_from_before_its_basis_was_written_out_is_r
 def test_a_pickle_in_a_checkpoint_runs_nothing(tmp_path):
     touched = tmp_path / "touched"
     with pytest.raises(DataError, match="refers to posix system"):
-        Twin.load(checkpoint(tmp_path / "bad.ckpt", change=at("mosa", "losses", value=Runs(touched))))
+        Twin.load(
+            checkpoint(tmp_path / "bad.ckpt", change=at("mosa", "losses", value=Runs(touched)))
+        )
     assert not touched.exists()
 
 
 def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path):
     good = checkpoint(tmp_path / "good.ckpt")
-    with zipfile.ZipFile(good) as source, zipfile.ZipFile(tmp_path / "bomb.ckpt", "w", zipfile.ZIP_DEFLATED) as bomb:
+    with (
+        zipfile.ZipFile(good) as source,
+        zipfile.ZipFile(tmp_path / "bomb.ckpt", "w", zipfile.ZIP_DEFLATED) as bomb,
+    ):
         for name in source.namelist():
             bomb.writestr(name, source.read(name))
         bomb.writestr("archive/data/999", bytes(10**7))
@@ -177,7 +198,13 @@ def test_stored_paths_are_not_written_to(tmp_path):
     cfg = OmegaConf.create({"ckpt_path": "a.ckpt", "cache": str(tmp_path / "mine"), "scene": None})
     keys = evaluated_scene(cfg, twin).scene
     assert keys.name == "tiny" and keys.cache == str(tmp_path / "mine")
-    own = OmegaConf.create({"ckpt_path": "a.ckpt", "cache": None, "scene": {"format": "builtin", "name": "tiny", "cache": "own"}})
+    own = OmegaConf.create(
+        {
+            "ckpt_path": "a.ckpt",
+            "cache": None,
+            "scene": {"format": "builtin", "name": "tiny", "cache": "own"},
+        }
+    )
     assert evaluated_scene(own, twin).scene.cache == "own"  # what the user names himself is obeyed
 
 
@@ -189,8 +216,11 @@ def entry(name: str, array: np.ndarray, shape: tuple[bytes, bytes] = (b"", b""))
     content = plain.getvalue()
     if was:
         longer = len(now) - len(was)
-        content = content.replace(was, now).replace(b" " * longer + b"\n", b"\n", 1) if longer > 0 else content.replace(
-            was, now + b" " * -longer)
+        content = (
+            content.replace(was, now).replace(b" " * longer + b"\n", b"\n", 1)
+            if longer > 0
+            else content.replace(was, now + b" " * -longer)
+        )
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(f"{name}.npy", content)
     return file.getvalue()
@@ -210,7 +240,9 @@ def test_an_npz_that_cannot_be_finished_leaves_nothing(tmp_path):
     write_npz(tmp_path / "a.npz", {"x": np.zeros(3)})
     with pytest.raises(OSError, match="No space"):
         write_npz(tmp_path / "a.npz", {"x": np.ones(3), "y": Full()})
-    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"] and not read_npz(tmp_path / "a.npz")["x"].any()
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"] and not read_npz(
+        tmp_path / "a.npz"
+    )["x"].any()
 
 
 def test_a_malicious_npz_runs_nothing_and_takes_no_memory(tmp_path):
@@ -221,7 +253,9 @@ def test_a_malicious_npz_runs_nothing_and_takes_no_memory(tmp_path):
     assert not touched.exists()
     for claimed in (b"(10000000000000,)", b"(-1,)"):
         file.write_bytes(entry("x", np.zeros(100), (b"(100,)", claimed)))
-        with pytest.raises(DataError, match="expected as many numbers as are stored, found a header of shape"):
+        with pytest.raises(
+            DataError, match="expected as many numbers as are stored, found a header of shape"
+        ):
             read_npz(file)
 
 
@@ -234,7 +268,10 @@ def test_a_cut_npz_is_named(tmp_path, share):
         read_npz(tmp_path / "a.npz")
 
 
-@pytest.mark.parametrize("tag", ["!!python/object/apply:os.system ['touch {}']", "!!python/object/new:pathlib.Path ['{}']"])
+@pytest.mark.parametrize(
+    "tag",
+    ["!!python/object/apply:os.system ['touch {}']", "!!python/object/new:pathlib.Path ['{}']"],
+)
 def test_a_malicious_yaml_runs_nothing(tmp_path, tag):
     (tmp_path / "train.yaml").write_text("seed: 0\n")
     (tmp_path / "prior").mkdir()
@@ -246,7 +283,9 @@ def test_a_malicious_yaml_runs_nothing(tmp_path, tag):
     assert not (tmp_path / "touched").exists()
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": [' + '{"a":' * 50_000, '{"frames": ' + "9" * 100_000 + "}"])
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"frames": [' + '{"a":' * 50_000, '{"frames": ' + "9" * 100_000 + "}"]
+)
 def test_a_malicious_listing_is_one_message(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(DataError, match=r"transforms\.json: expected"):
@@ -259,6 +298,10 @@ def test_a_flipped_bit_is_seen(tmp_path):
     content, body = good.read_bytes(), read_checkpoint(good)["state_dict"]["body.rest"]
     place = content.index(body.numpy().tobytes()) + 5
     bad.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-    assert not torch.equal(torch.load(bad, weights_only=True)["state_dict"]["body.rest"], body)  # what it would have been
-    with pytest.raises(DataError, match=r"bad\.ckpt is damaged: its part .* is not what was written"):
+    assert not torch.equal(
+        torch.load(bad, weights_only=True)["state_dict"]["body.rest"], body
+    )  # what it would have been
+    with pytest.raises(
+        DataError, match=r"bad\.ckpt is damaged: its part .* is not what was written"
+    ):
         Twin.load(bad)

@@ -52,9 +52,16 @@ def test_a_strangers_body_can_be(tmp_path, name, change, message):
         Twin.load(checkpoint(tmp_path / "bad.ckpt", change=changed))
 
 
-@pytest.mark.parametrize("scene, error", [
-    (..., DataError), (None, DataError), (5, DataError), ({"format": "builtin"}, DataError),
-    ({"format": "transforms", "name": "x"}, ConfigError)])
+@pytest.mark.parametrize(
+    "scene, error",
+    [
+        (..., DataError),
+        (None, DataError),
+        (5, DataError),
+        ({"format": "builtin"}, DataError),
+        ({"format": "transforms", "name": "x"}, ConfigError),
+    ],
+)
 def test_a_run_without_a_built_in_scene_has_no_truth(tmp_path, scene, error):
     def change(stored):
         cfg = stored["mosa"]["config"]["cfg"]
@@ -62,7 +69,10 @@ def test_a_run_without_a_built_in_scene_has_no_truth(tmp_path, scene, error):
         if scene is not ...:
             cfg["scene"] = scene
 
-    with pytest.raises(error, match=r"cfg\.scene|expected learned or isotropic for a run on a scene of format transforms"):
+    with pytest.raises(
+        error,
+        match=r"cfg\.scene|expected learned or isotropic for a run on a scene of format transforms",
+    ):
         simulator_named("truth", checkpoint(tmp_path / "bad.ckpt", change=change))
 
 
@@ -73,14 +83,19 @@ def test_a_truths_spacing_is_a_distance_in_the_body(spacing):
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("field, value", [("near", -1), ("steps", 0), ("control_dt", math.nan), ("still", "a"), ("near", None)])
+@pytest.mark.parametrize(
+    "field, value",
+    [("near", -1), ("steps", 0), ("control_dt", math.nan), ("still", "a"), ("near", None)],
+)
 def test_a_tasks_fields_have_ranges(task, field, value):
     with pytest.raises(ConfigError, match=f"options.{field}: expected"):
         task_named(task, torch.rand(9, 3), **{field: value})
 
 
 def test_a_tasks_ranges_begin_before_they_end():
-    with pytest.raises(ConfigError, match=r"options.low: expected at most options.high=0.2, found 0.4"):
+    with pytest.raises(
+        ConfigError, match=r"options.low: expected at most options.high=0.2, found 0.4"
+    ):
         task_named("placement", torch.rand(9, 3), low=0.4, high=0.2)
     with pytest.raises(ConfigError, match=r"options.foo: expected a field of the task placement"):
         task_named("placement", torch.rand(9, 3), foo=1)
@@ -133,7 +148,10 @@ def test_mistakes_in_the_arguments_of_experiments_are_said_before_any_job(words,
 
 
 def test_the_results_folder_is_tried_before_any_job():
-    with contextlib.redirect_stdout(io.StringIO()), pytest.raises(ConfigError, match="--results: expected a folder that can be"):
+    with (
+        contextlib.redirect_stdout(io.StringIO()),
+        pytest.raises(ConfigError, match="--results: expected a folder that can be"),
+    ):
         run(arguments(["table_time", "--collect", "--results", "/proc/nowhere"]))
 
 
@@ -148,12 +166,19 @@ def test_the_viewer_listens_where_it_was_told_to_alone():
 
 
 def test_a_message_is_one_line():
-    assert str(ConfigError(f"rotation: found\n{np.eye(2)}\r\nagain")) == "rotation: found [[1. 0.]  [0. 1.]] again"
+    assert (
+        str(ConfigError(f"rotation: found\n{np.eye(2)}\r\nagain"))
+        == "rotation: found [[1. 0.]  [0. 1.]] again"
+    )
     assert isinstance(DataError("a"), MosaError)
 
 
 def test_a_gpu_without_memory_is_told_from_other_errors():
     OutOfMemoryError = type("OutOfMemoryError", (RuntimeError,), {})  # as torch calls it
-    assert "no memory left (CUDA out of memory" in memory_message(OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"))
-    assert "no memory left" in memory_message(RuntimeError("Failed to allocate 4000 bytes on device 'cuda:0'"))
+    assert "no memory left (CUDA out of memory" in memory_message(
+        OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+    )
+    assert "no memory left" in memory_message(
+        RuntimeError("Failed to allocate 4000 bytes on device 'cuda:0'")
+    )
     assert memory_message(RuntimeError("mat1 and mat2 shapes cannot be multiplied")) is None

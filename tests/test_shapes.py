@@ -12,7 +12,9 @@ from mosa.rendering import covariance
 
 jaxtyping = pytest.importorskip("jaxtyping")
 beartype = pytest.importorskip("beartype").beartype
-VECTOR, MATRIX, QUATERNION = (jaxtyping.Float[Tensor, shape] for shape in ("*n 3", "*n 3 3", "*n 4"))
+VECTOR, MATRIX, QUATERNION = (
+    jaxtyping.Float[Tensor, shape] for shape in ("*n 3", "*n 3 3", "*n 4")
+)
 SHAPES = {
     skew: ((VECTOR,), MATRIX),
     axial: ((MATRIX,), VECTOR),
@@ -30,7 +32,9 @@ SHAPES = {
 def checked(function, given, answer):
     """The function with these types of its arguments and its answer, compared with what it is called with and returns."""
     code = function.__code__
-    copy = types.FunctionType(code, function.__globals__, function.__name__, function.__defaults__, function.__closure__)
+    copy = types.FunctionType(
+        code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
     copy.__annotations__ = dict(zip(code.co_varnames, given), **{"return": answer})
     return jaxtyping.jaxtyped(copy, typechecker=beartype)
 
@@ -38,7 +42,9 @@ def checked(function, given, answer):
 def drawn(kind, leading, dtype):
     """Tensors that every function takes: of positive determinant and symmetric, or vectors of positive numbers."""
     last = {VECTOR: (3,), MATRIX: (3, 3), QUATERNION: (4,)}[kind]
-    values = torch.rand(*leading, *last, dtype=dtype, generator=torch.Generator().manual_seed(0)) + 0.1
+    values = (
+        torch.rand(*leading, *last, dtype=dtype, generator=torch.Generator().manual_seed(0)) + 0.1
+    )
     return values @ values.mT + torch.eye(3, dtype=dtype) if kind is MATRIX else values
 
 
@@ -57,4 +63,6 @@ def test_a_wrong_shape_is_found():
     with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
         checked(skew, (VECTOR,), MATRIX)(torch.ones(5, 4))
     with pytest.raises(jaxtyping.TypeCheckError):  # leading dimensions that differ
-        checked(covariance.covariance_from, (VECTOR, QUATERNION), MATRIX)(torch.ones(5, 3), torch.ones(1, 4))
+        checked(covariance.covariance_from, (VECTOR, QUATERNION), MATRIX)(
+            torch.ones(5, 3), torch.ones(1, 4)
+        )

@@ -24,10 +24,14 @@ def outside(shape, q):
         d = q.abs() - 0.5 * torch.tensor(shape.size)
         return d.clamp_min(0).norm(dim=1) + d.amax(1).clamp_max(0)
     if isinstance(shape, Cylinder):
-        d = torch.stack([q[:, :2].norm(dim=1) - shape.radius, q[:, 2].abs() - 0.5 * shape.length], 1)
+        d = torch.stack(
+            [q[:, :2].norm(dim=1) - shape.radius, q[:, 2].abs() - 0.5 * shape.length], 1
+        )
         return d.clamp_min(0).norm(dim=1) + d.amax(1).clamp_max(0)
     half = 0.5 * getattr(shape, "length", 0.0)
-    return (q - torch.stack([0 * q[:, 2], 0 * q[:, 2], q[:, 2].clamp(-half, half)], 1)).norm(dim=1) - shape.radius
+    return (q - torch.stack([0 * q[:, 2], 0 * q[:, 2], q[:, 2].clamp(-half, half)], 1)).norm(
+        dim=1
+    ) - shape.radius
 
 
 @pytest.mark.parametrize("shape, area", [
@@ -48,7 +52,9 @@ def test_points_lie_on_the_solid_and_leave_no_hole(shape, area):
 
 def picture(shown, frame):
     K = torch.tensor([[120.0, 0, 32], [0, 120.0, 32], [0, 0, 1]])
-    camera = Cameras(K[None], look_at(torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3), UP)[None], 64, 64, ("view",))
+    camera = Cameras(
+        K[None], look_at(torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3), UP)[None], 64, 64, ("view",)
+    )
     return shown.images(camera, torch.ones(3))[0, frame]
 
 
@@ -56,13 +62,22 @@ def test_a_solid_hides_what_is_behind_it_and_moves():
     """A red blob at the origin, a plate in front of it that moves away to the right by 0.2 m a second."""
     blob = Seen(torch.zeros(2, 1, 3), (0.02**2 * torch.eye(3)).expand(2, 1, 3, 3), torch.tensor([0.99]),
                 constant_coefficients(torch.tensor([[1.0, 0.0, 0.0]])))  # fmt: skip
-    plate = {"type": "box", "size": [0.2, 0.2, 0.02], "position": [0, 0, 0.2], "motion": {"velocity": [0.2, 0, 0]}}
+    plate = {
+        "type": "box",
+        "size": [0.2, 0.2, 0.02],
+        "position": [0, 0, 0.2],
+        "motion": {"velocity": [0.2, 0, 0]},
+    }
     behind = {**plate, "position": [0, 0, -0.2]}
     times, red = torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
     shown = with_solids(blob, colliders_from_config([plate]), times, UP, 0.01)
     grey = torch.tensor(SOLID) / 255
-    assert (picture(shown, 0)[32, 32] - grey).abs().max() < 0.2 and (picture(shown, 1)[32, 32] - red).abs().max() < 0.1
-    assert (picture(shown, 1)[32, 55] - grey).abs().max() < 0.2 and (picture(shown, 0)[32, 8] == 1).all()
+    assert (picture(shown, 0)[32, 32] - grey).abs().max() < 0.2 and (
+        picture(shown, 1)[32, 32] - red
+    ).abs().max() < 0.1
+    assert (picture(shown, 1)[32, 55] - grey).abs().max() < 0.2 and (
+        picture(shown, 0)[32, 8] == 1
+    ).all()
     before = with_solids(blob, colliders_from_config([behind]), times, UP, 0.01)
     assert (picture(before, 0)[32, 32] - red).abs().max() < 0.1
     assert with_solids(blob, (), times, UP, 0.01) is blob
@@ -71,13 +86,22 @@ def test_a_solid_hides_what_is_behind_it_and_moves():
 def test_an_exported_motion_has_its_solids_and_the_ground(tmp_path):
     one = twin()
     rollout, alone = one.simulate(frames=4, colliders=[PLATE]), one.simulate(frames=4)
-    with pytest.raises(ConfigError, match=r"colliders: expected the 1 that the rollout was simulated with, .* found 0"):
+    with pytest.raises(
+        ConfigError,
+        match=r"colliders: expected the 1 that the rollout was simulated with, .* found 0",
+    ):
         one.export(rollout, tmp_path / "no")
-    with pytest.raises(ConfigError, match=r"expected the 0 that the rollout was simulated with.*found 1"):
+    with pytest.raises(
+        ConfigError, match=r"expected the 0 that the rollout was simulated with.*found 1"
+    ):
         one.export(alone, tmp_path / "no", colliders=[PLATE])
     assert not (tmp_path / "no").exists()
     one.export(rollout, tmp_path / "met", video=False, colliders=[PLATE])
-    assert np.load(tmp_path / "met" / "rollout.npz")["simulation/collider_position"].shape == (4, 1, 3)
+    assert np.load(tmp_path / "met" / "rollout.npz")["simulation/collider_position"].shape == (
+        4,
+        1,
+        3,
+    )
     # grey lines on the ground, of which a picture in space has none
     images = one.render(alone, size=96)
     lines = ((images - 120 / 255).abs().amax(-1) < 0.3) & (images.amax(-1) - images.amin(-1) < 0.02)

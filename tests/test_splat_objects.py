@@ -38,12 +38,17 @@ def ball(count: int = 1500, scale: float = 0.004, open_at: float | None = None) 
     if open_at is not None:
         normal = normal[RADIUS * normal[:, 1] > open_at]
     axis = torch.linalg.cross(torch.tensor([0.0, 0, 1]).expand_as(normal), normal)
-    turns = Rotation.from_rotvec((torch.nn.functional.normalize(axis, dim=1) * normal[:, 2:].clamp(-1, 1).acos()).numpy())
+    turns = Rotation.from_rotvec(
+        (torch.nn.functional.normalize(axis, dim=1) * normal[:, 2:].clamp(-1, 1).acos()).numpy()
+    )
     rotations = torch.as_tensor(turns.as_quat(scalar_first=True)).float()
     scales = scale * torch.tensor([1.0, 1, 0.3]).expand_as(normal)
     harmonics = 0.2 * torch.randn(len(normal), 4, 3, generator=g)
     colors = 0.5 + 0.28209479 * harmonics[:, 0]
-    return Appearance(Splats(RADIUS * normal, scales, rotations, torch.full((len(normal),), 0.9), colors), harmonics)
+    return Appearance(
+        Splats(RADIUS * normal, scales, rotations, torch.full((len(normal),), 0.9), colors),
+        harmonics,
+    )
 
 
 def test_a_line_is_blocked_where_it_meets_the_shell():
@@ -56,7 +61,9 @@ def test_a_line_is_blocked_where_it_meets_the_shell():
 
 @pytest.mark.parametrize(("resolution", "error"), [(40, 0.12), (80, 0.08)])
 def test_a_shell_is_filled(resolution, error):
-    assert body_volume(solid_of(ball().splats, resolution=resolution)) == pytest.approx(BALL, rel=error)
+    assert body_volume(solid_of(ball().splats, resolution=resolution)) == pytest.approx(
+        BALL, rel=error
+    )
 
 
 def test_an_open_underside_is_closed_where_that_is_said():
@@ -71,7 +78,10 @@ def test_what_encloses_nothing_is_named(tmp_path):
     with pytest.raises(DataError, match="an extent of 0"):
         solid_of(replace(point, means=torch.zeros_like(point.means)))
     path = save_ply(tmp_path / "a.ply", ball().splats)
-    with pytest.raises(DataError, match=r"a\.ply: expected at least 100 Gaussians .* in the box, found 0 of 1500; the file spans"):
+    with pytest.raises(
+        DataError,
+        match=r"a\.ply: expected at least 100 Gaussians .* in the box, found 0 of 1500; the file spans",
+    ):
         read_object(path, box=[[1, 1, 1], [2, 2, 2]])
     with pytest.raises(ConfigError, match="box: expected two corners"):
         read_object(path, box=[[1, 1, 1], [0, 2, 2]])
@@ -89,22 +99,39 @@ def test_a_file_in_other_units_gets_its_size(tmp_path):
 
 def test_the_object_falls_and_can_be_read_again(tmp_path):
     """It bounces on its ground, the Gaussians stay on its surface, and its checkpoint gives the same motion."""
-    twin = object_twin(ball(), LAW, particles=300, height=0.1, up=(0, 0, 2.0), ground={"mode": "separate", "friction": 0.3})
-    assert 250 < len(twin.body.rest) < 380 and torch.allclose(twin.world.gravity, torch.tensor([0.0, 0, -9.81]))
+    twin = object_twin(
+        ball(),
+        LAW,
+        particles=300,
+        height=0.1,
+        up=(0, 0, 2.0),
+        ground={"mode": "separate", "friction": 0.3},
+    )
+    assert 250 < len(twin.body.rest) < 380 and torch.allclose(
+        twin.world.gravity, torch.tensor([0.0, 0, -9.81])
+    )
     assert float(twin.body.volume.sum()) == pytest.approx(BALL, rel=0.1)
     rollout = twin.simulate(frames=10)
     lowest = rollout.x[:, :, 2].amin(1) - twin.world.ground.height
-    assert float(lowest[0]) == pytest.approx(0.1, abs=1e-5) and 0 < float(lowest.min()) < twin.body.settings.dx
+    assert (
+        float(lowest[0]) == pytest.approx(0.1, abs=1e-5)
+        and 0 < float(lowest.min()) < twin.body.settings.dx
+    )
     carried = twin.body.splats.carry(rollout.x)
     far = torch.cdist(carried.means[-1], rollout.x[-1]).amin(1)
     assert float(far.max()) < 0.05
     folder = twin.export(rollout, tmp_path, video=False, formats=("ply", "splat"))
     vertex = PlyData.read(folder / "splats" / "ply" / "009.ply")["vertex"]
-    assert len(vertex) == len(twin.body.splats) and np.allclose(vertex["z"], carried.means[-1, :, 2].numpy())
+    assert len(vertex) == len(twin.body.splats) and np.allclose(
+        vertex["z"], carried.means[-1, :, 2].numpy()
+    )
     again = Twin.load(save_twin(twin, tmp_path / "checkpoints" / "last.ckpt"))
     assert torch.equal(again.simulate(frames=10).x, rollout.x)
     clip = read_run(tmp_path)[0]
-    assert clip.name == "simulation" and clip.splats("learned", 9, "appearance")[0].shape == (len(twin.body.splats), 3)
+    assert clip.name == "simulation" and clip.splats("learned", 9, "appearance")[0].shape == (
+        len(twin.body.splats),
+        3,
+    )
 
 
 def test_a_learned_law_is_taken_over(tmp_path):
@@ -112,7 +139,9 @@ def test_a_learned_law_is_taken_over(tmp_path):
 
     def stiffer(stored):
         state = stored["state_dict"]
-        name = next(key for key in state if key.startswith("body.material") and state[key].ndim == 0)
+        name = next(
+            key for key in state if key.startswith("body.material") and state[key].ndim == 0
+        )
         state[name] = state[name] + 0.7
 
     learned = Twin.load(checkpoint(tmp_path / "a.ckpt", change=stiffer))
@@ -129,9 +158,17 @@ def test_the_command_makes_all_of_it(tmp_path):
     path = save_ply(tmp_path / "ball.ply", source.splats, source.harmonics)
     arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply,splat]", "prior=corotated",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
-    done = subprocess.run([sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr[-2000:]
-    for name in ("splats/ply/002.ply", "splats/splat/002.splat", "simulation.mp4", "rollout.npz", "checkpoints/last.ckpt"):
+    for name in (
+        "splats/ply/002.ply",
+        "splats/splat/002.splat",
+        "simulation.mp4",
+        "rollout.npz",
+        "checkpoints/last.ckpt",
+    ):
         assert (tmp_path / "run" / name).is_file(), name
 
 

@@ -44,8 +44,12 @@ def test_an_epoch_is_a_pass_over_the_views_and_one_that_is_resumed_is_finished()
     schedule = ViewSchedule(5, 2, seed=1)
     epochs = Epochs(schedule, list)
     first = list(epochs)
-    assert first == [schedule[i] for i in range(3)] and {view for step in first for view in step} == set(range(5))
-    epochs.begin(whole=False, step=10, done=4, left=9)  # four of the stage's steps were made, one of its second epoch
+    assert first == [schedule[i] for i in range(3)] and {
+        view for step in first for view in step
+    } == set(range(5))
+    epochs.begin(
+        whole=False, step=10, done=4, left=9
+    )  # four of the stage's steps were made, one of its second epoch
     assert list(epochs) == [schedule[10], schedule[11]]
     epochs.begin(whole=False, step=10, done=4, left=1)
     assert list(epochs) == [schedule[10]]
@@ -56,5 +60,13 @@ def test_an_epoch_is_a_pass_over_the_views_and_one_that_is_resumed_is_finished()
 def test_a_stage_says_what_it_learns_and_what_its_result_is_kept_as():
     prior, prior_eta, joint = (Stage(name, 1, 0.1) for name in ("prior", "prior_eta", "joint"))
     assert [s.calibrates for s in (prior, prior_eta, joint)] == [True, False, False]
-    assert [s.learns("eta", "adapter") for s in (prior, prior_eta, joint)] == [(), ("eta",), ("eta", "adapter")]
-    assert [set(s.keeps) for s in (prior, prior_eta, joint)] == [{"prior", "prior_eta"}, {"prior_eta"}, set()]
+    assert [s.learns("eta", "adapter") for s in (prior, prior_eta, joint)] == [
+        (),
+        ("eta",),
+        ("eta", "adapter"),
+    ]
+    assert [set(s.keeps) for s in (prior, prior_eta, joint)] == [
+        {"prior", "prior_eta"},
+        {"prior_eta"},
+        set(),
+    ]

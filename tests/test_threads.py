@@ -39,4 +39,6 @@ def test_what_is_no_number_of_threads_is_one_thread(monkeypatch, capsys, given, 
         monkeypatch.setenv("OMP_NUM_THREADS", given)
     settle_threads()
     assert os.environ["OMP_NUM_THREADS"] == kept
-    assert ("OMP_NUM_THREADS: expected a whole number above 0" in capsys.readouterr().err) == (bool(given) and kept != given)
+    assert ("OMP_NUM_THREADS: expected a whole number above 0" in capsys.readouterr().err) == (
+        bool(given) and kept != given
+    )

@@ -35,7 +35,9 @@ with written_whole({str(path)!r}) as partial:
     partial.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
-    killed = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    killed = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    )
     assert killed.returncode == -9
     (left,) = tmp_path.iterdir()
     other = left.with_name(left.name.replace("a[1]", "b"))
@@ -49,7 +51,10 @@ with written_whole({str(path)!r}) as partial:
 
 def test_a_disk_that_fills_up_is_said_with_the_file(tmp_path):
     """Python names no file where a write fails, only where it cannot be opened."""
-    with pytest.raises(OSError, match=r"No space left on device: '.*a\.npz'") as caught, written_whole(tmp_path / "a.npz"):
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*a\.npz'") as caught,
+        written_whole(tmp_path / "a.npz"),
+    ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert caught.value.filename == str(tmp_path / "a.npz") and not list(tmp_path.iterdir())
 
@@ -60,7 +65,12 @@ def test_frames_of_an_export_are_whole_and_of_this_motion_alone(tmp_path, monkey
     (tmp_path / "notes.ply").write_text("mine")
     write_frames(tmp_path, x, colors)
     write_frames(tmp_path, x[:3] + 1, colors)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["000.ply", "001.ply", "002.ply", "notes.ply"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        "000.ply",
+        "001.ply",
+        "002.ply",
+        "notes.ply",
+    ]
     before = (tmp_path / "001.ply").read_bytes()
 
     def full(path, *_):

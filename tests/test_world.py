@@ -33,7 +33,10 @@ def twin(world=WORLD):
 def test_a_plate_presses_the_body_down():
     free = twin().simulate(frames=8)
     assert free.reactions is None
-    for rollout in (twin().simulate(frames=8, colliders=[PLATE]), twin(WORLD | {"colliders": [PLATE]}).simulate(frames=8)):
+    for rollout in (
+        twin().simulate(frames=8, colliders=[PLATE]),
+        twin(WORLD | {"colliders": [PLATE]}).simulate(frames=8),
+    ):
         top = rollout.x[-1, :, 1].max()
         assert top < 0.16 + 0.06 < free.x[-1, :, 1].max() + 0.06
         assert top < free.x[-1, :, 1].max() - 0.01
@@ -41,7 +44,9 @@ def test_a_plate_presses_the_body_down():
         assert up[0] == 0 and up[-1] > 5.0
 
 
-@pytest.mark.parametrize("start", [{"height": 0.0}, {"height": 0.5}, {"height": 0.5, "velocity": (1, -2, 0)}])
+@pytest.mark.parametrize(
+    "start", [{"height": 0.0}, {"height": 0.5}, {"height": 0.5, "velocity": (1, -2, 0)}]
+)
 def test_a_long_motion_takes_the_time_step_that_its_drop_needs(start):
     """What a body reaches is told by how far it can fall, not by how long it is simulated."""
     made = twin()
@@ -51,14 +56,25 @@ def test_a_long_motion_takes_the_time_step_that_its_drop_needs(start):
         made.reset(**start, frames=frames, box=[[-99, -9, -99], [99, 9, 99]])
         counts.append(made.episode.substeps)
     assert counts[1] == counts[2] == counts[3] <= 1.3 * counts[0]
-    begun = Start(*(getattr(made.episode._starts, name) for name in ("rotation", "center", "velocity", "angular_velocity")))
+    begun = Start(
+        *(
+            getattr(made.episode._starts, name)
+            for name in ("rotation", "center", "velocity", "angular_velocity")
+        )
+    )
     world, size = made.world, made.body.size
     rollout = made.simulate(**start, frames=60, box=[[-99, -9, -99], [99, 9, 99]])
-    assert float(rollout.v.norm(dim=-1).max()) < world.fastest(begun, size, 60 * 0.02) < 1.5 * (2.3 + (2 * 9.8 * 0.8) ** 0.5)
+    assert (
+        float(rollout.v.norm(dim=-1).max())
+        < world.fastest(begun, size, 60 * 0.02)
+        < 1.5 * (2.3 + (2 * 9.8 * 0.8) ** 0.5)
+    )
     # in a short motion it is the time that tells, and without a ground, or along one that slopes, it always is
     drop = begun.velocity.norm()
     assert world.fastest(begun, size, 0.1) == pytest.approx(float(drop) + 0.98)
-    assert replace(world, ground=None).fastest(begun, size, 20.0) == pytest.approx(float(drop) + 196)
+    assert replace(world, ground=None).fastest(begun, size, 20.0) == pytest.approx(
+        float(drop) + 196
+    )
     sloping = replace(world, up=torch.tensor([0.6, 0.8, 0.0]))
     assert 0.6 * 9.8 * 20 < sloping.fastest(begun, size, 20.0) < 0.6 * 9.8 * 20 + 10
 
@@ -76,7 +92,9 @@ def test_worlds_take_the_time_step_of_the_one_that_needs_most():
 
 def test_a_fall_that_nothing_ends_is_refused_with_the_way_out():
     made = twin(WORLD | {"ground": None})
-    with pytest.raises(ConfigError, match=r"speed 1.96e\+04 m/s.*fewer frames where no ground ends the fall"):
+    with pytest.raises(
+        ConfigError, match=r"speed 1.96e\+04 m/s.*fewer frames where no ground ends the fall"
+    ):
         made.simulate(frames=100_000)
 
 
@@ -103,8 +121,16 @@ def test_a_collider_of_the_wrong_form_is_named(colliders, message):
         build_world(WORLD | {"colliders": colliders})
 
 
-@pytest.mark.parametrize("walls", [{}, {"friction": float("nan")}, {"mode": "separate", "friction": float("inf")},
-                                   {"mode": ["slip"]}, {"mode": "separate", "friction": True}])
+@pytest.mark.parametrize(
+    "walls",
+    [
+        {},
+        {"friction": float("nan")},
+        {"mode": "separate", "friction": float("inf")},
+        {"mode": ["slip"]},
+        {"mode": "separate", "friction": True},
+    ],
+)
 def test_walls_of_the_wrong_form_are_named(walls):
     with pytest.raises(ConfigError, match=r"^world\.walls"):
         build_world(WORLD | {"walls": walls})
@@ -115,12 +141,18 @@ def test_walls_of_the_wrong_form_are_named(walls):
     {"type": "plane", "normal": [0, 1, 0], "position": [0, 0.5, 0]},
 ])  # fmt: skip
 def test_a_collider_that_contains_the_body_is_named(collider):
-    with pytest.raises(ConfigError, match=r"^colliders\[0\]: expected a solid that the body is outside of"):
+    with pytest.raises(
+        ConfigError, match=r"^colliders\[0\]: expected a solid that the body is outside of"
+    ):
         twin().simulate(frames=2, colliders=[collider])
 
 
-ARRIVES = {"waypoints": [{"time": -1.0, "position": [0, 5, 0]}, {"time": 0.0, "position": [0, 0.1, 0]}]}
-LEAVES = {"waypoints": [{"time": -1.0, "position": [0, 0.1, 0]}, {"time": 0.0, "position": [0, 5, 0]}]}
+ARRIVES = {
+    "waypoints": [{"time": -1.0, "position": [0, 5, 0]}, {"time": 0.0, "position": [0, 0.1, 0]}]
+}
+LEAVES = {
+    "waypoints": [{"time": -1.0, "position": [0, 0.1, 0]}, {"time": 0.0, "position": [0, 5, 0]}]
+}
 
 
 @pytest.mark.parametrize("solids, named", [
@@ -133,7 +165,9 @@ LEAVES = {"waypoints": [{"time": -1.0, "position": [0, 0.1, 0]}, {"time": 0.0, "
 ])  # fmt: skip
 def test_a_body_that_is_partly_inside_of_solids_is_refused(solids, named):
     with pytest.raises(ConfigError, match=named):
-        twin().reset(colliders=[{"type": "box", "name": "", **solid} for solid in solids], substeps=50)
+        twin().reset(
+            colliders=[{"type": "box", "name": "", **solid} for solid in solids], substeps=50
+        )
 
 
 @pytest.mark.parametrize("solids", [
@@ -145,7 +179,10 @@ def test_a_body_that_is_partly_inside_of_solids_is_refused(solids, named):
 def test_a_body_beside_solids_is_not(solids):
     made = [{"type": "box", **solid} for solid in solids]
     assert twin().simulate(frames=1, colliders=made).x.shape[0] == 1
-    state = twin().reset(colliders=[{"type": "box", "name": str(i), **solid} for i, solid in enumerate(solids)], substeps=400)
+    state = twin().reset(
+        colliders=[{"type": "box", "name": str(i), **solid} for i, solid in enumerate(solids)],
+        substeps=400,
+    )
     assert torch.isfinite(state.x).all()
 
 
@@ -155,7 +192,16 @@ def test_a_body_beside_solids_is_not(solids):
 def test_what_is_set_down_stays(mode, count):
     """At height 0, with any number of particles: it comes to rest within a fraction of a cell, and is not thrown up."""
     h = 0.18 / count
-    made = twin(WORLD | {"ground": {"height": 0.03, "mode": mode, "friction": 0.3 if mode in ("touch", "separate") else 0.0}})
+    made = twin(
+        WORLD
+        | {
+            "ground": {
+                "height": 0.03,
+                "mode": mode,
+                "friction": 0.3 if mode in ("touch", "separate") else 0.0,
+            }
+        }
+    )
     axis = (torch.arange(count) + 0.5) * h - 0.09
     rest = torch.cartesian_prod(axis, axis, axis)
     made.body = Body(
@@ -193,7 +239,9 @@ def test_a_start_is_put_beside_where_the_training_was():
     """The body moves as from its own place, numbers that are None are kept, and the height wins along `up`."""
     made = twin()
     usual = made.simulate(frames=3)
-    aside = made.simulate(frames=3, position=[0.12, None, -0.06])  # whole cells, so that the grid lies the same
+    aside = made.simulate(
+        frames=3, position=[0.12, None, -0.06]
+    )  # whole cells, so that the grid lies the same
     moved = torch.tensor([0.12, 0.0, -0.06])
     torch.testing.assert_close(aside.x, usual.x + moved, rtol=0, atol=1e-5)
     high = made.simulate(frames=1, position=(0.12, 5.0, 0.0), height=0.2)
@@ -212,8 +260,14 @@ def test_a_start_is_put_beside_where_the_training_was():
 def test_a_tensor_that_waits_for_gradients_is_not_left_without(given, named):
     """The motion came without them, and whoever asked for them was told nothing."""
     falling = twin()
-    for begin in (lambda: falling.simulate(frames=2, **given), lambda: falling.reset(frames=2, **given)):
-        with pytest.raises(ConfigError, match=rf"^{named}: expected a tensor without gradients.*reset\(differentiable=True\)"):
+    for begin in (
+        lambda: falling.simulate(frames=2, **given),
+        lambda: falling.reset(frames=2, **given),
+    ):
+        with pytest.raises(
+            ConfigError,
+            match=rf"^{named}: expected a tensor without gradients.*reset\(differentiable=True\)",
+        ):
             begin()
     started = {k: v for k, v in given.items() if k != "colliders"}
     with pytest.raises(ConfigError, match="expected a tensor without gradients"):

@@ -28,9 +28,16 @@ class DirectAdapter(Adapter):
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
-        switches = {"no_C": no_C, "no_pre": no_pre, "no_post": no_post, "no_prior_stress": no_prior_stress}
+        switches = {
+            "no_C": no_C,
+            "no_pre": no_pre,
+            "no_post": no_post,
+            "no_prior_stress": no_prior_stress,
+        }
         if on := [name for name, value in switches.items() if value]:
-            raise ConfigError(f"adapter=direct: {', '.join(on)} ablates parts of adapter=mosa that a black box has not")
+            raise ConfigError(
+                f"adapter=direct: {', '.join(on)} ablates parts of adapter=mosa that a black box has not"
+            )
         self.l_max, self.scale, self.rest_free = l_max, input_scale, rest_free
         self.net = TwoHiddenLayers(12, 6, hidden)
         zero_outputs(self.net[-1])
@@ -52,4 +59,6 @@ class DirectAdapter(Adapter):
         outer, inner = state.w.dtype, self.E_ref.dtype
         b = self.increment(state.w.to(inner), state.stress.to(inner) / self.E_ref)
         self.note_stress(b)
-        return AdapterOperator(torch.zeros(len(b), 6, 6, dtype=outer, device=b.device), (self.E_ref * b).to(outer))
+        return AdapterOperator(
+            torch.zeros(len(b), 6, 6, dtype=outer, device=b.device), (self.E_ref * b).to(outer)
+        )

@@ -51,54 +51,93 @@ class InteractionNetwork(Adapter):
     knobs = {"hidden": whole(1, WIDEST), "nodes": whole(8, 10**5), "neighbours": whole(4, 1000),
              "stiffer": number(0, 5, above=True)}  # fmt: skip
 
-    def __init__(self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 20, stiffer: float = 1.0) -> None:
+    def __init__(
+        self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 20, stiffer: float = 1.0
+    ) -> None:
         super().__init__()
         self.most, self.neighbours, self.stiffer = nodes, neighbours, stiffer
         self.net = TwoHiddenLayers(3, 2, hidden)
         zero_outputs(self.net[-1])
         self.register_buffer("scale", torch.tensor(SCALE), persistent=False)
-        self._dynamics: tuple[float, object, float, Interactions] | None = None  # the last one, with what it was asked for
+        self._dynamics: tuple[float, object, float, Interactions] | None = (
+            None  # the last one, with what it was asked for
+        )
 
     def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "_dynamics": None}  # it holds graphs, which can be neither copied nor pickled
+        return {
+            **super().__getstate__(),
+            "_dynamics": None,
+        }  # it holds graphs, which can be neither copied nor pickled
 
     def settle(self, rest: Tensor, volume: Tensor) -> None:
         """Choose nodes and bonds of a body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError for too few particles."""
         X, V = rest.detach().cpu().double().numpy(), volume.detach().cpu().double().numpy()
         count = min(self.most, len(X))
         if count <= self.neighbours:
-            raise ConfigError(f"adapter.neighbours: expected fewer than the body's {count} nodes, found {self.neighbours}")
+            raise ConfigError(
+                f"adapter.neighbours: expected fewer than the body's {count} nodes, found {self.neighbours}"
+            )
         nodes = spread(X, count)
         tree = cKDTree(X[nodes])
         V_nodes = np.bincount(tree.query(X)[1], weights=V, minlength=count)
         near = tree.query(X[nodes], k=self.neighbours + 1)[1][:, 1:]
-        pairs = np.sort(np.stack([np.repeat(np.arange(count), self.neighbours), near.ravel()], 1), axis=1)
+        pairs = np.sort(
+            np.stack([np.repeat(np.arange(count), self.neighbours), near.ravel()], 1), axis=1
+        )
         i, j = np.unique(pairs, axis=0).T
         L = np.linalg.norm(X[nodes][j] - X[nodes][i], axis=1)
-        total = np.bincount(i, weights=L, minlength=count) + np.bincount(j, weights=L, minlength=count)
-        share = 6 * V_nodes / total  # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
+        total = np.bincount(i, weights=L, minlength=count) + np.bincount(
+            j, weights=L, minlength=count
+        )
+        share = (
+            6 * V_nodes / total
+        )  # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
         area = share[i] + share[j]
         bond = area / L
-        rate = (np.bincount(i, weights=bond, minlength=count) + np.bincount(j, weights=bond, minlength=count)) / V_nodes
+        rate = (
+            np.bincount(i, weights=bond, minlength=count)
+            + np.bincount(j, weights=bond, minlength=count)
+        ) / V_nodes
         degree = np.bincount(i, minlength=count) + np.bincount(j, minlength=count)
         followed, weight, center, inverse = following(X, X[nodes], tree)
-        found = {"nodes": nodes, "i": i, "j": j, "length": L, "area": area, "node_volume": V_nodes, "degree": degree.astype(float),
-                 "followed": followed, "weight": weight, "center": center, "inverse": inverse, "node_rest": X[nodes], "rest": X}
+        found = {
+            "nodes": nodes,
+            "i": i,
+            "j": j,
+            "length": L,
+            "area": area,
+            "node_volume": V_nodes,
+            "degree": degree.astype(float),
+            "followed": followed,
+            "weight": weight,
+            "center": center,
+            "inverse": inverse,
+            "node_rest": X[nodes],
+            "rest": X,
+        }
         for name, value in found.items():
             self.register_buffer(name, torch.as_tensor(value).to(rest.device), persistent=False)
         for name, value in self.named_buffers():
             if value.is_floating_point() and name not in ("E_ref", "poisson"):
                 setattr(self, name, value.to(rest.dtype))
-        self.fastest = float(np.sqrt(2 * rate.max()))  # bound of the nodes' frequencies, times sqrt(E_ref/density)
+        self.fastest = float(
+            np.sqrt(2 * rate.max())
+        )  # bound of the nodes' frequencies, times sqrt(E_ref/density)
         self.radius = 0.5 * float(V.mean()) ** (1 / 3)
 
-    def tension(self, e: Tensor, rate: Tensor, mean: Tensor, net: Callable[[Tensor], Tensor]) -> Tensor:
+    def tension(
+        self, e: Tensor, rate: Tensor, mean: Tensor, net: Callable[[Tensor], Tensor]
+    ) -> Tensor:
         """(B,) f/(E_ref a) of bonds; e, rate, mean: (B,) strain, its rate over c and the mean strain around."""
         raw = net(self.scale * torch.stack([e, rate, mean], -1))
         bounded = torch.tanh(raw)
-        return e * torch.exp(self.stiffer * bounded[:, 0]) + DAMPING * torch.exp(bounded[:, 1]) * rate
+        return (
+            e * torch.exp(self.stiffer * bounded[:, 0]) + DAMPING * torch.exp(bounded[:, 1]) * rate
+        )
 
-    def forces(self, x: Tensor, v: Tensor, density: float, net: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+    def forces(
+        self, x: Tensor, v: Tensor, density: float, net: Callable[[Tensor], Tensor] | None = None
+    ) -> Tensor:
         """(M, 3) [N] on the nodes at x (M, 3) [m] with velocities v (M, 3) [m/s]; density [kg/m^3]; net: in place of the
         network, with other weights."""
         d = x[self.j] - x[self.i]
@@ -109,7 +148,9 @@ class InteractionNetwork(Adapter):
         zero = torch.zeros(len(x), dtype=x.dtype, device=x.device)
         around = (zero.index_add(0, self.i, e).index_add(0, self.j, e)) / self.degree
         mean = 0.5 * (around[self.i] + around[self.j])
-        f = (self.E_ref * self.area * self.tension(e, rate, mean, self.net if net is None else net))[:, None] * n
+        f = (
+            self.E_ref * self.area * self.tension(e, rate, mean, self.net if net is None else net)
+        )[:, None] * n
         return torch.zeros_like(x).index_add(0, self.i, f).index_add(0, self.j, -f)
 
     def follow_nodes(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -120,18 +161,29 @@ class InteractionNetwork(Adapter):
         middle = (w * near).sum(1)
         F = torch.einsum("nka,nkb,nbc->nac", w * (near - middle[:, None]), arms, self.inverse)
         moved = middle + (F @ (self.rest - self.center)[..., None])[..., 0]
-        return moved.index_copy(0, self.nodes, x), (w * v[self.followed]).sum(1).index_copy(0, self.nodes, v), F
+        return (
+            moved.index_copy(0, self.nodes, x),
+            (w * v[self.followed]).sum(1).index_copy(0, self.nodes, v),
+            F,
+        )
 
     def simulator(self, density: float, world, frame_dt: float) -> Interactions:
         """What rolls the nodes out in a world, in place of the body's `Simulator`. Errors: ConfigError."""
         self.check_on()
         last = self._dynamics
         if last is None or (last[0], last[2]) != (density, frame_dt) or last[1] is not world:
-            self._dynamics = last = density, world, frame_dt, Interactions(self, density, world, frame_dt)
+            self._dynamics = last = (
+                density,
+                world,
+                frame_dt,
+                Interactions(self, density, world, frame_dt),
+            )
         return last[3]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
-        raise ConfigError("adapter=interaction: pair forces have no stress; expected a rollout by `Body.simulate`")
+        raise ConfigError(
+            "adapter=interaction: pair forces have no stress; expected a rollout by `Body.simulate`"
+        )
 
 
 def spread(X: np.ndarray, count: int) -> np.ndarray:
@@ -152,4 +204,11 @@ def following(X: np.ndarray, nodes: np.ndarray, tree: cKDTree) -> tuple[np.ndarr
     weight /= weight.sum(1, keepdims=True)
     center = np.einsum("nk,nka->na", weight, nodes[near])
     arms = nodes[near] - center[:, None]
-    return near, weight, center, np.linalg.pinv(np.einsum("nk,nka,nkb->nab", weight, arms, arms), rcond=1e-4, hermitian=True)
+    return (
+        near,
+        weight,
+        center,
+        np.linalg.pinv(
+            np.einsum("nk,nka,nkb->nab", weight, arms, arms), rcond=1e-4, hermitian=True
+        ),
+    )

@@ -54,7 +54,10 @@ def invariants(W: Tensor) -> Tensor:
 
 def network(hidden: int) -> nn.Sequential:
     """13 to 9 through two hidden layers with GELU and without biases, Xavier's weights: an input of zeros answers zeros."""
-    layers = [nn.Linear(a, b, bias=False) for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, OUTPUTS))]
+    layers = [
+        nn.Linear(a, b, bias=False)
+        for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, OUTPUTS))
+    ]
     for layer in layers:
         nn.init.xavier_normal_(layer.weight)
     return nn.Sequential(layers[0], nn.GELU(), layers[1], nn.GELU(), layers[2])
@@ -71,7 +74,9 @@ def polar_rotation(F: Tensor, iterations: int = 8) -> Tensor:
     R = F
     for _ in range(iterations):
         a, b, c = R.unbind(-2)
-        cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
+        cofactor = torch.stack(
+            [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2
+        )
         R = 0.5 * (R + cofactor / (a * cofactor[:, 0]).sum(-1)[:, None, None])
     return R
 
@@ -85,9 +90,21 @@ class NeuralLaw(Adapter):
     """
 
     replaces_law = True
-    knobs = {"hidden": whole(1, WIDEST), "start": one_of("prior", "random"), "plastic": FLAG, "plastic_rate": POSITIVE}
+    knobs = {
+        "hidden": whole(1, WIDEST),
+        "start": one_of("prior", "random"),
+        "plastic": FLAG,
+        "plastic_rate": POSITIVE,
+    }
 
-    def __init__(self, *, hidden: int = 64, start: str = "prior", plastic: bool = False, plastic_rate: float = 2.0) -> None:
+    def __init__(
+        self,
+        *,
+        hidden: int = 64,
+        start: str = "prior",
+        plastic: bool = False,
+        plastic_rate: float = 2.0,
+    ) -> None:
         super().__init__()
         self.start, self.plastic_rate = start, plastic_rate
         self.elastic = network(hidden)
@@ -98,7 +115,9 @@ class NeuralLaw(Adapter):
     def check_law(self, law: str) -> None:
         """Errors: ConfigError for a plastic network beside a prior that does not keep the elastic part of F apart."""
         if self.plastic is not None and law != "von_mises":
-            raise ConfigError(f"adapter.plastic: expected prior=von_mises, which keeps the elastic part of F apart, found {law}")
+            raise ConfigError(
+                f"adapter.plastic: expected prior=von_mises, which keeps the elastic part of F apart, found {law}"
+            )
 
     def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:
         self.check_law(law)
@@ -119,8 +138,9 @@ class NeuralLaw(Adapter):
         return s.new_zeros(len(s), 6, 6), self.stress(w)
 
     def forward(self, state: MaterialState) -> AdapterOperator:
-        """The law's stress as an offset to the prior's, exact at the state it was asked at. Errors: ConfigError before `switch_on`.
-        """
+        """The law's stress as an offset to the prior's, exact at the state it was asked at.
+
+        Errors: ConfigError before `switch_on`."""
         self.check_on()
         outer, inner = state.w.dtype, self.E_ref.dtype
         h = self.E_ref * self.increment(state.w.to(inner), state.stress.to(inner) / self.E_ref)
@@ -130,7 +150,12 @@ class NeuralLaw(Adapter):
         if state.plastic_strain is None or self.plastic is None:
             return AdapterOperator(G, h.to(outer))  # the prior's own yield, where it has one
         # the strain in the prior's yield function becomes 0: it never yields, the network flows instead
-        return AdapterOperator(G, h.to(outer), -torch.eye(6).to(G).expand(n, 6, 6).contiguous(), torch.zeros_like(state.w))
+        return AdapterOperator(
+            G,
+            h.to(outer),
+            -torch.eye(6).to(G).expand(n, 6, 6).contiguous(),
+            torch.zeros_like(state.w),
+        )
 
     def flow(self, F: Tensor, time: float) -> Tensor:
         """F (N, 3, 3) after plastic flow for `time` [s]; F itself without a plastic network."""
@@ -181,7 +206,11 @@ def pretrain(
         features = fitted[:-1](x)
         basis = torch.eye(OUTPUTS).double()
         columns = torch.stack([stress_of(e.expand(len(W), -1), W) for e in basis], -1)  # (N, 6, 9)
-        rows = (weight[:, :, None, None] * columns[..., None] * features[:, None, None, :]).flatten(2).flatten(0, 1)
+        rows = (
+            (weight[:, :, None, None] * columns[..., None] * features[:, None, None, :])
+            .flatten(2)
+            .flatten(0, 1)
+        )
         target = (weight * s).flatten()
         normal = rows.T @ rows
         ridge = 1e-9 * normal.diagonal().mean() * torch.eye(len(normal)).double()
@@ -189,5 +218,7 @@ def pretrain(
         last += change.view_as(last)
         W, s, weight = draw()
         error = (stress_of(fitted(invariants(W)), W) - s).norm(dim=1) * weight[:, 0]
-        net.load_state_dict({name: value.to(device, inner) for name, value in fitted.state_dict().items()})
+        net.load_state_dict(
+            {name: value.to(device, inner) for name, value in fitted.state_dict().items()}
+        )
     return float(error.square().mean().sqrt())

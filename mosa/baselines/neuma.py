@@ -25,7 +25,10 @@ class LowRankLinear(nn.Linear):
     def __init__(self, held: nn.Linear, rank: int, scaling: float) -> None:
         super().__init__(held.in_features, held.out_features, bias=False)
         self.weight = nn.Parameter(held.weight.detach().clone(), requires_grad=False)
-        self.A, self.B = nn.Parameter(torch.empty(rank, held.in_features)), nn.Parameter(torch.zeros(held.out_features, rank))
+        self.A, self.B = (
+            nn.Parameter(torch.empty(rank, held.in_features)),
+            nn.Parameter(torch.zeros(held.out_features, rank)),
+        )
         nn.init.kaiming_uniform_(self.A, a=5**0.5)
         self.factor = scaling / rank
 
@@ -35,7 +38,12 @@ class LowRankLinear(nn.Linear):
 
 def low_rank(net: nn.Sequential, rank: int, scaling: float) -> nn.Sequential:
     """The network with every linear layer as a `LowRankLinear`."""
-    return nn.Sequential(*(LowRankLinear(part, rank, scaling) if isinstance(part, nn.Linear) else part for part in net))
+    return nn.Sequential(
+        *(
+            LowRankLinear(part, rank, scaling) if isinstance(part, nn.Linear) else part
+            for part in net
+        )
+    )
 
 
 class LowRankLaw(NeuralLaw):
@@ -48,7 +56,13 @@ class LowRankLaw(NeuralLaw):
              **{name: NeuralLaw.knobs[name] for name in ("hidden", "plastic", "plastic_rate")}}  # fmt: skip
 
     def __init__(
-        self, *, hidden: int = 64, rank: int = 16, scaling: float = 16.0, plastic: bool = False, plastic_rate: float = 2.0
+        self,
+        *,
+        hidden: int = 64,
+        rank: int = 16,
+        scaling: float = 16.0,
+        plastic: bool = False,
+        plastic_rate: float = 2.0,
     ) -> None:
         super().__init__(hidden=hidden, plastic=plastic, plastic_rate=plastic_rate)
         self.hidden = hidden

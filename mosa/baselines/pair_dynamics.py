@@ -26,9 +26,17 @@ class Interactions:
 
     def __init__(self, network, density: float, world, frame_dt: float) -> None:
         if world.planes or world.colliders:
-            raise ConfigError("adapter=interaction: expected a world with a ground alone, found world.walls or world.colliders")
-        fastest = network.fastest * math.sqrt(float(network.E_ref) / density) * math.exp(0.5 * network.stiffer)
-        self.substeps = math.ceil(frame_dt * fastest)  # half of the limit of stability, 2/fastest, for bonds at their stiffest
+            raise ConfigError(
+                "adapter=interaction: expected a world with a ground alone, found world.walls or world.colliders"
+            )
+        fastest = (
+            network.fastest
+            * math.sqrt(float(network.E_ref) / density)
+            * math.exp(0.5 * network.stiffer)
+        )
+        self.substeps = math.ceil(
+            frame_dt * fastest
+        )  # half of the limit of stability, 2/fastest, for bonds at their stiffest
         self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt
         self._passes: FramePasses | None = None
 
@@ -48,8 +56,10 @@ class Interactions:
         for frame in range(1, frames):
             x, v = Frame.apply(passes, x, v, *weights)
             if not bool(torch.isfinite(x).all()):
-                raise SimulationDiverged(f"adapter=interaction: a position is not finite in frame {frame}; lower "
-                                         "fit.joint.lr_adapter")
+                raise SimulationDiverged(
+                    f"adapter=interaction: a position is not finite in frame {frame}; lower "
+                    "fit.joint.lr_adapter"
+                )
             recorded.append(network.follow_nodes(x, v))
             if progress is not None:
                 progress(frame)
@@ -61,20 +71,37 @@ class Interactions:
         a, b, c = Fs.detach().unbind(-2)
         inverted = int(((a * torch.linalg.cross(b, c)).sum(-1) <= 0).sum())
         final = ParticleState(xs[-1], vs[-1], C, Fs[-1], Fs[-1])
-        return Rollout(x=xs, v=vs, F=Fs, F_tot=Fs, times=times, final=final, inverted=inverted, reactions=None,
-                       counts=(self.substeps,) * (frames - 1))
+        return Rollout(
+            x=xs,
+            v=vs,
+            F=Fs,
+            F_tot=Fs,
+            times=times,
+            final=final,
+            inverted=inverted,
+            reactions=None,
+            counts=(self.substeps,) * (frames - 1),
+        )
 
     def stepper(self, *_, **__) -> None:
-        raise ConfigError("adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step")
+        raise ConfigError(
+            "adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step"
+        )
 
     def passes(self, x: Tensor) -> FramePasses:
         """Those of nodes like x, with the network's weights as they are now."""
-        if self._passes is None or self._passes.x.device != x.device or self._passes.x.dtype != x.dtype:
+        if (
+            self._passes is None
+            or self._passes.x.device != x.device
+            or self._passes.x.dtype != x.dtype
+        ):
             self._passes = FramePasses(self, x)
         self._passes.follow()
         return self._passes
 
-    def frame(self, x: Tensor, v: Tensor, gravity: Tensor, up: Tensor, net: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    def frame(
+        self, x: Tensor, v: Tensor, gravity: Tensor, up: Tensor, net: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
         """(x, v) (M, 3) of the nodes one frame later; net: the network."""
         network, dt = self.network, self.frame_dt / self.substeps
         mass = self.density * network.node_volume[:, None]
@@ -109,7 +136,9 @@ class FramePasses:
         self.dynamics = dynamics
         self.x, self.v, *self.seeds = (torch.zeros_like(like) for _ in range(4))
         self.after = (torch.zeros_like(like), torch.zeros_like(like))
-        self.gravity, self.up = (t.detach().to(like) for t in (dynamics.world.gravity, dynamics.world.up))
+        self.gravity, self.up = (
+            t.detach().to(like) for t in (dynamics.world.gravity, dynamics.world.up)
+        )
         self.names, self.weights, self.gradients = [], [], []
         failing = "adapter=interaction cannot be captured as a CUDA graph and runs uncaptured"
         self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if like.is_cuda else 0)
@@ -146,7 +175,9 @@ class FramePasses:
 
     @torch.no_grad()
     def _forward(self) -> None:
-        found = self.dynamics.frame(self.x, self.v, self.gravity, self.up, self.dynamics.network.net)
+        found = self.dynamics.frame(
+            self.x, self.v, self.gravity, self.up, self.dynamics.network.net
+        )
         for into, value in zip(self.after, found, strict=True):
             into.copy_(value)
 
@@ -156,7 +187,10 @@ class FramePasses:
             leaves = [t.detach().requires_grad_() for t in (self.x, self.v, *self.weights)]
             named = dict(zip(self.names, leaves[2:], strict=True))
             found = self.dynamics.frame(
-                *leaves[:2], self.gravity, self.up, lambda read: functional_call(self.dynamics.network.net, named, (read,))
+                *leaves[:2],
+                self.gravity,
+                self.up,
+                lambda read: functional_call(self.dynamics.network.net, named, (read,)),
             )
             gradients = torch.autograd.grad(found, leaves, self.seeds)
         for into, value in zip(self.gradients, gradients, strict=True):
@@ -169,7 +203,9 @@ class Frame(torch.autograd.Function):
     @staticmethod
     def forward(ctx, passes: FramePasses, x: Tensor, v: Tensor, *weights: Tensor):
         ctx.passes = passes
-        ctx.save_for_backward(x, v, *weights)  # the weights too: a change of them before the adjoint is then an error
+        ctx.save_for_backward(
+            x, v, *weights
+        )  # the weights too: a change of them before the adjoint is then an error
         return passes.advance(x, v)
 
     @staticmethod
@@ -177,4 +213,6 @@ class Frame(torch.autograd.Function):
     def backward(ctx, *seeds: Tensor):
         x, v, *_ = ctx.saved_tensors
         found = ctx.passes.adjoint(x, v, seeds)
-        return None, *(g if needed else None for g, needed in zip(found, ctx.needs_input_grad[1:], strict=True))
+        return None, *(
+            g if needed else None for g, needed in zip(found, ctx.needs_input_grad[1:], strict=True)
+        )

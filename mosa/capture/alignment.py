@@ -42,7 +42,9 @@ def pixels_at(track: Track, times: np.ndarray) -> np.ndarray:
     return np.where(((share >= 0) & (share <= 1)), found, np.nan)
 
 
-def disagreement(phones: tuple[Phone, Phone], tracks: tuple[Track, Track], offsets: np.ndarray) -> np.ndarray:
+def disagreement(
+    phones: tuple[Phone, Phone], tracks: tuple[Track, Track], offsets: np.ndarray
+) -> np.ndarray:
     """(K,) in [0, 1] for K offsets [s] by which the second phone's clock is to be put forward: mean over the first's moving frames
     of how far its line of sight passes the second's, (distance / MISS radii)^2, at most 1, which it is where there is none."""
     one, two = phones
@@ -82,10 +84,17 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
         for v in set(range(len(phones))) - set(placed):
             cost = np.zeros(len(grid))
             for u in placed:
-                cost += disagreement((phones[u], phones[v]), (tracks[u], tracks[v]), grid - offsets[u])
-                cost += disagreement((phones[v], phones[u]), (tracks[v], tracks[u]), offsets[u] - grid)
+                cost += disagreement(
+                    (phones[u], phones[v]), (tracks[u], tracks[v]), grid - offsets[u]
+                )
+                cost += disagreement(
+                    (phones[v], phones[u]), (tracks[v], tracks[u]), offsets[u] - grid
+                )
             costs[v] = cost / (2 * len(placed))
-        v = min(costs, key=lambda v: (costs[v].min() > LOST, int((costs[v] < costs[v].min() + NEARLY).sum())))
+        v = min(
+            costs,
+            key=lambda v: (costs[v].min() > LOST, int((costs[v] < costs[v].min() + NEARLY).sum())),
+        )
         best = int(costs[v].argmin())
         if costs[v][best] > LOST:
             others = ", ".join(phones[u].name for u in placed)
@@ -99,7 +108,9 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
     return offsets
 
 
-def centres_at(phones: list[Phone], tracks: list[Track], offsets: np.ndarray, times: np.ndarray) -> np.ndarray:
+def centres_at(
+    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, times: np.ndarray
+) -> np.ndarray:
     """(T, 3) where the lines of sight meet at times of the first phone's clock; NaN with fewer than two."""
     pixels = np.stack([pixels_at(track, times - offset) for track, offset in zip(tracks, offsets)])
     origins = np.stack([phone.camera.centre for phone in phones])

@@ -40,22 +40,30 @@ def read_model(folder: Path) -> dict[str, Camera]:
         images, cameras = folder / f"images{ending}", folder / f"cameras{ending}"
         if images.is_file():
             if not cameras.is_file():
-                raise DataError(f"{cameras}: file not found; a COLMAP model has it beside {images.name}")
+                raise DataError(
+                    f"{cameras}: file not found; a COLMAP model has it beside {images.name}"
+                )
             try:
                 return assembled(cameras_of(cameras), images_of(images), images)
             except (struct.error, UnicodeDecodeError, OverflowError) as error:
-                raise DataError(f"{folder}: expected a COLMAP model, found a damaged file ({error}); export it again") from error
+                raise DataError(
+                    f"{folder}: expected a COLMAP model, found a damaged file ({error}); export it again"
+                ) from error
     raise DataError(f"{folder}: expected images.bin or images.txt of a COLMAP model, found neither")
 
 
 def assembled(
-    cameras: dict[int, Intrinsics], images: list[tuple[str, int, np.ndarray, np.ndarray]], file: Path
+    cameras: dict[int, Intrinsics],
+    images: list[tuple[str, int, np.ndarray, np.ndarray]],
+    file: Path,
 ) -> dict[str, Camera]:
     found = {}
     for name, number, quaternion, shift in images:
         where = f"{file}, image {name}"
         if number not in cameras:
-            raise DataError(f"{where}: expected one of the cameras {sorted(cameras)}, found CAMERA_ID {number}")
+            raise DataError(
+                f"{where}: expected one of the cameras {sorted(cameras)}, found CAMERA_ID {number}"
+            )
         norm = float(np.linalg.norm(quaternion))
         if not np.isfinite([*quaternion, *shift]).all() or abs(norm - 1) > 1e-3:
             raise DataError(
@@ -63,7 +71,9 @@ def assembled(
             )
         K, coefficients, fisheye, size = cameras[number]
         w2c = np.eye(4)
-        w2c[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # COLMAP writes w first, scipy last
+        w2c[:3, :3] = Rotation.from_quat(
+            np.roll(quaternion, -1)
+        ).as_matrix()  # COLMAP writes w first, scipy last
         w2c[:3, 3] = shift
         found[name] = Camera(K, w2c, size, where, coefficients, fisheye)
     if not found:
@@ -79,11 +89,17 @@ def intrinsics(model: str, width: int, height: int, values: list[float], where: 
         )
     names = MODELS[model][1]
     if len(values) != len(names):
-        raise DataError(f"{where}: expected the {len(names)} parameters {', '.join(names)} of {model}, found {len(values)}")
+        raise DataError(
+            f"{where}: expected the {len(names)} parameters {', '.join(names)} of {model}, found {len(values)}"
+        )
     given = dict(zip(names, values))
     fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
-    if not (np.isfinite(values).all() and fx > 0 and fy > 0 and 0 < width < 1e5 and 0 < height < 1e5):
-        raise DataError(f"{where}: expected positive focal lengths and sizes, found {given} for {width}x{height} px")
+    if not (
+        np.isfinite(values).all() and fx > 0 and fy > 0 and 0 < width < 1e5 and 0 < height < 1e5
+    ):
+        raise DataError(
+            f"{where}: expected positive focal lengths and sizes, found {given} for {width}x{height} px"
+        )
     K = np.array([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]])
     coefficients = {name: value for name, value in given.items() if name[0] in "kp"}
     return K, coefficients, model.endswith("FISHEYE"), (width, height)
@@ -108,7 +124,9 @@ def lines_of(file: Path) -> list[tuple[int, str]]:
     try:
         lines = file.read_text().splitlines()
     except UnicodeDecodeError as error:
-        raise DataError(f"{file}: expected the text of a COLMAP model, found a damaged file ({error}); export it again") from error
+        raise DataError(
+            f"{file}: expected the text of a COLMAP model, found a damaged file ({error}); export it again"
+        ) from error
     return [(i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#")]
 
 
@@ -119,7 +137,9 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
         if not words:
             continue
         if len(words) < 5:
-            raise DataError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line[:80]!r}")
+            raise DataError(
+                f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line[:80]!r}"
+            )
         number, width, height = whole([words[0], *words[2:4]], where)
         found[number] = intrinsics(words[1], width, height, numbers(words[4:], where), where)
     return found
@@ -133,7 +153,9 @@ def text_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
             continue
         words, where = line.split(maxsplit=9), f"{file}, line {i}"
         if len(words) < 10:
-            raise DataError(f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line[:80]!r}")
+            raise DataError(
+                f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line[:80]!r}"
+            )
         (_, number), values = whole([words[0], words[8]], where), numbers(words[1:8], where)
         found.append((words[9], number, np.array(values[:4]), np.array(values[4:])))
     return found
@@ -146,7 +168,9 @@ def binary_cameras(file: Path) -> dict[int, Intrinsics]:
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         where = f"{file}, camera {number}"
         if model not in BY_NUMBER:
-            raise DataError(f"{where}: expected a camera model of {', '.join(MODELS)}, found number {model}; undistort the images")
+            raise DataError(
+                f"{where}: expected a camera model of {', '.join(MODELS)}, found number {model}; undistort the images"
+            )
         names = MODELS[BY_NUMBER[model]][1]
         values = struct.unpack_from(f"<{len(names)}d", data, at + 24)
         at += 24 + 8 * len(names)
@@ -161,7 +185,9 @@ def binary_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
         _, *values, number = struct.unpack_from("<i7di", data, at)
         end = data.find(b"\0", at + 64)
         if end < 0:
-            raise DataError(f"{file}: expected an image's name, found the end of the file; export the model again")
+            raise DataError(
+                f"{file}: expected an image's name, found the end of the file; export the model again"
+            )
         name = data[at + 64 : end].decode()
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * points
@@ -183,7 +209,9 @@ def read_points(folder: Path) -> np.ndarray:
                 f"{binary}: expected points of a COLMAP model, found a damaged file ({error}); export it again"
             ) from error
     elif text.is_file():
-        found = [point(line.split(maxsplit=4), f"{text}, line {i}") for i, line in lines_of(text) if line]
+        found = [
+            point(line.split(maxsplit=4), f"{text}, line {i}") for i, line in lines_of(text) if line
+        ]
     else:
         return np.zeros((0, 3))
     points = np.array(found, float).reshape(-1, 3)
@@ -199,5 +227,7 @@ def point(words: list[str], where: str) -> list[float]:
 def counted(data: bytes, file: Path, most: int = MOST) -> int:
     (count,) = struct.unpack_from("<Q", data, 0)
     if count > most:
-        raise DataError(f"{file}: expected at most {most} entries, found {count}: not a file of a COLMAP model")
+        raise DataError(
+            f"{file}: expected at most {most} entries, found {count}: not a file of a COLMAP model"
+        )
     return count

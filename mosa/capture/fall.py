@@ -123,7 +123,10 @@ def longest_parabola(times: np.ndarray, points: np.ndarray, tolerance: float) ->
 
 
 def rough_window(
-    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, flight: tuple[float, float] | None
+    phones: list[Phone],
+    tracks: list[Track],
+    offsets: np.ndarray,
+    flight: tuple[float, float] | None,
 ) -> tuple[float, float]:
     """First and last time [s] of free fall on the first phone's clock; flight: where it is known."""
     if flight is not None:
@@ -140,14 +143,20 @@ class Problem:
     """Residuals of a window. Numbers: position, velocity, acceleration in units of depth, then per phone offset (but the first's),
     readout, shift. until [s]: end of the frames that are read, of the window's where None."""
 
-    def __init__(self, phones, tracks, offsets, window, knowledge: Knowledge, until: float | None = None):
+    def __init__(
+        self, phones, tracks, offsets, window, knowledge: Knowledge, until: float | None = None
+    ):
         self.phones, self.knowledge, self.window = phones, knowledge, window
         end = window[1] if until is None else until
         self.origin = 0.5 * (window[0] + window[1])
         self.start = offsets
         self.times, self.pixels, self.shares, self.sigma, self.frames = [], [], [], [], []
         for phone, track, offset in zip(phones, tracks, offsets):
-            inside = np.flatnonzero(track.seen & (track.times + offset >= window[0] - 1e-9) & (track.times + offset <= end + 1e-9))
+            inside = np.flatnonzero(
+                track.seen
+                & (track.times + offset >= window[0] - 1e-9)
+                & (track.times + offset <= end + 1e-9)
+            )
             self.frames.append(inside)
             self.times.append(track.times[inside])
             self.pixels.append(track.centres[inside])
@@ -160,13 +169,20 @@ class Problem:
         t = np.linspace(*window, 12)[good] - self.origin
         design = np.stack([np.ones_like(t), t, 0.5 * t * t], 1)
         self.rough = np.linalg.lstsq(design, points[good], rcond=None)[0]
-        self.depth = float(np.mean([np.linalg.norm(self.rough[0] - phone.camera.centre) for phone in phones]))
+        self.depth = float(
+            np.mean([np.linalg.norm(self.rough[0] - phone.camera.centre) for phone in phones])
+        )
         self.readouts = [knowledge.readout_of(phone.name) for phone in phones]
 
     def begin(self) -> np.ndarray:
         readouts = np.array([READOUT if known is None else known for known in self.readouts])
         return np.concatenate(
-            [(self.rough / self.depth).ravel(), np.zeros(len(self.phones) - 1), readouts, np.zeros(2 * len(self.phones))]
+            [
+                (self.rough / self.depth).ravel(),
+                np.zeros(len(self.phones) - 1),
+                readouts,
+                np.zeros(2 * len(self.phones)),
+            ]
         )
 
     def parts(self, numbers: np.ndarray):
@@ -192,31 +208,50 @@ class Problem:
             found.append(self.pixels[v] - expected - shifts[v])
         return found
 
-    def residuals(self, numbers: np.ndarray, noise: float, without: int | None = None) -> np.ndarray:
+    def residuals(
+        self, numbers: np.ndarray, noise: float, without: int | None = None
+    ) -> np.ndarray:
         motion, _, readouts, shifts = self.parts(numbers)
-        parts = [miss.ravel() / noise for v, miss in enumerate(self.misses(numbers)) if v != without]
+        parts = [
+            miss.ravel() / noise for v, miss in enumerate(self.misses(numbers)) if v != without
+        ]
         parts += [(shifts / np.array(self.sigma)[:, None]).ravel()]
         parts.append(
             np.array(
-                [(r - READOUT) / READOUT_SD if known is None else (r - known) / 1e-5 for r, known in zip(readouts, self.readouts)]
+                [
+                    (r - READOUT) / READOUT_SD if known is None else (r - known) / 1e-5
+                    for r, known in zip(readouts, self.readouts)
+                ]
             )
         )
         g = self.knowledge.gravity
         if self.knowledge.scale is not None:
-            parts.append(np.array([(np.linalg.norm(motion[2]) * self.knowledge.scale / g - 1) / 3e-3]))
+            parts.append(
+                np.array([(np.linalg.norm(motion[2]) * self.knowledge.scale / g - 1) / 3e-3])
+            )
         if self.knowledge.up is not None:
-            across = np.cross(motion[2], self.knowledge.up) / np.linalg.norm(motion[2]) / np.linalg.norm(self.knowledge.up)
+            across = (
+                np.cross(motion[2], self.knowledge.up)
+                / np.linalg.norm(motion[2])
+                / np.linalg.norm(self.knowledge.up)
+            )
             parts.append(across / 5e-3)
         # the first clock is the others', and of a phone that is left out nothing is asked
         parts.append(1e-3 * (self.parts(numbers)[1] - self.start) / 1e-2)
         return np.concatenate(parts)
 
     def solve(self, numbers: np.ndarray, noise: float, without: int | None = None):
-        return least_squares(self.residuals, numbers, args=(noise, without), x_scale="jac", method="trf", max_nfev=60)
+        return least_squares(
+            self.residuals, numbers, args=(noise, without), x_scale="jac", method="trf", max_nfev=60
+        )
 
 
 def fit_fall(
-    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, knowledge: Knowledge, flight: tuple[float, float] | None = None
+    phones: list[Phone],
+    tracks: list[Track],
+    offsets: np.ndarray,
+    knowledge: Knowledge,
+    flight: tuple[float, float] | None = None,
 ) -> Fall:
     """The fall from rough offsets (V,) [s]. flight: first and last time of it, where they are known. Errors: DataError."""
     window = rough_window(phones, tracks, offsets, flight)
@@ -237,7 +272,9 @@ def fit_fall(
         every = np.concatenate([m.ravel() for m in misses])
         noise = max(NOISE, OUTLINE * problem.radius, 1.4826 * float(np.median(np.abs(every))))
         offsets = problem.parts(numbers)[1]
-        numbers = np.concatenate([numbers[:9], np.zeros(len(phones) - 1), numbers[8 + len(phones) :]])
+        numbers = np.concatenate(
+            [numbers[:9], np.zeros(len(phones) - 1), numbers[8 + len(phones) :]]
+        )
         if flight is not None:
             if attempt >= 2:
                 break
@@ -253,7 +290,9 @@ def fit_fall(
     return described(problem, solution, noise, count)
 
 
-def trimmed(problem: Problem, misses, offsets, noise: float, window, interval: float) -> tuple[float, float]:
+def trimmed(
+    problem: Problem, misses, offsets, noise: float, window, interval: float
+) -> tuple[float, float]:
     """The window without an interval at an end in which the centres are off, by more than noise, from the parabola."""
     when = np.concatenate([t + o for t, o in zip(problem.times, offsets)])
     off = np.concatenate([np.square(m).sum(1) for m in misses]) / (2 * noise**2)
@@ -295,12 +334,20 @@ def described(problem: Problem, solution, noise: float, count: int) -> Fall:
     across = np.trace(covariance[6:9, 6:9]) * problem.depth**2 - slope
     scale_sd, up_sd = np.sqrt(slope) / size, np.degrees(np.sqrt(max(across, 0)) / size)
     sd = np.sqrt(np.diag(covariance))
-    others = [problem.parts(problem.solve(solution.x, noise, v).x) for v in range(V)] if V > 3 else []
+    others = (
+        [problem.parts(problem.solve(solution.x, noise, v).x) for v in range(V)] if V > 3 else []
+    )
     if others:  # a phone's mistakes are in all of its frames: what the fit is without it says more than its residuals
         sizes = np.array([np.linalg.norm(m[2]) for m, *_ in others])
         turns = np.array(
             [
-                np.degrees(np.arcsin(np.clip(np.linalg.norm(np.cross(m[2], direction)) / np.linalg.norm(m[2]), 0, 1)))
+                np.degrees(
+                    np.arcsin(
+                        np.clip(
+                            np.linalg.norm(np.cross(m[2], direction)) / np.linalg.norm(m[2]), 0, 1
+                        )
+                    )
+                )
                 for m, *_ in others
             ]
         )

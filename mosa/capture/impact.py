@@ -40,9 +40,13 @@ class Impact(Problem):
         self.begun = fall
         end = until - self.origin
         first = fall.window[1] - self.origin
-        self.knots = np.concatenate([[first] * 3, np.linspace(first, end, round(AFTER / STEP) + 1), [end] * 3])
+        self.knots = np.concatenate(
+            [[first] * 3, np.linspace(first, end, round(AFTER / STEP) + 1), [end] * 3]
+        )
         count = len(self.knots) - 4
-        self.bend = np.diff(np.eye(count), 3, axis=0)[:, 3:]  # the first three vanish: the curve joins the parabola smoothly
+        self.bend = np.diff(np.eye(count), 3, axis=0)[
+            :, 3:
+        ]  # the first three vanish: the curve joins the parabola smoothly
         focal = float(np.mean([phone.camera.K[0, 0] for phone in phones]))
         self.size = self.radius / focal  # of the object, in units of depth
         self.base = 8 + 4 * len(phones)
@@ -62,30 +66,44 @@ class Impact(Problem):
         """At the fall, and a curve through where lines of sight meet after it."""
         fall = self.begun
         motion = np.stack([fall.position, fall.velocity, fall.acceleration]) / self.depth
-        numbers = np.concatenate([motion.ravel(), np.zeros(len(self.phones) - 1), fall.readouts, fall.shifts.ravel()])
+        numbers = np.concatenate(
+            [motion.ravel(), np.zeros(len(self.phones) - 1), fall.readouts, fall.shifts.ravel()]
+        )
         times = np.linspace(self.knots[0], self.knots[-1], 3 * self.bend.shape[1])
         tracks = [Track(None, t, p, np.ones(len(t))) for t, p in zip(self.times, self.pixels)]
-        beside = (centres_at(self.phones, tracks, fall.offsets, times + self.origin) - fall.at(times + self.origin)) / self.depth
+        beside = (
+            centres_at(self.phones, tracks, fall.offsets, times + self.origin)
+            - fall.at(times + self.origin)
+        ) / self.depth
         good = np.isfinite(beside[:, 0])
         matrix = np.concatenate([self.curve(times[good]) / OUTLINE, self.bend / BEND])
         right = np.concatenate([beside[good] / OUTLINE, np.zeros((len(self.bend), 3))])
         return np.concatenate([numbers, np.linalg.lstsq(matrix, right, rcond=None)[0].ravel()])
 
     def path(self, numbers: np.ndarray, times: np.ndarray) -> np.ndarray:
-        return super().path(numbers, times) + self.depth * self.curve(times) @ numbers[self.base :].reshape(-1, 3)
+        return super().path(numbers, times) + self.depth * self.curve(times) @ numbers[
+            self.base :
+        ].reshape(-1, 3)
 
     def misses(self, numbers: np.ndarray) -> list[np.ndarray]:
         """Per phone (n, 2): seen minus expected [px], after the fall in pixels of as many standard deviations in it."""
         noise = self.begun.noise
         share = min(1.0, noise / (OUTLINE * self.radius))
-        return [np.where(late[:, None], share, 1.0) * miss for late, miss in zip(self.late, super().misses(numbers))]
+        return [
+            np.where(late[:, None], share, 1.0) * miss
+            for late, miss in zip(self.late, super().misses(numbers))
+        ]
 
-    def residuals(self, numbers: np.ndarray, noise: float, without: int | None = None) -> np.ndarray:
+    def residuals(
+        self, numbers: np.ndarray, noise: float, without: int | None = None
+    ) -> np.ndarray:
         bends = self.bend @ numbers[self.base :].reshape(-1, 3) / (BEND * self.size)
         return np.concatenate([super().residuals(numbers, noise, without), bends.ravel()])
 
 
-def through_impact(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> Fall:
+def through_impact(
+    phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge
+) -> Fall:
     """The fall with clocks and a path that are the impact's too; as it is where some phone does not see what followed.
 
     Scale, down and readouts stay those of the free flight alone: what is read of a collision pulls at the parabola's bend, of the
@@ -98,7 +116,9 @@ def through_impact(phones: list[Phone], tracks: list[Track], fall: Fall, knowled
     solution = problem.solve(problem.begin(), fall.noise)
     (position, velocity, acceleration), offsets, _, shifts = problem.parts(solution.x)
     data = np.concatenate([miss.ravel() for miss in problem.misses(solution.x)]) / fall.noise
-    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * max(1.0, float(np.square(data).mean()))
+    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * max(
+        1.0, float(np.square(data).mean())
+    )
     sd, V = np.sqrt(np.diag(covariance)), len(phones)
     return replace(
         fall, position=position, velocity=velocity, acceleration=acceleration, offsets=offsets, shifts=shifts,

@@ -61,9 +61,15 @@ COARSE = 320
 
 def make(cfg: DictConfig) -> dict[str, Any]:
     """`python -m mosa.capture`: write the scene and its report; returns what capture.json says. Errors: ConfigError, DataError."""
-    for key, example in (("videos", "<folder>"), ("poses", "<COLMAP model>"), ("output", "<folder>")):
+    for key, example in (
+        ("videos", "<folder>"),
+        ("poses", "<COLMAP model>"),
+        ("output", "<folder>"),
+    ):
         if OmegaConf.is_missing(cfg, key):
-            raise ConfigError(f"{key}: expected a folder, found none; python -m mosa.capture {key}={example} ...")
+            raise ConfigError(
+                f"{key}: expected a folder, found none; python -m mosa.capture {key}={example} ..."
+            )
     values = plain(cfg)
     check_capture(values)
     return capture(values)
@@ -72,9 +78,14 @@ def make(cfg: DictConfig) -> dict[str, Any]:
 def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     """From the keys of conf/capture.yaml. Errors: ConfigError, DataError."""
     folder = output_folder(values)
-    clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in find_videos(values["videos"])]
+    clips = [
+        open_clip(file, of_phone(values, file.stem, "fps"))
+        for file in find_videos(values["videos"])
+    ]
     refuse_unknown_phones(values, [clip.path.stem for clip in clips])
-    phones = read_phones(values["videos"], values["poses"], {clip.path.name: clip.size for clip in clips})
+    phones = read_phones(
+        values["videos"], values["poses"], {clip.path.name: clip.size for clip in clips}
+    )
     plates = plates_folder(values)
     mattings = [matting_of(values["mattes"], clip, plates=plates, plate_seconds=values["plate_seconds"],
                            masks=None if values["masks"] is None else Path(values["masks"])) for clip in clips]  # fmt: skip
@@ -84,10 +95,19 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
     given = phones
     fall, phones = found_fall(phones, tracks, knowledge, float(values["max_offset"]), flight)
-    log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *fall.window, phones[0].name, fall.frames)
+    log.info(
+        "fall: %.3f to %.3f s on the clock of %s, %d centres",
+        *fall.window,
+        phones[0].name,
+        fall.frames,
+    )
     common = common_path(phones, tracks, fall, knowledge)
-    exposures = [exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))]
-    times = common_times(exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"])
+    exposures = [
+        exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))
+    ]
+    times = common_times(
+        exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"]
+    )
     ground = None if values["ground"] is None else np.array(values["ground"], float)
     own = world is None
     free = check_known_world(fall, knowledge, phones, tracks, flight, ground if own else None)
@@ -104,18 +124,44 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     floor = {"from": "like" if not own else "ground", "sd": None, "tilt_degrees": None}
     if own and ground is None:
         scale = min(1.0, COARSE / max(phones[0].camera.size))
-        pixel = world.scale * np.mean([np.linalg.norm(p.camera.centre - fall.position) / p.camera.K[0, 0] for p in phones])
+        pixel = world.scale * np.mean(
+            [np.linalg.norm(p.camera.centre - fall.position) / p.camera.K[0, 0] for p in phones]
+        )
         height, error = ground_height(lowest_points(folder, centres, radius, scale), float(pixel))
         floor = {"from": "lowest contact", "sd": error, "tilt_degrees": None}
-        level = floor_of_points(world.points(scene_points(values["poses"])), radius, height, max(3 * error, 0.3 * radius))
+        level = floor_of_points(
+            world.points(scene_points(values["poses"])),
+            radius,
+            height,
+            max(3 * error, 0.3 * radius),
+        )
         if level is not None:
-            height, floor = level[0], {"from": "points of the model", "sd": level[1], "tilt_degrees": level[2]}
+            height, floor = (
+                level[0],
+                {"from": "points of the model", "sd": level[1], "tilt_degrees": level[2]},
+            )
         world = world.lowered(height)
         centres = centres - [0, height, 0]
         write_transforms(folder, phones, times, world)
-    beside = np.stack([now.camera.K[:2, 2] - then.camera.K[:2, 2] for now, then in zip(phones, given)])
+    beside = np.stack(
+        [now.camera.K[:2, 2] - then.camera.K[:2, 2] for now, then in zip(phones, given)]
+    )
     told = replace(fall, shifts=fall.shifts + beside)
-    found = figures(values, phones, clips, tracks, told, free, knowledge, world, times, centres, radius, floor, gains)
+    found = figures(
+        values,
+        phones,
+        clips,
+        tracks,
+        told,
+        free,
+        knowledge,
+        world,
+        times,
+        centres,
+        radius,
+        floor,
+        gains,
+    )
     write_whole(folder / FILE, json.dumps(found, indent=1))
     write_report(folder, found, phones, fall, exposures, world, times)
     for line in found["warnings"]:
@@ -136,13 +182,17 @@ def output_folder(values: Mapping[str, Any]) -> Path:
     folder = Path(values["output"])
     for key in ("videos", "poses", "plates", "masks", "like"):
         if values[key] is not None and folder.resolve() == Path(values[key]).resolve():
-            raise ConfigError(f"output: expected a folder of its own, found that of {key}={values[key]}")
+            raise ConfigError(
+                f"output: expected a folder of its own, found that of {key}={values[key]}"
+            )
     try:
         (folder / "images").mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise DataError(f"output: {folder}: expected a folder that can be written, found none ({error.strerror})") from error
+        raise DataError(
+            f"output: {folder}: expected a folder that can be written, found none ({error.strerror})"
+        ) from error
     return folder
 
 
@@ -157,7 +207,11 @@ def check_known_world(
     """What the keys say of scale, up and ground is possible. Returns the fall as it is where nobody knows scale and up: a known
     scale pulls the acceleration to gravity's, so that of it a mistake cannot be told. Errors: ConfigError."""
     given = knowledge.scale is not None or knowledge.up is not None
-    free = fit_fall(phones, tracks, fall.offsets, replace(knowledge, scale=None, up=None), flight) if given else fall
+    free = (
+        fit_fall(phones, tracks, fall.offsets, replace(knowledge, scale=None, up=None), flight)
+        if given
+        else fall
+    )
     if knowledge.scale is not None and not 1 / FAR_OFF < knowledge.scale / free.scale < FAR_OFF:
         raise ConfigError(f"scale: expected about {free.scale:.3g} m per unit of the poses, as the object then falls at "
                           f"{knowledge.gravity:g} m/s^2, found {knowledge.scale:g}; check like, fps and gravity too")  # fmt: skip
@@ -174,7 +228,11 @@ def check_known_world(
 
 
 def found_fall(
-    phones: list[Phone], tracks: list[Track], knowledge: Knowledge, most: float, flight: tuple[float, float] | None = None
+    phones: list[Phone],
+    tracks: list[Track],
+    knowledge: Knowledge,
+    most: float,
+    flight: tuple[float, float] | None = None,
 ) -> tuple[Fall, list[Phone]]:
     """The fall from nothing but tracks, and the phones turned to where they see it: rough clocks, a parabola, and again with the
     outlines that the hull has, the impact, and these phones. most [s]: of offsets; flight: first and last time [s], where they are
@@ -183,9 +241,13 @@ def found_fall(
     for _ in range(CORRECTIONS):
         better = corrected(phones, tracks, fall, knowledge)
         if better is None:
-            log.warning("warning: the mattes have no common hull in the free fall: poses, or mattes, are off")
+            log.warning(
+                "warning: the mattes have no common hull in the free fall: poses, or mattes, are off"
+            )
             break
-        fall = fit_fall(phones, better, fall.offsets, knowledge, fall.window if flight is None else flight)
+        fall = fit_fall(
+            phones, better, fall.offsets, knowledge, fall.window if flight is None else flight
+        )
         fall = through_impact(phones, better, fall, knowledge)
         shifts = without_common(phones, fall)
         phones = [shifted(phone, shift) for phone, shift in zip(phones, shifts)]
@@ -203,7 +265,9 @@ def refuse_unknown_phones(values: Mapping[str, Any], names: list[str]) -> None:
         if name not in names:
             raise ConfigError(f"phones.{name}: no video of that name; there are {', '.join(names)}")
         if unknown := sorted(set(section) - set(OWN)):
-            raise ConfigError(f"phones.{name}.{unknown[0]}: expected the keys {', '.join(OWN)} only")
+            raise ConfigError(
+                f"phones.{name}.{unknown[0]}: expected the keys {', '.join(OWN)} only"
+            )
 
 
 def plates_folder(values: Mapping[str, Any]) -> Path | None:
@@ -213,7 +277,10 @@ def plates_folder(values: Mapping[str, Any]) -> Path | None:
             raise DataError(f"plates: folder {values['plates']} not found")
         return Path(values["plates"])
     videos = Path(values["videos"])
-    return next((folder for folder in (videos / "plates", videos.parent / "plates") if folder.is_dir()), None)
+    return next(
+        (folder for folder in (videos / "plates", videos.parent / "plates") if folder.is_dir()),
+        None,
+    )
 
 
 def followed(clips: list[Clip], mattings: list[Matting]) -> list[Track]:
@@ -229,7 +296,9 @@ def known(values: Mapping[str, Any], clips: list[Clip], world: World | None) -> 
         scan = of_phone(values, name, "scan")
         scans[name] = TURNED.get(clip.turned, "down") if scan == "auto" else scan
         if scans[name] not in SCANS:
-            raise ConfigError(f"phones.{name}.scan: expected auto, {', '.join(SCANS)}, found {scan!r}")
+            raise ConfigError(
+                f"phones.{name}.scan: expected auto, {', '.join(SCANS)}, found {scan!r}"
+            )
     readouts = {name: of_phone(values, name, "readout") for name in names}
     up = None if values["up"] is None else np.array(values["up"], float)
     knowledge = Knowledge(values["gravity"], values["scale"], up, readouts, scans)
@@ -251,13 +320,31 @@ def centres_of(exposures, phones: list[Phone], times: np.ndarray) -> np.ndarray:
 
 
 def figures(
-    values, phones, clips, tracks, fall: Fall, free: Fall, knowledge: Knowledge, world: World, times, centres, radius, floor, gains
+    values,
+    phones,
+    clips,
+    tracks,
+    fall: Fall,
+    free: Fall,
+    knowledge: Knowledge,
+    world: World,
+    times,
+    centres,
+    radius,
+    floor,
+    gains,
 ) -> dict[str, Any]:
     """All that capture.json says. free: the fall without what was known of scale and up, which it so checks."""
     box = box_of(centres, radius)
     folder = Path(values["output"])
     acceleration = float(np.linalg.norm(free.acceleration)) * world.scale
-    turned = float(np.degrees(np.arccos(np.clip(-free.acceleration @ fall.up / np.linalg.norm(free.acceleration), -1, 1))))
+    turned = float(
+        np.degrees(
+            np.arccos(
+                np.clip(-free.acceleration @ fall.up / np.linalg.norm(free.acceleration), -1, 1)
+            )
+        )
+    )
     per_phone = []
     for v, (phone, clip, track) in enumerate(zip(phones, clips, tracks)):
         per_phone.append({
@@ -283,7 +370,9 @@ def figures(
     return found | {"warnings": warnings_of(found, values, knowledge, phones)}
 
 
-def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Knowledge, phones: list[Phone]) -> list[str]:
+def warnings_of(
+    found: dict[str, Any], values: Mapping[str, Any], knowledge: Knowledge, phones: list[Phone]
+) -> list[str]:
     """What a reader has to know before training on it."""
     said = []
     g = values["gravity"]
@@ -298,7 +387,9 @@ def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Kno
             f"{g:.3g}: check scale, fps and gravity"
         )
     if knowledge.up is not None and found["fall"]["turned_degrees"] > 3:
-        said.append(f"the object falls {found['fall']['turned_degrees']:.1f} degrees beside the given up: check up, or like")
+        said.append(
+            f"the object falls {found['fall']['turned_degrees']:.1f} degrees beside the given up: check up, or like"
+        )
     for phone, record in zip(phones, found["phones"]):
         if record["jitter"] > 0.5:
             said.append(
@@ -319,7 +410,10 @@ def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Kno
             f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; scene.ground "
             "is a level plane"
         )
-    if found["ground"]["from"] == "lowest contact" and found["ground"]["sd"] > 0.05 * found["radius"]:
+    if (
+        found["ground"]["from"] == "lowest contact"
+        and found["ground"]["sd"] > 0.05 * found["radius"]
+    ):
         said.append(
             f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the "
             "floor with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"

@@ -48,10 +48,14 @@ class Track:
         x0, y0, part = self.masks[frame]
         column, row = np.floor(pixels).astype(int).T - np.array([[x0], [y0]])
         inside = (column >= 0) & (column < part.shape[1]) & (row >= 0) & (row < part.shape[0])
-        return inside & part[np.clip(row, 0, part.shape[0] - 1), np.clip(column, 0, part.shape[1] - 1)]
+        return (
+            inside & part[np.clip(row, 0, part.shape[0] - 1), np.clip(column, 0, part.shape[1] - 1)]
+        )
 
 
-def matting_of(kind: str, clip: Clip, *, plates: Path | None, plate_seconds, masks: Path | None) -> Matting:
+def matting_of(
+    kind: str, clip: Clip, *, plates: Path | None, plate_seconds, masks: Path | None
+) -> Matting:
     """How the frames of a clip are matted. kind: plates | rembg | masks. Errors: ConfigError, DataError."""
     if kind == "plates":
         plate = plate_of(plates, clip, plate_seconds)
@@ -59,7 +63,9 @@ def matting_of(kind: str, clip: Clip, *, plates: Path | None, plate_seconds, mas
     if kind == "rembg":
         return by_network()
     if masks is None:
-        raise ConfigError("masks: expected the folder of mask videos (white: the object), found none; or choose mattes=plates")
+        raise ConfigError(
+            "masks: expected the folder of mask videos (white: the object), found none; or choose mattes=plates"
+        )
     return from_videos(masks, clip)
 
 
@@ -70,7 +76,11 @@ def same_exposure(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
     gains = []
     for channel in range(3):
         bright = behind[..., channel] > DARK
-        gains.append(float(np.median(small[..., channel][bright] / behind[..., channel][bright])) if bright.any() else 1.0)
+        gains.append(
+            float(np.median(small[..., channel][bright] / behind[..., channel][bright]))
+            if bright.any()
+            else 1.0
+        )
     return np.clip(picture / np.maximum(gains, 0.1), 0, 1).astype(np.float32)
 
 
@@ -79,7 +89,9 @@ def by_network() -> Matting:
     try:
         from rembg import new_session, remove
     except ImportError as error:
-        raise ConfigError("mattes: rembg is not installed; pip install 'mosa[rembg]', or mattes=plates or masks") from error
+        raise ConfigError(
+            "mattes: rembg is not installed; pip install 'mosa[rembg]', or mattes=plates or masks"
+        ) from error
     session = new_session(REMBG)
 
     def matted(_: int, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +105,9 @@ def from_videos(folder: Path, clip: Clip) -> Matting:
     """Masks of another program, one video per phone of as many frames, white where the object is. Errors: DataError."""
     named = [file for file in find_videos(folder) if file.stem == clip.path.stem]
     if not named:
-        raise DataError(f"{folder}: expected a mask video named {clip.path.stem}, found {[f.name for f in find_videos(folder)]}")
+        raise DataError(
+            f"{folder}: expected a mask video named {clip.path.stem}, found {[f.name for f in find_videos(folder)]}"
+        )
     other = open_clip(named[0])
     if len(other.times) != len(clip.times) or other.size != clip.size:
         raise DataError(
@@ -131,7 +145,11 @@ def whole_object(matte: np.ndarray, near: np.ndarray | None = None) -> np.ndarra
         candidates = np.flatnonzero(large >= 0.3 * large.max())
         best = int(candidates[np.linalg.norm(centroids[candidates] - near, axis=1).argmin()])
     reach = np.sqrt(area[best] / np.pi)
-    kept = inside & (area >= SPECK * area[best]) & (np.linalg.norm(centroids - centroids[best], axis=1) < 2 * reach)
+    kept = (
+        inside
+        & (area >= SPECK * area[best])
+        & (np.linalg.norm(centroids - centroids[best], axis=1) < 2 * reach)
+    )
     kept[best] = True
     around = cv2.dilate(kept[labels].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return fill_holes(np.where(around, matte, 0).astype(np.float32), int(HOLE * area[best]))

@@ -32,14 +32,18 @@ def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:
     return float(
         np.median(
             [
-                np.median(track.radii[track.seen]) / phone.camera.K[0, 0] * np.linalg.norm(phone.camera.centre - fall.position)
+                np.median(track.radii[track.seen])
+                / phone.camera.K[0, 0]
+                * np.linalg.norm(phone.camera.centre - fall.position)
                 for phone, track in zip(phones, tracks)
             ]
         )
     )
 
 
-def hull_in_flight(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> np.ndarray:
+def hull_in_flight(
+    phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge
+) -> np.ndarray:
     """(N, 3) points of the visual hull relative to the falling centre, in units of the poses; the body does not turn."""
     radius = radius_of(phones, tracks, fall)
     steps = np.arange(-REACH, REACH + PITCH, PITCH) * radius
@@ -48,10 +52,16 @@ def hull_in_flight(phones: list[Phone], tracks: list[Track], fall: Fall, knowled
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         times = track.times + fall.offsets[v]
         inside = np.flatnonzero(track.seen & (times >= first) & (times <= last))
-        for k in np.unique(inside[np.linspace(0, len(inside) - 1, VIEWS + 2)[1:-1].round().astype(int)]) if len(inside) else ():
+        for k in (
+            np.unique(inside[np.linspace(0, len(inside) - 1, VIEWS + 2)[1:-1].round().astype(int)])
+            if len(inside)
+            else ()
+        ):
             own = times[k] + fall.readouts[v] * row_share(phone, track.centres[k], knowledge)
             pixels = phone.camera.project(points + fall.at(own))
-            when = times[k] + fall.readouts[v] * row_share(phone, pixels, knowledge)  # each point when its row is read
+            when = times[k] + fall.readouts[v] * row_share(
+                phone, pixels, knowledge
+            )  # each point when its row is read
             pixels = phone.camera.project(points + fall.at(when))
             points = points[track.shows(k, pixels)]
     return points
@@ -63,13 +73,18 @@ def outline_centre(phone: Phone, points: np.ndarray, pitch: float) -> np.ndarray
     depth = np.linalg.norm(points.mean(0) - phone.camera.centre)
     cell = pitch / depth * phone.camera.K[0, 0]
     cells = np.floor((pixels - pixels.min(0)) / cell)[:, ::-1]
-    covered = np.zeros(counted(f"{phone.name}: cells of an outline", cells.max(0) + 1, "look at the phone's pose"), bool)
+    covered = np.zeros(
+        counted(f"{phone.name}: cells of an outline", cells.max(0) + 1, "look at the phone's pose"),
+        bool,
+    )
     covered[tuple(cells.astype(int).T)] = True
     rows, columns = np.nonzero(covered)
     return pixels.min(0) + cell * np.array([columns.mean() + 0.5, rows.mean() + 0.5])
 
 
-def corrected(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> list[Track] | None:
+def corrected(
+    phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge
+) -> list[Track] | None:
     """The tracks with centres at which the body's own centre would be seen during the fall, outside of its window moved as at its
     end; None where the mattes have no common hull."""
     points = hull_in_flight(phones, tracks, fall, knowledge)
@@ -77,16 +92,26 @@ def corrected(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: K
     if len(points) * (PITCH * radius) ** 3 < 0.3 * radius**3:  # of a ball it is 4.2
         return None
     times = np.linspace(*fall.window, SAMPLES)
-    middle = points.mean(0)  # a place of the body's own, or the centre would wander from one correction to the next
+    middle = points.mean(
+        0
+    )  # a place of the body's own, or the centre would wander from one correction to the next
     found = []
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         places = fall.at(times)
-        off = np.stack([outline_centre(phone, points + c, PITCH * radius) for c in places]) - phone.camera.project(places + middle)
+        off = np.stack(
+            [outline_centre(phone, points + c, PITCH * radius) for c in places]
+        ) - phone.camera.project(places + middle)
         if np.abs(off).max() > MOST * float(np.median(track.radii[track.seen])):
             return None
         curve = np.polyfit(times - fall.origin, off, 2)
         t = np.clip(track.times + fall.offsets[v], *fall.window) - fall.origin
-        found.append(replace(track, centres=track.centres - (curve[0] * t[:, None] ** 2 + curve[1] * t[:, None] + curve[2])))
+        found.append(
+            replace(
+                track,
+                centres=track.centres
+                - (curve[0] * t[:, None] ** 2 + curve[1] * t[:, None] + curve[2]),
+            )
+        )
     return found
 
 

@@ -62,7 +62,11 @@ class Camera:
         """Unit directions (N, 3) in the world of what pixels (N, 2) show."""
         K, shape = self.opencv_K(), (-1, 1, 2)
         flat = np.asarray(pixels, np.float64).reshape(shape) - HALF
-        flat = cv2.fisheye.undistortPoints(flat, K, self.lens()) if self.fisheye else cv2.undistortPoints(flat, K, self.lens())
+        flat = (
+            cv2.fisheye.undistortPoints(flat, K, self.lens())
+            if self.fisheye
+            else cv2.undistortPoints(flat, K, self.lens())
+        )
         flat = flat.reshape(-1, 2)
         rays = np.concatenate([flat, np.ones((len(flat), 1))], 1) @ self.w2c[:3, :3]
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -92,7 +96,9 @@ def plausible(camera: Camera) -> Camera:
                 f"{camera.where}: expected a principal point near the images of {width}x{height} px, found {name}={value:g}"
             )
     if not np.abs(camera.w2c[:3, 3]).max() <= FARTHEST:
-        raise DataError(f"{camera.where}: expected a camera within {FARTHEST:g} of the origin, found {camera.centre.tolist()}")
+        raise DataError(
+            f"{camera.where}: expected a camera within {FARTHEST:g} of the origin, found {camera.centre.tolist()}"
+        )
     lens_of(K, camera.coefficients, width, height, fisheye=camera.fisheye, where=camera.where)
     return camera
 

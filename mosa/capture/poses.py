@@ -22,7 +22,9 @@ MOVED, TURNED = 0.01, 0.5
 """Share of the distance between cameras, and degrees, by which poses of one phone may differ: it stands still."""
 
 
-def read_phones(videos: str | Path, poses: str | Path, sizes: dict[str, tuple[int, int]]) -> list[Phone]:
+def read_phones(
+    videos: str | Path, poses: str | Path, sizes: dict[str, tuple[int, int]]
+) -> list[Phone]:
     """One phone for each of the videos whose frame sizes [px] are given (name of the file -> width, height).
 
     Errors: DataError naming the video without a pose, or the poses that do not belong together.
@@ -43,7 +45,9 @@ def read_phones(videos: str | Path, poses: str | Path, sizes: dict[str, tuple[in
         one = plausible(still(mine, extent, video.stem))
         phones.append(Phone(video.stem, resized(one, size, video), video))
     if len(phones) < FEWEST:
-        raise DataError(f"{folder}: expected at least {FEWEST} videos, one of each phone, found {len(phones)}")
+        raise DataError(
+            f"{folder}: expected at least {FEWEST} videos, one of each phone, found {len(phones)}"
+        )
     return phones
 
 
@@ -63,7 +67,10 @@ def read_poses(path: str | Path) -> dict[str, Camera]:
 
 def model_folder(place: Path) -> Path | None:
     """Where a COLMAP model lies, in the folder or as COLMAP nests it; None where there is none."""
-    return next((f for f in (place, place / "sparse" / "0", place / "sparse", place / "0") if is_model(f)), None)
+    return next(
+        (f for f in (place, place / "sparse" / "0", place / "sparse", place / "0") if is_model(f)),
+        None,
+    )
 
 
 def scene_points(path: str | Path) -> np.ndarray:
@@ -75,7 +82,11 @@ def scene_points(path: str | Path) -> np.ndarray:
 def read_transforms_poses(file: Path) -> dict[str, Camera]:
     """Poses and lenses of a transforms.json; its images are not read. Errors: DataError naming entry and key."""
     document = read_json(file)
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+    if (
+        not isinstance(document, dict)
+        or not isinstance(document.get("frames"), list)
+        or not document["frames"]
+    ):
         raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
     found = {}
     for i, entry in enumerate(document["frames"]):
@@ -85,21 +96,41 @@ def read_transforms_poses(file: Path) -> dict[str, Camera]:
                 raise DataError(f"{where}: expected the key {key}")
         keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
         both = {**document, **entry}
-        known = {key: number(both[key], f"{where}, {key}") for key in keys if both.get(key) is not None}
+        known = {
+            key: number(both[key], f"{where}, {key}") for key in keys if both.get(key) is not None
+        }
         if not {"w", "h"} <= set(known):
-            raise DataError(f"{where}: expected the images' size in pixels, w and h, found {sorted(known)}")
+            raise DataError(
+                f"{where}: expected the images' size in pixels, w and h, found {sorted(known)}"
+            )
         if min(known["w"], known["h"]) < 1:
-            raise DataError(f"{where}: expected an image size w, h of at least 1 px, found {known['w']:g}x{known['h']:g}")
+            raise DataError(
+                f"{where}: expected an image size w, h of at least 1 px, found {known['w']:g}x{known['h']:g}"
+            )
         if "fl_x" not in known and not 0 < known.get("camera_angle_x", 0) < math.pi:
-            raise DataError(f"{where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
-        focal = known["fl_x"] if "fl_x" in known else 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
+            raise DataError(
+                f"{where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither"
+            )
+        focal = (
+            known["fl_x"]
+            if "fl_x" in known
+            else 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
+        )
         K = np.array(
-            [[focal, 0, known.get("cx", known["w"] / 2)], [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)], [0, 0, 1]]
+            [
+                [focal, 0, known.get("cx", known["w"] / 2)],
+                [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)],
+                [0, 0, 1],
+            ]
         )
         fisheye = is_fisheye(both.get("camera_model"), both.get("is_fisheye"), where)
-        w2c = world_to_camera(matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix"), where)
+        w2c = world_to_camera(
+            matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix"), where
+        )
         lens = {name: known[name] for name in COEFFICIENTS if name in known}
-        found[str(entry["file_path"])] = Camera(K, w2c, (int(known["w"]), int(known["h"])), where, lens, fisheye)
+        found[str(entry["file_path"])] = Camera(
+            K, w2c, (int(known["w"]), int(known["h"])), where, lens, fisheye
+        )
     return found
 
 
@@ -108,7 +139,10 @@ def belongs(image: str, phone: str) -> bool:
     path = Path(image)
     if phone in path.parts[:-1]:
         return True
-    return re.fullmatch(re.escape(phone) + r"([ _.-]+\d+|[ _.-]*frame[ _.-]*\d+)?", path.stem) is not None
+    return (
+        re.fullmatch(re.escape(phone) + r"([ _.-]+\d+|[ _.-]*frame[ _.-]*\d+)?", path.stem)
+        is not None
+    )
 
 
 def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:

@@ -33,7 +33,10 @@ def write_report(
     times: np.ndarray,
 ) -> None:
     """capture.md, contact.png and fall.png into the folder."""
-    cv2.imwrite(str(folder / "contact.png"), contact_sheet(folder, [phone.name for phone in phones], len(times)))
+    cv2.imwrite(
+        str(folder / "contact.png"),
+        contact_sheet(folder, [phone.name for phone in phones], len(times)),
+    )
     draw_fall(folder / "fall.png", phones, fall, exposures, world)
     write_whole(folder / "capture.md", page(found))
 
@@ -45,7 +48,11 @@ def page(found: dict[str, Any]) -> str:
     lines = [
         f"# A capture by {len(found['phones'])} phones",
         "",
-        *(["**To be looked at first:**", "", *(f"- {line}" for line in said), ""] if said else ["Nothing unusual was found.", ""]),
+        *(
+            ["**To be looked at first:**", "", *(f"- {line}" for line in said), ""]
+            if said
+            else ["Nothing unusual was found.", ""]
+        ),
         "Learn from it:",
         "",
         f"    {found['command']}",
@@ -100,7 +107,10 @@ def contact_sheet(folder: Path, names: list[str], frames: int) -> np.ndarray:
     chosen = np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
     rows = []
     for name in names:
-        pictures = [cv2.imread(str(folder / "images" / f"{name}_{k:03d}.png"), cv2.IMREAD_UNCHANGED) for k in chosen]
+        pictures = [
+            cv2.imread(str(folder / "images" / f"{name}_{k:03d}.png"), cv2.IMREAD_UNCHANGED)
+            for k in chosen
+        ]
         covered = np.max([p[..., 3] for p in pictures], 0) > 127
         y, x = (np.flatnonzero(covered.any(axis)) for axis in (1, 0))
         spare = 10
@@ -109,21 +119,45 @@ def contact_sheet(folder: Path, names: list[str], frames: int) -> np.ndarray:
         for picture, k in zip(pictures, chosen):
             part = picture[y0:y1, x0:x1]
             alpha = part[..., 3:].astype(np.float32) / 255
-            shown = np.ascontiguousarray((part[..., :3] * alpha + 200 * (1 - alpha)).astype(np.uint8))
-            outline, _ = cv2.findContours((part[..., 3] > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+            shown = np.ascontiguousarray(
+                (part[..., :3] * alpha + 200 * (1 - alpha)).astype(np.uint8)
+            )
+            outline, _ = cv2.findContours(
+                (part[..., 3] > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+            )
             cv2.drawContours(shown, outline, -1, (0, 0, 220), 1)
             factor = TILE / shown.shape[0]
-            shown = cv2.resize(shown, (max(60, round(shown.shape[1] * factor)), TILE), interpolation=cv2.INTER_AREA)
-            cv2.putText(shown, f"{name} {k}", (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-            tiles.append(cv2.copyMakeBorder(shown, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255, 255, 255)))
+            shown = cv2.resize(
+                shown, (max(60, round(shown.shape[1] * factor)), TILE), interpolation=cv2.INTER_AREA
+            )
+            cv2.putText(
+                shown,
+                f"{name} {k}",
+                (4, 14),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.4,
+                (0, 0, 0),
+                1,
+                cv2.LINE_AA,
+            )
+            tiles.append(
+                cv2.copyMakeBorder(shown, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+            )
         rows.append(np.hstack(tiles))
     width = max(row.shape[1] for row in rows)
     return np.vstack(
-        [cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)) for row in rows]
+        [
+            cv2.copyMakeBorder(
+                row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)
+            )
+            for row in rows
+        ]
     )
 
 
-def draw_fall(file: Path, phones: list[Phone], fall: Fall, exposures: list[Exposure], world: World) -> None:
+def draw_fall(
+    file: Path, phones: list[Phone], fall: Fall, exposures: list[Exposure], world: World
+) -> None:
     """Heights at which each phone sees the centre, with the parabola; and how far each sees it from
     there, in pixels, but for a constant."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(8, 7), sharex=True, height_ratios=(2, 1))

@@ -60,7 +60,9 @@ class Exposure:
         return self.own_times[np.isfinite(self.centres[:, 0])]
 
 
-def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> tuple[BSpline, float, float]:
+def common_path(
+    phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge
+) -> tuple[BSpline, float, float]:
     """(path (3,) of the object at a common time [s], first and last time of it), to which the lines of sight of all phones
     come nearest.
 
@@ -70,7 +72,11 @@ def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge:
     step = min(track.clip.interval for track in tracks) / KNOTS
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         seen = track.seen
-        own = track.times[seen] + fall.offsets[v] + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
+        own = (
+            track.times[seen]
+            + fall.offsets[v]
+            + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
+        )
         off = centre_shift(phone, own, track.centres[seen], fall)
         rays = phone.camera.rays(track.centres[seen] - off)
         across = np.eye(3) - rays[:, :, None] * rays[:, None]
@@ -81,7 +87,12 @@ def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge:
     low, high = max(t.min() for t in times), min(t.max() for t in times)
     inside = (every >= low) & (every <= high)
     every, across, values = every[inside], across[inside], values[inside]
-    count, _ = counted("knots of the videos' path", [max(4, (high - low) // step)] * 2, "cut the videos, or set fps", each=144)
+    count, _ = counted(
+        "knots of the videos' path",
+        [max(4, (high - low) // step)] * 2,
+        "cut the videos, or set fps",
+        each=144,
+    )
     knots = np.concatenate([[low] * 3, np.linspace(low, high, count), [high] * 3])
     basis = BSpline.design_matrix(np.clip(every, low, high), knots, 3).toarray()
     n = basis.shape[1]
@@ -99,7 +110,12 @@ def centre_shift(phone: Phone, times: np.ndarray, centres: np.ndarray, fall: Fal
 
 
 def exposure_of(
-    v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowledge, common: tuple[BSpline, float, float]
+    v: int,
+    phone: Phone,
+    track: Track,
+    fall: Fall,
+    knowledge: Knowledge,
+    common: tuple[BSpline, float, float],
 ) -> Exposure:
     """Of phone v of a fall; common: of `common_path`. What of a phone's own centres lies beside that path is interpolated
     linearly."""
@@ -117,11 +133,18 @@ def exposure_of(
         return found if np.ndim(time) else found[0]
 
     axis, sign = knowledge.scan_of(phone.name)
-    return Exposure(phone, times, float(fall.readouts[v]), axis, sign, track.centres, path, (low, high))
+    return Exposure(
+        phone, times, float(fall.readouts[v]), axis, sign, track.centres, path, (low, high)
+    )
 
 
 def common_times(
-    exposures: list[Exposure], window: tuple[float, float], *, before: float, after: float, rate: float | None
+    exposures: list[Exposure],
+    window: tuple[float, float],
+    *,
+    before: float,
+    after: float,
+    rate: float | None,
 ) -> np.ndarray:
     """(T,) [s], evenly spaced, from `before` seconds before the free fall ends to `after` after it, as far as every phone has a
     whole object in the frames around. rate [1/s]: None for the slowest phone's. Errors: DataError where less than five are left."""
@@ -131,7 +154,9 @@ def common_times(
     first = exposures[0].times[np.abs(exposures[0].times - window[1]).argmin()]
     low, high = int(np.floor(before / step)), int(np.floor(after / step))
     grid = first + step * np.arange(-low, high + 1)
-    good = np.array([all(between(e, t) is not None for e in exposures) and t > window[0] for t in grid])
+    good = np.array(
+        [all(between(e, t) is not None for e in exposures) and t > window[0] for t in grid]
+    )
     bad = np.flatnonzero(~good)
     begin, end = max(bad[bad <= low], default=-1) + 1, min(bad[bad > low], default=len(grid))
     if end - begin < 5 or low - begin < 1:
@@ -154,7 +179,9 @@ def between(exposure: Exposure, time: float) -> tuple[int, int] | None:
     for k in (after - 1, after):
         if abs(own[k] - time) < NEAR * gap and np.isfinite(exposure.centres[k, 0]):
             return k, k
-    if not np.isfinite(exposure.centres[after - 1 : after + 1, 0]).all() or gap > 2.5 * float(np.median(np.diff(exposure.times))):
+    if not np.isfinite(exposure.centres[after - 1 : after + 1, 0]).all() or gap > 2.5 * float(
+        np.median(np.diff(exposure.times))
+    ):
         return None
     return after - 1, after
 
@@ -166,12 +193,18 @@ def around(exposure: Exposure, pair: tuple[int, int]) -> list[int]:
     own, usual = exposure.own_times, float(np.median(np.diff(exposure.times)))
     found = sorted({k0, k1})
     for k, beside in ((k0 - 1, k0), (k1 + 1, k1)):
-        if 0 <= k < len(own) and np.isfinite(exposure.centres[k, 0]) and abs(own[k] - own[beside]) < 2.5 * usual:
+        if (
+            0 <= k < len(own)
+            and np.isfinite(exposure.centres[k, 0])
+            and abs(own[k] - own[beside]) < 2.5 * usual
+        ):
             found.append(k)
     return sorted(found)
 
 
-def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> tuple[np.ndarray, np.ndarray]:
+def moved(
+    picture: np.ndarray, exposure: Exposure, frame: int, time: float
+) -> tuple[np.ndarray, np.ndarray]:
     """A frame (H, W, C) of 8 bits as it would have been exposed at one time, were the object's motion that of its centre in the
     picture; in [0, 1]. And the times (H or W,) [s] at which what its lines then show was read."""
     height, width = picture.shape[:2]
@@ -179,15 +212,26 @@ def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> t
     size = (width, height)[exposure.axis]
     line = np.arange(size) + 0.5
     source, shift, when = line, np.zeros((size, 2)), np.zeros(size)
-    for _ in range(4):  # where a row comes from depends on when it was read: a contraction by velocity times readout over size
+    for _ in range(
+        4
+    ):  # where a row comes from depends on when it was read: a contraction by velocity times readout over size
         when = exposure.times[frame] + exposure.readout * exposure.sign * (source / size - 0.5)
         shift = exposure.path(when) - wanted
         source = line + shift[:, exposure.axis]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     by = shift.astype(np.float32)
-    dx, dy = (by[:, 0][:, None], by[:, 1][:, None]) if exposure.axis == 1 else (by[:, 0][None], by[:, 1][None])
+    dx, dy = (
+        (by[:, 0][:, None], by[:, 1][:, None])
+        if exposure.axis == 1
+        else (by[:, 0][None], by[:, 1][None])
+    )
     found = cv2.remap(
-        picture.astype(np.float32) / 255, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        picture.astype(np.float32) / 255,
+        x + dx,
+        y + dy,
+        cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
     )
     return found, when
 
@@ -203,7 +247,13 @@ def lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
 
 
 def blended(
-    pictures: list[np.ndarray], when: np.ndarray, anchors: list[int], time: float, axis: int, centre: np.ndarray, radius: float
+    pictures: list[np.ndarray],
+    when: np.ndarray,
+    anchors: list[int],
+    time: float,
+    axis: int,
+    centre: np.ndarray,
+    radius: float,
 ) -> np.ndarray:
     """What premultiplied RGBA pictures (H, W, 4) of n frames, moved along the path, would show at one time.
 
@@ -235,13 +285,21 @@ def blended(
         for k in range(len(parts)):
             if k != a:
                 by += weights[k][..., None] * flow_of.calc(greys[a], greys[k], None)
-        inside += share * cv2.remap(parts[a], x - by[..., 0], y - by[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        inside += share * cv2.remap(
+            parts[a],
+            x - by[..., 0],
+            y - by[..., 1],
+            cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
     found = np.zeros_like(pictures[0])
     found[y0:y1, x0:x1] = inside
     return found
 
 
-def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndarray, kind: str = "flow") -> np.ndarray:
+def resampled(
+    exposure: Exposure, track: Track, matting: Matting, times: np.ndarray, kind: str = "flow"
+) -> np.ndarray:
     """(T, H, W, 4) uint8, straight alpha, of a phone at common times (T,) [s]. kind: flow | shift (the nearest frame, moved) | none
     (the nearest frame)."""
     pairs = [between(exposure, float(t)) for t in times]
@@ -265,7 +323,9 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
             pictures, when = zip(*(moved(frames[k], exposure, k, time) for k in near))
             anchors = [near.index(k) for k in sorted({k0, k1})]
             centre = exposure.path(np.asarray(time))
-            picture = blended(list(pictures), np.stack(when), anchors, time, exposure.axis, centre, radius)
+            picture = blended(
+                list(pictures), np.stack(when), anchors, time, exposure.axis, centre, radius
+            )
         found.append(without_tunnels(straight(picture)))
     return np.stack(found)
 

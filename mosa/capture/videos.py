@@ -38,10 +38,14 @@ def find_videos(folder: str | Path) -> list[Path]:
         raise DataError(f"{place}: folder not found; expected one video of each phone in it")
     found = sorted(file for file in place.iterdir() if file.suffix.lower() in VIDEOS)
     if not found:
-        raise DataError(f"{place}: expected videos ({', '.join(VIDEOS)}), one of each phone, found none")
+        raise DataError(
+            f"{place}: expected videos ({', '.join(VIDEOS)}), one of each phone, found none"
+        )
     stems = [file.stem for file in found]
     if len(set(stems)) < len(stems):
-        raise DataError(f"{place}: expected one video of each phone, found two of one name: {', '.join(f.name for f in found)}")
+        raise DataError(
+            f"{place}: expected one video of each phone, found two of one name: {', '.join(f.name for f in found)}"
+        )
     return found
 
 
@@ -77,7 +81,9 @@ def open_clip(path: Path, fps: float | None = None) -> Clip:
     return Clip(path, stamps, size, turned, jitter)
 
 
-def frames_of(clip: Clip, first: int = 0, last: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def frames_of(
+    clip: Clip, first: int = 0, last: int | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
     """(number, RGB picture (H, W, 3) uint8) of the frames first to last, both included. Read one after the other: seeking in a
     compressed video is not exact. Errors: DataError where one cannot be decoded."""
     last = len(clip.times) - 1 if last is None else last
@@ -89,7 +95,9 @@ def frames_of(clip: Clip, first: int = 0, last: int | None = None) -> Iterator[t
                 continue
             good, picture = video.read()
             if not good or picture.shape[1::-1] != clip.size:
-                raise DataError(f"{clip.path}: frame {i} of {len(clip.times)} cannot be decoded; export the video again")
+                raise DataError(
+                    f"{clip.path}: frame {i} of {len(clip.times)} cannot be decoded; export the video again"
+                )
             yield i, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     finally:
         video.release()
@@ -105,11 +113,16 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                 other = open_clip(file)
                 return median_of(other, 0, len(other.times) - 1, clip)
             if file.stem == stem and file.suffix.lower() in (".png", ".jpg", ".jpeg"):
-                read_image(file)  # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
+                read_image(
+                    file
+                )  # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
                 picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
                 if picture is None:
                     raise DataError(f"{file}: expected a readable picture, found a damaged one")
-                return fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file).astype(np.float32) / 255
+                return (
+                    fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file).astype(np.float32)
+                    / 255
+                )
     if seconds is None:
         raise DataError(
             f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) of the empty scene in "

@@ -52,7 +52,9 @@ class World:
 
     def lowered(self, height: float) -> World:
         """The world whose zero is at that height [m] of this one."""
-        return World(self.scale, self.R, self.origin + self.R.T @ np.array([0.0, height / self.scale, 0.0]))
+        return World(
+            self.scale, self.R, self.origin + self.R.T @ np.array([0.0, height / self.scale, 0.0])
+        )
 
     def written(self) -> dict:
         return {"scale": self.scale, "rotation": self.R.tolist(), "origin": self.origin.tolist()}
@@ -82,9 +84,14 @@ def read_world(folder: str | Path) -> World:
             "mosa-capture wrote"
         )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
-    scale, R = number(found["scale"], f"{file}, world.scale"), matrix(found["rotation"], (3, 3), f"{file}, world.rotation")
+    scale, R = (
+        number(found["scale"], f"{file}, world.scale"),
+        matrix(found["rotation"], (3, 3), f"{file}, world.rotation"),
+    )
     if not scale > 0:
-        raise DataError(f"{file}, world.scale: expected metres per unit of the poses, above 0, found {scale:g}")
+        raise DataError(
+            f"{file}, world.scale: expected metres per unit of the poses, above 0, found {scale:g}"
+        )
     if not (np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0):
         raise DataError(f"{file}, world.rotation: expected a rotation matrix, found {R.tolist()}")
     return World(scale, R, origin)
@@ -123,10 +130,14 @@ def lowest_points(folder: Path, centres: np.ndarray, radius: float, scale: float
     """(T, 2) [m] heights of `lowest_of_hull` in each frame of a written capture; centres: (T, 3), radius [m]; scale: of
     the images."""
     footage = read_transforms(folder, scale=scale)
-    return np.array([lowest_of_hull(footage, t, centre, radius) for t, centre in enumerate(centres)])
+    return np.array(
+        [lowest_of_hull(footage, t, centre, radius) for t, centre in enumerate(centres)]
+    )
 
 
-def lowest_of_hull(footage: Footage, frame: int, centre: np.ndarray, radius: float) -> tuple[float, float]:
+def lowest_of_hull(
+    footage: Footage, frame: int, centre: np.ndarray, radius: float
+) -> tuple[float, float]:
     """Heights [m] of the hull's tip, and of the lowest level with FOOT of its widest level's area. Below a flat underside a hull
     ends in a cone of the lowest phone's slope, so that the ground lies between. NaNs where it is empty, or cut by the search."""
     steps = np.arange(-REACH, REACH, PITCH)
@@ -154,10 +165,15 @@ def ground_height(lowest: np.ndarray, pixel: float) -> tuple[float, float]:
     return float(smooth[k, 1]), max(pixel, float(smooth[k, 1] - smooth[k, 0]))
 
 
-def floor_of_points(points: np.ndarray, radius: float, near: float, apart: float) -> tuple[float, float, float] | None:
+def floor_of_points(
+    points: np.ndarray, radius: float, near: float, apart: float
+) -> tuple[float, float, float] | None:
     """(height [m], one standard deviation [m], tilt against level [degrees]) of the floor among points (N, 3) [m] of the
     surroundings, the densest level within `apart` of `near`, where the object was lowest; None where there are too few of them."""
-    around = points[(np.hypot(points[:, 0], points[:, 2]) < AROUND * radius) & (np.abs(points[:, 1] - near) < apart)]
+    around = points[
+        (np.hypot(points[:, 0], points[:, 2]) < AROUND * radius)
+        & (np.abs(points[:, 1] - near) < apart)
+    ]
     if len(around) < FEWEST:
         return None
     thick = LAYER * radius
@@ -167,18 +183,29 @@ def floor_of_points(points: np.ndarray, radius: float, near: float, apart: float
         return None
     height = float(np.median(layer[:, 1]))
     spread = 1.4826 * float(np.median(np.abs(layer[:, 1] - height)))
-    slope = np.linalg.lstsq(np.concatenate([layer[:, [0, 2]], np.ones((len(layer), 1))], 1), layer[:, 1], rcond=None)[0]
-    return height, max(1e-4, 1.25 * spread / len(layer) ** 0.5), float(np.degrees(np.arctan(np.hypot(slope[0], slope[1]))))
+    slope = np.linalg.lstsq(
+        np.concatenate([layer[:, [0, 2]], np.ones((len(layer), 1))], 1), layer[:, 1], rcond=None
+    )[0]
+    return (
+        height,
+        max(1e-4, 1.25 * spread / len(layer) ** 0.5),
+        float(np.degrees(np.arctan(np.hypot(slope[0], slope[1])))),
+    )
 
 
 def box_of(centres: np.ndarray, radius: float) -> list[list[float]]:
     """Where the object may be [m], two corners, from its centres (T, 3)."""
     across = np.abs(centres[:, [0, 2]]).max() + 4.5 * radius
     top = float(centres[:, 1].max()) + 3.5 * radius
-    return [[-round(across, 2), -round(0.8 * radius, 2), -round(across, 2)], [round(across, 2), round(top, 2), round(across, 2)]]
+    return [
+        [-round(across, 2), -round(0.8 * radius, 2), -round(across, 2)],
+        [round(across, 2), round(top, 2), round(across, 2)],
+    ]
 
 
-def floor_gains(phones: list[Phone], plates: list[np.ndarray], world: World, radius: float) -> np.ndarray | None:
+def floor_gains(
+    phones: list[Phone], plates: list[np.ndarray], world: World, radius: float
+) -> np.ndarray | None:
     """(V, 3) factors that give the phones one colour of the floor where the object lands, seen empty in all plates (H, W, 3) in
     [0, 1]; None where some phone does not see it, or where they differ by more than exposure and white balance do."""
     steps = np.arange(-FLOOR, FLOOR, 0.1) * radius

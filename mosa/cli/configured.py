@@ -30,7 +30,9 @@ def command(module: str, job: str) -> Callable[[], None]:
         return attempt(imported, cfg)
 
     run.__module__ = module  # Hydra names the job, and with it the run's folder, after the module of its function
-    configured = hydra.main(version_base="1.3", config_path=configuration(), config_name=module.rpartition(".")[2])(run)
+    configured = hydra.main(
+        version_base="1.3", config_path=configuration(), config_name=module.rpartition(".")[2]
+    )(run)
 
     def main() -> None:
         run_command(configured, configuration())

@@ -26,21 +26,52 @@ RESULTS = Path("docs/results")
 
 def arguments(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME",
-                        help="experiments, or all; the jobs of what is named first begin first; none: list them")
-    parser.add_argument("--quick", action="store_true", help="the small variant, minutes on two cores")
-    parser.add_argument("--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing")
-    parser.add_argument("--collect", action="store_true", help="run nothing, write the results of the jobs that are complete")
-    parser.add_argument("--page", action="store_true", help="write the page of all results, results.md beside their folder")
-    parser.add_argument("--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders")
     parser.add_argument(
-        "--results", type=Path, default=None, help="folder of the tables; default: docs/results, quick: RUNS/results"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="experiments, or all; the jobs of what is named first begin first; none: list them",
     )
-    parser.add_argument("--jobs", type=int, default=1, help="jobs side by side, on each device where there are devices")
+    parser.add_argument(
+        "--quick", action="store_true", help="the small variant, minutes on two cores"
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing"
+    )
+    parser.add_argument(
+        "--collect",
+        action="store_true",
+        help="run nothing, write the results of the jobs that are complete",
+    )
+    parser.add_argument(
+        "--page",
+        action="store_true",
+        help="write the page of all results, results.md beside their folder",
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders"
+    )
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=None,
+        help="folder of the tables; default: docs/results, quick: RUNS/results",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        help="jobs side by side, on each device where there are devices",
+    )
     parser.add_argument("--devices", default=None, help="GPUs by number, as 0,1; default: the CPU")
     parser.add_argument("--seeds", default=None, help="instead of the experiment's, as 0,1,2")
-    parser.add_argument("--only", action="append", default=[], metavar="AXIS=NAME,NAME",
-                        help="these of an axis; EXPERIMENT:AXIS=NAME,NAME of one experiment's alone")
+    parser.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        metavar="AXIS=NAME,NAME",
+        help="these of an axis; EXPERIMENT:AXIS=NAME,NAME of one experiment's alone",
+    )
     parser.add_argument(
         "--set",
         action="append",
@@ -54,7 +85,9 @@ def arguments(words: list[str]) -> argparse.Namespace:
 
 def main(words: list[str] | None = None) -> None:
     settle_threads()
-    signal.signal(signal.SIGTERM, interrupt)  # or the jobs would go on without anyone who waits for them
+    signal.signal(
+        signal.SIGTERM, interrupt
+    )  # or the jobs would go on without anyone who waits for them
     with outlived():  # hours of jobs do not end with whoever read their lines
         code = code_of(words)
     sys.exit(code)
@@ -84,7 +117,15 @@ def interrupt(*_) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Exit code: 1 where jobs failed. Errors: ConfigError naming argument or file."""
-    from mosa.experiments.specification import estimate, experiment_names, jobs_of, load_experiment, narrowed, pairs, total_minutes
+    from mosa.experiments.specification import (
+        estimate,
+        experiment_names,
+        jobs_of,
+        load_experiment,
+        narrowed,
+        pairs,
+        total_minutes,
+    )
 
     folder = Path(configuration()) / "experiment" / "paper"
     if options.page and not options.names:
@@ -103,9 +144,7 @@ def run(options: argparse.Namespace) -> int:
             turns.setdefault(name, turn)
     experiments = [load_experiment(folder, name, quick=options.quick) for name in turns]
     seeds = None if options.seeds is None else tuple(whole_numbers("--seeds", options.seeds))
-    experiments = [
-        narrowed(e, pairs(options.only, experiments), seeds) for e in experiments
-    ]
+    experiments = [narrowed(e, pairs(options.only, experiments), seeds) for e in experiments]
     more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
     planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
     wanted: dict[Path, Job] = {}
@@ -127,13 +166,17 @@ def run(options: argparse.Namespace) -> int:
     by_name, command = {experiment.name: experiment for experiment in experiments}, shown(options)
 
     def write(name: str) -> None:
-        from mosa.experiments.report.writing import write_results  # which imports the simulator: jobs do not wait for it
+        from mosa.experiments.report.writing import (
+            write_results,
+        )  # which imports the simulator: jobs do not wait for it
 
         page = write_results(by_name[name], planned[name], results, command)
         print(f"{name}: {page}, {total_minutes(planned[name]):.1f} minutes of jobs", flush=True)
 
     with Writer(planned, write) as writer:
-        failed = {} if options.collect else run_counted(options, jobs, devices, minutes, writer.ended)
+        failed = (
+            {} if options.collect else run_counted(options, jobs, devices, minutes, writer.ended)
+        )
         writer.finish()
     if options.page:
         print(write_the_page(folder, options))
@@ -159,7 +202,10 @@ def run_counted(
     left = sum(not job.finished for job in jobs)
     if not left:
         return {}
-    clock = Clock(options.runs, Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)))
+    clock = Clock(
+        options.runs,
+        Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)),
+    )
 
     def told(job: Job, job_failed: bool) -> None:
         with only_said():
@@ -170,7 +216,9 @@ def run_counted(
         return run_jobs(jobs, devices, options.jobs, told)
     finally:
         with only_said():
-            print(said_of([go for go in clock.write() if go.command == clock.go.command]), flush=True)
+            print(
+                said_of([go for go in clock.write() if go.command == clock.go.command]), flush=True
+            )
 
 
 @contextmanager
@@ -205,7 +253,9 @@ def whole_numbers(where: str, text: str) -> list[int]:
     except ValueError:
         raise ConfigError(f"{where}: expected whole numbers as 0,1, found {text!r}") from None
     if len(set(found)) < len(found) or min(found) < 0 or max(found) >= 2**32:
-        raise ConfigError(f"{where}: expected different whole numbers of at least 0 and below 2^32, found {text!r}")
+        raise ConfigError(
+            f"{where}: expected different whole numbers of at least 0 and below 2^32, found {text!r}"
+        )
     return found
 
 
@@ -216,8 +266,10 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
     for word in words:
         key = word.partition("=")[0].lstrip("+~")
         if "=" not in word or key.split(".")[0] == "hydra" or key in ("resume", "seed"):
-            raise ConfigError(f"--set: expected KEY=VALUE of train.py, without hydra's, resume and seed, which are the jobs' own, "
-                              f"found {word!r}")
+            raise ConfigError(
+                f"--set: expected KEY=VALUE of train.py, without hydra's, resume and seed, which are the jobs' own, "
+                f"found {word!r}"
+            )
     if not words:
         return
     from hydra import compose, initialize_config_dir
@@ -240,4 +292,6 @@ def writable(where: str, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{where}: expected a folder that can be written, found {folder} ({error.strerror})") from error
+        raise ConfigError(
+            f"{where}: expected a folder that can be written, found {folder} ({error.strerror})"
+        ) from error

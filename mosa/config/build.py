@@ -49,18 +49,32 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 def world_config(scene: Scene) -> dict[str, Any]:
     """Plain description of the world a scene plays in."""
-    return {"ground": asdict(scene.ground) if scene.ground is not None else None, "gravity": scene.gravity.tolist(),
-            "up": scene.up.tolist(), "box": scene.box.tolist()}
+    return {
+        "ground": asdict(scene.ground) if scene.ground is not None else None,
+        "gravity": scene.gravity.tolist(),
+        "up": scene.up.tolist(),
+        "box": scene.box.tolist(),
+    }
 
 
 def build_world(config: Mapping[str, Any]) -> World:
     """walls: {mode, friction} of the box's six sides, or None; colliders: list, see `colliders_from_config`; both may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
-    if ground is not None and ground.mode == AUTO:  # where it is found, it is written down; until then the body sticks
+    if (
+        ground is not None and ground.mode == AUTO
+    ):  # where it is found, it is written down; until then the body sticks
         ground = replace(ground, mode="sticky")
-    gravity, up, box = (torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box"))
-    return World(ground, gravity, up, box, build_walls(config.get("walls"), box),
-                 colliders_from_config(config.get("colliders") or ()))
+    gravity, up, box = (
+        torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box")
+    )
+    return World(
+        ground,
+        gravity,
+        up,
+        box,
+        build_walls(config.get("walls"), box),
+        colliders_from_config(config.get("colliders") or ()),
+    )
 
 
 def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ...]:
@@ -68,14 +82,21 @@ def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ..
     if walls is None:
         return ()
     if not walls:
-        raise ConfigError("world.walls: expected null, or keys as in {mode: separate, friction: 0.1}, found none")
+        raise ConfigError(
+            "world.walls: expected null, or keys as in {mode: separate, friction: 0.1}, found none"
+        )
     return tuple(known_keys("world.walls", domain_walls, walls, box))
 
 
 def run_config(cfg: dict[str, Any], scene: Scene, dx: float) -> dict[str, Any]:
     """What a checkpoint keeps: the configuration, and what was measured from the data."""
-    return {"cfg": cfg, "world": world_config(scene) | (cfg.get("world") or {}), "density": scene.density, "dx": dx,
-            "frame_dt": float(scene.times[1] - scene.times[0])}
+    return {
+        "cfg": cfg,
+        "world": world_config(scene) | (cfg.get("world") or {}),
+        "density": scene.density,
+        "dx": dx,
+        "frame_dt": float(scene.times[1] - scene.times[0]),
+    }
 
 
 def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body:
@@ -84,10 +105,19 @@ def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body
     torch.manual_seed(cfg["seed"])
     settings = build_simulation(cfg["simulation"], config["dx"])
     material, options = build_prior(cfg["prior"])
-    heterogeneity = build_heterogeneity(cfg["heterogeneity"], tensors["rest"].amin(0), tensors["rest"].amax(0))
+    heterogeneity = build_heterogeneity(
+        cfg["heterogeneity"], tensors["rest"].amin(0), tensors["rest"].amax(0)
+    )
     adapter = fitting(build_adapter(cfg["adapter"]), material.law)
-    return Body(**tensors, density=config["density"], material=material, heterogeneity=heterogeneity, adapter=adapter,
-                settings=settings, law_options=options)
+    return Body(
+        **tensors,
+        density=config["density"],
+        material=material,
+        heterogeneity=heterogeneity,
+        adapter=adapter,
+        settings=settings,
+        law_options=options,
+    )
 
 
 def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None:
@@ -100,13 +130,23 @@ def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None
 
 def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings:
     """Settings of the rollouts on a grid of spacing dx [m]."""
-    if missing := [k for k in ("stride", "max_substeps", "courant", "precision", "contact_offset") if k not in config]:
+    if missing := [
+        k
+        for k in ("stride", "max_substeps", "courant", "precision", "contact_offset")
+        if k not in config
+    ]:
         raise ConfigError(f"simulation.{missing[0]}: expected this key, found none")
     if config["stride"] > config["max_substeps"]:
-        raise ConfigError(f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
-                          f"whole strides, found {config['stride']}")
+        raise ConfigError(
+            f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
+            f"whole strides, found {config['stride']}"
+        )
     # whose grid is given as dx
-    return known_keys("simulation", SimulationSettings, {k: v for k, v in config.items() if k not in SIZES} | {"dx": dx})
+    return known_keys(
+        "simulation",
+        SimulationSettings,
+        {k: v for k, v in config.items() if k not in SIZES} | {"dx": dx},
+    )
 
 
 def build_prior(config: Mapping[str, Any]) -> tuple[Material, LawOptions]:
@@ -117,7 +157,9 @@ def build_prior(config: Mapping[str, Any]) -> tuple[Material, LawOptions]:
     return known_keys("prior", Material, keys), options
 
 
-def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) -> torch.nn.Module | None:
+def build_heterogeneity(
+    config: Mapping[str, Any], low: Tensor, high: Tensor
+) -> torch.nn.Module | None:
     """The field on the box (3,) to (3,) [m], None where it is switched off. Errors: ConfigError naming the key."""
     settings = known_keys("heterogeneity", HeterogeneitySettings, config)
     return HETEROGENEITY[settings.kind](low, high, settings) if settings.enabled else None
@@ -141,9 +183,14 @@ def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
     build_identification(cfg)
     build_evaluation(cfg)
     check_terms(cfg["losses"], adapter)
-    if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
-        raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
-                          "tells the prior anything")
+    if not any(
+        cfg["losses"].get(name)
+        for name in ("image", "mask", "flow", "rotation", "stretch", "position")
+    ):
+        raise ConfigError(
+            "losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
+            "tells the prior anything"
+        )
     build_walls(cfg["world"]["walls"], torch.stack([low, high]))
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
@@ -156,7 +203,9 @@ def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
     build = adapter_class(config)
     if build is None:
         return None
-    return known_keys("adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")})
+    return known_keys(
+        "adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")}
+    )
 
 
 def build_criterion(cfg: Mapping[str, Any]) -> Criterion:
@@ -175,17 +224,28 @@ def build_evaluation(cfg: Mapping[str, Any]) -> EvaluationSettings:
 
 
 def build_stages(
-    fit: Mapping[str, Any], heterogeneity: torch.nn.Module | None, adapter: torch.nn.Module | None, searching: bool = False
+    fit: Mapping[str, Any],
+    heterogeneity: torch.nn.Module | None,
+    adapter: torch.nn.Module | None,
+    searching: bool = False,
 ) -> list[Stage]:
     """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs.
 
     searching: whether the calibration chooses the law too."""
     stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in STAGES]
     learned = {s.name: s.learns(heterogeneity, adapter) for s in stages}
-    wanted = [s for s in stages if s.iterations > 0 and (s.calibrates or any(part is not None for part in learned[s.name]))]
+    wanted = [
+        s
+        for s in stages
+        if s.iterations > 0 and (s.calibrates or any(part is not None for part in learned[s.name]))
+    ]
     stages = recalibrations([s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted])
     if searching and stages and not stages[0].newton:
-        raise ConfigError("prior=auto: expected fit.prior.optimizer=auto or gauss_newton, which compares candidates; found adam")
+        raise ConfigError(
+            "prior=auto: expected fit.prior.optimizer=auto or gauss_newton, which compares candidates; found adam"
+        )
     if not stages or not stages[0].calibrates:
-        raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
+        raise ConfigError(
+            "fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior"
+        )
     return stages

@@ -38,11 +38,15 @@ def compose(*overrides: str, name: str = "train") -> DictConfig:
         return hydra_compose(name, overrides=list(overrides))
 
 
-def composed(first: str | Mapping[str, Any] | DictConfig | None, overrides: tuple[str, ...]) -> DictConfig:
+def composed(
+    first: str | Mapping[str, Any] | DictConfig | None, overrides: tuple[str, ...]
+) -> DictConfig:
     """A whole configuration, from one (which takes no overrides), or from overrides, of which the first may be a scene's name."""
     if isinstance(first, Mapping | DictConfig):
         if overrides:
-            raise TypeError(f"overrides: expected none beside a whole configuration, found {overrides}; give them to mosa.compose")
+            raise TypeError(
+                f"overrides: expected none beside a whole configuration, found {overrides}; give them to mosa.compose"
+            )
         return first if isinstance(first, DictConfig) else OmegaConf.create(dict(first))
     given = () if first is None else (first if "=" in first else f"{GROUPED}={first}",)
     return compose(*given, *overrides)

@@ -22,15 +22,19 @@ def load_extensions(names: Sequence[str] | None) -> None:
         raise ConfigError(f"extensions: expected {NAMES.described}, found {names!r}")
     for name in names or ():
         if not all(part.isidentifier() for part in name.split(".")):
-            raise ConfigError(f"extensions: expected the name of a module like my_package.my_law, found {name!r}")
+            raise ConfigError(
+                f"extensions: expected the name of a module like my_package.my_law, found {name!r}"
+            )
         try:
             importlib.import_module(name)
         except MosaError:
             raise
         except (Exception, SystemExit) as error:  # whatever the module does while it is imported
             reason = error if isinstance(error, ImportError) else f"{type(error).__name__}: {error}"
-            raise ConfigError(f"extensions: expected a module that can be imported (installed, or in PYTHONPATH), found {name!r} "
-                              f"({' '.join(str(reason).split())[:300]})") from error
+            raise ConfigError(
+                f"extensions: expected a module that can be imported (installed, or in PYTHONPATH), found {name!r} "
+                f"({' '.join(str(reason).split())[:300]})"
+            ) from error
 
 
 def registered_keys(values: Mapping[str, Any]) -> dict[str, Kind]:

@@ -88,7 +88,9 @@ def idle(overrides: Iterable[str], values: Mapping[str, Any], stages: Sequence[S
     return found
 
 
-def warn_of_idle(overrides: Iterable[str], values: Mapping[str, Any], stages: Sequence[Stage]) -> None:
+def warn_of_idle(
+    overrides: Iterable[str], values: Mapping[str, Any], stages: Sequence[Stage]
+) -> None:
     """One warning for each such key."""
     for sentence in idle(overrides, values, stages):
         warnings.warn(sentence, stacklevel=3)

@@ -51,10 +51,26 @@ SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", 
             "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried",
             "reconstruction.informed", "reconstruction.geometry")  # fmt: skip
 
-FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
-              lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
-FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames",
-           "extrapolated", "val")
+FIGURE = Kind(
+    "a figure's name like test/rms_m (docs/figures.md)",
+    lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v,
+)
+FIGURES = (
+    "train",
+    "test",
+    "camera",
+    "prior",
+    "prior_eta",
+    "id",
+    "id_prior",
+    "floor",
+    "time",
+    "posterior",
+    "geometry",
+    "frames",
+    "extrapolated",
+    "val",
+)
 """What the names of figures begin with."""
 
 TRAINING: dict[str, Kind] = {
@@ -121,15 +137,23 @@ SIMULATION: dict[str, Kind] = {
     "simulate.frames": COUNT,
 }
 SPLATS: dict[str, Kind] = {
-    **{key: kind for key, kind in BODY.items() if key.split(".")[0] in ("seed", "prior", "simulation", "adapter", "heterogeneity")},
+    **{
+        key: kind
+        for key, kind in BODY.items()
+        if key.split(".")[0] in ("seed", "prior", "simulation", "adapter", "heterogeneity")
+    },
     "extensions": or_null(NAMES),
     "ply": TEXT,
     "ckpt_path": or_null(TEXT),
     "device": TEXT,
     "size": or_null(POSITIVE),
     "up": THREE,
-    "box": or_null(Kind("two corners [[x, y, z], [x, y, z]]",
-                        lambda v: isinstance(v, list) and len(v) == 2 and all(map(THREE.fits, v)))),
+    "box": or_null(
+        Kind(
+            "two corners [[x, y, z], [x, y, z]]",
+            lambda v: isinstance(v, list) and len(v) == 2 and all(map(THREE.fits, v)),
+        )
+    ),
     "opacity": number(0, 1),
     "open_below": FLAG,
     "resolution": whole(8, 512),
@@ -149,9 +173,13 @@ SPLATS: dict[str, Kind] = {
     "video": FLAG,
 }
 """Of conf/splats.yaml."""
-PERIOD = Kind("two numbers [from, to] in seconds",
-              lambda v: isinstance(v, list) and len(v) == 2 and all(map(is_number, v)) and v[0] < v[1])
-FOLDER = Kind("the path of a folder", lambda v: isinstance(v, str) and bool(v.strip()) and "\0" not in v)
+PERIOD = Kind(
+    "two numbers [from, to] in seconds",
+    lambda v: isinstance(v, list) and len(v) == 2 and all(map(is_number, v)) and v[0] < v[1],
+)
+FOLDER = Kind(
+    "the path of a folder", lambda v: isinstance(v, str) and bool(v.strip()) and "\0" not in v
+)
 RATE = number(1, 1e5)
 """Frames per second."""
 CAPTURE: dict[str, Kind] = {
@@ -171,7 +199,9 @@ CAPTURE: dict[str, Kind] = {
     "flight": or_null(PERIOD),
     "gravity": number(0.01, 1000),
     "scale": or_null(number(1e-6, 1e6)),
-    "up": or_null(Kind("a direction of three numbers, not zero", lambda v: THREE.fits(v) and any(v))),
+    "up": or_null(
+        Kind("a direction of three numbers, not zero", lambda v: THREE.fits(v) and any(v))
+    ),
     "ground": or_null(THREE),
     "rate": or_null(number(1, 2000)),
     "before": number(0, 60, above=True),
@@ -185,9 +215,14 @@ ENVIRONMENTS: dict[str, Kind] = {
     "task": TEXT,
     "policy": TEXT,
     "checkpoint": or_null(TEXT),
-    "simulator": Kind("a name, or a list of names", lambda v: isinstance(v, str) or (NAMES.fits(v) and bool(v))),
+    "simulator": Kind(
+        "a name, or a list of names", lambda v: isinstance(v, str) or (NAMES.fits(v) and bool(v))
+    ),
     "seed": whole(0, 2**32 - 1),
-    "seeds": Kind("a list of whole numbers", lambda v: isinstance(v, list) and bool(v) and all(map(whole(0, 2**32 - 1).fits, v))),
+    "seeds": Kind(
+        "a list of whole numbers",
+        lambda v: isinstance(v, list) and bool(v) and all(map(whole(0, 2**32 - 1).fits, v)),
+    ),
     "trials": COUNT,
     "device": TEXT,
     "worlds": or_auto(COUNT),

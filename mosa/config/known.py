@@ -39,7 +39,11 @@ def placed(file: Path, main: bool = False) -> dict[str, Any]:
     """The keys of a file, where Hydra puts them: in its group's section, or anywhere with the package _global_."""
     text = file.read_text()
     found = {key: value for key, value in (yaml.safe_load(text) or {}).items() if key != "defaults"}
-    return found if main or "@package _global_" in text.partition("\n")[0] else {file.parent.name: found}
+    return (
+        found
+        if main or "@package _global_" in text.partition("\n")[0]
+        else {file.parent.name: found}
+    )
 
 
 def merge(tree: dict[str, Any], more: Mapping[str, Any]) -> None:
@@ -61,15 +65,22 @@ def paths(tree: Mapping[str, Any], above: str = "") -> Iterator[str]:
             yield from paths(value, f"{above}{key}.")
 
 
-def refuse_unknown(values: Mapping[str, Any], tree: Mapping[str, Any], schemas: Iterable[Mapping[str, Any]]) -> None:
+def refuse_unknown(
+    values: Mapping[str, Any], tree: Mapping[str, Any], schemas: Iterable[Mapping[str, Any]]
+) -> None:
     """Errors: ConfigError naming the first key that neither the YAML files nor a schema know, and the nearest one they do."""
     known = set(paths(tree))
-    patterns = [pattern for schema in schemas for pattern in schema if not pattern.endswith(".*")]  # which say a kind, not a name
+    patterns = [
+        pattern for schema in schemas for pattern in schema if not pattern.endswith(".*")
+    ]  # which say a kind, not a name
     for path in paths(values):
         if path in known or any(path.startswith(f"{section}.") for section in ELSEWHERE):
             continue
         levels = path.split(".")
-        if any(len(levels) == len(p.split(".")) and all(map(fnmatchcase, levels, p.split("."))) for p in patterns):
+        if any(
+            len(levels) == len(p.split(".")) and all(map(fnmatchcase, levels, p.split(".")))
+            for p in patterns
+        ):
             continue
         nearest = max(known, key=lambda name: SequenceMatcher(None, path, name).ratio())
         raise ConfigError(f"{path}: unknown key; the nearest known one is {nearest}")
@@ -80,7 +91,11 @@ def refuse_missing(values: Mapping[str, Any], conf: Path, name: str) -> None:
     have = set(paths(values))
     for path in needed(conf, name):
         if path not in have:
-            way = f"; choose an option, {path}=<name>" if path in groups_of(conf, name) else " (deleted with ~?)"
+            way = (
+                f"; choose an option, {path}=<name>"
+                if path in groups_of(conf, name)
+                else " (deleted with ~?)"
+            )
             raise ConfigError(f"{path}: expected this key, found none{way}")
 
 
@@ -96,7 +111,9 @@ def needed(conf: Path, name: str) -> tuple[str, ...]:
     return tuple(path for path in found if not path.startswith(loose))
 
 
-def check_known(values: Mapping[str, Any], conf: Path, name: str, *schemas: Mapping[str, Any]) -> None:
+def check_known(
+    values: Mapping[str, Any], conf: Path, name: str, *schemas: Mapping[str, Any]
+) -> None:
     """What a configuration of conf/<name>.yaml has is known, and nothing is missing. Errors: ConfigError naming the key."""
     refuse_unknown(values, tree_of(conf, name), schemas)
     refuse_missing(values, conf, name)
@@ -115,5 +132,14 @@ def conf_folder() -> Path | None:
 def groups_of(conf: Path, name: str) -> tuple[str, ...]:
     """The groups that conf/<name>.yaml takes an option of by default, and that fill a section of their own."""
     defaults = (yaml.safe_load((conf / f"{name}.yaml").read_text()) or {}).get("defaults", [])
-    chosen = {group: option for entry in defaults if isinstance(entry, Mapping) for group, option in entry.items()}
-    return tuple(group for group, option in chosen.items() if option is not None and group not in ("hydra", "ablation", "debug"))
+    chosen = {
+        group: option
+        for entry in defaults
+        if isinstance(entry, Mapping)
+        for group, option in entry.items()
+    }
+    return tuple(
+        group
+        for group, option in chosen.items()
+        if option is not None and group not in ("hydra", "ablation", "debug")
+    )

@@ -1,9 +1,9 @@
 """Batches of a fit: some views of every frame of each sequence, with its motion cues, and the order in which views are served.
 
-    data = SceneDataModule("rabbit")
-    data.prepare_data()
-    data.setup("fit")
-    print(next(iter(data.train_dataloader())))
+data = SceneDataModule("rabbit")
+data.prepare_data()
+data.setup("fit")
+print(next(iter(data.train_dataloader())))
 """
 
 from __future__ import annotations
@@ -38,19 +38,35 @@ class SequenceBatch(SimpleNamespace):
     extra: dict[str, Tensor]
 
     def to(self, device: torch.device | str) -> SequenceBatch:
-        moved = dict(vars(self), observations=self.observations.to(device), extra={k: v.to(device) for k, v in self.extra.items()})
+        moved = dict(
+            vars(self),
+            observations=self.observations.to(device),
+            extra={k: v.to(device) for k, v in self.extra.items()},
+        )
         if self.cues is not None:
             moved["cues"] = self.cues.to(device)
         return SequenceBatch(**moved)
 
     def __repr__(self) -> str:
         seen, cues = self.observations, self.cues
-        shapes = {"images": seen.images, "mattes": seen.mattes, "flow": seen.flow, "cameras.K": seen.cameras.K}
+        shapes = {
+            "images": seen.images,
+            "mattes": seen.mattes,
+            "flow": seen.flow,
+            "cameras.K": seen.cameras.K,
+        }
         if cues is not None:
-            shapes |= {f"cues.{name}": getattr(cues, name) for name in ("positions", "rotation", "stretch", "weight")}
+            shapes |= {
+                f"cues.{name}": getattr(cues, name)
+                for name in ("positions", "rotation", "stretch", "weight")
+            }
         shapes |= {f"extra.{name}": value for name, value in self.extra.items()}
-        shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in shapes.items() if value is not None)
-        return f"SequenceBatch({self.name!r}, views {self.views}, {len(self.frames)} frames: {shown})"
+        shown = ", ".join(
+            f"{name} {tuple(value.shape)}" for name, value in shapes.items() if value is not None
+        )
+        return (
+            f"SequenceBatch({self.name!r}, views {self.views}, {len(self.frames)} frames: {shown})"
+        )
 
 
 class MotionBatch(SimpleNamespace):
@@ -93,7 +109,9 @@ class Epochs(IterableDataset[MotionBatch]):
     fit that is resumed in the middle of an epoch finishes it; left: steps of the stage at most, where its last epoch is shorter.
     """
 
-    def __init__(self, schedule: ViewSchedule, batch: Callable[[Sequence[int]], MotionBatch]) -> None:
+    def __init__(
+        self, schedule: ViewSchedule, batch: Callable[[Sequence[int]], MotionBatch]
+    ) -> None:
         self.schedule, self.batch = schedule, batch
         self.begin(whole=False, step=0, done=0, left=schedule.epoch_steps)
 

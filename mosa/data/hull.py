@@ -17,7 +17,10 @@ from mosa.rendering.cameras import sample_images
 from mosa.system.limits import counted
 from mosa.types import Cameras
 
-voxel_counts = partial(counted, "voxels of the object", remedy="take fewer and larger ones", each=40, error=DataError)
+voxel_counts = partial(
+    counted, "voxels of the object", remedy="take fewer and larger ones", each=40, error=DataError
+)
+
 
 @dataclass(frozen=True)
 class Volume:
@@ -30,7 +33,8 @@ class Volume:
     def points(self) -> Tensor:
         """Grid points, (X, Y, Z, 3) [m]."""
         axes = [
-            self.origin[a] + self.pitch * torch.arange(n, device=self.values.device) for a, n in enumerate(self.values.shape)
+            self.origin[a] + self.pitch * torch.arange(n, device=self.values.device)
+            for a, n in enumerate(self.values.shape)
         ]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
 
@@ -51,7 +55,9 @@ def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     pixel = pixel[..., :2] / depth.clamp(min=1e-6)[..., None]
     size = pixel.new_tensor([cameras.width, cameras.height])
     values = sample_images(mattes[:, None], pixel, beyond="border")[:, 0]
-    border = torch.cat([mattes[:, 0], mattes[:, -1], mattes[:, :, 0], mattes[:, :, -1]], 1).amax(1) > 0.5
+    border = (
+        torch.cat([mattes[:, 0], mattes[:, -1], mattes[:, :, 0], mattes[:, :, -1]], 1).amax(1) > 0.5
+    )
     inside = ((pixel >= 0) & (pixel <= size)).all(-1)
     values = torch.where(inside, values, border[:, None].to(values))
     return torch.where(depth > 1e-3, values, torch.zeros_like(values))
@@ -69,7 +75,9 @@ def _smallest(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     smallest = torch.ones(len(points), dtype=points.dtype, device=points.device)
     left = torch.arange(len(points), device=points.device)
     for v in range(len(cameras)):
-        smallest[left] = torch.minimum(smallest[left], matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0])
+        smallest[left] = torch.minimum(
+            smallest[left], matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0]
+        )
         left = left[smallest[left] > 0]
     return smallest
 
@@ -78,7 +86,9 @@ def _grow(mattes: Tensor, radius: int) -> Tensor:
     if radius <= 0:
         return mattes
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    return torch.as_tensor(np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()]), device=mattes.device)
+    return torch.as_tensor(
+        np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()]), device=mattes.device
+    )
 
 
 def _grown_views(mattes: Tensor, cameras: Cameras, radius: int) -> tuple[Tensor, Cameras]:
@@ -88,7 +98,9 @@ def _grown_views(mattes: Tensor, cameras: Cameras, radius: int) -> tuple[Tensor,
     wide = F.pad(mattes[:, None], (border,) * 4, mode="replicate")[:, 0]
     K = cameras.K.clone()
     K[:, :2, 2] += border
-    views = replace(cameras, K=K, width=cameras.width + 2 * border, height=cameras.height + 2 * border)
+    views = replace(
+        cameras, K=K, width=cameras.width + 2 * border, height=cameras.height + 2 * border
+    )
     return _grow(wide, radius), views
 
 
@@ -104,7 +116,10 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
         counts = (extent / pitch).ceil().long() + 1
         grid = Volume(torch.empty(tuple(counts.tolist()), device=mattes.device), bounds[0], pitch)
         points = grid.points()
-        depth = (points.reshape(-1, 3).mean(0) @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, :3, 3])[:, 2]
+        depth = (
+            points.reshape(-1, 3).mean(0) @ cameras.w2c[:, :3, :3].transpose(1, 2)
+            + cameras.w2c[:, :3, 3]
+        )[:, 2]
         radius = float((0.9 * pitch * cameras.K[:, 0, 0] / depth.clamp(min=1e-3)).max())
         radius = max(1, min(int(radius + 1), min(cameras.width, cameras.height) // 4))
         inside = points[occupancy(points, *_grown_views(mattes, cameras, radius)) > 0.5]
@@ -129,12 +144,16 @@ def visual_hull(mattes: Tensor, cameras: Cameras, box: Tensor, *, pitch: float) 
 def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: int = 40) -> Tensor:
     """Centre of mass of the visual hull, (3,) [m]."""
     bounds = hull_bounds(mattes, cameras, box)
-    hull = visual_hull(mattes, cameras, box, pitch=float((bounds[1] - bounds[0]).max()) / resolution)
+    hull = visual_hull(
+        mattes, cameras, box, pitch=float((bounds[1] - bounds[0]).max()) / resolution
+    )
     inside = hull.values > 0.5
     return hull.points()[inside].mean(0)
 
 
-def shave_ridges(volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: float = 2.0) -> Volume:
+def shave_ridges(
+    volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: float = 2.0
+) -> Volume:
     """The hull with its ridges rounded where no silhouette asks for them; returns 0 or 1 per voxel.
 
     A hull of few views sticks out where the cones of two silhouettes meet: by 3 to 10 % of the volume for 8 to 12 cameras,
@@ -151,7 +170,11 @@ def shave_ridges(volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: f
         pixel = seen @ K.T
         # bins of 0.75 voxels: fine enough not to lose a skin of the silhouette, coarse enough that a column of voxels
         # leaves no hole
-        column, row = (pixel[:, :2] / pixel[:, 2:] / (0.75 * volume.pitch * K[0, 0] / seen[:, 2].mean())).long().unbind(1)
+        column, row = (
+            (pixel[:, :2] / pixel[:, 2:] / (0.75 * volume.pitch * K[0, 0] / seen[:, 2].mean()))
+            .long()
+            .unbind(1)
+        )
         rays.append(np.unique((row * (column.max() + 1) + column).numpy(), return_inverse=True)[1])
     current, flat = hull.astype(np.float32), np.ravel_multi_index(index.T, hull.shape)
     for _ in range(passes):
@@ -162,4 +185,6 @@ def shave_ridges(volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: f
             missing |= (np.bincount(ray[inside], minlength=ray.max() + 1) == 0)[ray]
         kept[flat[missing]] = True
         current = kept.reshape(hull.shape).astype(np.float32)
-    return Volume(torch.as_tensor(current, device=volume.values.device), volume.origin, volume.pitch)
+    return Volume(
+        torch.as_tensor(current, device=volume.values.device), volume.origin, volume.pitch
+    )

@@ -27,13 +27,28 @@ class Observations:
     def select(self, views: Sequence[int], frames: int | None = None) -> Observations:
         """The given views and the first `frames` frames, all of them where None."""
         views = list(views)
-        flow = None if self.flow is None else self.flow[views, : None if frames is None else frames - 1]
-        return Observations(self.images[views, :frames], self.mattes[views, :frames], flow, self.cameras.select(views),
-                            self.image_width)
+        flow = (
+            None
+            if self.flow is None
+            else self.flow[views, : None if frames is None else frames - 1]
+        )
+        return Observations(
+            self.images[views, :frames],
+            self.mattes[views, :frames],
+            flow,
+            self.cameras.select(views),
+            self.image_width,
+        )
 
     def to(self, device: torch.device | str) -> Observations:
         flow = None if self.flow is None else self.flow.to(device)
-        return Observations(self.images.to(device), self.mattes.to(device), flow, self.cameras.to(device), self.image_width)
+        return Observations(
+            self.images.to(device),
+            self.mattes.to(device),
+            flow,
+            self.cameras.to(device),
+            self.image_width,
+        )
 
 
 def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: int) -> Observations:
@@ -41,23 +56,38 @@ def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: i
     views, frames = list(views), list(frames)
     images, mattes = scene.images[views][:, frames], scene.mattes[views][:, frames]
     x0, y0, width, height = crop_boxes(mattes, margin=margin)
-    images, mattes = (crop_images(stack, x0, y0, width, height, axis=2) for stack in (images, mattes))
+    images, mattes = (
+        crop_images(stack, x0, y0, width, height, axis=2) for stack in (images, mattes)
+    )
     cameras = crop_cameras(scene.cameras.select(views), x0, y0, width, height)
     return Observations(images, mattes, None, cameras, scene.cameras.width)
 
 
 @torch.no_grad()
-def training_observations(scene: Scene, reconstruction: Reconstruction, *, margin: int = 6,
-                          device: torch.device | str = "cpu") -> Observations:
+def training_observations(
+    scene: Scene,
+    reconstruction: Reconstruction,
+    *,
+    margin: int = 6,
+    device: torch.device | str = "cpu",
+) -> Observations:
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
     found = cropped(scene, scene.training_cameras, frames, margin).to(device)
     cues, splats = reconstruction.cues, reconstruction.splats
     flow = [
-        observe(cues.positions[: len(frames)].to(device), cues.covariances[: len(frames)].to(device),
-                splats.opacities.to(device), splats.colors.to(device), found.cameras.select([v]), scene.background.to(device),
-                flow=True).flow
+        observe(
+            cues.positions[: len(frames)].to(device),
+            cues.covariances[: len(frames)].to(device),
+            splats.opacities.to(device),
+            splats.colors.to(device),
+            found.cameras.select([v]),
+            scene.background.to(device),
+            flow=True,
+        ).flow
         for v in range(len(found.cameras))
     ]
     # each is there, as it was asked for
-    return Observations(found.images, found.mattes, torch.cat(flow), found.cameras, found.image_width)  # type: ignore[arg-type]
+    return Observations(
+        found.images, found.mattes, torch.cat(flow), found.cameras, found.image_width
+    )  # type: ignore[arg-type]

@@ -37,7 +37,13 @@ def register_format(name: str, place: str) -> None:
 
 
 def load_scene(
-    *, format: str | None = None, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys
+    *,
+    format: str | None = None,
+    root: str | None = None,
+    path: str | None = None,
+    ground=None,
+    cache=None,
+    **keys,
 ) -> Scene:
     """The scene that the keys of conf/scene describe, validated.
 
@@ -46,17 +52,30 @@ def load_scene(
     Errors: ConfigError for keys (unknown, missing, out of range), DataError for files.
     """
     if not isinstance(format, str) or format not in FORMATS:
-        raise ConfigError(f"scene.format: expected one of {', '.join(sorted(FORMATS))}, found {format!r}")
+        raise ConfigError(
+            f"scene.format: expected one of {', '.join(sorted(FORMATS))}, found {format!r}"
+        )
     module, function = FORMATS[format].split(":")
     loader = getattr(importlib.import_module(module), function)
     if format == "builtin":
-        if given := [key for key, value in (("path", path), ("ground", ground)) if value is not None]:
-            raise ConfigError(f"scene.{given[0]}: not a key of built-in scenes, which have their own; scene=transforms reads one")
-        return validate(call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}}))
+        if given := [
+            key for key, value in (("path", path), ("ground", ground)) if value is not None
+        ]:
+            raise ConfigError(
+                f"scene.{given[0]}: not a key of built-in scenes, which have their own; scene=transforms reads one"
+            )
+        return validate(
+            call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}})
+        )
     if keys.get("fps") is not None:
         check_fps(keys["fps"])
     check_names(name=keys.get("name"), sequence=keys.get("sequence"))
-    for key, text in (("root", root), ("path", path), ("cache", cache), ("particles", keys.get("particles"))):
+    for key, text in (
+        ("root", root),
+        ("path", path),
+        ("cache", cache),
+        ("particles", keys.get("particles")),
+    ):
         if text is not None and (not isinstance(text, (str, Path)) or "\0" in str(text)):
             raise ConfigError(f"scene.{key}: expected a folder, found {text!r}")
     if path is None:
@@ -75,8 +94,12 @@ def load_scene(
 def check_names(**names) -> None:
     """They become parts of file names. Errors: ConfigError naming the key."""
     for key, name in names.items():
-        if name is not None and (not isinstance(name, str) or re.fullmatch(r"[\w][\w .+-]{0,99}", name) is None):
-            raise ConfigError(f"scene.{key}: expected a name of at most 100 letters, digits and - _ . +, found {str(name)[:120]!r}")
+        if name is not None and (
+            not isinstance(name, str) or re.fullmatch(r"[\w][\w .+-]{0,99}", name) is None
+        ):
+            raise ConfigError(
+                f"scene.{key}: expected a name of at most 100 letters, digits and - _ . +, found {str(name)[:120]!r}"
+            )
 
 
 def held_out_sequences(**keys) -> list[Scene]:
@@ -100,7 +123,9 @@ def under(root: str | None, path: str) -> Path:
         whole.exists()  # of a name that no file system takes it is an error
     except (RuntimeError, OSError, ValueError) as error:
         said = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"scene.path: expected a folder that can be, found {ascii(str(path))[:100]} ({said})") from error
+        raise ConfigError(
+            f"scene.path: expected a folder that can be, found {ascii(str(path))[:100]} ({said})"
+        ) from error
     return whole
 
 
@@ -114,10 +139,18 @@ def call(loader: Callable, arguments: dict) -> Scene:
     """loader(**arguments). Errors: ConfigError where it does not know a key that is set."""
     takes = dict(inspect.signature(loader).parameters)
     if "world" in takes:
-        takes |= {k: p for k, p in inspect.signature(scene_from_footage).parameters.items() if k not in MADE}
+        takes |= {
+            k: p
+            for k, p in inspect.signature(scene_from_footage).parameters.items()
+            if k not in MADE
+        }
     known = set(takes)
     for key, parameter in takes.items():
-        if parameter.default is parameter.empty and parameter.kind is parameter.KEYWORD_ONLY and key not in arguments:
+        if (
+            parameter.default is parameter.empty
+            and parameter.kind is parameter.KEYWORD_ONLY
+            and key not in arguments
+        ):
             raise ConfigError(f"scene.{key}: expected a value, found none")
     for key in arguments:
         if key not in known:
@@ -132,18 +165,30 @@ def ground_from(keys) -> Ground | None:
     if keys is None or isinstance(keys, Ground):
         return keys
     if not isinstance(keys, Mapping):
-        raise ConfigError(f"scene.ground: expected the keys height, mode and friction, or null, found {keys!r}")
+        raise ConfigError(
+            f"scene.ground: expected the keys height, mode and friction, or null, found {keys!r}"
+        )
     unknown = set(keys) - {"height", "mode", "friction"}
     if unknown:
-        raise ConfigError(f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only")
+        raise ConfigError(
+            f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only"
+        )
     mode, friction = keys.get("mode", "sticky"), keys.get("friction") or 0.0
     if not isinstance(mode, str) or mode not in (AUTO, *GROUND_MODES):
-        raise ConfigError(f"scene.ground.mode: expected {', '.join(GROUND_MODES)} or {AUTO}, found {mode!r}")
+        raise ConfigError(
+            f"scene.ground.mode: expected {', '.join(GROUND_MODES)} or {AUTO}, found {mode!r}"
+        )
     if not is_number(keys.get("height")):
-        raise ConfigError(f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}")
+        raise ConfigError(
+            f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}"
+        )
     if not is_number(friction) or friction < 0:
-        raise ConfigError(f"scene.ground.friction: expected a finite number >= 0, found {friction!r}")
+        raise ConfigError(
+            f"scene.ground.friction: expected a finite number >= 0, found {friction!r}"
+        )
     if friction > 0 and mode not in RUBBING:
         modes = " and ".join(RUBBING)
-        raise ConfigError(f"scene.ground.friction: acts with modes {modes} only, found {friction} with mode {mode!r}")
+        raise ConfigError(
+            f"scene.ground.friction: acts with modes {modes} only, found {friction} with mode {mode!r}"
+        )
     return Ground(float(keys["height"]), mode, float(friction))

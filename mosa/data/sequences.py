@@ -17,7 +17,17 @@ from mosa.data.scene import beside, held_out_sequences, load_scene, under
 from mosa.errors import ConfigError, DataError
 from mosa.types import Scene
 
-OWN = ("path", "name", "frames", "fps", "last_free_frame", "holdout_cameras", "particles", "scale", "fill_holes")
+OWN = (
+    "path",
+    "name",
+    "frames",
+    "fps",
+    "last_free_frame",
+    "holdout_cameras",
+    "particles",
+    "scale",
+    "fill_holes",
+)
 """What a sequence may have otherwise than the training one: not the world, of which there is one for all."""
 DEPTH = 3
 """Folders that a name is made of at most; what is then still called the same is numbered."""
@@ -35,18 +45,23 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
     also_train, test = keys.pop("also_train", None) or [], keys.pop("test", None) or []
     if keys.get("format") == "builtin":
         if test:
-            raise ConfigError("scene.test: a built-in scene brings its held-out sequences itself; expected no list")
+            raise ConfigError(
+                "scene.test: a built-in scene brings its held-out sequences itself; expected no list"
+            )
         scene, others = load_scene(**keys), held_out_sequences(**keys)
         known = [s.sequence for s in others]
         if unknown := [name for name in also_train if name not in known]:
             found = f"has {', '.join(known)}" if known else "has none"
-            raise ConfigError(f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}")
+            raise ConfigError(
+                f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}"
+            )
         return scene, others
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
     others = [
-        load_scene(**keys_of(keys, where, entry), name=scene.name, sequence=name) for (where, entry), name in zip(entries, names)
+        load_scene(**keys_of(keys, where, entry), name=scene.name, sequence=name)
+        for (where, entry), name in zip(entries, names)
     ]
     check_distinct([scene, *others], ["scene.path", *(f"scene.{where}" for where, _ in entries)])
     return scene, others
@@ -56,13 +71,19 @@ def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:
     """No recording is another's copy: what is learned from says nothing as a held-out sequence. Errors: DataError."""
     pictures: dict[bytes, int] = {}
     for k, scene in enumerate(scenes):
-        own = {hashlib.sha256(picture.numpy().tobytes()).digest()
-               for views, mattes in zip(scene.images, scene.mattes) for picture, matte in zip(views, mattes) if bool(matte.any())}
+        own = {
+            hashlib.sha256(picture.numpy().tobytes()).digest()
+            for views, mattes in zip(scene.images, scene.mattes)
+            for picture, matte in zip(views, mattes)
+            if bool(matte.any())
+        }
         same = [pictures[each] for each in own if each in pictures]
         if len(same) > SHARED * len(own):
-            raise DataError(f"{where[k]}: {len(same)} of the {len(own)} pictures of {scene.name}/{scene.sequence} are those of "
-                            f"{where[same[0]]} too: expected every recording once; what is learned from says nothing as a held-out "
-                            "sequence")
+            raise DataError(
+                f"{where[k]}: {len(same)} of the {len(own)} pictures of {scene.name}/{scene.sequence} are those of "
+                f"{where[same[0]]} too: expected every recording once; what is learned from says nothing as a held-out "
+                "sequence"
+            )
         pictures |= {each: k for each in own if each not in pictures}
 
 
@@ -71,7 +92,9 @@ def taught_names(keys: Mapping[str, Any]) -> list[str]:
     also_train = keys.get("also_train") or []
     if keys.get("format") == "builtin":
         return list(also_train)
-    entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in keys.get("test") or []]
+    entries = [("also_train", entry) for entry in also_train] + [
+        ("test", entry) for entry in keys.get("test") or []
+    ]
     return sequence_names(keys, entries)[: len(also_train)]
 
 
@@ -80,9 +103,13 @@ def section(where: str, entry: str | Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(entry, str):
         return {"path": entry}
     if not isinstance(entry, Mapping) or not isinstance(entry.get("path"), str):
-        raise ConfigError(f"scene.{where}: expected folders, or sections like {{path: <folder>, frames: [0, 9]}}, found {entry!r}")
+        raise ConfigError(
+            f"scene.{where}: expected folders, or sections like {{path: <folder>, frames: [0, 9]}}, found {entry!r}"
+        )
     if unknown := [key for key in entry if key not in OWN]:
-        raise ConfigError(f"scene.{where}: {unknown[0]}: not a key of a single sequence; expected {', '.join(OWN)}")
+        raise ConfigError(
+            f"scene.{where}: {unknown[0]}: not a key of a single sequence; expected {', '.join(OWN)}"
+        )
     return dict(entry)
 
 
@@ -93,9 +120,17 @@ def keys_of(keys: Mapping[str, Any], where: str, entry: str | Mapping[str, Any])
     relative scene.particles counts where such a folder lies beside the images.
     """
     own = section(where, entry)
-    inherited = {k: v for k, v in keys.items() if k not in ("name", "sequence", "last_free_frame", "holdout_frames", "particles")}
+    inherited = {
+        k: v
+        for k, v in keys.items()
+        if k not in ("name", "sequence", "last_free_frame", "holdout_frames", "particles")
+    }
     shared = keys.get("particles")
-    if shared and not Path(shared).is_absolute() and beside(under(keys.get("root"), own["path"]), shared):
+    if (
+        shared
+        and not Path(shared).is_absolute()
+        and beside(under(keys.get("root"), own["path"]), shared)
+    ):
         inherited["particles"] = shared
     return inherited | {k: v for k, v in own.items() if k != "name"}
 
@@ -106,7 +141,10 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
     sections = [section(*each) for each in entries]
     root, first = keys.get("root"), keys.get("path")
     places = [("scene.path", first, keys.get("frames"))] if isinstance(first, str) else []
-    places += [(f"scene.{where}", s["path"], s.get("frames", keys.get("frames"))) for (where, _), s in zip(entries, sections)]
+    places += [
+        (f"scene.{where}", s["path"], s.get("frames", keys.get("frames")))
+        for (where, _), s in zip(entries, sections)
+    ]
     for k, (where, path, frames) in enumerate(places):
         for before, other, others in places[:k]:
             if place(root, path) == place(root, other) and overlap(frames, others):
@@ -118,19 +156,30 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
     for (where, _), own in zip(entries, sections):
         name = own.get("name")
         if name is not None and (not isinstance(name, str) or not NAME.fullmatch(name)):
-            raise ConfigError(f"scene.{where}: name: expected letters, digits, _, - and ., found {name!r}")
+            raise ConfigError(
+                f"scene.{where}: name: expected letters, digits, _, - and ., found {name!r}"
+            )
         parts.append([name] if name is not None else pieces(place(root, own["path"])))
     depth = [1] * len(parts)
     while True:
         names = ["_".join(each[-d:]) for each, d in zip(parts, depth)]
-        twice = {k for k, name in enumerate(names) if [n.casefold() for n in names].count(name.casefold()) > 1}
+        twice = {
+            k
+            for k, name in enumerate(names)
+            if [n.casefold() for n in names].count(name.casefold()) > 1
+        }
         if not (deeper := [k for k in twice if depth[k] < min(len(parts[k]), DEPTH)]):
             break
         for k in deeper:
             depth[k] += 1
     if named := [names[k] for k in twice if "name" in sections[k]]:
-        raise ConfigError(f"scene.{entries[0][0]}: name: expected a name once, found {named[0]!r} again")
-    return [f"{name}_{1 + sorted(twice).index(k)}" if k in twice else name for k, name in enumerate(names)]
+        raise ConfigError(
+            f"scene.{entries[0][0]}: name: expected a name once, found {named[0]!r} again"
+        )
+    return [
+        f"{name}_{1 + sorted(twice).index(k)}" if k in twice else name
+        for k, name in enumerate(names)
+    ]
 
 
 def place(root: str | None, path: str) -> Path:
@@ -143,10 +192,16 @@ def pieces(path: Path) -> list[str]:
     """The parts of a path that a name can be made of, without the ending of a file."""
     *above, last = path.parts
     parts = [*above, Path(last).stem if last.endswith(".json") else last]
-    return [safe for part in parts if (safe := re.sub(r"[^\w.-]+", "_", part).strip("._"))] or ["sequence"]
+    return [safe for part in parts if (safe := re.sub(r"[^\w.-]+", "_", part).strip("._"))] or [
+        "sequence"
+    ]
 
 
 def overlap(a, b) -> bool:
     """Whether two ranges [first, last] of frames share one; anything else stands for all frames."""
-    ranges = [r for r in (a, b) if isinstance(r, (list, tuple)) and len(r) == 2 and all(isinstance(f, int) for f in r)]
+    ranges = [
+        r
+        for r in (a, b)
+        if isinstance(r, (list, tuple)) and len(r) == 2 and all(isinstance(f, int) for f in r)
+    ]
     return len(ranges) < 2 or (ranges[0][0] <= ranges[1][1] and ranges[1][0] <= ranges[0][1])

@@ -32,7 +32,12 @@ class Simulator:
 
 
 def simulator_named(
-    name: str, checkpoint: str | Path | None = None, *, scene: str | None = None, device: str = "cpu", spacing: float | None = None
+    name: str,
+    checkpoint: str | Path | None = None,
+    *,
+    scene: str | None = None,
+    device: str = "cpu",
+    spacing: float | None = None,
 ) -> Simulator:
     """learned | isotropic: of a run's checkpoint; truth: of the built-in scene that the run learned from, or of `scene`.
 
@@ -41,7 +46,11 @@ def simulator_named(
     if name not in SIMULATORS:
         raise ConfigError(f"simulator: expected one of {', '.join(SIMULATORS)}, found {name!r}")
     if checkpoint is None and (name != "truth" or scene is None):
-        wanted = "a run's checkpoint, or truth.scene=<a built-in scene>" if name == "truth" else "a run's checkpoint"
+        wanted = (
+            "a run's checkpoint, or truth.scene=<a built-in scene>"
+            if name == "truth"
+            else "a run's checkpoint"
+        )
         raise ConfigError(f"checkpoint: expected {wanted} for simulator={name}, found none")
     learned = None if checkpoint is None else Twin.load(checkpoint, device)
     if name != "truth":
@@ -52,7 +61,11 @@ def simulator_named(
 
 def truth_of(known: Mapping[str, Any]) -> dict[str, Any]:
     """What tells the hidden truths of built-in scenes apart, of a scene's configuration: arguments of `true_twin`."""
-    return {"name": known["name"], "material": known.get("material", "anisotropic"), "seed": known.get("seed", 0)}
+    return {
+        "name": known["name"],
+        "material": known.get("material", "anisotropic"),
+        "seed": known.get("seed", 0),
+    }
 
 
 def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
@@ -113,10 +126,14 @@ class Arena:
         self.trials: Trials | None = None
         self.states: list[tuple[Tensor, Tensor, Tensor]] | None = None
 
-    def reset(self, trials: Trials, *, differentiable: bool = False, record: bool = False) -> Tensor:
+    def reset(
+        self, trials: Trials, *, differentiable: bool = False, record: bool = False
+    ) -> Tensor:
         """Begin these trials, one a world; the first observation (B, O). Errors: ConfigError."""
         if len(trials) != self.count:
-            raise ConfigError(f"trials: expected one for each of {self.count} worlds, found {len(trials)}")
+            raise ConfigError(
+                f"trials: expected one for each of {self.count} worlds, found {len(trials)}"
+            )
         self.trials, self.differentiable, self.done = trials, differentiable, 0
         self.diverged = torch.zeros(self.count, dtype=torch.bool)
         self.last: list[Tensor] = []
@@ -171,7 +188,9 @@ class Arena:
         self.view = look(state, self.weights, self.tool)
         if self.states is not None:
             places = torch.cat([state.rotation, state.position[..., None]], 3)
-            self.states.append(tuple(value.detach().cpu() for value in (state.positions, state.F_tot, places)))
+            self.states.append(
+                tuple(value.detach().cpu() for value in (state.positions, state.F_tot, places))
+            )
 
 
 LOST = 5.0
@@ -185,7 +204,12 @@ def world_of(error: SimulationDiverged) -> int | None:
 
 
 def play(
-    arena: Arena, trials: Trials, policy: Callable[[Tensor], Tensor], *, differentiable: bool = False, record: bool = False
+    arena: Arena,
+    trials: Trials,
+    policy: Callable[[Tensor], Tensor],
+    *,
+    differentiable: bool = False,
+    record: bool = False,
 ) -> Played:
     """All steps of one episode in each world. policy: observations (B, O) to actions (B, A) in [-1, 1]."""
     with torch.set_grad_enabled(differentiable):
@@ -198,7 +222,9 @@ def play(
         return Played(arena.loss(), arena.success(), arena.diverged, states)
 
 
-def play_all(arena: Arena, trials: Trials, policy: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def play_all(
+    arena: Arena, trials: Trials, policy: Callable[[Tensor], Tensor]
+) -> tuple[Tensor, Tensor]:
     """(loss (n,), success (n,)) of any number of trials, as many at a time as the arena has worlds."""
     losses, successes = [], []
     for first in range(0, len(trials), arena.count):

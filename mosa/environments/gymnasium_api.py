@@ -28,8 +28,10 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ConfigError("mosa.environments.gymnasium_api: expected Gymnasium, found none; pip install 'mosa[environments]' "
-                      "(mosa.environments.arena and the gradient policy work without it)") from error
+    raise ConfigError(
+        "mosa.environments.gymnasium_api: expected Gymnasium, found none; pip install 'mosa[environments]' "
+        "(mosa.environments.arena and the gradient policy work without it)"
+    ) from error
 
 
 def reinforcement_library():
@@ -37,15 +39,32 @@ def reinforcement_library():
     try:
         import stable_baselines3
     except ImportError as error:
-        raise ConfigError("policy: expected stable-baselines3 for sac and ppo, found none; pip install 'mosa[environments]', or "
-                          "policy=gradient, which needs nothing more") from error
+        raise ConfigError(
+            "policy: expected stable-baselines3 for sac and ppo, found none; pip install 'mosa[environments]', or "
+            "policy=gradient, which needs nothing more"
+        ) from error
     return stable_baselines3
 
 
-def arena_of(task: str | Task, worlds: int, simulator: str, checkpoint, scene, device: str, spacing, options: dict | None) -> Arena:
+def arena_of(
+    task: str | Task,
+    worlds: int,
+    simulator: str,
+    checkpoint,
+    scene,
+    device: str,
+    spacing,
+    options: dict | None,
+) -> Arena:
     """Errors: ConfigError, DataError."""
     made = simulator_named(simulator, checkpoint, scene=scene, device=device, spacing=spacing)
-    return Arena(made, task if isinstance(task, Task) else task_named(task, made.twin.body.rest, **(options or {})), worlds)
+    return Arena(
+        made,
+        task
+        if isinstance(task, Task)
+        else task_named(task, made.twin.body.rest, **(options or {})),
+        worlds,
+    )
 
 
 def action_space(task: Task) -> spaces.Box:
@@ -57,7 +76,10 @@ def observation_space(task: Task) -> spaces.Box:
     """Of a start its drawn ranges, a little wider than rounding; of a motion no bounds, as a body may fly anywhere."""
     if not task.once:
         return spaces.Box(-np.inf, np.inf, (len(task.observations),), np.float32)
-    low, high = (np.array([getattr(q, side) for q in task.observations], np.float32) for side in ("low", "high"))
+    low, high = (
+        np.array([getattr(q, side) for q in task.observations], np.float32)
+        for side in ("low", "high")
+    )
     return spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
 
 
@@ -104,12 +126,19 @@ class TwinEnv(gymnasium.Env, _Worlds):
         render_mode: str | None = None, size: int = 240,
     ) -> None:  # fmt: skip
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ConfigError(f"render_mode: expected one of {', '.join(self.metadata['render_modes'])}, found {render_mode!r}")
+            raise ConfigError(
+                f"render_mode: expected one of {', '.join(self.metadata['render_modes'])}, found {render_mode!r}"
+            )
         self.arena = arena_of(task, 1, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.render_mode, self.size = self.arena.task, render_mode, size
-        self.action_space, self.observation_space = action_space(self.task), observation_space(self.task)
+        self.action_space, self.observation_space = (
+            action_space(self.task),
+            observation_space(self.task),
+        )
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
         return self._draw(self.np_random, self.render_mode is not None)[0], {}
 
@@ -135,7 +164,9 @@ def held(arena: Arena) -> tuple[Tensor, Tensor, None]:
     turns = torch.stack([start["rotation"] for start in starts]).to(arena.rest)
     x = arena.rest @ turns.mT
     place = torch.stack([torch.as_tensor(start["position"]) for start in starts]).to(arena.rest)
-    place[:, 1] = torch.stack([torch.as_tensor(start["height"]) for start in starts]).to(arena.rest) - x[..., 1].amin(1)
+    place[:, 1] = torch.stack([torch.as_tensor(start["height"]) for start in starts]).to(
+        arena.rest
+    ) - x[..., 1].amin(1)
     return x + place[:, None], turns[:, None].expand(*x.shape, 3), None
 
 
@@ -152,25 +183,44 @@ class TwinVectorEnv(VectorEnv, _Worlds):
     ) -> None:  # fmt: skip
         self.arena = arena_of(task, worlds, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.num_envs, self.render_mode = self.arena.task, worlds, None
-        self.single_action_space, self.single_observation_space = action_space(self.task), observation_space(self.task)
+        self.single_action_space, self.single_observation_space = (
+            action_space(self.task),
+            observation_space(self.task),
+        )
         self.action_space = batch_space(self.single_action_space, worlds)
         self.observation_space = batch_space(self.single_observation_space, worlds)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
         if seed is not None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
         return self._draw(self.np_random, False), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         seen, rewards, over = self._step(actions)
         ended, never = np.full(self.num_envs, over), np.zeros(self.num_envs, bool)
-        info: dict[str, Any] = {"success": self.arena.success().numpy(), "diverged": self.arena.diverged.numpy().copy()}
+        info: dict[str, Any] = {
+            "success": self.arena.success().numpy(),
+            "diverged": self.arena.diverged.numpy().copy(),
+        }
         if over:
             last = np.empty(self.num_envs, dtype=object)
             last[:] = list(seen)
-            info = {"final_obs": last, "_final_obs": ended.copy(), "final_info": info, "_final_info": ended.copy()}
+            info = {
+                "final_obs": last,
+                "_final_obs": ended.copy(),
+                "final_info": info,
+                "_final_info": ended.copy(),
+            }
             seen = self._draw(self.np_random, False)
-        return (seen, rewards, ended, never, info) if self.task.once else (seen, rewards, never, ended, info)
+        return (
+            (seen, rewards, ended, never, info)
+            if self.task.once
+            else (seen, rewards, never, ended, info)
+        )
 
 
 for _name in TASKS:
@@ -209,8 +259,14 @@ def library_worlds(arena: Arena, seed: int):
             infos: list[dict] = [{} for _ in range(self.num_envs)]
             if over:
                 success = self.arena.success().tolist()
-                self.finished += [(self.decisions, value, won) for value, won in zip(self.earned.tolist(), success)]
-                infos = [{"terminal_observation": last, "TimeLimit.truncated": not self.arena.task.once} for last in seen]
+                self.finished += [
+                    (self.decisions, value, won)
+                    for value, won in zip(self.earned.tolist(), success)
+                ]
+                infos = [
+                    {"terminal_observation": last, "TimeLimit.truncated": not self.arena.task.once}
+                    for last in seen
+                ]
                 seen = self.reset()
             return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
 

@@ -43,21 +43,33 @@ def mark(target: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     """As `scenery`, of a disc of radius `near` [m] at target (3,) on what lies there."""
     flat = lattice(2 * near, 2 * near, THIN)
     flat = flat[flat.norm(dim=1) <= near]
-    points = target.float() + torch.stack([flat[:, 0], torch.full((len(flat),), THIN), flat[:, 1]], 1)
+    points = target.float() + torch.stack(
+        [flat[:, 0], torch.full((len(flat),), THIN), flat[:, 1]], 1
+    )
     return points, torch.full((len(points),), 0.5 * THIN), torch.tensor(MARK).expand(len(points), 3)
 
 
-def scenery(solids: Sequence[Mapping[str, Any]], places: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def scenery(
+    solids: Sequence[Mapping[str, Any]], places: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
     """(means (K, 3), standard deviations (K,) [m], colours (K, 3)) of ground and solids. places: (solids, 3, 4) poses, None for
     those that they begin at."""
     flat = lattice(2 * GROUND, 2 * GROUND, TILE)
     ground = torch.stack([flat[:, 0], torch.full((len(flat),), -0.5 * TILE), flat[:, 1]], 1)
-    tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor([0.08, 0.08, 0.08]) + torch.tensor([0.66, 0.65, 0.62])
+    tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor(
+        [0.08, 0.08, 0.08]
+    ) + torch.tensor([0.66, 0.65, 0.62])
     parts = [(ground, torch.full((len(ground),), 0.5 * TILE), tiles)]
     for k, solid in enumerate(colliders_from_config(solids, "solids")):
         points = solid_surface(solid, None if places is None else places[k])
         color = torch.tensor(COLORS.get(solid.name, (0.5, 0.5, 0.5)))
-        parts.append((points, torch.full((len(points),), WIDTH * PITCH), shaded(points, torch.tensor([0.0, 1.0, 0.0]), color)))
+        parts.append(
+            (
+                points,
+                torch.full((len(points),), WIDTH * PITCH),
+                shaded(points, torch.tensor([0.0, 1.0, 0.0]), color),
+            )
+        )
     return tuple(torch.cat(values) for values in zip(*parts))
 
 
@@ -65,7 +77,9 @@ def camera_of(arena: Arena, size: int) -> Cameras:
     """One camera that sees what the body falls on, or the way that it is pushed."""
     focal = 1.5 * size
     height = getattr(arena.task, "top", 0.0) + 0.05
-    target = torch.tensor([arena.task.watched, height if height > 0.05 else arena.task.watched_height, 0.0])
+    target = torch.tensor(
+        [arena.task.watched, height if height > 0.05 else arena.task.watched_height, 0.0]
+    )
     eye = target + torch.tensor([0.55, 0.42, 1.05])
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     device = arena.rest.device
@@ -74,7 +88,9 @@ def camera_of(arena: Arena, size: int) -> Cameras:
 
 
 @torch.no_grad()
-def picture(arena: Arena, x: Tensor, F_tot: Tensor, places: Tensor | None, size: int = 240, world: int = 0) -> np.ndarray:
+def picture(
+    arena: Arena, x: Tensor, F_tot: Tensor, places: Tensor | None, size: int = 240, world: int = 0
+) -> np.ndarray:
     """(size, size, 3) uint8 of a body with particles x (N, 3) [m], F_tot (N, 3, 3), the solids at their poses (K, 3, 4), and the
     target of the trial that is played in `world`."""
     device = arena.rest.device
@@ -93,11 +109,15 @@ def picture(arena: Arena, x: Tensor, F_tot: Tensor, places: Tensor | None, size:
     return to_uint8(image.clamp(0, 1).cpu())
 
 
-def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor], world: int, frames: int, size: int = 240) -> list[np.ndarray]:
+def film(
+    arena: Arena, states: tuple[Tensor, Tensor, Tensor], world: int, frames: int, size: int = 240
+) -> list[np.ndarray]:
     """`frames` pictures, from the first to the last moment, of one recorded world (`Played.states`)."""
     x, F_tot, places = states
     chosen = np.linspace(0, len(x) - 1, min(frames, len(x))).round().astype(int)
-    return [picture(arena, x[t, world], F_tot[t, world], places[t, world], size, world) for t in chosen]
+    return [
+        picture(arena, x[t, world], F_tot[t, world], places[t, world], size, world) for t in chosen
+    ]
 
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
@@ -106,10 +126,17 @@ def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) 
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
     written = [write_strip(folder / f"{name}.png", rows, frames=6)]
-    frames = [np.concatenate([label(rows[title][t], title) for title in rows], 1) for t in range(count)]
+    frames = [
+        np.concatenate([label(rows[title][t], title) for title in rows], 1) for t in range(count)
+    ]
     try:
         written.append(write_video(folder / f"{name}.mp4", frames, fps=12))
-    except (ImportError, RuntimeError, ValueError, OSError):  # imageio without ffmpeg says it in several ways
+    except (
+        ImportError,
+        RuntimeError,
+        ValueError,
+        OSError,
+    ):  # imageio without ffmpeg says it in several ways
         (folder / f"{name}.mp4").unlink(missing_ok=True)
         (folder / name).mkdir(exist_ok=True)
         for t, frame in enumerate(frames):

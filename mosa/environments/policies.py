@@ -29,7 +29,9 @@ class LinearPolicy(nn.Module):
 
     def __init__(self, task: Task) -> None:
         super().__init__()
-        low, high = (torch.tensor([getattr(q, side) for q in task.observations]) for side in ("low", "high"))
+        low, high = (
+            torch.tensor([getattr(q, side) for q in task.observations]) for side in ("low", "high")
+        )
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("spread", 0.5 * (high - low))
         weight, bias = task.starting_weights()
@@ -55,7 +57,9 @@ class LinearPolicy(nn.Module):
             policy.load_state_dict({name: torch.tensor(value) for name, value in written.items()})
         except (RuntimeError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
-            raise DataError(f"policy: expected the numbers of a policy for {task.name}, found {reason}") from error
+            raise DataError(
+                f"policy: expected the numbers of a policy for {task.name}, found {reason}"
+            ) from error
         return policy
 
 
@@ -94,9 +98,18 @@ class Looks:
 
     check: the arena that the trials are played in; say: told a line of each look."""
 
-    def __init__(self, policy: LinearPolicy, check: Arena, search: Search, seed: int, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        policy: LinearPolicy,
+        check: Arena,
+        search: Search,
+        seed: int,
+        say: Callable[[str], None],
+    ) -> None:
         self.policy, self.check, self.search, self.say = policy, check, search, say
-        self.trials = check.task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
+        self.trials = check.task.draw(
+            search.validation, torch.Generator().manual_seed(10**6 + seed)
+        )
         self.history: list[dict[str, float]] = []
         self.best = math.inf, self.numbers()
         self.began, self.played = time.perf_counter(), 0
@@ -107,9 +120,15 @@ class Looks:
         if over or iteration % self.search.every == 0:
             loss, success = play_all(self.check, self.trials, self.policy)
             self.played += len(self.trials)
-            entry = {"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())}
+            entry = {
+                "iteration": iteration,
+                "loss": float(loss.mean()),
+                "success": float(success.float().mean()),
+            }
             self.history.append(entry)
-            self.say(f"iteration {iteration}: loss {entry['loss']:.3f}, success {entry['success']:.2f}")
+            self.say(
+                f"iteration {iteration}: loss {entry['loss']:.3f}, success {entry['success']:.2f}"
+            )
             if entry["loss"] < self.best[0]:
                 self.best = entry["loss"], self.numbers()
         return over
@@ -121,18 +140,29 @@ class Looks:
     def found(self) -> Found:
         """The policy as it was at its best."""
         self.policy.load_state_dict(self.best[1])
-        return Found(self.policy.requires_grad_(False), self.history, time.perf_counter() - self.began, self.played)
+        return Found(
+            self.policy.requires_grad_(False),
+            self.history,
+            time.perf_counter() - self.began,
+            self.played,
+        )
 
 
 def by_gradient(
-    train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None
+    train: Arena,
+    check: Arena,
+    search: Search,
+    seed: int,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Found:
     """The mean loss descended through the simulator, contact and all. train, check: of the same simulator and task."""
     task, generator = train.task, torch.Generator().manual_seed(seed)
     policy = LinearPolicy(task)
     looks = Looks(policy, check, search, seed, say)
     optimiser = torch.optim.Adam(policy.parameters(), lr=search.rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, search.iterations, 0.1 * search.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimiser, search.iterations, 0.1 * search.rate
+    )
 
     def bounded(observation: Tensor) -> Tensor:
         action = policy(observation)
@@ -156,17 +186,27 @@ def by_gradient(
 
 
 @torch.no_grad()
-def by_evolution(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
+def by_evolution(
+    train: Arena,
+    check: Arena,
+    search: Search,
+    seed: int,
+    say: Callable[[str], None] = lambda line: None,
+) -> Found:
     """The covariance matrix adaptation of the library cma, its matrix diagonal: candidates are compared on the same trials, and
     gradients are not used. train, check: of the same simulator and task, the former with `search.candidates` times `search.batch`
     worlds. Errors: ConfigError for another number of worlds, or where cma is not installed."""
     task, count = train.task, search.candidates
     if train.count != count * search.batch:
-        raise ConfigError(f"search: expected {count} candidates times {search.batch} trials as worlds, found {train.count}")
+        raise ConfigError(
+            f"search: expected {count} candidates times {search.batch} trials as worlds, found {train.count}"
+        )
     try:
         import cma
     except ImportError as error:
-        raise ConfigError("policy: cma needs the package of that name: pip install '.[environments]'") from error
+        raise ConfigError(
+            "policy: cma needs the package of that name: pip install '.[environments]'"
+        ) from error
     generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
     looks = Looks(policy, check, search, seed, say)
     start = torch.nn.utils.parameters_to_vector(policy.parameters())
@@ -174,13 +214,19 @@ def by_evolution(train: Arena, check: Arena, search: Search, seed: int, say: Cal
     strategy = cma.CMAEvolutionStrategy(start.tolist(), search.spread, {
         "popsize": count, "seed": seed + 1, "CMA_diagonal": True, "verbose": -9, "verb_log": 0})  # fmt: skip
     for iteration in range(search.iterations + 1):
-        torch.nn.utils.vector_to_parameters(torch.tensor(strategy.mean).to(start), policy.parameters())
+        torch.nn.utils.vector_to_parameters(
+            torch.tensor(strategy.mean).to(start), policy.parameters()
+        )
         if looks.last(iteration):
             break
         drawn = strategy.ask()
         numbers = torch.tensor(np.array(drawn)).to(start)
         trials = task.draw(search.batch, generator)
-        outcome = play(train, trials.select(torch.arange(search.batch).repeat(count)), _side_by_side(policy, numbers, search.batch))
+        outcome = play(
+            train,
+            trials.select(torch.arange(search.batch).repeat(count)),
+            _side_by_side(policy, numbers, search.batch),
+        )
         looks.played += train.count
         strategy.tell(drawn, outcome.loss.cpu().view(count, search.batch).mean(1).tolist())
     return looks.found()
@@ -196,7 +242,10 @@ class OutcomeModel(nn.Module):
         self.register_buffer("middle", outcomes.median(0).values)
         self.register_buffer("spread", (outcomes - self.middle).abs().mean(0).clamp_min(1e-6))
         sizes = (inputs.shape[1], HIDDEN, HIDDEN, outcomes.shape[1])
-        begun = [torch.randn(MEMBERS, a, b, generator=generator) / math.sqrt(a) for a, b in pairwise(sizes)]
+        begun = [
+            torch.randn(MEMBERS, a, b, generator=generator) / math.sqrt(a)
+            for a, b in pairwise(sizes)
+        ]
         self.weights = nn.ParameterList(begun)
         self.biases = nn.ParameterList([torch.zeros(MEMBERS, 1, b) for b in sizes[1:]])
 
@@ -221,7 +270,12 @@ OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))
 
 def _outcome(view: View) -> Tensor:
     """(B, 10)."""
-    return torch.cat([getattr(view, name).reshape(-1, size) for name, size in OUTCOME], 1).detach().cpu().float()
+    return (
+        torch.cat([getattr(view, name).reshape(-1, size) for name, size in OUTCOME], 1)
+        .detach()
+        .cpu()
+        .float()
+    )
 
 
 def _seen_as(outcome: Tensor) -> View:
@@ -241,7 +295,9 @@ def _fitted_model(inputs: Tensor, outcomes: Tensor, generator: torch.Generator) 
     for _ in range(FITTED):
         optimiser.zero_grad()
         # a body that was missed is thrown about: it shall not outweigh those that were not
-        away = torch.nn.functional.smooth_l1_loss(model.scaled(inputs), wanted.expand(MEMBERS, -1, -1), beta=0.3, reduction="none")
+        away = torch.nn.functional.smooth_l1_loss(
+            model.scaled(inputs), wanted.expand(MEMBERS, -1, -1), beta=0.3, reduction="none"
+        )
         (away * counted).mean().backward()
         optimiser.step()
         schedule.step()
@@ -249,14 +305,22 @@ def _fitted_model(inputs: Tensor, outcomes: Tensor, generator: torch.Generator) 
 
 
 @torch.no_grad()
-def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
+def by_model(
+    train: Arena,
+    check: Arena,
+    search: Search,
+    seed: int,
+    say: Callable[[str], None] = lambda line: None,
+) -> Found:
     """A model of how trials end is fitted to all that was tried in the simulator, and the policy is descended on the model; then
     more is tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over many.
     train, check: of the same simulator and a task of one decision, the former with `search.candidates` times `search.batch` worlds.
     Errors: ConfigError for a task that decides in every step."""
     task = train.task
     if not task.once:
-        raise ConfigError(f"policy: expected a task of one decision with policy=model, found task={task.name}")
+        raise ConfigError(
+            f"policy: expected a task of one decision with policy=model, found task={task.name}"
+        )
     generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
     looks = Looks(policy, check, search, seed, say)
     tried: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -279,7 +343,9 @@ def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callabl
 
 
 @torch.enable_grad()
-def _descend(policy: LinearPolicy, model: OutcomeModel, task: Task, generator: torch.Generator) -> None:
+def _descend(
+    policy: LinearPolicy, model: OutcomeModel, task: Task, generator: torch.Generator
+) -> None:
     """The policy's numbers to the least cost that the model's members agree on: their mean and their standard deviation."""
     trials = task.draw(IMAGINED, generator)
     observed, many = trials.observed, trials.select(torch.arange(IMAGINED).repeat(MEMBERS))
@@ -309,11 +375,15 @@ def _side_by_side(policy: LinearPolicy, numbers: Tensor, batch: int) -> Callable
 
 def _clipped(gradient: Tensor, most: float) -> Tensor:
     """Rows (B, A) of at most that norm; 0 where one is not finite."""
-    gradient = torch.where(torch.isfinite(gradient).all(1, keepdim=True), gradient, torch.zeros_like(gradient))
+    gradient = torch.where(
+        torch.isfinite(gradient).all(1, keepdim=True), gradient, torch.zeros_like(gradient)
+    )
     return gradient * (most / gradient.norm(dim=1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
 
 
-def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: Mapping[str, Any] | None = None) -> Found:
+def by_reinforcement(
+    method: str, train: Arena, steps: int, seed: int, options: Mapping[str, Any] | None = None
+) -> Found:
     """stable-baselines3's SAC or PPO on the arena's worlds. steps: decisions in all worlds together; options: of the algorithm.
 
     Errors: ConfigError for another method, or where stable-baselines3 is not installed."""
@@ -328,7 +398,9 @@ def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: 
                      "policy_kwargs": {"net_arch": [64, 64]}},
              "ppo": {"n_steps": max(2, 4 if train.task.once else train.task.steps), "batch_size": 64,
                      "policy_kwargs": {"net_arch": [64, 64]}}}[method] | dict(options or {})  # fmt: skip
-    model = getattr(library, method.upper())("MlpPolicy", worlds, seed=seed, device="cpu", verbose=0, **given)
+    model = getattr(library, method.upper())(
+        "MlpPolicy", worlds, seed=seed, device="cpu", verbose=0, **given
+    )
     model.learn(steps)
 
     def policy(observation: Tensor) -> Tensor:
@@ -336,5 +408,8 @@ def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: 
         return torch.as_tensor(action).clamp(-1, 1)
 
     episodes = worlds.finished
-    history = [{"iteration": k, "loss": float(-value), "success": float(success)} for k, value, success in episodes]
+    history = [
+        {"iteration": k, "loss": float(-value), "success": float(success)}
+        for k, value, success in episodes
+    ]
     return Found(policy, history, time.perf_counter() - began, len(episodes))

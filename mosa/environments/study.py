@@ -17,9 +17,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named, truth_of
+from mosa.environments.arena import (
+    Arena,
+    Simulator,
+    play,
+    play_all,
+    scene_of,
+    simulator_named,
+    truth_of,
+)
 from mosa.environments.pictures import film, write_films
-from mosa.environments.policies import Found, LinearPolicy, Search, by_evolution, by_gradient, by_model, by_reinforcement
+from mosa.environments.policies import (
+    Found,
+    LinearPolicy,
+    Search,
+    by_evolution,
+    by_gradient,
+    by_model,
+    by_reinforcement,
+)
 from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
@@ -69,7 +85,9 @@ class Bench:
         key = (name, training)
         if key not in self._simulators:
             spacing = s.train_spacing if training else s.spacing
-            self._simulators[key] = simulator_named(name, s.checkpoint, scene=s.scene, device=s.device, spacing=spacing)
+            self._simulators[key] = simulator_named(
+                name, s.checkpoint, scene=s.scene, device=s.device, spacing=spacing
+            )
         return self._simulators[key]
 
     def task(self, name: str) -> Task:
@@ -130,8 +148,11 @@ def expected(bench: Bench, simulator: str) -> str:
             taken = time.perf_counter() - began
     looks = search.validation * (1 + math.ceil(search.iterations / search.every))
     drawn = search.iterations * search.batch
-    episodes = {"gradient": looks + drawn, "cma": looks + drawn * search.candidates,
-                "model": looks + drawn * search.candidates}
+    episodes = {
+        "gradient": looks + drawn,
+        "cma": looks + drawn * search.candidates,
+        "model": looks + drawn * search.candidates,
+    }
     searched = episodes.get(s.policy, s.decisions / (1 if task.once else task.steps))
     slower = (BACKWARD - 1) * drawn if s.policy == "gradient" else 0
     tested = s.trials * (1 if simulator == "truth" else 2)
@@ -162,15 +183,29 @@ def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) 
     tested = dict.fromkeys([simulator, *(["truth"] if record["truth"] is not None else [])])
     for name in tested:
         count = sum(record["truth" if name == "truth" else "own"]["success"])
-        log.info("%s, trained in %s: %d of %d in %s", bench.setting.task, simulator, count, bench.setting.trials, name)
+        log.info(
+            "%s, trained in %s: %d of %d in %s",
+            bench.setting.task,
+            simulator,
+            count,
+            bench.setting.trials,
+            name,
+        )
     _write(folder / "result.json", record)
     if record["policy"] is not None:
-        films(bench, {f"trained in {simulator}": LinearPolicy.read(bench.task(simulator), record["policy"])},
-              "truth" if record["truth"] is not None else simulator, folder, filmed)
+        films(
+            bench,
+            {f"trained in {simulator}": LinearPolicy.read(bench.task(simulator), record["policy"])},
+            "truth" if record["truth"] is not None else simulator,
+            folder,
+            filmed,
+        )
     return record
 
 
-def make_jobs(bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path) -> dict[tuple[str, int], dict[str, Any]]:
+def make_jobs(
+    bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path
+) -> dict[tuple[str, int], dict[str, Any]]:
     """The records of (simulator or `UNTRAINED`, seed); what lies in `folder`/jobs from the same setting is not made again. Several
     processes may make jobs of one folder."""
     records = {}
@@ -182,20 +217,34 @@ def make_jobs(bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path) -> di
                 log.info(expected(bench, name))
             record = _record(bench, name, seed)
             _write(file, record)
-        log.info("%s, trained in %s, seed %d: %d of %d in the truth", bench.setting.task, name, seed,
-                 sum(record["truth"]["success"]), bench.setting.trials)
+        log.info(
+            "%s, trained in %s, seed %d: %d of %d in the truth",
+            bench.setting.task,
+            name,
+            seed,
+            sum(record["truth"]["success"]),
+            bench.setting.trials,
+        )
         records[name, seed] = record
     return records
 
 
-def table(bench: Bench, simulators: Sequence[str], seeds: Sequence[int], folder: Path, filmed: int = 3) -> Path:
+def table(
+    bench: Bench, simulators: Sequence[str], seeds: Sequence[int], folder: Path, filmed: int = 3
+) -> Path:
     """Every simulator and seed, and the untrained policy. Writes <task>.md, .csv and films of that many trials into `folder`; the
     page's path."""
     simulators = [name for name in simulators if name != UNTRAINED]
-    records = make_jobs(bench, [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)], folder)
+    records = make_jobs(
+        bench, [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)], folder
+    )
     page = write_table(bench.setting, records, bench.task("truth"), folder, about_twin(bench))
     shown = {f"trained in {name}": records[name, seeds[0]] for name in simulators}
-    policies = {title: LinearPolicy.read(bench.task("truth"), r["policy"]) for title, r in shown.items() if r["policy"] is not None}
+    policies = {
+        title: LinearPolicy.read(bench.task("truth"), r["policy"])
+        for title, r in shown.items()
+        if r["policy"] is not None
+    }
     if policies:
         films(bench, policies, "truth", folder, filmed)
     return page
@@ -227,7 +276,11 @@ def _of_builtin(bench: Bench) -> bool:
 
 def _plain(setting: Setting) -> dict[str, Any]:
     """The setting, of the checkpoint its content in place of its path: a study may go on on another machine."""
-    content = None if setting.checkpoint is None else hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
+    content = (
+        None
+        if setting.checkpoint is None
+        else hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
+    )
     return json.loads(json.dumps(asdict(setting) | {"checkpoint": content}))
 
 
@@ -241,7 +294,11 @@ def _identity(bench: Bench, simulator: str) -> dict[str, Any]:
     s, found = bench.setting, _plain(bench.setting)
     if simulator not in (UNTRAINED, "truth"):
         return found
-    known = {"name": s.scene} if s.scene is not None else scene_of(bench.simulator("learned").twin, s.checkpoint)
+    known = (
+        {"name": s.scene}
+        if s.scene is not None
+        else scene_of(bench.simulator("learned").twin, s.checkpoint)
+    )
     return found | {"checkpoint": None, "scene": None, "truth": truth_of(known)}
 
 
@@ -253,11 +310,19 @@ def _read(file: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
         record = json.loads(file.read_text())
         kept = {k: v for k, v in record["setting"].items() if k not in FREE}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{file}: expected the result of a job, found a damaged one ({error}); remove it and try again") from error
+        raise DataError(
+            f"{file}: expected the result of a job, found a damaged one ({error}); remove it and try again"
+        ) from error
     wanted = {k: v for k, v in wanted.items() if k not in FREE}
     if kept != wanted:
-        other = ", ".join(f"{k}={kept.get(k)!r} instead of {wanted[k]!r}" for k in wanted if kept.get(k) != wanted[k])
-        raise DataError(f"{file}: expected a job of the same setting, found {other}; choose another folder with out=")
+        other = ", ".join(
+            f"{k}={kept.get(k)!r} instead of {wanted[k]!r}"
+            for k in wanted
+            if kept.get(k) != wanted[k]
+        )
+        raise DataError(
+            f"{file}: expected a job of the same setting, found {other}; choose another folder with out="
+        )
     return record
 
 
@@ -270,7 +335,11 @@ def _write(file: Path, record: Mapping[str, Any]) -> None:
 
 
 def films(
-    bench: Bench, policies: Mapping[str, Callable[[Tensor], Tensor]], simulator: str, folder: Path, filmed: int
+    bench: Bench,
+    policies: Mapping[str, Callable[[Tensor], Tensor]],
+    simulator: str,
+    folder: Path,
+    filmed: int,
 ) -> list[Path]:
     """The first tested trials under each policy, in that simulator: one strip and one video a trial."""
     task = bench.task(simulator)
@@ -279,12 +348,18 @@ def films(
         return []
     arena = bench.arena(simulator, count)
     # the same numbers as in the test: trials are drawn column by column
-    drawn = task.draw(bench.setting.trials, torch.Generator().manual_seed(TEST_SEED)).select(slice(count))
+    drawn = task.draw(bench.setting.trials, torch.Generator().manual_seed(TEST_SEED)).select(
+        slice(count)
+    )
     played = {title: play(arena, drawn, policy, record=True) for title, policy in policies.items()}
     written = []
     for b in range(count):
-        rows = {f"{title}: {'success' if bool(p.success[b]) else 'failure'} ({simulator})": film(arena, p.states, b, 25)
-                for title, p in played.items()}
+        rows = {
+            f"{title}: {'success' if bool(p.success[b]) else 'failure'} ({simulator})": film(
+                arena, p.states, b, 25
+            )
+            for title, p in played.items()
+        }
         written += write_films(folder, rows, f"{task.name}_trial_{b}")
     return written
 
@@ -299,11 +374,22 @@ def about_twin(bench: Bench) -> str:
 
 
 def write_table(
-    setting: Setting, records: Mapping[tuple[str, int], Mapping[str, Any]], task: Task, folder: Path, about: str = ""
+    setting: Setting,
+    records: Mapping[tuple[str, int], Mapping[str, Any]],
+    task: Task,
+    folder: Path,
+    about: str = "",
 ) -> Path:
     """<task>.md and <task>.csv. Every row is one simulator to train in. about: a sentence on the twin."""
     names = list(dict.fromkeys(name for name, _ in records))
-    header = ["trained in", "success in the truth", "mean", "in its own simulator", "mean loss in the truth", "seconds of training"]
+    header = [
+        "trained in",
+        "success in the truth",
+        "mean",
+        "in its own simulator",
+        "mean loss in the truth",
+        "seconds of training",
+    ]
     lines = []
     for name in names:
         found = [r for (n, _), r in sorted(records.items()) if n == name]
@@ -327,7 +413,10 @@ def write_table(
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{task.name}.md"
     write_whole(page, "\n\n".join(text) + "\n")
-    with written_whole(folder / f"{task.name}.csv") as partial, open(partial, "w", newline="") as file:
+    with (
+        written_whole(folder / f"{task.name}.csv") as partial,
+        open(partial, "w", newline="") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"])
         for (name, seed), record in sorted(records.items()):
@@ -344,7 +433,9 @@ UNSAID = ("search", "options", "checkpoint", *FREE)
 
 
 def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
+    return ", ".join(
+        f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()
+    )
 
 
 def put_into(page: Path, table: Path, task: str) -> None:
@@ -356,7 +447,9 @@ def put_into(page: Path, table: Path, task: str) -> None:
     head, found, rest = text.partition(begin)
     _, closed, tail = rest.partition(end)
     if not found or not closed:
-        raise DataError(f"page: {page}: expected a line '{begin.strip()}' and after it a line '{end}', found none")
+        raise DataError(
+            f"page: {page}: expected a line '{begin.strip()}' and after it a line '{end}', found none"
+        )
     content = table.read_text().split("\n", 2)[2]
     write_whole(page, f"{head}{begin}{content}{end}{tail}")
 
@@ -367,4 +460,6 @@ def _mean(counts: Sequence[int], trials: int) -> str:
     mean = sum(shares) / len(shares)
     if len(shares) < 2:
         return f"{mean:.0f} %"
-    return f"{mean:.0f} ± {math.sqrt(sum((s - mean) ** 2 for s in shares) / (len(shares) - 1)):.0f} %"
+    return (
+        f"{mean:.0f} ± {math.sqrt(sum((s - mean) ** 2 for s in shares) / (len(shares) - 1)):.0f} %"
+    )

@@ -105,11 +105,15 @@ class Task(ABC):
         for field in fields(self):
             value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
             if not kind.fits(value):
-                raise ConfigError(f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}")
+                raise ConfigError(
+                    f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}"
+                )
         for low, high in (("low", "high"), ("close", "far"), ("slowest", "fastest")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):
-                raise ConfigError(f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
-                                  f"{getattr(self, low):g}")
+                raise ConfigError(
+                    f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
+                    f"{getattr(self, low):g}"
+                )
 
     @property
     @abstractmethod
@@ -131,7 +135,9 @@ class Task(ABC):
         """Colliders beside the ground, as `colliders_from_config` takes them."""
 
     @abstractmethod
-    def starts(self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float) -> list[dict]:
+    def starts(
+        self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float
+    ) -> list[dict]:
         """Of `TwinWorlds.reset`, for each trial. action: (B, A) in [-1, 1] of a task of one decision; rest: (N, 3) [m] about the
         centre; gravity [m/s^2]."""
 
@@ -157,28 +163,44 @@ class Task(ABC):
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:
         """(A, O), (A,) of the policy that a search begins from; zeros: the aim without any knowledge of how the body bounces."""
-        return torch.zeros(len(self.actions), len(self.observations)), torch.zeros(len(self.actions))
+        return torch.zeros(len(self.actions), len(self.observations)), torch.zeros(
+            len(self.actions)
+        )
 
     def world(self, world: World) -> World:
         """The same gravity over a ground at height 0 with friction, in a wide box, whatever the scene's own are."""
         if float((world.up - torch.tensor([0.0, 1.0, 0.0]).to(world.up)).abs().max()) > 1e-6:
-            raise ConfigError(f"task {self.name}: expected a world with up = [0, 1, 0], found {world.up.tolist()}")
+            raise ConfigError(
+                f"task {self.name}: expected a world with up = [0, 1, 0], found {world.up.tolist()}"
+            )
         box = torch.tensor([[-ROOM, -1.0, -ROOM], [ROOM, ROOM, ROOM]]).to(world.box)
-        return replace(world, ground=Ground(0.0, "separate", self.ground_friction), box=box, planes=(), colliders=())
+        return replace(
+            world,
+            ground=Ground(0.0, "separate", self.ground_friction),
+            box=box,
+            planes=(),
+            colliders=(),
+        )
 
     def draw(self, count: int, generator: torch.Generator) -> Trials:
         """`count` trials."""
         counted("trials", (count, sum(map(len, self.drawn))), "take fewer", each=3 * 8)
         found = []
         for quantities in self.drawn:
-            low, high = (torch.tensor([getattr(q, side) for q in quantities], dtype=torch.float64) for side in ("low", "high"))
+            low, high = (
+                torch.tensor([getattr(q, side) for q in quantities], dtype=torch.float64)
+                for side in ("low", "high")
+            )
             part = torch.rand(count, len(quantities), generator=generator, dtype=torch.float64)
             found.append((low + (high - low) * part).float())
         return Trials(*found)
 
     def physical(self, action: Tensor) -> Tensor:
         """(B, A) in units, of actions in [-1, 1]."""
-        low, high = (torch.tensor([getattr(q, side) for q in self.actions]).to(action) for side in ("low", "high"))
+        low, high = (
+            torch.tensor([getattr(q, side) for q in self.actions]).to(action)
+            for side in ("low", "high")
+        )
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
     def loss(self, trials: Trials, view: View) -> Tensor:

@@ -83,7 +83,9 @@ class Release(Task):
         """(3, 3) how the body is held before it is tilted, relative to its rest shape."""
         return torch.eye(3, dtype=torch.float64)
 
-    def starts(self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float) -> list[dict]:
+    def starts(
+        self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float
+    ) -> list[dict]:
         given = self.physical(action).cpu() + trials.hidden
         down = self.thrown(given)
         fallen = (down.square() + 2 * gravity * (trials.observed[:, 0] - CLEARANCE)).sqrt()
@@ -122,7 +124,9 @@ class Placement(Release):
 
     @property
     def situation(self) -> tuple[Quantity, ...]:
-        return tuple(Quantity(f"askew about {axis}", "rad", -self.askew, self.askew) for axis in "xz")
+        return tuple(
+            Quantity(f"askew about {axis}", "rad", -self.askew, self.askew) for axis in "xz"
+        )
 
     def release(self, trials: Trials, given: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         return given[:, :2] + trials.observed[:, 1:3], torch.zeros_like(given[:, 2:4])
@@ -250,7 +254,11 @@ class Hanging(Release):
 
     def succeeded(self, trials: Trials, view: View) -> Tensor:
         away = torch.hypot(view.center[:, 0], view.center[:, 1] - self.grip)
-        return (away < self.near) & (view.lowest > self.free) & (view.velocity.norm(dim=1) < self.still)
+        return (
+            (away < self.near)
+            & (view.lowest > self.free)
+            & (view.velocity.norm(dim=1) < self.still)
+        )
 
 
 SIDES = (("left", -1.0), ("right", 1.0))
@@ -282,7 +290,9 @@ class Pushing(Task):
 
     @property
     def actions(self) -> tuple[Quantity, ...]:
-        moves = tuple(Quantity(f"paddle velocity {axis}", "m/s", -self.fastest, self.fastest) for axis in "xz")
+        moves = tuple(
+            Quantity(f"paddle velocity {axis}", "m/s", -self.fastest, self.fastest) for axis in "xz"
+        )
         return (*moves, Quantity("paddle's turn towards z", "rad/s", -self.turning, self.turning))
 
     @property
@@ -307,13 +317,19 @@ class Pushing(Task):
     @property
     def first(self) -> tuple[float, float, float]:
         """Where the paddle begins [m]; its lower edge is over the ground by `ABOVE`."""
-        return -(0.5 * self.extents[0] + self.apart + 0.5 * self.size[0] + 0.02), ABOVE + 0.5 * self.size[1], 0.0
+        return (
+            -(0.5 * self.extents[0] + self.apart + 0.5 * self.size[0] + 0.02),
+            ABOVE + 0.5 * self.size[1],
+            0.0,
+        )
 
     def solids(self) -> list[Mapping[str, Any]]:
         return [{"type": "box", "name": "paddle", "size": list(self.size), "position": list(self.first), "mode": "separate",
                  "friction": 0.3}]  # fmt: skip
 
-    def starts(self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float) -> list[dict]:
+    def starts(
+        self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float
+    ) -> list[dict]:
         still = (0.0, 0.0, 0.0)
         upright = torch.eye(3)
         return [{"rotation": upright, "position": (float(x), 0.0, float(z)), "height": 0.0, "velocity": still,
@@ -333,8 +349,15 @@ class Pushing(Task):
     def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
         v = self.physical(action)
         none = torch.zeros_like(v[:, 0])
-        turn = torch.stack([none, -v[:, 2], none], 1)  # from x towards z is against the sense about y
-        return {"paddle": {"velocity": torch.stack([v[:, 0], none, v[:, 1]], 1), "angular_velocity": turn}}
+        turn = torch.stack(
+            [none, -v[:, 2], none], 1
+        )  # from x towards z is against the sense about y
+        return {
+            "paddle": {
+                "velocity": torch.stack([v[:, 0], none, v[:, 1]], 1),
+                "angular_velocity": turn,
+            }
+        }
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:
         """Towards the target, across to where the body is, and turned a little to the target's side: without the first two the
@@ -345,13 +368,19 @@ class Pushing(Task):
         return weight, bias
 
     def miss(self, trials: Trials, view: View) -> Tensor:
-        away = (view.center[:, [0, 2]] - trials.observed.to(view.center)).square().sum(1) / self.near**2
+        away = (view.center[:, [0, 2]] - trials.observed.to(view.center)).square().sum(
+            1
+        ) / self.near**2
         moving = view.velocity.square().sum(1) / (4 * self.still) ** 2
         return away + moving + (1 - view.upright[:, 1]) / (1 - math.cos(self.lean))
 
     def succeeded(self, trials: Trials, view: View) -> Tensor:
         near = (view.center[:, [0, 2]] - trials.observed.to(view.center)).norm(dim=1) < self.near
-        return near & (view.upright[:, 1] > math.cos(self.lean)) & (view.velocity.norm(dim=1) < self.still)
+        return (
+            near
+            & (view.upright[:, 1] > math.cos(self.lean))
+            & (view.velocity.norm(dim=1) < self.still)
+        )
 
 
 @dataclass(frozen=True)
@@ -388,7 +417,11 @@ class Striking(Pushing):
         return trials.observed
 
     def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
-        return super().command(action, step) if step < self.stroke else {self.tool: {"velocity": (0.0, 0.0, 0.0)}}
+        return (
+            super().command(action, step)
+            if step < self.stroke
+            else {self.tool: {"velocity": (0.0, 0.0, 0.0)}}
+        )
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:
         """The middle of what may be asked, turned to the target's side."""
@@ -406,7 +439,9 @@ def task_named(name: str, rest: Tensor, **options: Any) -> Task:
     Errors: ConfigError naming what is unknown."""
     if not isinstance(name, str) or name not in TASKS:
         raise ConfigError(f"task: expected one of {', '.join(TASKS)}, found {name!r}")
-    if unknown := sorted(set(options) - {field.name for field in fields(TASKS[name])} | set(options) & {"extents"}):
+    if unknown := sorted(
+        set(options) - {field.name for field in fields(TASKS[name])} | set(options) & {"extents"}
+    ):
         raise ConfigError(f"options.{unknown[0]}: expected a field of the task {name}, found it")
     extents = tuple(round(float(e), 2) for e in (rest.amax(0) - rest.amin(0)))
     return TASKS[name](extents, **options)

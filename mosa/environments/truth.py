@@ -72,11 +72,15 @@ def true_twin(
     """
     device, body, drop = named_device(device), object_named(name), drop_named(name, sequence)
     if not whole(0, 2**32 - 1).fits(seed):
-        raise ConfigError(f"scene.seed: expected a whole number of at least 0 and below 2^32, found {str(seed)[:80]!r}")
+        raise ConfigError(
+            f"scene.seed: expected a whole number of at least 0 and below 2^32, found {str(seed)[:80]!r}"
+        )
     widest = float(np.ptp(np.asarray(SHAPES[body.shape].bounds), axis=0).max()) / COARSEST
     if spacing is not None and not number(FINEST, widest).fits(spacing):
-        raise ConfigError(f"truth.spacing: expected a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the "
-                          f"body's longest side, or null, found {str(spacing)[:80]!r}")
+        raise ConfigError(
+            f"truth.spacing: expected a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the "
+            f"body's longest side, or null, found {str(spacing)[:80]!r}"
+        )
     spacing = body.spacing if spacing is None else float(spacing)
     surface, particles, _ = built(body.shape, body.pitch, spacing, seed)
     hidden = body.material.variant(material)
@@ -101,5 +105,10 @@ def true_twin(
     reach = BOX[1][0] if body.reach is None else body.reach
     box = torch.tensor([[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]])
     world = World(Ground(0.0, "sticky"), tensor(GRAVITY), torch.tensor([0.0, 1.0, 0.0]), box)
-    start = Start(tensor(drop.rotation), tensor(begun.mean(0)), tensor([0.0, -drop.speed, 0.0]), torch.zeros(3))
+    start = Start(
+        tensor(drop.rotation),
+        tensor(begun.mean(0)),
+        tensor([0.0, -drop.speed, 0.0]),
+        torch.zeros(3),
+    )
     return Twin(made.to(device).eval(), world, 1 / body.footage.fps, {}, start)

@@ -45,9 +45,14 @@ class Sequence:
     contact: int
 
 
-def sequences(body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]) -> list[Sequence]:
+def sequences(
+    body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]
+) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences."""
-    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
+    return [
+        Sequence(p, s, start, first_contact(body, start, s))
+        for (p, start), s in zip(found.items(), [training, *others])
+    ]
 
 
 def run_sequences(config: Mapping[str, Any], body: Body) -> list[Sequence]:
@@ -57,7 +62,9 @@ def run_sequences(config: Mapping[str, Any], body: Body) -> list[Sequence]:
 
 
 @torch.no_grad()
-def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Rollout], float | None, float]:
+def rollouts(
+    body: Body, sequence: Sequence, world: World
+) -> tuple[dict[str, Rollout], float | None, float]:
     """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
     particle substeps per second of the last. A variant that cannot be simulated on it is left out, with a warning: on a training
     sequence too, which the fit has simulated near the observed motion, and without its held-out frames."""
@@ -68,11 +75,20 @@ def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Ro
     for v in VARIANTS:
         began, counted = time.perf_counter(), len(sizes)
         try:
-            result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
-                                      collect=lambda found: sizes.append(float(found.mean_abs_C)))
+            result[v] = body.simulate(
+                sequence.start,
+                world,
+                scene.frames,
+                frame_dt,
+                model=body.model(v),
+                collect=lambda found: sizes.append(float(found.mean_abs_C)),
+            )
         except (SimulationDiverged, ConfigError) as error:
             del sizes[counted:]
-            warn(f"{sequence.prefix}: {NAMES[v]} cannot be simulated there, its errors count as infinite ({error})", stacklevel=2)
+            warn(
+                f"{sequence.prefix}: {NAMES[v]} cannot be simulated there, its errors count as infinite ({error})",
+                stacklevel=2,
+            )
             continue
         if body.rest.is_cuda:
             torch.cuda.synchronize()
@@ -85,10 +101,14 @@ def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Te
     """(V, T, H, W, 3) images of a rollout from the given cameras, on the body's device: of its splats where it has some."""
     device = body.rest.device
     shown = seen(body, rollout.x, rollout.F_tot)
-    return shown.images(scene.cameras.select(cameras).to(device), scene.background.to(device)).clamp_(0, 1)
+    return shown.images(
+        scene.cameras.select(cameras).to(device), scene.background.to(device)
+    ).clamp_(0, 1)
 
 
-def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list[int]) -> dict[str, float]:
+def image_metrics(
+    images: Tensor, scene: Scene, cameras: list[int], frames: list[int]
+) -> dict[str, float]:
     """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
 
     images: (V, T, H, W, 3), all frames; where they lie is where they are compared.
@@ -96,7 +116,9 @@ def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list
     if not cameras or not frames:
         return {}
     x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
-    found: dict[str, list[float]] = {f"{kind}_{name}": [] for name in ("crop", "full") for kind in ("psnr", "ssim")}
+    found: dict[str, list[float]] = {
+        f"{kind}_{name}": [] for name in ("crop", "full") for kind in ("psnr", "ssim")
+    }
     for v, (camera, x, y) in enumerate(zip(cameras, x0.tolist(), y0.tolist())):
         seen, real = images[v][frames], scene.images[camera][frames].to(images.device)
         crop = (slice(None), slice(y, y + height), slice(x, x + width))
@@ -109,7 +131,12 @@ def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list
 
 
 def motion_metrics(
-    x: Tensor, body: Body, sequence: Sequence, frames: list[int], settings: EvaluationSettings, target: Tensor | None = None
+    x: Tensor,
+    body: Body,
+    sequence: Sequence,
+    frames: list[int],
+    settings: EvaluationSettings,
+    target: Tensor | None = None,
 ) -> dict[str, float]:
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
@@ -128,19 +155,30 @@ def motion_metrics(
     else:
         target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
-        result |= {name: metric.function(x[after], target[after]) for name, metric in metrics.MOTION_METRICS.items()}
+        result |= {
+            name: metric.function(x[after], target[after])
+            for name, metric in metrics.MOTION_METRICS.items()
+        }
         pairs = [(x[t], truth.positions[t]) for t in after]
-    each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=settings.samples), pairs))
+    each = list(
+        threaded(lambda pair: metrics.chamfer_distances(*pair, samples=settings.samples), pairs)
+    )
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
     last = pairs[:: max(1, len(pairs) // 3)]
-    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=settings.assignment), last))))
+    result["emd_m"] = float(
+        np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=settings.assignment), last)))
+    )
     return result
 
 
 def true_motion(body: Body, scene: Scene) -> Tensor | None:
     """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
     truth = scene.truth
-    return None if truth is None else metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
+    return (
+        None
+        if truth is None
+        else metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
+    )
 
 
 @torch.no_grad()
@@ -152,7 +190,9 @@ def evaluate(
     Errors: SimulationDiverged where none of them could be."""
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
-    bar = tqdm(total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True)
+    bar = tqdm(
+        total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True
+    )
     rates, measured, missing = [], set[str](), list[tuple[str, str]]()
     for sequence in sequences:
         kept[sequence.prefix] = {}
@@ -165,16 +205,26 @@ def evaluate(
             model = PREFIX[variant]
             if variant in simulated:
                 kept[sequence.prefix][variant] = simulated[variant]
-                figures |= sequence_metrics(body, sequence, simulated[variant], model, settings, target)
-                measured |= {key.rpartition("/")[2] for key in figures if key.startswith(f"{model}{sequence.prefix}/")}
+                figures |= sequence_metrics(
+                    body, sequence, simulated[variant], model, settings, target
+                )
+                measured |= {
+                    key.rpartition("/")[2]
+                    for key in figures
+                    if key.startswith(f"{model}{sequence.prefix}/")
+                }
             else:
                 missing += [(model, part) for part in parts_of(sequence)]
             bar.update()
     bar.close()
     if not measured:
-        raise SimulationDiverged("evaluation: neither the law nor its prior can be simulated on any of these sequences: "
-                                 f"{', '.join(s.prefix for s in sequences)}; the warnings above say why")
-    of_pictures = {name for name in measured if name.endswith(("_crop", "_full"))}  # all that held-out cameras tell
+        raise SimulationDiverged(
+            "evaluation: neither the law nor its prior can be simulated on any of these sequences: "
+            f"{', '.join(s.prefix for s in sequences)}; the warnings above say why"
+        )
+    of_pictures = {
+        name for name in measured if name.endswith(("_crop", "_full"))
+    }  # all that held-out cameras tell
     figures |= {f"{model}{part}/{name}": worst(name) for model, part in missing
                 for name in (of_pictures if part == "camera" else measured - {"mean_abs_C"})}  # fmt: skip
     figures |= test_means(figures)
@@ -194,11 +244,22 @@ def worst(name: str) -> float:
     """The figure of a rollout that there is not: no error so large and no picture so bad; of pictures compared by a metric that was
     registered, no number."""
     kind = name.split("_")[0]
-    return -math.inf if kind in ("psnr", "ssim") else math.nan if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS else math.inf
+    return (
+        -math.inf
+        if kind in ("psnr", "ssim")
+        else math.nan
+        if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS
+        else math.inf
+    )
 
 
 def sequence_metrics(
-    body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings, target: Tensor | None
+    body,
+    sequence: Sequence,
+    rollout: Rollout,
+    model: str,
+    settings: EvaluationSettings,
+    target: Tensor | None,
 ) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x, parts = sequence.scene, rollout.x.cpu(), parts_of(sequence)
@@ -213,16 +274,22 @@ def sequence_metrics(
     result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
     if "frames" in parts:
         held = list(scene.holdout_frames)
-        figures = {**motion_metrics(x, body, sequence, held, settings, target),
-                   **image_metrics(images, scene, cameras, held)}
+        figures = {
+            **motion_metrics(x, body, sequence, held, settings, target),
+            **image_metrics(images, scene, cameras, held),
+        }
         result |= {f"{model}frames/{k}": v for k, v in figures.items()}
     if "camera" in parts:
         held = list(scene.holdout_cameras)
         images = render(body, rollout, scene, held)
-        result |= {f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()}
+        result |= {
+            f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()
+        }
         for t in frames:
             per_frame = image_metrics(images, scene, held, [t])
-            result |= {f"{model}camera/frame_{t:02d}/{k}": per_frame[k] for k in ("psnr_crop", "ssim_crop")}
+            result |= {
+                f"{model}camera/frame_{t:02d}/{k}": per_frame[k] for k in ("psnr_crop", "ssim_crop")
+            }
     return result
 
 
@@ -236,7 +303,9 @@ def test_means(figures: Mapping[str, float]) -> dict[str, float]:
     return {key: float(np.mean(values)) for key, values in groups.items()}
 
 
-def floor_figures(body: Body, evaluated: list[Sequence], world: World, settings: EvaluationSettings) -> dict[str, float]:
+def floor_figures(
+    body: Body, evaluated: list[Sequence], world: World, settings: EvaluationSettings
+) -> dict[str, float]:
     """What no law can get below, to read the figures of a model against.
 
     `floor/<part>/...`: the true law on the learner's own grid and particles, on synthetic scenes, over the same frames and with as
@@ -250,15 +319,27 @@ def floor_figures(body: Body, evaluated: list[Sequence], world: World, settings:
         if scene.truth is None:
             continue
         x = floor_rollout(body, scene, world)
-        frames = scene.training_frames if sequence.prefix.startswith("train") else list(range(scene.frames))
+        frames = (
+            scene.training_frames
+            if sequence.prefix.startswith("train")
+            else list(range(scene.frames))
+        )
         result = motion_metrics(x, body, sequence, frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)
-    clouds = [scene.truth.rest if scene.truth is not None else scene.particles[0] for scene in (s.scene for s in evaluated)
-              if scene.truth is not None or scene.particles is not None]
+    clouds = [
+        scene.truth.rest if scene.truth is not None else scene.particles[0]
+        for scene in (s.scene for s in evaluated)
+        if scene.truth is not None or scene.particles is not None
+    ]
     if clouds:
-        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), samples=settings.samples,
-                                          assignment=settings.assignment)
+        floors = metrics.sampling_floors(
+            clouds[0],
+            len(body.rest),
+            len(clouds[0]),
+            samples=settings.samples,
+            assignment=settings.assignment,
+        )
         figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}
     return figures
 
@@ -273,7 +354,9 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
             scale = mean if name in material.modulated else 1.0
             figures[f"{prefix}/{name}"] = float(value.detach()) * scale
             if name in scene.known_parameters:
-                errors = metrics.identification_errors(name, figures[f"{prefix}/{name}"], scene.known_parameters[name])
+                errors = metrics.identification_errors(
+                    name, figures[f"{prefix}/{name}"], scene.known_parameters[name]
+                )
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
         figures[f"{prefix}/contact_offset_m"] = float(model.contact.lift(scene.ground).detach())
     return figures
@@ -288,12 +371,20 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
     from mosa.evaluation.floor import hidden_of
 
     hidden, found = hidden_of(scene), {}
-    fibre, axis = getattr(hidden, "fibre", None), [figures.get(f"id/stiffest_{name}") for name in "xyz"]
+    fibre, axis = (
+        getattr(hidden, "fibre", None),
+        [figures.get(f"id/stiffest_{name}") for name in "xyz"],
+    )
     if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
         found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
-    learned, true = body.factor(body.model().heterogeneity).detach().cpu(), hidden.factor(body.rest.cpu().float())
+    learned, true = (
+        body.factor(body.model().heterogeneity).detach().cpu(),
+        hidden.factor(body.rest.cpu().float()),
+    )
     if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
-        found["id/stiffness_correlation"] = float(torch.corrcoef(torch.stack([true, learned.float()]))[0, 1])
+        found["id/stiffness_correlation"] = float(
+            torch.corrcoef(torch.stack([true, learned.float()]))[0, 1]
+        )
     return found
 
 
@@ -304,11 +395,20 @@ def law_figures(body: Body) -> dict[str, float]:
         return {}
     figures = {}
     adapter.follow(material.poisson())
-    growth = vibration_growth(material, adapter, density=body.density, stride=body.settings.stride, law_options=body.law_options)
+    growth = vibration_growth(
+        material,
+        adapter,
+        density=body.density,
+        stride=body.settings.stride,
+        law_options=body.law_options,
+    )
     figures["id/growth_per_period"] = growth
     if growth > GROWTH_LIMIT:
-        warn(f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
-             "adapter=operator has an energy and cannot", stacklevel=2)
+        warn(
+            f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
+            "adapter=operator has an energy and cannot",
+            stacklevel=2,
+        )
     if (stiffness := adapter.stiffness()) is not None:
         axis, ratio = stiffest(stiffness.detach().cpu())
         figures["id/stiffness_ratio"] = float(ratio)

@@ -18,7 +18,9 @@ def hidden_of(scene: Scene) -> Hidden:
     """The hidden material of a built-in scene, for figures alone. Errors: ConfigError where the scene is not a built-in one."""
     if scene.truth is None or not scene.synthetic:
         raise ConfigError(f"scene {scene.name}: the true law is known for built-in scenes only")
-    return object_named(scene.name).material.variant("anisotropic" if scene.truth.parameters["ratio"] > 1 else "isotropic")
+    return object_named(scene.name).material.variant(
+        "anisotropic" if scene.truth.parameters["ratio"] > 1 else "isotropic"
+    )
 
 
 @torch.no_grad()
@@ -42,7 +44,9 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         hidden.density,
         frame_dt,
         settings.dx,
-        v_max=world.fastest(begun, float((rest.amax(0) - rest.amin(0)).max()), frame_dt * scene.frames),
+        v_max=world.fastest(
+            begun, float((rest.amax(0) - rest.amin(0)).max()), frame_dt * scene.frames
+        ),
         courant=min(settings.courant, 0.3),
         limit=5000,
         viscosity=hidden.viscosity(),
@@ -63,9 +67,13 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact.lift(world.ground).detach().float().cpu() * up
     F = Q.expand(n, 3, 3).contiguous()
-    velocity = (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()
+    velocity = (
+        (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()
+    )
     F = F.to(device)
-    state = ParticleState((start + lift).to(device), velocity.to(device), torch.zeros(n, 3, 3, device=device), F, F)
+    state = ParticleState(
+        (start + lift).to(device), velocity.to(device), torch.zeros(n, 3, 3, device=device), F, F
+    )
     parameters = {name: value.to(device) for name, value in hidden.parameters(rest).items()}
     rollout = simulator.rollout(
         state, parameters, body.volume.float().to(device), hidden.density, scene.frames,

@@ -41,14 +41,21 @@ class Likeness(NamedTuple):
 def likeness(body: Body, start: Start, scene: Scene) -> Likeness:
     """Of the body at the start of a film to its first frame, in some of the cameras that learning may read."""
     every, rotation = scene.training_cameras, start.rotation.to(body.rest)
-    cameras = [every[i] for i in torch.linspace(0, len(every) - 1, min(VIEWS, len(every))).round().long().tolist()]
+    cameras = [
+        every[i]
+        for i in torch.linspace(0, len(every) - 1, min(VIEWS, len(every))).round().long().tolist()
+    ]
     x = (body.rest - body.center) @ rotation.T + start.center.to(body.rest)
     shown = seen(body, x[None], rotation.expand(1, len(x), 3, 3))
     views = scene.cameras.select(cameras).to(x.device)
-    black, white = (shown.images(views, torch.full((3,), value).to(x))[:, 0] for value in (0.0, 1.0))
+    black, white = (
+        shown.images(views, torch.full((3,), value).to(x))[:, 0] for value in (0.0, 1.0)
+    )
     alpha = (1 - (white - black).mean(-1)).clamp(0, 1)
     mattes, images = scene.mattes[cameras, 0].to(alpha), scene.images[cameras, 0].to(alpha)
-    common = torch.minimum(alpha, mattes).sum((1, 2)) / torch.maximum(alpha, mattes).sum((1, 2)).clamp(min=1e-6)
+    common = torch.minimum(alpha, mattes).sum((1, 2)) / torch.maximum(alpha, mattes).sum(
+        (1, 2)
+    ).clamp(min=1e-6)
     inside = ((alpha > 0.9) & (mattes > 0.9)).to(alpha)[..., None]
     rendered = black + (1 - alpha)[..., None] * scene.background.to(alpha)
     off = ((images - rendered) * inside).sum((0, 1, 2)) / inside.sum().clamp(min=1)
@@ -65,13 +72,22 @@ def warn_of_others(body: Body, found: Mapping[str, Start], scenes: Sequence[Scen
             own = like
             continue
         if like.outline < FILLED * own.outline:
-            warnings.warn(f"{prefix}: in its first frame the body of the training film fills {like.outline:.0%} of the outlines, "
-                          f"where it looks most like it, and {own.outline:.0%} of its own: another body, a pose that was not "
-                          "found, or a shape that the training film tells too little of (few cameras)? figures of this sequence "
-                          "count on it", stacklevel=2)
+            warnings.warn(
+                f"{prefix}: in its first frame the body of the training film fills {like.outline:.0%} of the outlines, "
+                f"where it looks most like it, and {own.outline:.0%} of its own: another body, a pose that was not "
+                "found, or a shape that the training film tells too little of (few cameras)? figures of this sequence "
+                "count on it",
+                stacklevel=2,
+            )
         off = like.color - own.color
         if float(off.abs().max()) > BRIGHTER:
-            said = ", ".join(f"{name} {value:+.2f}" for name, value in zip(("red", "green", "blue"), off.tolist()))
-            warnings.warn(f"{prefix}: in its first frame the object's mean colour is not the body's ({said}): another exposure, "
-                          "white balance or light, or another object? PSNR and SSIM of this sequence say that as well, and its "
-                          "start was sought by colours", stacklevel=2)
+            said = ", ".join(
+                f"{name} {value:+.2f}"
+                for name, value in zip(("red", "green", "blue"), off.tolist())
+            )
+            warnings.warn(
+                f"{prefix}: in its first frame the object's mean colour is not the body's ({said}): another exposure, "
+                "white balance or light, or another object? PSNR and SSIM of this sequence say that as well, and its "
+                "start was sought by colours",
+                stacklevel=2,
+            )

@@ -46,8 +46,14 @@ def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
 
     Errors: ConfigError if another metric has the name."""
     known = IMAGE_METRICS if images else MOTION_METRICS
-    if re.fullmatch(r"\w+", name) is None or name in RESERVED or known.setdefault(name, metric) != metric:
-        raise ConfigError(f"metric {name!r}: expected a name of letters and digits that no figure has yet; choose another one")
+    if (
+        re.fullmatch(r"\w+", name) is None
+        or name in RESERVED
+        or known.setdefault(name, metric) != metric
+    ):
+        raise ConfigError(
+            f"metric {name!r}: expected a name of letters and digits that no figure has yet; choose another one"
+        )
 
 
 RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")
@@ -57,7 +63,9 @@ RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")
 # --- motion ---------------------------------------------------------------------------------------------------------
 
 
-def interpolate_motion(rest: Tensor, positions: Tensor, query: Tensor, neighbours: int = 8) -> Tensor:
+def interpolate_motion(
+    rest: Tensor, positions: Tensor, query: Tensor, neighbours: int = 8
+) -> Tensor:
     """True motion at rest positions `query` (N, 3): (T, N, 3) [m], from true rest points (M, 3) and positions (T, M, 3).
 
     A linear fit to the nearest true rest points, weighted by inverse distance. A plain weighted mean lies at the
@@ -67,17 +75,23 @@ def interpolate_motion(rest: Tensor, positions: Tensor, query: Tensor, neighbour
     """
     points, wanted = rest.cpu().double(), query.cpu().double()
     displaced = positions.cpu().double() - points
-    distance, index = cKDTree(points.numpy()).query(wanted.numpy(), k=np.arange(1, min(neighbours, len(points)) + 1))
+    distance, index = cKDTree(points.numpy()).query(
+        wanted.numpy(), k=np.arange(1, min(neighbours, len(points)) + 1)
+    )
     weight = torch.as_tensor(1 / np.maximum(distance, 1e-12))
     weight, index = weight / weight.sum(1, keepdim=True), torch.as_tensor(index)
     center = points.mean(0)
     basis = torch.nn.functional.pad(points - center, (0, 1), value=1.0)
     # (T, 4, 3), the shortest solution: clouds that are flat or have few points pass
-    affine = torch.linalg.lstsq(basis.expand(len(displaced), -1, -1), displaced, driver="gelsd").solution
+    affine = torch.linalg.lstsq(
+        basis.expand(len(displaced), -1, -1), displaced, driver="gelsd"
+    ).solution
     residual = displaced - basis @ affine
     # value at the query of the fit = weighted sum of the neighbours' residuals with these coefficients
     reach = torch.as_tensor(distance).amax(1).clamp(min=1e-12)
-    local = torch.nn.functional.pad((points[index] - wanted[:, None]) / reach[:, None, None], (0, 1), value=1.0)
+    local = torch.nn.functional.pad(
+        (points[index] - wanted[:, None]) / reach[:, None, None], (0, 1), value=1.0
+    )
     moment = torch.einsum("nk,nki,nkj->nij", weight, local, local)
     moment = moment + torch.diag(torch.tensor([RIDGE, RIDGE, RIDGE, 0.0], dtype=torch.float64))
     unit = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(wanted), 4)
@@ -97,7 +111,11 @@ def rms(x: Tensor, target: Tensor) -> float:
 def subsample(points: Tensor, count: int, seed: int) -> np.ndarray:
     """At most `count` points without replacement, float64."""
     found = points.detach().cpu().double().numpy()
-    return found if len(found) <= count else found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
+    return (
+        found
+        if len(found) <= count
+        else found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
+    )
 
 
 def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -105,11 +123,16 @@ def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray,
     return cKDTree(second).query(first)[0], cKDTree(first).query(second)[0]
 
 
-def chamfer_distances(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> dict[str, float]:
+def chamfer_distances(
+    a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0
+) -> dict[str, float]:
     """`cd_sq_m2`, two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m], and `cd_m` [m], the same
     of the distances themselves."""
     ab, ba = _nearest(a, b, samples, seed)
-    return {"cd_sq_m2": float((ab**2).mean() + (ba**2).mean()), "cd_m": float(ab.mean() + ba.mean())}
+    return {
+        "cd_sq_m2": float((ab**2).mean() + (ba**2).mean()),
+        "cd_m": float(ab.mean() + ba.mean()),
+    }
 
 
 def chamfer(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
@@ -132,7 +155,9 @@ def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
     """
     points = cloud.detach().cpu().double().numpy()
     generator = np.random.default_rng(seed)
-    k = min(12, len(points) - 1)  # at 12 a lattice gives its own spacing to 2 %, and so does a random cloud
+    k = min(
+        12, len(points) - 1
+    )  # at 12 a lattice gives its own spacing to 2 %, and so does a random cloud
     reach = np.median(cKDTree(points).query(points, k=[k + 1])[0])
     spacing = reach * (4 / 3 * np.pi / (k + 0.5)) ** (1 / 3)
     chosen = points[generator.integers(len(points), size=count)]
@@ -152,8 +177,13 @@ def sampling_floors(
 
     cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.
     """
-    a, b = resample_shape(cloud, first, 2 * seed + 101), resample_shape(cloud, second, 2 * seed + 102)
-    return chamfer_distances(a, b, samples=samples, seed=seed) | {"emd_m": emd(a, b, samples=assignment, seed=seed)}
+    a, b = (
+        resample_shape(cloud, first, 2 * seed + 101),
+        resample_shape(cloud, second, 2 * seed + 102),
+    )
+    return chamfer_distances(a, b, samples=samples, seed=seed) | {
+        "emd_m": emd(a, b, samples=assignment, seed=seed)
+    }
 
 
 # --- images ---------------------------------------------------------------------------------------------------------
@@ -162,7 +192,9 @@ def sampling_floors(
 def psnr(rendered: Tensor, real: Tensor) -> float:
     """Mean over images (T, H, W, 3) in [0, 1] of each one's PSNR [dB]; infinite if one of them is exact."""
     a, b = rendered.movedim(-1, 1), real.movedim(-1, 1)
-    return float(peak_signal_noise_ratio(a, b, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean"))
+    return float(
+        peak_signal_noise_ratio(a, b, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean")
+    )
 
 
 def ssim(rendered: Tensor, real: Tensor) -> float:
@@ -171,14 +203,22 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
     Over all pixels, with borders reflected (torchmetrics, kornia; others leave 5 px at the border out). At least 6 x 6 px.
     """
     if rendered.shape != real.shape:
-        raise ValueError(f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}")
+        raise ValueError(
+            f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}"
+        )
     if min(rendered.shape[1:3]) < 6:
-        raise ValueError(f"ssim: expected images of at least 6 x 6 px, found {tuple(rendered.shape[1:3])}")
+        raise ValueError(
+            f"ssim: expected images of at least 6 x 6 px, found {tuple(rendered.shape[1:3])}"
+        )
     if rendered.device.type == "cpu":
         pairs = zip(rendered.detach().numpy(), real.detach().numpy())
         return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))
     # in float64: convolutions on a GPU may round to TF32, and variances are small differences
-    return float(kornia_ssim(rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double(), 11, eps=0.0).mean())
+    return float(
+        kornia_ssim(
+            rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double(), 11, eps=0.0
+        ).mean()
+    )
 
 
 def _ssim_on_cpu(a: np.ndarray, b: np.ndarray) -> float:

@@ -41,7 +41,13 @@ QUANTILES = 400
 
 @torch.no_grad()
 def predicted_spread(
-    body: Body, posterior: Posterior, sequences: Ordered[Sequence], world: World, *, draws: int = DRAWS, seed: int = 0
+    body: Body,
+    posterior: Posterior,
+    sequences: Ordered[Sequence],
+    world: World,
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """(figures, standard deviation (T, N) [m] of every particle's position by the sequence's prefix).
 
@@ -62,15 +68,22 @@ def predicted_spread(
             continue
     sequences = [s for s in sequences if s.prefix in base]
     if not sequences:  # of no draw would anything be simulated
-        return {"posterior/draws": 0.0, "posterior/rivals": 0.0, "posterior/model_error_m": posterior.model_error}, {}
+        return {
+            "posterior/draws": 0.0,
+            "posterior/rivals": 0.0,
+            "posterior/model_error_m": posterior.model_error,
+        }, {}
 
     def positions() -> dict[str, Tensor]:
         return {s.prefix: _positions(body, s, world) for s in sequences}
 
     drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
     others = rival_motions(body, posterior, positions)
-    figures: dict[str, float] = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others)),
-                                 "posterior/model_error_m": posterior.model_error}
+    figures: dict[str, float] = {
+        "posterior/draws": float(len(drawn)),
+        "posterior/rivals": float(len(others)),
+        "posterior/model_error_m": posterior.model_error,
+    }
     spreads: dict[str, Tensor] = {}
     if figures["posterior/draws"] < LEAST_DRAWS:
         return figures, spreads
@@ -82,7 +95,9 @@ def predicted_spread(
         target = true_motion(body, s.scene)
         if target is not None:
             error = (base[s.prefix].cpu() - target)[s.contact :].norm(dim=-1)
-            figures[f"posterior/{s.prefix}/coverage"] = float((error <= 2 * sd.cpu()[s.contact :]).double().mean())
+            figures[f"posterior/{s.prefix}/coverage"] = float(
+                (error <= 2 * sd.cpu()[s.contact :]).double().mean()
+            )
     return figures, spreads
 
 
@@ -90,10 +105,14 @@ Predicted = TypeVar("Predicted")
 
 
 @torch.no_grad()
-def drawn_motions(body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False) -> list[Predicted]:
+def drawn_motions(
+    body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False
+) -> list[Predicted]:
     """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
     found = []
-    for _ in tqdm(each_law(body, laws), "draws of the posterior", total=len(laws), leave=False, disable=quiet):
+    for _ in tqdm(
+        each_law(body, laws), "draws of the posterior", total=len(laws), leave=False, disable=quiet
+    ):
         try:
             found.append(predict())
         except MosaError:
@@ -102,7 +121,9 @@ def drawn_motions(body: Body, laws: Tensor, predict: Callable[[], Predicted], *,
 
 
 @torch.no_grad()
-def rival_motions(body: Body, posterior: Posterior, predict: Callable[[], Predicted]) -> list[Predicted]:
+def rival_motions(
+    body: Body, posterior: Posterior, predict: Callable[[], Predicted]
+) -> list[Predicted]:
     """What predict() says of `body` as each of the posterior's rivals in turn; those that cannot be simulated are left out."""
     found = []
     for law, numbers in posterior.rivals.items():
@@ -122,7 +143,9 @@ def among_forms(base: Tensor, others: Ordered[Tensor]) -> Tensor | None:
     return torch.stack([(x - base).square().sum(-1) for x in others]).sum(0) / (len(others) + 1)
 
 
-def total_spread(drawn: Tensor, model_error: float, forms: Tensor | None = None, *, seen: bool = False) -> Tensor:
+def total_spread(
+    drawn: Tensor, model_error: float, forms: Tensor | None = None, *, seen: bool = False
+) -> Tensor:
     """(T, N) standard deviation [m] of positions (D, T, N, 3) under drawn laws, of the law's form (`among_forms`, [m^2]), and of
     what no law explains. seen: the law was learned from this very motion."""
     own = drawn.var(0).sum(-1)
@@ -131,7 +154,9 @@ def total_spread(drawn: Tensor, model_error: float, forms: Tensor | None = None,
 
 
 def _positions(body: Body, s: Sequence, world: World) -> Tensor:
-    return body.simulate(s.start, world, s.scene.frames, float(s.scene.times[1] - s.scene.times[0])).x
+    return body.simulate(
+        s.start, world, s.scene.frames, float(s.scene.times[1] - s.scene.times[0])
+    ).x
 
 
 def physical_sd(name: str, raw: Tensor, sd: float) -> float:
@@ -147,15 +172,24 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
     if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
         return sd * float(slope.abs())
     low, high = limits_of(name)
-    middle, sd = raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9)  # one that was extrapolated may lie beyond a limit
-    below, within = torch.special.ndtr((torch.tensor([low, high], dtype=torch.float64) - middle) / sd).tolist()
-    shares = below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    middle, sd = (
+        raw.detach().clamp(low, high),
+        min(max(sd, 1e-9), 1e9),
+    )  # one that was extrapolated may lie beyond a limit
+    below, within = torch.special.ndtr(
+        (torch.tensor([low, high], dtype=torch.float64) - middle) / sd
+    ).tolist()
+    shares = (
+        below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    )
     drawn = (middle + sd * torch.special.ndtri(shares)).clamp(low, high)
     return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
 
 
 @torch.no_grad()
-def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1) -> dict[str, float]:
+def determined(
+    body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1
+) -> dict[str, float]:
     """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
     how many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction:
     of draws about every form of the law that explains the data, each form as likely as the others."""
@@ -165,10 +199,15 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
         blocks.setdefault(name.split("[")[0], []).append(i)
     for name, index in blocks.items():
         if name in body.material.raw:
-            raw, own = posterior.mean[index[0]], float(posterior.covariance[index[0], index[0]].sqrt()) * INFLATION
+            raw, own = (
+                posterior.mean[index[0]],
+                float(posterior.covariance[index[0], index[0]].sqrt()) * INFLATION,
+            )
             sd = physical_sd(name, raw, own)
             if name in RELATIVE:
-                figures[f"posterior/{name}_relative_sd"] = sd / float(body.material.physical_of(name, raw))
+                figures[f"posterior/{name}_relative_sd"] = sd / float(
+                    body.material.physical_of(name, raw)
+                )
             else:
                 figures[f"posterior/{name}_sd"] = sd
         elif name in ("operator", "stiffness"):
@@ -177,7 +216,12 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
     if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:
         generator = torch.Generator().manual_seed(seed)
         axis, _ = stiffest(body.adapter.stiffness().cpu())
-        stiffnesses, forms = [], torch.stack([posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())])
+        stiffnesses, forms = (
+            [],
+            torch.stack(
+                [posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())]
+            ),
+        )
         # wider draws than the likelihood's own
         away = INFLATION * (posterior.draws(draws, generator) - posterior.mean)
         for _ in each_law(body, forms[torch.arange(draws) % len(forms)] + away):

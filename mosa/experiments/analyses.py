@@ -14,12 +14,25 @@ from matplotlib.figure import Figure as Canvas
 from torch import Tensor
 
 from mosa.data.synthetic.bodies.objects import OBJECTS
-from mosa.evaluation.analysis.anisotropy import directional_modulus, directions_in_plane, redistribution_response, stress_jacobian
+from mosa.evaluation.analysis.anisotropy import (
+    directional_modulus,
+    directions_in_plane,
+    redistribution_response,
+    stress_jacobian,
+)
 from mosa.evaluation.analysis.stiffness import angle_between, directional_moduli
 from mosa.evaluation.analysis.tables import markdown
 from mosa.experiments.collecting import Record
 from mosa.experiments.parameters import parameters
-from mosa.experiments.report.drawing import WIDTH, legend, logarithmic, save, say_cut, style_of, wide
+from mosa.experiments.report.drawing import (
+    WIDTH,
+    legend,
+    logarithmic,
+    save,
+    say_cut,
+    style_of,
+    wide,
+)
 from mosa.experiments.run_folders import label, loaded, prefix, write_table
 from mosa.experiments.specification import Experiment
 from mosa.experiments.specimens import compression
@@ -36,7 +49,12 @@ MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}
 def errors_by_frame(record: Record) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """{held-out sequence: (times (T,) [s], root mean square distance of the particles from the true motion (T,) [m])}."""
     folder, name = record.job.folder, MOTIONS.get(prefix(record))
-    if record.figures is None or name is None or not (folder / name).is_file() or not (folder / "truth.npz").is_file():
+    if (
+        record.figures is None
+        or name is None
+        or not (folder / name).is_file()
+        or not (folder / "truth.npz").is_file()
+    ):
         return {}
     found = {}
     with np.load(folder / name) as motions, np.load(folder / "truth.npz") as truth:
@@ -44,11 +62,16 @@ def errors_by_frame(record: Record) -> dict[str, tuple[np.ndarray, np.ndarray]]:
             sequence = key.removesuffix("/x")
             if sequence.startswith("test/") and f"{sequence}/x" in motions.files:
                 distance = motions[f"{sequence}/x"] - truth[key]
-                found[sequence] = (motions[f"{sequence}/times"], np.sqrt(np.square(distance).sum(-1).mean(-1)))
+                found[sequence] = (
+                    motions[f"{sequence}/times"],
+                    np.sqrt(np.square(distance).sum(-1).mean(-1)),
+                )
     return found
 
 
-def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
+def long_term(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """Error of every frame, mean over the held-out drops of an object; a band of one standard deviation over the seeds. All parts
     have one axis, which is logarithmic where a linear one would hide the least of the errors."""
     columns = [option.name for option in experiment.axes[experiment.columns]]
@@ -61,7 +84,9 @@ def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> 
             column = record.place[experiment.columns].name
             times[column] = next(iter(found.values()))[0]
             drops[column] = len(found)
-            curves[column].setdefault(label(experiment, record), []).append(np.mean([e for _, e in found.values()], 0))
+            curves[column].setdefault(label(experiment, record), []).append(
+                np.mean([e for _, e in found.values()], 0)
+            )
     shown = [column for column in columns if curves[column]]
     if not shown:
         return "", []
@@ -71,13 +96,29 @@ def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> 
     for place, column in zip(places, shown):
         for name in sorted(curves[column], key=names.index):  # whatever the order of the jobs is
             seeds, style = curves[column][name], style_of(name, names)
-            mean, sd = 1e3 * np.mean(seeds, 0), 1e3 * np.std(seeds, 0, ddof=1) if len(seeds) > 1 else 0 * seeds[0]
+            mean, sd = (
+                1e3 * np.mean(seeds, 0),
+                1e3 * np.std(seeds, 0, ddof=1) if len(seeds) > 1 else 0 * seeds[0],
+            )
             place.plot(times[column], mean, label=name, **style)
             if len(seeds) > 1:
-                place.fill_between(times[column], mean - sd, mean + sd, alpha=0.2, color=style["color"], linewidth=0)
+                place.fill_between(
+                    times[column],
+                    mean - sd,
+                    mean + sd,
+                    alpha=0.2,
+                    color=style["color"],
+                    linewidth=0,
+                )
             drawn += mean.tolist()
-            rows += [[column, name, f"{t:.4f}", f"{m:.4f}", f"{s:.4f}"] for t, m, s in zip(times[column], mean, sd)]
-        place.set_title(f"{column}, mean of {drops[column]} held-out drop{'s' * (drops[column] != 1)}", fontsize=9)
+            rows += [
+                [column, name, f"{t:.4f}", f"{m:.4f}", f"{s:.4f}"]
+                for t, m, s in zip(times[column], mean, sd)
+            ]
+        place.set_title(
+            f"{column}, mean of {drops[column]} held-out drop{'s' * (drops[column] != 1)}",
+            fontsize=9,
+        )
         place.set_xlabel("time [s]")
     places[0].set_ylabel("rms error [mm]", fontsize=9)
     if wide(drawn):
@@ -88,7 +129,11 @@ def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> 
     say_cut(places[0])
     legend(canvas, names, without="no motion kept")
     frames = stem.with_name(stem.name + "_frames")
-    write_table(frames.with_suffix(".csv"), [experiment.columns, experiment.rows, "time_s", "rms_mm", "sd_mm"], rows)
+    write_table(
+        frames.with_suffix(".csv"),
+        [experiment.columns, experiment.rows, "time_s", "rms_mm", "sd_mm"],
+        rows,
+    )
     return f"Error of every frame on held-out drops: `{frames.name}.csv`.", [save(canvas, frames)]
 
 
@@ -111,7 +156,10 @@ def true_modulus(name: str, variant: str, directions: Tensor) -> Tensor | None:
     if name not in OBJECTS:
         return None
     hidden = OBJECTS[name].material.variant(variant)
-    one = {key: (value[0] if value.ndim else value) for key, value in hidden.parameters(torch.zeros(1, 3)).items()}
+    one = {
+        key: (value[0] if value.ndim else value)
+        for key, value in hidden.parameters(torch.zeros(1, 3)).items()
+    }
     factor = float(hidden.factor(torch.zeros(1, 3))[0])
     return directional_modulus(material_states(hidden.law, one), None, directions) / factor
 
@@ -133,7 +181,9 @@ NEARLY = 0.05
 """What E over its mean is drawn around 1 at least."""
 
 
-def directions(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
+def directions(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """w(theta) and E(theta) in the plane of the true fibres (or xy), theta from the fibres; beside the truth where it is known. E
     is drawn over its mean, on axes that show NEARLY at least, so that what is isotropic is a level line, and in kPa from 0."""
     found = []
@@ -160,7 +210,9 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
             grid[0, column].plot(angles, w, label=name, **style)
         grid[1, column].plot(angles, E / E.mean(), label=name, **style)
         grid[2, column].plot(angles, E / 1e3, label=name, **style)
-        if truth is not None and not any(line.get_label() == "truth" for line in grid[1, column].lines):
+        if truth is not None and not any(
+            line.get_label() == "truth" for line in grid[1, column].lines
+        ):
             grid[1, column].plot(angles, truth / truth.mean(), label="truth", **style_of("truth"))
             grid[2, column].plot(angles, truth / 1e3, label="truth", **style_of("truth"))
         grid[0, column].set_title(names[column], fontsize=10)
@@ -173,7 +225,14 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
         axis = angle_between(n[int(E.argmax())], n[0])
         ratio = "" if truth is None else f"{float((truth.max() - truth.min()) / truth.mean()):.3f}"
         lines.append(
-            [names[column], name, "" if w is None else f"{float(w.max()):.3f}", f"{spread:.3f}", ratio, f"{float(axis):.0f}"]
+            [
+                names[column],
+                name,
+                "" if w is None else f"{float(w.max()):.3f}",
+                f"{spread:.3f}",
+                ratio,
+                f"{float(axis):.0f}",
+            ]
         )
     for place, ratios, moduli in grid.T:
         largest = max([float(line.get_ydata().max()) for line in place.lines], default=0.0)
@@ -182,13 +241,21 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
         low, high = ratios.get_ylim()
         ratios.set_ylim(np.floor(100 * min(low, 1 - NEARLY) + 1e-6) / 100, max(high, 1 + NEARLY))
         moduli.set_ylim(0, 1.05 * moduli.get_ylim()[1])
-        for each, what in ((place, "w, response without the prior's"), (ratios, "E over its mean"), (moduli, "E [kPa]")):
+        for each, what in (
+            (place, "w, response without the prior's"),
+            (ratios, "E over its mean"),
+            (moduli, "E [kPa]"),
+        ):
             each.set_ylabel(what, fontsize=9)
             say_cut(each)
     grid[0, 0].set_xticks(range(0, 181, 30))
     legend(canvas, [*methods, "truth"], without="not known")
     path = stem.with_name(stem.name + "_directions")
-    write_table(path.with_suffix(".csv"), [experiment.columns, experiment.rows, "degrees", "w", "E_Pa", "true_E_Pa"], rows)
+    write_table(
+        path.with_suffix(".csv"),
+        [experiment.columns, experiment.rows, "degrees", "w", "E_Pa", "true_E_Pa"],
+        rows,
+    )
     header = [
         experiment.columns,
         experiment.rows,
@@ -197,12 +264,18 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
         "of the truth",
         "stiffest from the fibres [deg]",
     ]
-    return "Directions in a plane with the fibres, first seed:\n\n" + markdown(header, lines), [save(canvas, path)]
+    return "Directions in a plane with the fibres, first seed:\n\n" + markdown(header, lines), [
+        save(canvas, path)
+    ]
 
 
-def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
+def heterogeneity(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """Learned and true stiffness factor over the body, seen from the side."""
-    found = [(record, twin) for record, twin in loaded(records) if twin.body.heterogeneity is not None]
+    found = [
+        (record, twin) for record, twin in loaded(records) if twin.body.heterogeneity is not None
+    ]
     if not found:
         return "", []
     canvas = Canvas(figsize=(WIDTH, 6.4), layout="constrained")
@@ -212,11 +285,15 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
         body, scene = twin.body, twin.config["cfg"]["scene"]
         learned = body.factor(body.model().heterogeneity).detach()
         hidden = (
-            OBJECTS[scene["name"]].material.variant(scene.get("material", "anisotropic")) if scene.get("name") in OBJECTS else None
+            OBJECTS[scene["name"]].material.variant(scene.get("material", "anisotropic"))
+            if scene.get("name") in OBJECTS
+            else None
         )
         true = None if hidden is None else hidden.factor(body.rest.float())
         title = record.place[experiment.columns].name
-        grid[0, column].set_title(f"{title}, {label(experiment, record)}" if several else title, fontsize=10)
+        grid[0, column].set_title(
+            f"{title}, {label(experiment, record)}" if several else title, fontsize=10
+        )
         for place, values in zip(grid[:, column], (learned, true)):
             place.set(xticks=[], yticks=[], aspect="equal")
             place.spines[:].set_visible(False)
@@ -224,22 +301,43 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
                 continue
             order = body.rest[:, 2].argsort()
             across, up = body.rest[order, 0], body.rest[order, 1]
-            shown.append(place.scatter(across, up, c=values[order], s=7, cmap="coolwarm", linewidths=0))
+            shown.append(
+                place.scatter(across, up, c=values[order], s=7, cmap="coolwarm", linewidths=0)
+            )
         same = (
             ""
             if true is None or float(true.std()) < 1e-6 or float(learned.std()) < 1e-6
             else (f"{float(torch.corrcoef(torch.stack([learned.float(), true]))[0, 1]):.2f}")
         )
-        lines.append([record.place[experiment.columns].name, label(experiment, record), f"{float(learned.std()):.3f}", same])
+        lines.append(
+            [
+                record.place[experiment.columns].name,
+                label(experiment, record),
+                f"{float(learned.std()):.3f}",
+                same,
+            ]
+        )
     for place, what in zip(grid[:, 0], ("learned", "truth")):
         place.set_ylabel(what, fontsize=11)
     most = max(float(np.abs(part.get_array() - 1).max()) for part in shown)
     for part in shown:  # one range for all bodies, whose middle colour is 1
         part.set_clim(1 - most, 1 + most)
-    bar = canvas.colorbar(shown[0], ax=grid.ravel().tolist(), location="bottom", shrink=0.6, aspect=40)
-    bar.set_label("factor on the stiffness, 1: as the calibrated law (truth: as its law without the variation)", fontsize=9)
-    header = [experiment.columns, experiment.rows, "standard deviation of the factor", "correlation with the truth"]
-    return "Stiffness over the body:\n\n" + markdown(header, lines), [save(canvas, stem.with_name(stem.name + "_factor"))]
+    bar = canvas.colorbar(
+        shown[0], ax=grid.ravel().tolist(), location="bottom", shrink=0.6, aspect=40
+    )
+    bar.set_label(
+        "factor on the stiffness, 1: as the calibrated law (truth: as its law without the variation)",
+        fontsize=9,
+    )
+    header = [
+        experiment.columns,
+        experiment.rows,
+        "standard deviation of the factor",
+        "correlation with the truth",
+    ]
+    return "Stiffness over the body:\n\n" + markdown(header, lines), [
+        save(canvas, stem.with_name(stem.name + "_factor"))
+    ]
 
 
 ANALYSES: dict[str, Callable[[Experiment, Sequence[Record], Path], tuple[str, list[Path]]]] = {

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from mosa.experiments.specification import Experiment, Figure, Job, Option, read_job
 
 MEAN = "Mean: over all columns; a row that lacks one of them has none."
-INSTEAD = {"diverged": "the law cannot be simulated there",
-           "failed": "the run ended with an error, which the table's own file names"}
+INSTEAD = {
+    "diverged": "the law cannot be simulated there",
+    "failed": "the run ended with an error, which the table's own file names",
+}
 """What stands in place of a figure (`Cell.text`)."""
 
 
@@ -31,7 +33,11 @@ class Record:
         prefix = "".join(option.prefix for option in self.place.values())
         name = figure.figure
         # what is identified has two names of its own (docs/figures.md)
-        found = self.figures.get(f"id_prior/{name[3:]}" if prefix == "prior/" and name.startswith("id/") else prefix + name)
+        found = self.figures.get(
+            f"id_prior/{name[3:]}"
+            if prefix == "prior/" and name.startswith("id/")
+            else prefix + name
+        )
         return found * figure.scale if isinstance(found, (int, float)) else None
 
 
@@ -57,10 +63,17 @@ FAILED = Cell(math.nan, None, 0)
 
 def said_below(tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
     """What its words mean that stand in place of figures, and what a mean is; empty where there is neither."""
-    cells = [(column, cell) for rows in tables.values() for found in rows.values() for column, cell in found.items()]
+    cells = [
+        (column, cell)
+        for rows in tables.values()
+        for found in rows.values()
+        for column, cell in found.items()
+    ]
     used = {cell.text(0) for _, cell in cells if cell is not None}
     words = "; ".join(f"*{word}*: {meaning}" for word, meaning in INSTEAD.items() if word in used)
-    return " ".join([MEAN] * any(column == "mean" for column, _ in cells) + [f"{words}."] * bool(words))
+    return " ".join(
+        [MEAN] * any(column == "mean" for column, _ in cells) + [f"{words}."] * bool(words)
+    )
 
 
 def records_of(jobs: Sequence[Job]) -> list[Record]:
@@ -75,11 +88,15 @@ def records_of(jobs: Sequence[Job]) -> list[Record]:
 def cell(values: Sequence[float]) -> Cell | None:
     if not values:
         return None
-    spread = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+    spread = (
+        statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+    )
     return Cell(statistics.fmean(values), spread, len(values))
 
 
-def table(experiment: Experiment, records: Sequence[Record], figure: Figure) -> dict[str, dict[str, Cell | None]]:
+def table(
+    experiment: Experiment, records: Sequence[Record], figure: Figure
+) -> dict[str, dict[str, Cell | None]]:
     """{row: {column: cell}}, None where nothing was run, with a column `mean` of the rows that have finite figures in all columns
     (spread: over seeds, of these means)."""
     values: dict[str, dict[str, dict[int, float]]] = {}
@@ -97,7 +114,11 @@ def table(experiment: Experiment, records: Sequence[Record], figure: Figure) -> 
     result: dict[str, dict[str, Cell | None]] = {}
     for row, found in rows.items():
         result[row] = {column: cell(list(found.get(column, {}).values())) for column in columns}
-        result[row] |= {column: FAILED for column in columns if result[row][column] is None and (row, column) in failed}
+        result[row] |= {
+            column: FAILED
+            for column in columns
+            if result[row][column] is None and (row, column) in failed
+        }
         if experiment.mean and len(columns) > 1 and experiment.rows != experiment.columns:
             seeds = sorted(set.intersection(*(set(found.get(column, {})) for column in columns)))
             means = [statistics.fmean(found[column][seed] for column in columns) for seed in seeds]
@@ -105,7 +126,9 @@ def table(experiment: Experiment, records: Sequence[Record], figure: Figure) -> 
     return result
 
 
-def best_of(rows: Mapping[str, Mapping[str, Cell | None]], column: str, best: str | None) -> str | None:
+def best_of(
+    rows: Mapping[str, Mapping[str, Cell | None]], column: str, best: str | None
+) -> str | None:
     """The row with the best mean in a column."""
     found = {row: cells[column].mean for row, cells in rows.items()
              if cells.get(column) is not None and math.isfinite(cells[column].mean)}  # fmt: skip

@@ -53,7 +53,9 @@ class Clock:
         own = self.go.began, self.go.command
         goes = [*(go for go in read_goes(self.runs) if (go.began, go.command) != own), self.go]
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([[f.name for f in fields(Go)], *map(astuple, goes)])
+        csv.writer(text, lineterminator="\n").writerows(
+            [[f.name for f in fields(Go)], *map(astuple, goes)]
+        )
         write_whole(self.runs / GOES, text.getvalue())
         return goes
 
@@ -67,13 +69,26 @@ def read_goes(runs: Path) -> list[Go]:
     file = runs / GOES
     if not file.is_file():
         return []
-    types = {"devices": int, "side_by_side": int, "jobs": int, "expected": float, "minutes": float, "complete": int, "failed": int}
+    types = {
+        "devices": int,
+        "side_by_side": int,
+        "jobs": int,
+        "expected": float,
+        "minutes": float,
+        "complete": int,
+        "failed": int,
+    }
     try:
         with open(file, newline="") as lines:
-            return [Go(**{name: types.get(name, str)(value) for name, value in row.items()}) for row in csv.DictReader(lines)]
+            return [
+                Go(**{name: types.get(name, str)(value) for name, value in row.items()})
+                for row in csv.DictReader(lines)
+            ]
     except (TypeError, ValueError, OSError, csv.Error) as error:
-        raise DataError(f"{file}: expected a row for each time that jobs were run, found what cannot be read ({error}); "
-                        "remove it, and times are counted from then on") from error
+        raise DataError(
+            f"{file}: expected a row for each time that jobs were run, found what cannot be read ({error}); "
+            "remove it, and times are counted from then on"
+        ) from error
 
 
 def said_of(goes: Sequence[Go]) -> str:
@@ -81,5 +96,7 @@ def said_of(goes: Sequence[Go]) -> str:
     first = min(goes, key=lambda go: go.began)
     hours, jobs = sum(go.minutes * go.devices for go in goes) / 60, sum(go.complete for go in goes)
     times = "one go" if len(goes) == 1 else f"{len(goes)} goes"
-    return (f"{jobs} jobs in {times}: {hours:.2f} hours of a device; the first go began with {first.jobs} to run and "
-            f"expected {first.expected * first.devices / 60:.2f} for them")
+    return (
+        f"{jobs} jobs in {times}: {hours:.2f} hours of a device; the first go began with {first.jobs} to run and "
+        f"expected {first.expected * first.devices / 60:.2f} for them"
+    )

@@ -17,47 +17,105 @@ from mosa.modules.body.material import RELATIVE, unit_of
 
 def setting(overrides: Sequence[str], key: str) -> str | None:
     """The value of the last override of a key."""
-    return next((each.split("=", 1)[1] for each in reversed(overrides) if each.startswith(f"{key}=")), None)
+    return next(
+        (each.split("=", 1)[1] for each in reversed(overrides) if each.startswith(f"{key}=")), None
+    )
 
 
-def parameters(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
+def parameters(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """A line for each parameter of each built-in body whose law has the form that is identified, with means over the seeds."""
     asked = {claim.figure: claim.most for claim in experiment.claims if claim.most is not None}
     limits = {f.figure.removeprefix("id/").removesuffix("_relative_error"): asked.get(f.label)
               for f in experiment.figures if f.figure.startswith("id/")}  # fmt: skip
     rows, lines = [], []
     for option in experiment.axes[experiment.rows]:
-        runs = [r for r in records if r.place[experiment.rows].name == option.name and r.figures is not None]
+        runs = [
+            r
+            for r in records
+            if r.place[experiment.rows].name == option.name and r.figures is not None
+        ]
         if not runs:
             continue
-        name = setting(runs[0].job.overrides, "scene.name") or setting(runs[0].job.overrides, "scene")
+        name = setting(runs[0].job.overrides, "scene.name") or setting(
+            runs[0].job.overrides, "scene"
+        )
         if name not in OBJECTS:
             continue
-        material = OBJECTS[name].material.variant(setting(runs[0].job.overrides, "scene.material") or "anisotropic")
+        material = OBJECTS[name].material.variant(
+            setting(runs[0].job.overrides, "scene.material") or "anisotropic"
+        )
         for parameter, truth in material.known.items():
             found = [r.figures.get(f"id/{parameter}") for r in runs]
-            sds = [r.figures.get(f"posterior/{parameter}_{'relative_' if parameter in RELATIVE else ''}sd") for r in runs]
+            sds = [
+                r.figures.get(
+                    f"posterior/{parameter}_{'relative_' if parameter in RELATIVE else ''}sd"
+                )
+                for r in runs
+            ]
             if not all(isinstance(value, (int, float)) for value in [*found, *sds]):
                 continue
-            mean, sd = statistics.fmean(found), statistics.fmean(sds) / (1.0 if parameter in RELATIVE else abs(truth))
+            mean, sd = (
+                statistics.fmean(found),
+                statistics.fmean(sds) / (1.0 if parameter in RELATIVE else abs(truth)),
+            )
             off = statistics.fmean(abs(value / truth - 1) for value in found)
-            step = statistics.fmean(abs(math.log(value / truth)) for value in found) if parameter in RELATIVE else off
+            step = (
+                statistics.fmean(abs(math.log(value / truth)) for value in found)
+                if parameter in RELATIVE
+                else off
+            )
             said = verdict(100 * off, 100 * step, 100 * sd, limits.get(parameter))
             spread = f" ± {statistics.stdev(found):.2g}" if len(found) > 1 else ""
             unit = unit_of(material.law, parameter)
-            lines.append([option.name, f"{parameter} [{unit}]" if unit else parameter, f"{truth:g}", f"{mean:.3g}{spread}",
-                          f"{100 * (mean / truth - 1):+.1f}", f"{100 * sd:.1f}", said])
-            rows.append([option.name, parameter, unit, truth, mean, statistics.stdev(found) if len(found) > 1 else "",
-                         len(found), sd, said])
+            lines.append(
+                [
+                    option.name,
+                    f"{parameter} [{unit}]" if unit else parameter,
+                    f"{truth:g}",
+                    f"{mean:.3g}{spread}",
+                    f"{100 * (mean / truth - 1):+.1f}",
+                    f"{100 * sd:.1f}",
+                    said,
+                ]
+            )
+            rows.append(
+                [
+                    option.name,
+                    parameter,
+                    unit,
+                    truth,
+                    mean,
+                    statistics.stdev(found) if len(found) > 1 else "",
+                    len(found),
+                    sd,
+                    said,
+                ]
+            )
     if not lines:
         return "", []
-    write_table(stem.with_name(stem.name + "_parameters").with_suffix(".csv"),
-                [experiment.rows, "parameter", "unit", "truth", "found", "sd_over_seeds", "seeds", "posterior_sd", "verdict"],
-                rows)
+    write_table(
+        stem.with_name(stem.name + "_parameters").with_suffix(".csv"),
+        [
+            experiment.rows,
+            "parameter",
+            "unit",
+            "truth",
+            "found",
+            "sd_over_seeds",
+            "seeds",
+            "posterior_sd",
+            "verdict",
+        ],
+        rows,
+    )
     header = [experiment.rows, "parameter", "truth", "found", "off [%]", "posterior sd [%]", ""]
-    return ("Every parameter, ± over the seeds. *met*: as near as asked, and *by chance* where twice its posterior's deviation is "
-            "more than was asked; *not determined*: further off, and twice the deviation covers it; *missed*: further off than "
-            "that. The deviation of a modulus is one of its logarithm.\n\n" + markdown(header, lines)), []
+    return (
+        "Every parameter, ± over the seeds. *met*: as near as asked, and *by chance* where twice its posterior's deviation is "
+        "more than was asked; *not determined*: further off, and twice the deviation covers it; *missed*: further off than "
+        "that. The deviation of a modulus is one of its logarithm.\n\n" + markdown(header, lines)
+    ), []
 
 
 def verdict(off: float, step: float, sd: float, most: float | None) -> str:

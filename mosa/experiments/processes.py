@@ -18,7 +18,9 @@ STOPS = (signal.SIGINT, signal.SIGTERM)
 """Signals that the server never answers, and a job from the beginning of `work` on."""
 
 
-def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
+def begun(
+    program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]
+) -> BaseProcess:
     """A process of `program`, a "module:function", with its words on the command line and its output in the file `screen`.
     environment: all of it. On a system that cannot fork it imports for itself."""
     server = "forkserver" in multiprocessing.get_all_start_methods()
@@ -26,7 +28,9 @@ def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping
     if server:
         context.set_forkserver_preload(PRELOADED)  # which counts for the first process
     screen.write_bytes(b"")  # whoever reads it finds nothing of a run that was there before
-    process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)))
+    process = context.Process(
+        target=work, args=(program, list(words), str(screen), dict(environment))
+    )
     process.start()
     return process
 

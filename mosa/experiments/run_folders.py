@@ -36,7 +36,9 @@ def pressed_file(record: Record) -> Path:
     return record.job.folder / PRESSED
 
 
-def first_seeds(records: Sequence[Record], prefixes: Sequence[str], files: Sequence[Callable[[Record], Path]]) -> Iterator[Record]:
+def first_seeds(
+    records: Sequence[Record], prefixes: Sequence[str], files: Sequence[Callable[[Record], Path]]
+) -> Iterator[Record]:
     """The records of these models, of several seeds the first that is complete and has one of the files: what a run had learned by
     the time that it was stopped is no result."""
     seen = set()
@@ -49,7 +51,9 @@ def first_seeds(records: Sequence[Record], prefixes: Sequence[str], files: Seque
             yield record
 
 
-def loaded(records: Sequence[Record], prefixes: Sequence[str] = ("",)) -> Iterator[tuple[Record, Twin]]:
+def loaded(
+    records: Sequence[Record], prefixes: Sequence[str] = ("",)
+) -> Iterator[tuple[Record, Twin]]:
     """The records of these models (the learned law's, where nothing else is said) that have a checkpoint, with it; of several seeds
     the first."""
     for record in first_seeds(records, prefixes, [checkpoint]):

@@ -37,7 +37,9 @@ def run_jobs(
     Of jobs that share their films, or a reconstruction, the first runs without the others until these are made, and they find them
     in the cache."""
     waiting = in_turn([job for job in jobs if not job.finished], devices)
-    known: set[str] = set()  # what was made in earlier goes is found in the cache, or made again where that is another machine
+    known: set[str] = (
+        set()
+    )  # what was made in earlier goes is found in the cache, or made again where that is another machine
     free = dict.fromkeys(devices, side_by_side)
     running: dict[BaseProcess, tuple[Job, int | None, float]] = {}
     failed: dict[str, str] = {}
@@ -56,7 +58,10 @@ def run_jobs(
                 minutes = (time.perf_counter() - began) / 60
                 if outcome == "complete":
                     write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
-                print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
+                print(
+                    f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min",
+                    flush=True,
+                )
                 ended(job, outcome == "failed")
             making = {what for job, _, _ in running.values() for what in in_making(job)} - known
             ready = next((job for job in waiting if not {job.film, job.first} & making), None)
@@ -91,14 +96,20 @@ def begin(job: Job, device: int | None) -> BaseProcess:
     environment.setdefault("OMP_NUM_THREADS", "1")
     if device is not None:
         listed = [part for part in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
-        environment["CUDA_VISIBLE_DEVICES"] = listed[device] if device < len(listed) else str(device)
+        environment["CUDA_VISIBLE_DEVICES"] = (
+            listed[device] if device < len(listed) else str(device)
+        )
     return begun(PROGRAM, words_of(job), job.folder / "screen.log", environment)
 
 
 def in_making(job: Job) -> set[str]:
     """What a running job shares with others and does not have yet: its films, its reconstruction."""
     said = (job.folder / "screen.log").read_text(errors="replace")
-    return {what for what, stage in ((job.film, "data"), (job.first, "reconstruction")) if f"{stage} took" not in said}
+    return {
+        what
+        for what, stage in ((job.film, "data"), (job.first, "reconstruction"))
+        if f"{stage} took" not in said
+    }
 
 
 def reason(job: Job, code: int) -> str:

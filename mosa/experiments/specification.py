@@ -40,7 +40,11 @@ class Option:
 
     def cost_on(self, device: str) -> float:
         """device: cpu | gpu."""
-        return float(self.cost.get(device, 1.0)) if isinstance(self.cost, Mapping) else float(self.cost)
+        return (
+            float(self.cost.get(device, 1.0))
+            if isinstance(self.cost, Mapping)
+            else float(self.cost)
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,11 @@ class Job:
     def failed(self) -> str | None:
         """Why it failed when it was last run; None where it is complete, or was not run."""
         said = self.folder / FAILED
-        return None if self.finished or not said.is_file() else said.read_text(errors="replace").strip()
+        return (
+            None
+            if self.finished or not said.is_file()
+            else said.read_text(errors="replace").strip()
+        )
 
 
 def experiment_names(folder: Path) -> list[str]:
@@ -143,7 +151,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     """folder/<name>.yaml; quick: with its section `quick` in place of other keys. Errors: ConfigError naming the key."""
     if name not in experiment_names(folder):
-        raise ConfigError(f"experiment: expected one of {', '.join(experiment_names(folder))} or all, found {name!r}")
+        raise ConfigError(
+            f"experiment: expected one of {', '.join(experiment_names(folder))} or all, found {name!r}"
+        )
     keys, shared = read_yaml(folder / f"{name}.yaml"), read_yaml(folder / f"{SHARED}.yaml")
     small = keys.pop("quick", None)
     if quick:
@@ -152,20 +162,36 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
         keys |= small
     known = set(Experiment.__dataclass_fields__) - {"name", "quick"}
     if unknown := sorted(set(keys) - known):
-        raise ConfigError(f"{name}: {unknown[0]}: unknown key; expected one of {', '.join(sorted(known | {'quick'}))}")
-    if missing := [key for key in ("title", "axes", "rows", "columns", "figures") if key not in keys]:
+        raise ConfigError(
+            f"{name}: {unknown[0]}: unknown key; expected one of {', '.join(sorted(known | {'quick'}))}"
+        )
+    if missing := [
+        key for key in ("title", "axes", "rows", "columns", "figures") if key not in keys
+    ]:
         raise ConfigError(f"{name}: {missing[0]}: expected this key, found none")
-    keys["axes"] = {axis: options_of(f"{name}: axes.{axis}", found, shared) for axis, found in keys["axes"].items()}
+    keys["axes"] = {
+        axis: options_of(f"{name}: axes.{axis}", found, shared)
+        for axis, found in keys["axes"].items()
+    }
     for place in ("rows", "columns"):
         if keys[place] not in keys["axes"]:
-            raise ConfigError(f"{name}: {place}: expected one of {', '.join(keys['axes'])}, found {keys[place]!r}")
+            raise ConfigError(
+                f"{name}: {place}: expected one of {', '.join(keys['axes'])}, found {keys[place]!r}"
+            )
     if keys.get("plot", "bars") not in PLOTS:
-        raise ConfigError(f"{name}: plot: expected bars, lines, map or null, found {keys['plot']!r}")
+        raise ConfigError(
+            f"{name}: plot: expected bars, lines, map or null, found {keys['plot']!r}"
+        )
     try:
         keys["figures"] = tuple(Figure(**figure) for figure in keys["figures"])
     except TypeError as error:
-        raise ConfigError(f"{name}: figures: expected sections of {', '.join(Figure.__dataclass_fields__)} ({error})") from error
-    keys["claims"] = tuple(claim_of(f"{name}: claims[{i}]", each, keys["figures"]) for i, each in enumerate(keys.get("claims", ())))
+        raise ConfigError(
+            f"{name}: figures: expected sections of {', '.join(Figure.__dataclass_fields__)} ({error})"
+        ) from error
+    keys["claims"] = tuple(
+        claim_of(f"{name}: claims[{i}]", each, keys["figures"])
+        for i, each in enumerate(keys.get("claims", ()))
+    )
     keys["seeds"], keys["common"] = tuple(keys.get("seeds", (0,))), tuple(keys.get("common", ()))
     return Experiment(name=name, quick=quick, **keys)
 
@@ -175,11 +201,15 @@ def claim_of(where: str, found: Any, figures: Sequence[Figure]) -> Claim:
     try:
         claim = Claim(**{k: tuple(v) if isinstance(v, list) else v for k, v in found.items()})
     except (TypeError, AttributeError) as error:
-        raise ConfigError(f"{where}: expected fields of {', '.join(Claim.__dataclass_fields__)} ({error})") from error
+        raise ConfigError(
+            f"{where}: expected fields of {', '.join(Claim.__dataclass_fields__)} ({error})"
+        ) from error
     labels = [figure.label for figure in figures]
     for key in ("figure", "unless"):
         if (label := getattr(claim, key)) is not None and label not in labels:
-            raise ConfigError(f"{where}.{key}: expected one of {', '.join(labels)}, found {label!r}")
+            raise ConfigError(
+                f"{where}.{key}: expected one of {', '.join(labels)}, found {label!r}"
+            )
     if (claim.most is None) == (claim.row is None) or (claim.row is not None and not claim.against):
         raise ConfigError(f"{where}: expected row with against, or most")
     return claim
@@ -199,16 +229,24 @@ def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Optio
         raise ConfigError(f"{where}: expected a section of options, found {found!r}")
     options = []
     for name, content in found.items():
-        section = {"overrides": content} if isinstance(content, (list, tuple)) or content is None else dict(content)
+        section = (
+            {"overrides": content}
+            if isinstance(content, (list, tuple)) or content is None
+            else dict(content)
+        )
         section["overrides"] = tuple(str(each) for each in section.get("overrides") or ())
         try:
             options.append(Option(str(name), **section))
         except TypeError as error:
-            raise ConfigError(f"{where}.{name}: expected fields of {', '.join(Option.__dataclass_fields__)} ({error})") from error
+            raise ConfigError(
+                f"{where}.{name}: expected fields of {', '.join(Option.__dataclass_fields__)} ({error})"
+            ) from error
     return chosen(where, tuple(options), only)
 
 
-def chosen(where: str, options: tuple[Option, ...], only: Sequence[str] | None) -> tuple[Option, ...]:
+def chosen(
+    where: str, options: tuple[Option, ...], only: Sequence[str] | None
+) -> tuple[Option, ...]:
     """Those that are named, in the order they are named. Errors: ConfigError naming the axis."""
     if only is None:
         return options
@@ -226,16 +264,24 @@ def pairs(words: Sequence[str], experiments: Sequence[Experiment]) -> dict[str, 
     for word in words:
         axis, mark, names = word.partition("=")
         if not mark or axis not in known:
-            raise ConfigError(f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(axes)}, or EXPERIMENT:AXIS=NAME,NAME, "
-                              f"found {word!r}")
+            raise ConfigError(
+                f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(axes)}, or EXPERIMENT:AXIS=NAME,NAME, "
+                f"found {word!r}"
+            )
         found[axis] = names.split(",")
     return found
 
 
-def narrowed(experiment: Experiment, only: Mapping[str, Sequence[str]], seeds: tuple[int, ...] | None) -> Experiment:
+def narrowed(
+    experiment: Experiment, only: Mapping[str, Sequence[str]], seeds: tuple[int, ...] | None
+) -> Experiment:
     """With these options (of `pairs`; those that name the experiment go first) and seeds alone."""
-    axes = {axis: chosen(f"--only {axis}", options, only.get(f"{experiment.name}:{axis}", only.get(axis)))
-            for axis, options in experiment.axes.items()}
+    axes = {
+        axis: chosen(
+            f"--only {axis}", options, only.get(f"{experiment.name}:{axis}", only.get(axis))
+        )
+        for axis, options in experiment.axes.items()
+    }
     return replace(experiment, axes=axes, seeds=experiment.seeds if seeds is None else seeds)
 
 
@@ -247,19 +293,38 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     for options in itertools.product(*experiment.axes.values()):
         place = dict(zip(experiment.axes, options))
         for seed in experiment.seeds:
-            overrides = (*experiment.common, *(each for option in options for each in option.overrides), *more, f"seed={seed}")
+            overrides = (
+                *experiment.common,
+                *(each for option in options for each in option.overrides),
+                *more,
+                f"seed={seed}",
+            )
             folder = runs / (ALONE * experiment.alone + folder_name(overrides))
             known = found.get(folder)
             if known is not None:
                 found[folder] = replace(known, places=(*known.places, place))
                 continue
             parts = {each: each.split("=")[0].split(".") for each in overrides}
-            film = [each for each, key in parts.items() if key[0] in ("scene", "experiment") and key[1:] not in USES]
+            film = [
+                each
+                for each, key in parts.items()
+                if key[0] in ("scene", "experiment") and key[1:] not in USES
+            ]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
-            minutes = {device: value * math.prod(option.cost_on(device) for option in options)
-                       for device, value in experiment.minutes.items()}
-            found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join(film), " ".join([*film, *rest]),
-                                experiment.alone)
+            minutes = {
+                device: value * math.prod(option.cost_on(device) for option in options)
+                for device, value in experiment.minutes.items()
+            }
+            found[folder] = Job(
+                folder,
+                overrides,
+                seed,
+                (place,),
+                minutes,
+                " ".join(film),
+                " ".join([*film, *rest]),
+                experiment.alone,
+            )
     return list(found.values())
 
 
@@ -283,7 +348,9 @@ def folder_name(overrides: Sequence[str]) -> str:
 
 def figures_of(job: Job) -> dict[str, float | str]:
     """metrics.json of a complete job. Errors: DataError for a damaged one."""
-    from mosa.training.run_folder import read_figures  # which imports the simulator: a list of jobs does not wait for it
+    from mosa.training.run_folder import (
+        read_figures,
+    )  # which imports the simulator: a list of jobs does not wait for it
 
     return read_figures(job.folder / "metrics.json")
 
@@ -330,7 +397,9 @@ def device_kind(devices: Sequence[int | None]) -> str:
     return "cpu" if list(devices) == [None] else "gpu"
 
 
-def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> tuple[list[str], float]:
+def estimate(
+    jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int
+) -> tuple[list[str], float]:
     """A line for each job and one for all of them, in the order and places that they run in (`running.run_jobs`), and the minutes
     until they are complete. Minutes of jobs to come are scaled by those that are complete; a GPU's also by how many jobs it has at
     a time."""
@@ -341,7 +410,11 @@ def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
     crowd = 1 + CROWD * (beside - 1) if device == "gpu" and beside else 1.0
     scale = {True: 1.0, False: crowd}  # of jobs that run alone, and of all others
     for kind in scale:
-        done = [(taken[job.folder], job.minutes[device]) for job in jobs if taken[job.folder] is not None and job.alone == kind]
+        done = [
+            (taken[job.folder], job.minutes[device])
+            for job in jobs
+            if taken[job.folder] is not None and job.alone == kind
+        ]
         if done:
             scale[kind] = sum(t for t, _ in done) / sum(m for _, m in done)
     lines, ends = [], [0.0] * slots
@@ -356,7 +429,10 @@ def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
         state = f"complete, {known:.1f} min" if known is not None else f"about {expected:.1f} min"
         lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
     minutes = max(alone or ends)
-    return [*lines, f"{len(jobs)} jobs, {len(left)} to run, about {minutes:.1f} minutes with {slots} side by side"], minutes
+    return [
+        *lines,
+        f"{len(jobs)} jobs, {len(left)} to run, about {minutes:.1f} minutes with {slots} side by side",
+    ], minutes
 
 
 def read_job(job: Job) -> dict[str, float | str] | None:

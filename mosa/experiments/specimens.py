@@ -23,7 +23,14 @@ from mosa.evaluation.analysis.tables import markdown
 from mosa.evaluation.analysis.vibration import longitudinal_modulus
 from mosa.experiments.collecting import Record
 from mosa.experiments.report.drawing import WIDTH, legend, save, style_of
-from mosa.experiments.run_folders import checkpoint, first_seeds, label, prefix, pressed_file, write_table
+from mosa.experiments.run_folders import (
+    checkpoint,
+    first_seeds,
+    label,
+    prefix,
+    pressed_file,
+    write_table,
+)
 from mosa.experiments.specification import Experiment
 from mosa.modules.body.body import Body
 from mosa.system.whole_files import write_whole
@@ -62,7 +69,10 @@ def plane(name: str) -> tuple[list[float], Tensor]:
     """(degrees, unit vectors (K, 3)) in the plane of x and the vertical in which a built-in body is pressed: evenly over half a
     turn, and along its fibres where these lie in the plane."""
     angles, n = directions_in_plane((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), ANGLES + 1)
-    degrees, vectors = torch.rad2deg(angles)[:-1].tolist(), list(n[:-1])  # the last one is the first, turned over
+    degrees, vectors = (
+        torch.rad2deg(angles)[:-1].tolist(),
+        list(n[:-1]),
+    )  # the last one is the first, turned over
     fibre = getattr(OBJECTS[name].material, "fibre", None)
     if fibre is not None:
         fibre = torch.tensor(fibre, dtype=n.dtype) / torch.tensor(fibre, dtype=n.dtype).norm()
@@ -88,7 +98,9 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             found["degrees"], found["truth_Pa"], found["models"]
             return found
         except (ValueError, KeyError, TypeError) as error:
-            raise DataError(f"{kept}: not what a specimen has measured ({error}); remove it to measure again") from error
+            raise DataError(
+                f"{kept}: not what a specimen has measured ({error}); remove it to measure again"
+            ) from error
     twin = Twin.load(checkpoint(record))
     scene = twin.config["cfg"]["scene"]
     name, variant = scene.get("name"), scene.get("material", "anisotropic")
@@ -97,7 +109,10 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
     degrees, n = plane(name)
     if (name, variant) not in truths:
         hidden = OBJECTS[name].material.variant(variant)
-        one = {key: (value[0] if value.ndim else value) for key, value in hidden.parameters(torch.zeros(1, 3)).items()}
+        one = {
+            key: (value[0] if value.ndim else value)
+            for key, value in hidden.parameters(torch.zeros(1, 3)).items()
+        }
         truths[name, variant] = [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.known["nu"],
                                        density=hidden.density, stiffening=1.0) for k in n]  # fmt: skip
     true, models = truths[name, variant], {}
@@ -110,14 +125,20 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             log.warning("%s: %s", record.job.folder.name, error)
             models[each] = None
             continue
-        models[each] = {"modulus_Pa": [p.modulus for p in own],
-                        "force_off": max(abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(own, true))}
+        models[each] = {
+            "modulus_Pa": [p.modulus for p in own],
+            "force_off": max(
+                abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(own, true)
+            ),
+        }
     found = {"degrees": degrees, "truth_Pa": [p.modulus for p in true], "models": models}
     write_whole(kept, json.dumps(found, indent=1) + "\n")
     return found
 
 
-def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
+def compression(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical; a row
     of the picture for each column of the table: E, and how far it is from the truth's."""
     truths: Truths = {}
@@ -128,7 +149,10 @@ def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -
             continue
         column = record.place[experiment.columns].name
         laws.setdefault(column, {})[label(experiment, record)] = (
-            found["degrees"], found["truth_Pa"], found["models"][prefix(record)])
+            found["degrees"],
+            found["truth_Pa"],
+            found["models"][prefix(record)],
+        )
     if not laws:
         return "", []
     order = [option.name for option in experiment.axes[experiment.rows]]
@@ -139,17 +163,46 @@ def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -
             if model is None:
                 lines.append([column, name, "diverged", "", ""])
                 continue
-            off = [100 * abs(e / t - 1) for a, e, t in zip(degrees, model["modulus_Pa"], truth) if a < 180]
-            lines.append([column, name, f"{sum(off) / len(off):.1f}", f"{max(off):.1f}", f"{100 * model['force_off']:.1f}"])
-            rows += [[column, name, f"{a:.1f}", f"{e:.6g}", f"{t:.6g}"] for a, e, t in zip(degrees, model["modulus_Pa"], truth)]
+            off = [
+                100 * abs(e / t - 1)
+                for a, e, t in zip(degrees, model["modulus_Pa"], truth)
+                if a < 180
+            ]
+            lines.append(
+                [
+                    column,
+                    name,
+                    f"{sum(off) / len(off):.1f}",
+                    f"{max(off):.1f}",
+                    f"{100 * model['force_off']:.1f}",
+                ]
+            )
+            rows += [
+                [column, name, f"{a:.1f}", f"{e:.6g}", f"{t:.6g}"]
+                for a, e, t in zip(degrees, model["modulus_Pa"], truth)
+            ]
     path = stem.with_name(stem.name + "_plates")
-    write_table(path.with_suffix(".csv"), [experiment.columns, experiment.rows, "degrees", "E_Pa", "true_E_Pa"], rows)
-    header = [experiment.columns, experiment.rows, "E off, mean [%]", "E off, largest [%]", "force at 4 % strain off, largest [%]"]
-    text = "A specimen between plates, first seed, against the true law:\n\n" + markdown(header, lines)
+    write_table(
+        path.with_suffix(".csv"),
+        [experiment.columns, experiment.rows, "degrees", "E_Pa", "true_E_Pa"],
+        rows,
+    )
+    header = [
+        experiment.columns,
+        experiment.rows,
+        "E off, mean [%]",
+        "E off, largest [%]",
+        "force at 4 % strain off, largest [%]",
+    ]
+    text = "A specimen between plates, first seed, against the true law:\n\n" + markdown(
+        header, lines
+    )
     return text, [save(drawn(laws, order), path)]
 
 
-def drawn(laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]]], order: Sequence[str]) -> Canvas:
+def drawn(
+    laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]]], order: Sequence[str]
+) -> Canvas:
     """laws: {column: {model: (degrees, truth [Pa], measured)}}; order: of the models."""
     canvas = Canvas(figsize=(WIDTH, 3.4 * len(laws) + 0.6), layout="constrained")
     grid = canvas.subplots(len(laws), 2, squeeze=False)
@@ -160,14 +213,25 @@ def drawn(laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]
         for name in sorted(of, key=order.index):
             degrees, truth, model = of[name]
             if model is not None:
-                left.plot(degrees, [e / 1e3 for e in model["modulus_Pa"]], label=name, **style_of(name))
-                right.plot(degrees, [100 * (e / t - 1) for e, t in zip(model["modulus_Pa"], truth)], **style_of(name))
+                left.plot(
+                    degrees, [e / 1e3 for e in model["modulus_Pa"]], label=name, **style_of(name)
+                )
+                right.plot(
+                    degrees,
+                    [100 * (e / t - 1) for e, t in zip(model["modulus_Pa"], truth)],
+                    **style_of(name),
+                )
         stiffest = degrees[max(range(len(truth)), key=truth.__getitem__)]
-        for part, title, unit in ((left, column, "E between plates [kPa]"), (right, f"{column}: error", "E off the truth [%]")):
+        for part, title, unit in (
+            (left, column, "E between plates [kPa]"),
+            (right, f"{column}: error", "E off the truth [%]"),
+        ):
             part.axvline(stiffest, color="0.6", linewidth=0.8, linestyle=":")
             part.set_title(title, fontsize=10)
             part.set_ylabel(unit)
-            part.set_xlabel("direction of loading, from x towards y [degrees]; dotted: stiffest of the truth")
+            part.set_xlabel(
+                "direction of loading, from x towards y [degrees]; dotted: stiffest of the truth"
+            )
             part.xaxis.label.set_size(8)
         left.set_ylim(0, 1.05 * left.get_ylim()[1])
     legend(canvas, ["truth", *order])

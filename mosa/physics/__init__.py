@@ -8,7 +8,9 @@ those that it needs below it, never one above it (tests/physics/test_engine_part
 
 import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING  # lines on every small module compiled would drown the program's own
+wp.config.log_level = (
+    wp.LOG_WARNING
+)  # lines on every small module compiled would drown the program's own
 wp.init()
 
 from mosa.physics import constitutive  # noqa: E402, F401  the built-in laws register themselves

@@ -33,12 +33,16 @@ def use(wanted: bool = True) -> None:
     global _wanted
     _wanted = wanted
     if wanted:
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when torch first multiplies matrices there
+        os.environ.setdefault(
+            "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
+        )  # read when torch first multiplies matrices there
         # of what has no such algorithm only the gradient of grid_sample is used, and of it only that of the places, which is one
         # thread's each
         warnings.filterwarnings("ignore", message=".*grid_sampler.*deterministic.*")
     torch.use_deterministic_algorithms(wanted, warn_only=True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # nothing here reads memory that was not written
+    torch.utils.deterministic.fill_uninitialized_memory = (
+        False  # nothing here reads memory that was not written
+    )
 
 
 def needed(device: torch.device) -> bool:
@@ -66,7 +70,9 @@ def sum_functions(scalar) -> SimpleNamespace:
     def total(sums: wp.array2d(dtype=wp.int64), i: int):
         if sums[i, 2] != wp.int64(0):
             return scalar(wp.float64(wp.nan))
-        return scalar((wp.float64(sums[i, 0]) + wp.float64(sums[i, 1]) / wp.float64(LOW)) / wp.float64(HIGH))
+        return scalar(
+            (wp.float64(sums[i, 0]) + wp.float64(sums[i, 1]) / wp.float64(LOW)) / wp.float64(HIGH)
+        )
 
     @wp.func
     def clear(sums: wp.array2d(dtype=wp.int64), i: int):

@@ -73,7 +73,15 @@ def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = Non
         if adj_inputs is None:
             wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
         else:
-            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
+            wp.launch(
+                kernel,
+                dim,
+                inputs=inputs,
+                adj_inputs=adj_inputs,
+                adjoint=True,
+                device=device,
+                block_dim=block,
+            )
 
 
 def warp_stream(device: torch.device):
@@ -81,7 +89,9 @@ def warp_stream(device: torch.device):
     if device.type != "cuda":
         return wp.ScopedDevice("cpu")
     # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(
+        wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False
+    )
 
 
 def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
@@ -103,8 +113,12 @@ def aligned(t: Tensor) -> Tensor:
     return t if t.data_ptr() % BYTES == 0 else t.clone()
 
 
-def zeros_in_one(shapes: Sequence[Sequence[int]], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, list[Tensor]]:
+def zeros_in_one(
+    shapes: Sequence[Sequence[int]], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, list[Tensor]]:
     """(buffer, its parts of these shapes), each part as `aligned` wants it: all are cleared in one launch."""
     sizes = [-(-math.prod(shape) // APART) * APART for shape in shapes]
     buffer = torch.zeros(sum(sizes), dtype=dtype, device=device)
-    return buffer, [part[: math.prod(shape)].view(*shape) for part, shape in zip(buffer.split(sizes), shapes)]
+    return buffer, [
+        part[: math.prod(shape)].view(*shape) for part, shape in zip(buffer.split(sizes), shapes)
+    ]

@@ -60,7 +60,8 @@ def stress(law: str, F: Tensor, p: dict[str, Tensor], C_affine: Tensor | None = 
     """Kirchhoff stress (N, 3, 3) [Pa]; p: (N,) or () tensors, `reference` (N, 3, 3) for `linear`; C_affine: for `newtonian`."""
     J = torch.linalg.det(F)[:, None, None]
     mu, lam, kappa = (
-        torch.as_tensor(p.get(k, 0.0), dtype=torch.float64).expand(len(F))[:, None, None] for k in ("mu", "lam", "kappa")
+        torch.as_tensor(p.get(k, 0.0), dtype=torch.float64).expand(len(F))[:, None, None]
+        for k in ("mu", "lam", "kappa")
     )
     if law == "newtonian":
         return kappa * (J - J**-6) * EYE + mu * J * 0.5 * (C_affine + C_affine.mT)
@@ -89,7 +90,9 @@ def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_ep
     """Mapped F (N, 3, 3) of a trial F = (I + dt C_affine) before; operator: (plastic_G, plastic_h) or None."""
     if law == "newtonian":
         J = ((1 + dt * trace(C_affine)) * torch.linalg.det(before)).clamp_min(0.05)
-        return J[:, None, None] ** (1 / 3) * polar((EYE + 0.5 * dt * (C_affine - C_affine.mT)) @ before)
+        return J[:, None, None] ** (1 / 3) * polar(
+            (EYE + 0.5 * dt * (C_affine - C_affine.mT)) @ before
+        )
     if law not in ("von_mises", "drucker_prager", *RATED):
         return F
     p = {k: torch.as_tensor(v, dtype=torch.float64).expand(len(F)) for k, v in p.items()}
@@ -111,20 +114,28 @@ def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_ep
         tip = t >= 0
     keep = (1 - dgamma / n).clamp_min(0)
     R = polar(F)
-    flowed = R @ torch.linalg.matrix_exp(keep[:, None, None] * E + trace(H)[:, None, None] / 3 * EYE)
+    flowed = R @ torch.linalg.matrix_exp(
+        keep[:, None, None] * E + trace(H)[:, None, None] / 3 * EYE
+    )
     mapped = torch.where((dgamma > 0)[:, None, None], flowed, F)
     if law == "drucker_prager":
-        mapped = torch.where(tip[:, None, None], torch.exp(p["cohesion"])[:, None, None] * R, mapped)
+        mapped = torch.where(
+            tip[:, None, None], torch.exp(p["cohesion"])[:, None, None] * R, mapped
+        )
     return mapped
 
 
-def _rated_return(law: str, F: Tensor, p: dict[str, Tensor], H: Tensor, n2: Tensor, norm_eps: float, dt: float) -> Tensor:
+def _rated_return(
+    law: str, F: Tensor, p: dict[str, Tensor], H: Tensor, n2: Tensor, norm_eps: float, dt: float
+) -> Tensor:
     """Herschel-Bulkley: |s| = |s_trial| - y/(1 + viscosity/(2 mu' dt)) where y = |s_trial| - sqrt(2/3) yield_stress > 0."""
     b = F @ F.mT
     J = torch.linalg.det(F)[:, None, None]
     if law == "herschel_bulkley":
         d = deviator(J ** (-2 / 3) * b)
-        measure = (d**2).sum((1, 2)).sqrt() + 2 * (n2.sqrt() - (deviator(H) ** 2).sum((1, 2)).sqrt())
+        measure = (d**2).sum((1, 2)).sqrt() + 2 * (
+            n2.sqrt() - (deviator(H) ** 2).sum((1, 2)).sqrt()
+        )
         n = torch.sqrt((p["mu"] * measure) ** 2 + norm_eps)
         modulus = p["mu"]
     else:
@@ -152,7 +163,9 @@ def _rated_return(law: str, F: Tensor, p: dict[str, Tensor], H: Tensor, n2: Tens
     return torch.where((y > 0)[:, None, None], flowed, F)
 
 
-def adapted_stress(law: str, F: Tensor, p: dict[str, Tensor], operator=None, C_affine: Tensor | None = None) -> Tensor:
+def adapted_stress(
+    law: str, F: Tensor, p: dict[str, Tensor], operator=None, C_affine: Tensor | None = None
+) -> Tensor:
     """tau + R mat(G vech(R^T tau R) + h) R^T; operator: (G, h) or None."""
     tau = stress(law, F, p, C_affine)
     if operator is None:
@@ -174,18 +187,24 @@ def strain(measure: str, F: Tensor) -> Tensor:
 
 def stiffness_energy(measure: str, F: Tensor, mu: Tensor, S: Tensor) -> Tensor:
     """mu E : S : E (N,) of the strain E of F (N, 3, 3); S: (N, 6, 6) on Mandel components, mu: (N,) or ()."""
-    e = vech(strain(measure, F)) * torch.tensor([1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64)
+    e = vech(strain(measure, F)) * torch.tensor(
+        [1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64
+    )
     return mu * torch.einsum("ni,nij,nj->n", e, S, e)
 
 
 def stiffened_stress(law: str, measure: str, F: Tensor, p: dict[str, Tensor], S: Tensor) -> Tensor:
     """The law's Kirchhoff stress and (dpsi/dF) F^T of `stiffness_energy`; F (N, 3, 3) with three different stretches."""
     F = F if F.requires_grad else F.clone().requires_grad_()
-    slope = torch.autograd.grad(stiffness_energy(measure, F, p["mu"], S).sum(), F, create_graph=True)[0]
+    slope = torch.autograd.grad(
+        stiffness_energy(measure, F, p["mu"], S).sum(), F, create_graph=True
+    )[0]
     return stress(law, F, p) + slope @ F.mT
 
 
-def meet(x: Tensor, v: Tensor, planes: Sequence[Plane], volume: Tensor, spring: Tensor, dt: float) -> Tensor:
+def meet(
+    x: Tensor, v: Tensor, planes: Sequence[Plane], volume: Tensor, spring: Tensor, dt: float
+) -> Tensor:
     """Particle velocities (N, 3) [m/s] after the planes of mode `touch`. x: (N, 3) [m]; volume [m^3] and spring [1/s^2]: (N,)."""
     for plane in planes:
         if plane.mode != "touch":
@@ -196,7 +215,9 @@ def meet(x: Tensor, v: Tensor, planes: Sequence[Plane], volume: Tensor, spring: 
         push = dt * spring * depth.clamp_min(0)
         sliding = v - (v @ n)[:, None] * n
         length = sliding.norm(dim=1)
-        lost = (plane.friction * push / torch.where(length > 0, length, torch.ones_like(length))).clamp_max(GRIP)
+        lost = (
+            plane.friction * push / torch.where(length > 0, length, torch.ones_like(length))
+        ).clamp_max(GRIP)
         v = v + push[:, None] * n - lost[:, None] * sliding
     return v
 
@@ -216,9 +237,15 @@ def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:
             continue
         n = torch.tensor(plane.normal, dtype=torch.float64)
         n = n / n.norm()
-        thickness = plane.thickness if plane.thickness is not None else THICKNESS * dx * (plane.friction > 0)
+        thickness = (
+            plane.thickness
+            if plane.thickness is not None
+            else THICKNESS * dx * (plane.friction > 0)
+        )
         phi, un = (y - torch.tensor(plane.point, dtype=torch.float64)) @ n, v @ n
-        w = fade(phi, thickness) * torch.where(phi > TOUCHING, 1 / (1 + (un / SLOW) ** 2), torch.ones_like(un))
+        w = fade(phi, thickness) * torch.where(
+            phi > TOUCHING, 1 / (1 + (un / SLOW) ** 2), torch.ones_like(un)
+        )
         tangential = v - un[:, None] * n
         if plane.mode == "sticky":
             after = torch.zeros_like(v)
@@ -226,7 +253,9 @@ def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:
             after = tangential
         else:
             length = tangential.norm(dim=1)
-            keep = (length + plane.friction * un).clamp_min(0) / torch.where(length > 0, length, torch.ones_like(length))
+            keep = (length + plane.friction * un).clamp_min(0) / torch.where(
+                length > 0, length, torch.ones_like(length)
+            )
             sliding = keep[:, None] * tangential if plane.friction > 0 else tangential
             after = torch.where((un < 0)[:, None], sliding, v)
         v = v + w[:, None] * (after - v)
@@ -259,14 +288,18 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
                 local = node - low
                 index = (local[:, 0] * size[1] + local[:, 1]) * size[2] + local[:, 2]
                 stencil.append((index, w, arm))
-                momentum = momentum.index_add(0, index, w[:, None] * (mass[:, None] * v + (B @ arm[..., None])[..., 0]))
+                momentum = momentum.index_add(
+                    0, index, w[:, None] * (mass[:, None] * v + (B @ arm[..., None])[..., 0])
+                )
                 node_mass = node_mass.index_add(0, index, w * mass)
     occupied = node_mass > cutoff
     grid_v = momentum / torch.where(occupied, node_mass, torch.ones_like(node_mass))[:, None]
     grid_v = grid_v + dt * torch.as_tensor(gravity, dtype=torch.float64)
     axes = torch.meshgrid(*(torch.arange(s) for s in size), indexing="ij")
     y = dx * (torch.stack(axes, -1).reshape(-1, 3) + low).double()
-    grid_v = torch.where(occupied[:, None], collide(grid_v, y, planes, dx), torch.zeros_like(grid_v))
+    grid_v = torch.where(
+        occupied[:, None], collide(grid_v, y, planes, dx), torch.zeros_like(grid_v)
+    )
     new_v, new_C = torch.zeros_like(v), torch.zeros_like(C)
     for index, w, arm in stencil:
         u = w[:, None] * grid_v[index]

@@ -15,4 +15,6 @@ def skew(w: Tensor) -> Tensor:
 
 def axial(A: Tensor) -> Tensor:
     """Axial vector (..., 3) of A - A^T, (..., 3, 3)."""
-    return torch.stack([A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], -1)
+    return torch.stack(
+        [A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], -1
+    )

@@ -36,7 +36,9 @@ class Start:
     def read(cls, written: Mapping[str, list[Any]], like: Tensor | None = None) -> Start:
         """like: tensor of the device and type wanted, None for the CPU's float32."""
         found = {name: torch.tensor(value) for name, value in written.items()}
-        return cls(**{name: value if like is None else value.to(like) for name, value in found.items()})
+        return cls(
+            **{name: value if like is None else value.to(like) for name, value in found.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,20 @@ class World:
     def fastest(self, start: Start, size: float, time: float) -> float:
         """Bound of the speeds [m/s] of a body of this size [m] within `time` [s] from `start`: as far as it can fall, and what
         colliders add."""
-        up, gravity, center = (v.detach().double().cpu() for v in (self.up / self.up.norm(), self.gravity, start.center))
-        first, spin = (float(v.detach().norm()) for v in (start.velocity, start.angular_velocity * size))
+        up, gravity, center = (
+            v.detach().double().cpu()
+            for v in (self.up / self.up.norm(), self.gravity, start.center)
+        )
+        first, spin = (
+            float(v.detach().norm()) for v in (start.velocity, start.angular_velocity * size)
+        )
         fastest, pull = first + float(self.gravity.norm()) * time + spin, -float(gravity @ up)
         if self.ground is not None and pull > 0:
             height = max(0.0, float(center @ up) - self.ground.height + 0.5 * size)
             sliding = float((gravity + pull * up).norm()) * time
-            fastest = min(fastest, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding)
-        return fastest + max((c.motion.max_speed(reach(c.shape)) for c in self.colliders), default=0.0)
+            fastest = min(
+                fastest, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding
+            )
+        return fastest + max(
+            (c.motion.max_speed(reach(c.shape)) for c in self.colliders), default=0.0
+        )

@@ -36,7 +36,9 @@ LEADING = {"static": 1, "particles": 1, "motion": 2, "carried": 1}
 def check_result(name: str, result: Any, leading: tuple[int, ...] | None) -> None:
     """Errors: ValueError where a stored result is not one of that stage; names that are not in the table are not looked at."""
     if name == "hull":
-        if not (result["values"].ndim == 3 and result["origin"].shape == (3,) and result["pitch"] > 0):
+        if not (
+            result["values"].ndim == 3 and result["origin"].shape == (3,) and result["pitch"] > 0
+        ):
             raise ValueError("not a hull")
     for key, last in RESULTS.get(name, {}).items():
         found = tuple(result[key].shape)
@@ -47,8 +49,12 @@ def check_result(name: str, result: Any, leading: tuple[int, ...] | None) -> Non
         degree_of(result["harmonics"])
         if result["light"].shape != (LIGHT,) or not bool(torch.isfinite(result["light"]).all()):
             raise ValueError("not a light")
-        if len(result["harmonics"]) != leading[0] or not bool(torch.isfinite(result["harmonics"]).all()):
-            raise ValueError(f"harmonics of shape {tuple(result['harmonics'].shape)}, expected {leading[0]} splats' finite numbers")
+        if len(result["harmonics"]) != leading[0] or not bool(
+            torch.isfinite(result["harmonics"]).all()
+        ):
+            raise ValueError(
+                f"harmonics of shape {tuple(result['harmonics'].shape)}, expected {leading[0]} splats' finite numbers"
+            )
 
 
 class StageCache:
@@ -58,14 +64,20 @@ class StageCache:
         self.folder = None
         if root is not None:
             digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
-            self.folder = Path(root) / "reconstruction" / f"{key['scene'].replace('/', '_')[:80]}-{digest}"
+            self.folder = (
+                Path(root) / "reconstruction" / f"{key['scene'].replace('/', '_')[:80]}-{digest}"
+            )
             self.folder.mkdir(parents=True, exist_ok=True)
             file, text = self.folder / "key.json", json.dumps(key, indent=1, sort_keys=True)
-            if not file.is_file() or file.read_bytes() != text.encode():  # a cache that has all may be one that is only read
+            if (
+                not file.is_file() or file.read_bytes() != text.encode()
+            ):  # a cache that has all may be one that is only read
                 with written_whole(file) as partial:
                     partial.write_text(text)
 
-    def stage(self, name: str, compute: Callable[[], Any], leading: tuple[int, ...] | None = None) -> Any:
+    def stage(
+        self, name: str, compute: Callable[[], Any], leading: tuple[int, ...] | None = None
+    ) -> Any:
         """The stored result of a stage, or `compute()` stored. A damaged file, or one that holds something else, is computed again.
         leading: lengths that the first dimensions of its tensors have, where they are known."""
         if self.folder is None:

@@ -42,7 +42,9 @@ CACHE_VERSION = 3
 
 def _first_frame(scene: Scene) -> tuple[Tensor, Any]:
     if not scene.training_cameras or scene.training_frames[:1] != [0]:
-        raise DataError(f"scene {scene.name}: reconstruction needs frame 0 and at least one training camera")
+        raise DataError(
+            f"scene {scene.name}: reconstruction needs frame 0 and at least one training camera"
+        )
     return scene.mattes[scene.training_cameras, 0], scene.cameras.select(scene.training_cameras)
 
 
@@ -97,37 +99,67 @@ def spacing_for(
     `most`."""
     if particles is not None and particles < 8:
         raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
-    body = object_geometry(scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device).body
+    body = object_geometry(
+        scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device
+    ).body
     return filling_spacing(body, particles, per_cell=per_cell, most=most)
 
 
-def filling_spacing(body: Volume, particles: int | None, *, per_cell: float = PER_CELL, most: int = FEW) -> float:
+def filling_spacing(
+    body: Volume, particles: int | None, *, per_cell: float = PER_CELL, most: int = FEW
+) -> float:
     """Particle spacing [m] that fills a solid; arguments as of `spacing_for`."""
     volume = body_volume(body)
     if particles is None:
-        particles = particles_for(lambda spacing: fill(body, spacing=spacing).positions, volume, per_cell=per_cell, least=FEW,
-                                  most=max(most, FEW))
+        particles = particles_for(
+            lambda spacing: fill(body, spacing=spacing).positions,
+            volume,
+            per_cell=per_cell,
+            least=FEW,
+            most=max(most, FEW),
+        )
     return (volume / particles) ** (1 / 3)
 
 
 def stored(
-    scene: Scene, spacing: Callable[[], float], settings: ReconstructionSettings, *, cache_dir: str | Path, seed: int = 0
+    scene: Scene,
+    spacing: Callable[[], float],
+    settings: ReconstructionSettings,
+    *,
+    cache_dir: str | Path,
+    seed: int = 0,
 ) -> bool:
     """Whether the cache has the motion of `scene`, the last stage of its reconstruction. spacing: gives that of the particles [m],
     and is asked where the body it follows from is in the cache."""
     folder = _geometry_cache(scene, settings, cache_dir).folder
     if folder is None or settings.splats is not None or not (folder / "geometry.pt").is_file():
         return False
-    folder = _open_cache(cache_dir, scene, _motion_settings(settings), seed, spacing=spacing()).folder
+    folder = _open_cache(
+        cache_dir, scene, _motion_settings(settings), seed, spacing=spacing()
+    ).folder
     return folder is not None and (folder / "motion.pt").is_file()
 
 
-def _geometry_cache(scene: Scene, settings: ReconstructionSettings, cache_dir: str | Path | None) -> StageCache:
-    parts = {"resolution": settings.resolution, "ridge_passes": settings.ridge_passes, "margin": settings.margin}
-    return _open_cache(cache_dir, scene, parts | {"geometry": asdict(settings.geometry)}, 0, free=scene.last_free_frame)
+def _geometry_cache(
+    scene: Scene, settings: ReconstructionSettings, cache_dir: str | Path | None
+) -> StageCache:
+    parts = {
+        "resolution": settings.resolution,
+        "ridge_passes": settings.ridge_passes,
+        "margin": settings.margin,
+    }
+    return _open_cache(
+        cache_dir,
+        scene,
+        parts | {"geometry": asdict(settings.geometry)},
+        0,
+        free=scene.last_free_frame,
+    )
 
 
-def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: Mapping[str, Any], seed: int, **more: Any) -> StageCache:
+def _open_cache(
+    cache_dir: str | Path | None, scene: Scene, settings: Mapping[str, Any], seed: int, **more: Any
+) -> StageCache:
     """The cache of what is computed from the training views and frames of `scene`; more: whatever else the results depend on."""
     key = {
         "version": CACHE_VERSION,
@@ -148,7 +180,11 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 
 def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
     """What particles and their motion depend on."""
-    return {name: value for name, value in asdict(settings).items() if name not in ("carried", "informed")}
+    return {
+        name: value
+        for name, value in asdict(settings).items()
+        if name not in ("carried", "informed")
+    }
 
 
 def imported_splats(path: str, scene: Scene) -> Appearance:
@@ -181,10 +217,17 @@ def check_place(path: str, splats: Splats, scene: Scene) -> None:
     if len(views) < 2:
         return
     mattes, cameras = scene.mattes[views, 0], scene.cameras.select(views)
-    within = float((splats.opacities * (occupancy(splats.means, mattes, cameras) > 0.25)).sum() / splats.opacities.sum())
-    filled = 1 - float(left_open(splats.means, 2 * float(splats.scales.mean()), mattes, cameras).median())
-    said = (f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "
-            f"and {filled:.0%} of the mattes filled: check the file's unit, axes and place in the scene's world")
+    within = float(
+        (splats.opacities * (occupancy(splats.means, mattes, cameras) > 0.25)).sum()
+        / splats.opacities.sum()
+    )
+    filled = 1 - float(
+        left_open(splats.means, 2 * float(splats.scales.mean()), mattes, cameras).median()
+    )
+    said = (
+        f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "
+        f"and {filled:.0%} of the mattes filled: check the file's unit, axes and place in the scene's world"
+    )
     if min(within, filled) < FILLED:
         raise DataError(said)
     if within < SUSPECT:
@@ -241,11 +284,23 @@ def reconstruct(
     @functools.cache  # more than one stage reads it, also where there is no cache folder
     def static_stage() -> dict[str, Tensor]:
         if settings.splats is not None:
-            cache.strip("static", still, _render_still(imported.splats.to(device), still, background))
+            cache.strip(
+                "static", still, _render_still(imported.splats.to(device), still, background)
+            )
             return _tensors(imported.splats)
-        start = start_splats(geometry.body, still, settings.static, count=settings.points, seed=seed)
+        start = start_splats(
+            geometry.body, still, settings.static, count=settings.points, seed=seed
+        )
         with bar("static Gaussians", settings.static.iterations) as steps:
-            fitted = fit_splats(start, still, background, settings.static, move=True, seed=seed, progress=steps.update)
+            fitted = fit_splats(
+                start,
+                still,
+                background,
+                settings.static,
+                move=True,
+                seed=seed,
+                progress=steps.update,
+            )
         cache.strip("static", still, _render_still(fitted, still, background))
         return _tensors(fitted)
 
@@ -254,7 +309,15 @@ def reconstruct(
         particles = fill(geometry.body, spacing=spacing)
         start = scaffold_splats(particles, static, device)
         with bar("appearance of the particles", settings.appearance.iterations) as steps:
-            fitted = fit_splats(start, still, background, settings.appearance, move=False, seed=seed, progress=steps.update)
+            fitted = fit_splats(
+                start,
+                still,
+                background,
+                settings.appearance,
+                move=False,
+                seed=seed,
+                progress=steps.update,
+            )
         cache.strip("particles", still, _render_still(fitted, still, background))
         return _tensors(fitted) | {"volume": particles.volume}
 
@@ -272,28 +335,58 @@ def reconstruct(
 
     def carried_stage() -> dict[str, Tensor]:
         with bar("carried Gaussians", settings.carried.iterations) as steps:
-            found = fit_carried(static.to(device), splats.means.to(device), motion["positions"].to(device), windows, background,
-                                settings.carried, seed=seed, progress=steps.update).to("cpu")
-        return _tensors(found.splats) | {"harmonics": found.harmonics, "normals": found.normals, "light": found.light}
+            found = fit_carried(
+                static.to(device),
+                splats.means.to(device),
+                motion["positions"].to(device),
+                windows,
+                background,
+                settings.carried,
+                seed=seed,
+                progress=steps.update,
+            ).to("cpu")
+        return _tensors(found.splats) | {
+            "harmonics": found.harmonics,
+            "normals": found.normals,
+            "light": found.light,
+        }
 
     if settings.splats is not None:
         appearance = imported
     elif settings.carried.iterations == 0:
         appearance = Appearance(static, constant_coefficients(static.colors))
     else:  # a folder of its own: nothing else depends on its settings
-        apart = _open_cache(cache_dir, scene, _motion_settings(settings) | {"carried": asdict(settings.carried)}, seed, **more)
+        apart = _open_cache(
+            cache_dir,
+            scene,
+            _motion_settings(settings) | {"carried": asdict(settings.carried)},
+            seed,
+            **more,
+        )
         found = apart.stage("carried", carried_stage)
         colored = {name: found.pop(name) for name in ("harmonics", "normals", "light")}
         appearance = Appearance(Splats(**found), **colored)
-    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing), appearance,
-                          parts)
+    return Reconstruction(
+        splats,
+        spacing,
+        volume,
+        cues_of(motion, splats, settings),
+        static,
+        geometry.figures(spacing),
+        appearance,
+        parts,
+    )
 
 
 def posed(splats: Splats, rotation: Tensor, center: Tensor, rest_center: Tensor) -> Splats:
     """Splats turned by `rotation` (3, 3) about `rest_center` (3,), which comes to lie at `center` (3,) [m]."""
     Q = rotation.to(splats.means)
     means = (splats.means - rest_center.to(splats.means)) @ Q.T + center.to(splats.means)
-    return replace(splats, means=means, rotations=quaternion_multiply(matrix_to_quaternion(Q), splats.rotations))
+    return replace(
+        splats,
+        means=means,
+        rotations=quaternion_multiply(matrix_to_quaternion(Q), splats.rotations),
+    )
 
 
 def follow(
@@ -330,17 +423,40 @@ def follow(
         """In the pose, in the light that falls on it there: the one that frame 0 shows."""
         normals = surface_normals(rest.means, reconstruction.splats.means)
         still = [c for c in views if bool((scene.mattes[c, 0] > 0.5).any())]
-        light = light_of(rest.to(device), normals.to(device), (rotation, center), scene.images[still, 0], scene.mattes[still, 0],
-                         scene.cameras.select(still), background=scene.background, rest_center=rest_center).cpu()
+        light = light_of(
+            rest.to(device),
+            normals.to(device),
+            (rotation, center),
+            scene.images[still, 0],
+            scene.mattes[still, 0],
+            scene.cameras.select(still),
+            background=scene.background,
+            rest_center=rest_center,
+        ).cpu()
         moved = posed(rest.to("cpu"), *(p.cpu() for p in pose))
-        return replace(moved, colors=moved.colors * shading(light, normals.cpu(), rotation.cpu().to(normals))[:, None])
+        return replace(
+            moved,
+            colors=moved.colors
+            * shading(light, normals.cpu(), rotation.cpu().to(normals))[:, None],
+        )
 
     carried = settings.dynamic.carriers == "static"
-    splats = posed(reconstruction.splats.to("cpu"), *(p.cpu() for p in pose)) if carried else turned(reconstruction.splats)
-    static = turned(reconstruction.splats if reconstruction.static is None else reconstruction.static)
+    splats = (
+        posed(reconstruction.splats.to("cpu"), *(p.cpu() for p in pose))
+        if carried
+        else turned(reconstruction.splats)
+    )
+    static = turned(
+        reconstruction.splats if reconstruction.static is None else reconstruction.static
+    )
 
     def bar(name: str, total: int) -> tqdm:
-        return tqdm(total=total, desc=f"reconstruction of {scene.sequence}: {name}", disable=not progress, leave=False)
+        return tqdm(
+            total=total,
+            desc=f"reconstruction of {scene.sequence}: {name}",
+            disable=not progress,
+            leave=False,
+        )
 
     parts = MovingParts(scene, splats.to(device), static.to(device), settings)
 
@@ -348,8 +464,14 @@ def follow(
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
-    return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static,
-                          moving=parts)
+    return Reconstruction(
+        splats,
+        reconstruction.spacing,
+        reconstruction.volume,
+        cues_of(motion, splats, settings),
+        static,
+        moving=parts,
+    )
 
 
 def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:

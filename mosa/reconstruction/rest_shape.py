@@ -25,10 +25,18 @@ class RestShape:
     splats: CarriedSplats | None = None
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction, device: torch.device | str, *, with_splats: bool = True) -> RestShape:
+    def of(
+        cls, reconstruction: Reconstruction, device: torch.device | str, *, with_splats: bool = True
+    ) -> RestShape:
         """with_splats: whether images show the reconstruction's Gaussians, where it has some."""
         seen = reconstruction.splats
-        tensors = (seen.means, reconstruction.volume, seen.colors, seen.opacities, covariance_from(seen.scales, seen.rotations))
+        tensors = (
+            seen.means,
+            reconstruction.volume,
+            seen.colors,
+            seen.opacities,
+            covariance_from(seen.scales, seen.rotations),
+        )
         carried = None
         if with_splats and reconstruction.appearance is not None:
             carried = CarriedSplats(reconstruction.appearance, seen.means).to(device)
@@ -42,4 +50,7 @@ class RestShape:
 
     def tensors(self) -> dict[str, Tensor]:
         """What `build_body` takes."""
-        return {name: getattr(self, name) for name in ("rest", "volume", "colors", "opacities", "covariances")}
+        return {
+            name: getattr(self, name)
+            for name in ("rest", "volume", "colors", "opacities", "covariances")
+        }

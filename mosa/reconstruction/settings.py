@@ -40,7 +40,11 @@ class ReconstructionSettings:
     @property
     def looks_again(self) -> bool:
         """Whether the motion is found once more, informed by a simulation."""
-        return self.informed.iterations > 0 and self.cue == "neighbourhood" and self.dynamic.model == "modes"
+        return (
+            self.informed.iterations > 0
+            and self.cue == "neighbourhood"
+            and self.dynamic.model == "modes"
+        )
 
     def __post_init__(self) -> None:
         check_knobs(self, "reconstruction")

@@ -40,7 +40,9 @@ def rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
 def sample_images(images: Tensor, pixels: Tensor, *, beyond: str = "zeros") -> Tensor:
     """Bilinear values (V, C, N) of images (V, C, H, W) at pixels (V, N, 2). beyond: an image: zeros | border (its values)."""
     size = pixels.new_tensor([images.shape[3], images.shape[2]])
-    return F.grid_sample(images, (2 * pixels / size - 1)[:, None], padding_mode=beyond, align_corners=False)[:, :, 0]
+    return F.grid_sample(
+        images, (2 * pixels / size - 1)[:, None], padding_mode=beyond, align_corners=False
+    )[:, :, 0]
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
@@ -51,8 +53,12 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """
     forward = target - eye
     right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
-    if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()) or bool((forward.norm(dim=-1) == 0).any()):
-        raise ConfigError("look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up")
+    if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()) or bool(
+        (forward.norm(dim=-1) == 0).any()
+    ):
+        raise ConfigError(
+            "look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up"
+        )
     forward = forward / forward.norm(dim=-1, keepdim=True)
     right = right / right.norm(dim=-1, keepdim=True)
     R = torch.stack((right, torch.linalg.cross(forward, right), forward), -2)
@@ -68,7 +74,9 @@ def scale_cameras(cameras: Cameras, factor: float) -> Cameras:
     pixel."""
     width, height = round(cameras.width * factor), round(cameras.height * factor)
     if width < 1 or height < 1:
-        raise ConfigError(f"scale_cameras: factor {factor} makes images of {cameras.width}x{cameras.height} px vanish")
+        raise ConfigError(
+            f"scale_cameras: factor {factor} makes images of {cameras.width}x{cameras.height} px vanish"
+        )
     K = cameras.K.clone()
     K[:, 0] *= width / cameras.width
     K[:, 1] *= height / cameras.height
@@ -83,11 +91,16 @@ def crop_cameras(cameras: Cameras, x0: Tensor, y0: Tensor, width: int, height: i
     return replace(cameras, K=K, width=width, height=height)
 
 
-def crop_images(images: Tensor, x0: Tensor, y0: Tensor, width: int, height: int, *, axis: int = 1) -> Tensor:
+def crop_images(
+    images: Tensor, x0: Tensor, y0: Tensor, width: int, height: int, *, axis: int = 1
+) -> Tensor:
     """The windows of `crop_cameras` cut from images (V, ..., H, W, ...) whose rows are dimension `axis` and columns
     the next."""
     return torch.stack(
-        [image.narrow(axis - 1, y, height).narrow(axis, x, width) for image, x, y in zip(images, x0.tolist(), y0.tolist())]
+        [
+            image.narrow(axis - 1, y, height).narrow(axis, x, width)
+            for image, x, y in zip(images, x0.tolist(), y0.tolist())
+        ]
     )
 
 
@@ -104,7 +117,10 @@ def crop_boxes(
     views, _, H, W = mattes.shape
     seen = (mattes > threshold).any(1)
     lows, highs = [], []
-    for axis, size in ((1, W), (2, H)):  # columns are occupied where any row is, and the other way round
+    for axis, size in (
+        (1, W),
+        (2, H),
+    ):  # columns are occupied where any row is, and the other way round
         occupied = seen.any(axis)
         index = torch.arange(size, device=mattes.device)
         low = torch.where(occupied, index, size).amin(1)
@@ -113,7 +129,9 @@ def crop_boxes(
         highs.append(high)
     empty = highs[0] <= lows[0]
     if bool(empty.all()):
-        raise DataError(f"crop_boxes: none of the {views} mattes has a pixel above {threshold}; the object is not seen at all")
+        raise DataError(
+            f"crop_boxes: none of the {views} mattes has a pixel above {threshold}; the object is not seen at all"
+        )
     starts, sizes = [], []
     for low, high, limit in zip(lows, highs, (W, H)):
         size = int((high - low)[~empty].max()) + 2 * margin

@@ -57,7 +57,9 @@ def carried_covariance(deformation: Tensor, scales: Tensor, rotations: Tensor) -
     return axes @ axes.mT
 
 
-def project_gaussians(means: Tensor, covariances: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+def project_gaussians(
+    means: Tensor, covariances: Tensor, cameras: Cameras
+) -> tuple[Tensor, Tensor]:
     """Centres (B, N, 2) [px] and low-passed covariances (B, N, 3) [px^2] as (xx, xy, yy), one camera per batch entry.
 
     means: (B, N, 3) [m]; covariances: (B, N, 3, 3) [m^2]. The same map as the rasteriser's (`projection_kernels`): J from
@@ -71,10 +73,18 @@ def project_gaussians(means: Tensor, covariances: Tensor, cameras: Cameras) -> t
     fx, skew, fy, cx, cy = (K[:, None, i, j] for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2)))
     sx, sy = x / z, y / z
     half_x, half_y = 0.5 * cameras.width / fx, 0.5 * cameras.height / fy
-    jx = sx.clamp(-cx / fx - CLAMP_MARGIN * half_x, (cameras.width - cx) / fx + CLAMP_MARGIN * half_x)
-    jy = sy.clamp(-cy / fy - CLAMP_MARGIN * half_y, (cameras.height - cy) / fy + CLAMP_MARGIN * half_y)
+    jx = sx.clamp(
+        -cx / fx - CLAMP_MARGIN * half_x, (cameras.width - cx) / fx + CLAMP_MARGIN * half_x
+    )
+    jy = sy.clamp(
+        -cy / fy - CLAMP_MARGIN * half_y, (cameras.height - cy) / fy + CLAMP_MARGIN * half_y
+    )
     rows = R.unbind(-2)
-    first = (fx / z)[..., None] * rows[0] + (skew / z)[..., None] * rows[1] - ((fx * jx + skew * jy) / z)[..., None] * rows[2]
+    first = (
+        (fx / z)[..., None] * rows[0]
+        + (skew / z)[..., None] * rows[1]
+        - ((fx * jx + skew * jy) / z)[..., None] * rows[2]
+    )
     second = (fy / z)[..., None] * rows[1] - (fy * jy / z)[..., None] * rows[2]
     half_first = (covariances * first[..., None, :]).sum(-1)
     half_second = (covariances * second[..., None, :]).sum(-1)

@@ -25,7 +25,9 @@ def why_unavailable() -> str | None:
     if not torch.cuda.is_available():
         return "there is no CUDA device"
     try:
-        from gsplat.cuda._backend import _C  # gsplat's own check of its installation; builds the kernels where needed
+        from gsplat.cuda._backend import (
+            _C,
+        )  # gsplat's own check of its installation; builds the kernels where needed
     except Exception as error:  # a failed build ends in anything from ImportError to RuntimeError
         return f"the package gsplat does not import ({error})"
     return "its kernels are not compiled and nvcc is not there to do it" if _C is None else None
@@ -51,7 +53,12 @@ def obstacle(means: Tensor, cameras: Cameras, preset: str, scan: str | None) -> 
 
 
 def splat(
-    means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, cameras: Cameras, state_index: Tensor
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    cameras: Cameras,
+    state_index: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Image (B, H, W, C) and alpha (B, H, W) over zeros; arguments as `mosa.rendering.rasterizer.rasterize`.
 

@@ -134,7 +134,9 @@ def add_sums(dtype: type, channels: int, exact: bool = False):
     vecc = wp.types.vector(length=channels, dtype=dtype)
 
     sums = wp.array2d(dtype=wp.int64)
-    to_records, to_features = (sums, sums) if exact else (wp.array(dtype=record_type(dtype)), wp.array(dtype=vecc))
+    to_records, to_features = (
+        (sums, sums) if exact else (wp.array(dtype=record_type(dtype)), wp.array(dtype=vecc))
+    )
 
     @wp.func_native(ADD_SUMS.replace("TO_MEMORY", EXACT if exact else PLAIN))
     def function(

@@ -23,8 +23,13 @@ class Views:
 
 def repeat_cameras(cameras: Cameras, frames: int) -> Cameras:
     """Each of V cameras `frames` times in a row: image b = view * frames + frame."""
-    return Cameras(cameras.K.repeat_interleave(frames, 0), cameras.w2c.repeat_interleave(frames, 0), cameras.width,
-                   cameras.height, tuple(name for name in cameras.names for _ in range(frames)))
+    return Cameras(
+        cameras.K.repeat_interleave(frames, 0),
+        cameras.w2c.repeat_interleave(frames, 0),
+        cameras.width,
+        cameras.height,
+        tuple(name for name in cameras.names for _ in range(frames)),
+    )
 
 
 def observe(
@@ -48,7 +53,9 @@ def observe(
     backdrop = background
     if flow:
         following = (index + 1).clamp(max=frames - 1)
-        motion = flow_features(means[index], covariances[index], means[following], covariances[following], batch)
+        motion = flow_features(
+            means[index], covariances[index], means[following], covariances[following], batch
+        )
         features = torch.cat([colors[None].expand(len(index), -1, -1), motion], -1)
         backdrop = torch.cat([background, background.new_zeros(6)])
     image, alpha = rasterize(means, covariances, opacities, features, batch, index, backdrop)

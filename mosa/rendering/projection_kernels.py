@@ -44,7 +44,17 @@ def projection_kernels(dtype: type):
 
     @wp.func
     def rotation(w2c: mat44):
-        return mat33(w2c[0, 0], w2c[0, 1], w2c[0, 2], w2c[1, 0], w2c[1, 1], w2c[1, 2], w2c[2, 0], w2c[2, 1], w2c[2, 2])
+        return mat33(
+            w2c[0, 0],
+            w2c[0, 1],
+            w2c[0, 2],
+            w2c[1, 0],
+            w2c[1, 1],
+            w2c[1, 2],
+            w2c[2, 0],
+            w2c[2, 1],
+            w2c[2, 2],
+        )
 
     @wp.func
     def to_camera(w2c: mat44, m: vec3):
@@ -196,7 +206,9 @@ def projection_kernels(dtype: type):
                     x1 = t * wp.floor((wp.clamp(u - half + r + t - dtype(1.0), zero, w + t)) / t)
                     y0 = t * wp.floor((wp.clamp(v - half - r, zero, h + t)) / t)
                     y1 = t * wp.floor((wp.clamp(v - half + r + t - dtype(1.0), zero, h + t)) / t)
-                    rect = wp.vec4i(int(x0), wp.min(int(x1), width), int(y0), wp.min(int(y1), height))
+                    rect = wp.vec4i(
+                        int(x0), wp.min(int(x1), width), int(y0), wp.min(int(y1), height)
+                    )
                 else:
                     e = wp.min(settings[2], wp.sqrt(dtype(2.0) * wp.log(dtype(255.0) * o)))
                     rx = wp.ceil(e * wp.sqrt(sxx))
@@ -245,7 +257,13 @@ def projection_kernels(dtype: type):
                 limits = slope_limits(K[b], width, height, settings[1])
                 T = jacobian(K[b], p, limits) * R
                 G = covariance_gradient(conic(r), conic_gradient(m))
-                gJ = dtype(2.0) * G * T * symmetric(covariances[state_index[b] * count + n]) * wp.transpose(R)
+                gJ = (
+                    dtype(2.0)
+                    * G
+                    * T
+                    * symmetric(covariances[state_index[b] * count + n])
+                    * wp.transpose(R)
+                )
                 gA += wp.transpose(T) * G * T
                 gm += wp.transpose(R) * point_gradient(K[b], p, limits, center_gradient(r, m), gJ)
                 go += opacity_gradient(r, m)
@@ -293,7 +311,12 @@ def projection_kernels(dtype: type):
                 p = to_camera(w2c[b], m)
                 J = jacobian(K[b], p, limits)
                 # Sigma_2D = T A T^T with T = J R
-                gT = dtype(2.0) * covariance_gradient(conic(r), conic_gradient(moment)) * (J * R) * symmetric(covariances[s])
+                gT = (
+                    dtype(2.0)
+                    * covariance_gradient(conic(r), conic_gradient(moment))
+                    * (J * R)
+                    * symmetric(covariances[s])
+                )
                 gJ = gT * wp.transpose(R)
                 gc = center_gradient(r, moment)
                 gp = point_gradient(K[b], p, limits, gc, gJ)

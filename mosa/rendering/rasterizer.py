@@ -37,17 +37,28 @@ def use_backend(name: str, *, required: bool = True) -> None:
     """
     global _backend
     if name not in BACKENDS:
-        raise ConfigError(f"rendering.backend: expected one of {', '.join(BACKENDS)}, found {name!r}")
+        raise ConfigError(
+            f"rendering.backend: expected one of {', '.join(BACKENDS)}, found {name!r}"
+        )
     if name == "gsplat":
         reason = gsplat_backend.why_unavailable()
         if reason and not required:
             name = "warp"
         elif reason:
-            raise ConfigError(f"rendering.backend: gsplat cannot be used here: {reason}; choose rendering=warp")
+            raise ConfigError(
+                f"rendering.backend: gsplat cannot be used here: {reason}; choose rendering=warp"
+            )
     _backend = name
 
 
-def _check(means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, cameras: Cameras, state_index: Tensor) -> None:
+def _check(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    cameras: Cameras,
+    state_index: Tensor,
+) -> None:
     """Shapes, types and devices of `rasterize`; ConfigError names the first that is off."""
     states, count = (means.shape[0], means.shape[1]) if means.dim() == 3 else (-1, -1)
     images = len(cameras)
@@ -55,29 +66,55 @@ def _check(means: Tensor, covariances: Tensor, opacities: Tensor, features: Tens
         "means": (means, [(states, count, 3)]),
         "covariances": (covariances, [(states, count, 3, 3)]),
         "opacities": (opacities, [(count,), (states, count)]),
-        "features": (features, [(images, count, features.shape[-1]), (1, count, features.shape[-1])]),
+        "features": (
+            features,
+            [(images, count, features.shape[-1]), (1, count, features.shape[-1])],
+        ),
         "state_index": (state_index, [(images,)]),
     }
     for name, (value, shapes) in wanted.items():
         if tuple(value.shape) not in shapes or 0 in value.shape:
-            raise ConfigError(f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty")
+            raise ConfigError(
+                f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty"
+            )
         if value.device != means.device:
-            raise ConfigError(f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device")
+            raise ConfigError(
+                f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device"
+            )
         if name != "state_index" and (value.dtype != means.dtype or value.dtype not in SCALARS):
-            raise ConfigError(f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all")
-    numbers = {"means": means, "covariances": covariances, "opacities": opacities, "features": features}
+            raise ConfigError(
+                f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all"
+            )
+    numbers = {
+        "means": means,
+        "covariances": covariances,
+        "opacities": opacities,
+        "features": features,
+    }
     # largest magnitudes: nan and inf come through, in one pass over each and one wait for the GPU
-    largest = torch.stack([torch.linalg.vector_norm(value.detach(), torch.inf) for value in numbers.values()]).tolist()
+    largest = torch.stack(
+        [torch.linalg.vector_norm(value.detach(), torch.inf) for value in numbers.values()]
+    ).tolist()
     if not all(map(math.isfinite, largest)):
         name = next(name for name, size in zip(numbers, largest) if not math.isfinite(size))
         where = (~numbers[name].detach().isfinite()).nonzero()[0].tolist()
-        raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
+        raise DataError(
+            f"rasterize: {name}{where} is not finite; it would silently vanish from the image"
+        )
     for name, value, size in (("K", cameras.K, 3), ("w2c", cameras.w2c, 4)):
         if tuple(value.shape) != (images, size, size):
-            raise ConfigError(f"rasterize: cameras.{name} has shape {tuple(value.shape)}, expected {(images, size, size)}")
+            raise ConfigError(
+                f"rasterize: cameras.{name} has shape {tuple(value.shape)}, expected {(images, size, size)}"
+            )
     if max(cameras.width, cameras.height) > SIDE_MAX:
-        raise ConfigError(f"rasterize: images of {cameras.width} x {cameras.height} px; no side may be longer than {SIDE_MAX}")
-    counted("rasterize: numbers", (images, cameras.height, cameras.width, features.shape[-1] + 1), "render fewer or smaller images")
+        raise ConfigError(
+            f"rasterize: images of {cameras.width} x {cameras.height} px; no side may be longer than {SIDE_MAX}"
+        )
+    counted(
+        "rasterize: numbers",
+        (images, cameras.height, cameras.width, features.shape[-1] + 1),
+        "render fewer or smaller images",
+    )
     if not means.is_cuda and (int(state_index.min()) < 0 or int(state_index.max()) >= states):
         raise ConfigError(f"rasterize: state_index reaches outside the {states} states")
 
@@ -110,19 +147,27 @@ def rasterize(
     that cannot do what is asked. Source: Kerbl et al. 2023; conventions of gsplat (Ye et al. 2024).
     """
     if preset not in PRESETS:
-        raise ConfigError(f"rasterize: unknown preset '{preset}', expected one of {sorted(PRESETS)}")
+        raise ConfigError(
+            f"rasterize: unknown preset '{preset}', expected one of {sorted(PRESETS)}"
+        )
     if scan not in (None, "gaussian", "tile"):
         raise ConfigError(f"rasterize: unknown scan '{scan}', expected gaussian or tile")
     if backend not in (None, *BACKENDS):
-        raise ConfigError(f"rasterize: unknown backend '{backend}', expected one of {', '.join(BACKENDS)}")
+        raise ConfigError(
+            f"rasterize: unknown backend '{backend}', expected one of {', '.join(BACKENDS)}"
+        )
     _check(means, covariances, opacities, features, cameras, state_index)
     if (backend or _backend) == "gsplat":
         obstacle = gsplat_backend.obstacle(means, cameras, preset, scan)
         if obstacle is None:
-            image, alpha = gsplat_backend.splat(means, covariances, opacities, features, cameras, state_index)
+            image, alpha = gsplat_backend.splat(
+                means, covariances, opacities, features, cameras, state_index
+            )
             return _over(image, alpha, background), alpha
         if backend is not None:
-            raise ConfigError(f"rasterize: the gsplat backend cannot be used for this call: {obstacle}; use backend='warp'")
+            raise ConfigError(
+                f"rasterize: the gsplat backend cannot be used for this call: {obstacle}; use backend='warp'"
+            )
     start_warp()
     geometry = Geometry(
         state_index.to(torch.int32).contiguous(),
@@ -131,7 +176,15 @@ def rasterize(
         PRESETS[preset],
         scan or ("tile" if means.is_cuda else "gaussian"),
     )
-    image, alpha = Splat.apply(means, covariances, opacities, features, cameras.K.to(means), cameras.w2c.to(means), geometry)
+    image, alpha = Splat.apply(
+        means,
+        covariances,
+        opacities,
+        features,
+        cameras.K.to(means),
+        cameras.w2c.to(means),
+        geometry,
+    )
     return _over(image, alpha, background), alpha
 
 

@@ -75,7 +75,9 @@ def record_functions(dtype: type):
         """First and last + 1 column, first and last + 1 row; all zero for what is not seen."""
         columns = int(wp.cast(r[3], bits))
         rows = int(wp.cast(r[7], bits))
-        return wp.vec4i(columns & SIDE_MAX, (columns >> 16) & SIDE_MAX, rows & SIDE_MAX, (rows >> 16) & SIDE_MAX)
+        return wp.vec4i(
+            columns & SIDE_MAX, (columns >> 16) & SIDE_MAX, rows & SIDE_MAX, (rows >> 16) & SIDE_MAX
+        )
 
     return load, store, pack, center, conic, pixels
 

@@ -12,7 +12,9 @@ from torch import Tensor
 from mosa.types import Cameras
 
 
-def visible_covariance(mean: Tensor, covariance: Tensor, K: Tensor, w2c: Tensor, width: int, height: int):
+def visible_covariance(
+    mean: Tensor, covariance: Tensor, K: Tensor, w2c: Tensor, width: int, height: int
+):
     """Centre (N, 2) [px], covariance (N, 2, 2) [px^2] and depth (N,) [m] of Gaussians (N, 3), (N, 3, 3) in one
     camera."""
     p = mean @ w2c[:3, :3].T + w2c[:3, 3]
@@ -47,7 +49,9 @@ def alphas(center: Tensor, M: Tensor, opacity: Tensor, width: int, height: int) 
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     d = torch.stack((x, y), -1).reshape(-1, 1, 2).to(center) - center
     q = (d[..., None, :] @ torch.linalg.inv(M) @ d[..., None])[..., 0, 0]
-    extent = torch.minimum(torch.full_like(opacity, 3.33), torch.sqrt(2 * torch.log((255 * opacity).clamp(min=1))))
+    extent = torch.minimum(
+        torch.full_like(opacity, 3.33), torch.sqrt(2 * torch.log((255 * opacity).clamp(min=1)))
+    )
     reach = torch.ceil(extent[:, None] * torch.stack((M[:, 0, 0], M[:, 1, 1]), -1).sqrt())
     inside = (d.abs() <= reach).all(-1)
     alpha = torch.clamp(opacity * torch.exp(-0.5 * q), max=0.999)
@@ -72,7 +76,9 @@ def rasterize_reference(
         color = features[b] if features.shape[0] > 1 else features[0]
         visible = (means[s] @ w2c[2, :3] + w2c[2, 3]).detach() > 0.01
         index = visible.nonzero()[:, 0]
-        center, M, depth = visible_covariance(means[s][index], covariances[s][index], K, w2c, width, height)
+        center, M, depth = visible_covariance(
+            means[s][index], covariances[s][index], K, w2c, width, height
+        )
         near_first = depth.detach().argsort(stable=True)
         alpha = alphas(center[near_first], M[near_first], opacity[index][near_first], width, height)
         weights, left = composite(alpha)

@@ -91,10 +91,14 @@ class _Arrays:
         return wp.from_torch(x.view(-1), dtype=self.scalar, return_ctype=True)
 
     def vectors(self, x: Tensor):
-        return wp.from_torch(x.view(-1, x.shape[-1]), dtype=_vector(x.shape[-1], self.scalar), return_ctype=True)
+        return wp.from_torch(
+            x.view(-1, x.shape[-1]), dtype=_vector(x.shape[-1], self.scalar), return_ctype=True
+        )
 
     def matrices(self, x: Tensor):
-        return wp.from_torch(x.view(-1, *x.shape[-2:]), dtype=_matrix(*x.shape[-2:], self.scalar), return_ctype=True)
+        return wp.from_torch(
+            x.view(-1, *x.shape[-2:]), dtype=_matrix(*x.shape[-2:], self.scalar), return_ctype=True
+        )
 
 
 def _integers(x: Tensor):
@@ -116,25 +120,40 @@ class Splat(torch.autograd.Function):
             records, depths = project(means, covariances, opacities, K, w2c, geometry)
             lists = depth_lists(depths, records, geometry)
             image, transmittance, ends = composite(lists, records, features, geometry)
-        ctx.save_for_backward(means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists)
+        ctx.save_for_backward(
+            means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists
+        )
         ctx.geometry = geometry
         return image, 1 - transmittance
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_image: Tensor, grad_alpha: Tensor):
-        means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists = ctx.saved_tensors
+        means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists = (
+            ctx.saved_tensors
+        )
         with torch_stream(means.device):
             moments, grad_features = composite_backward(
-                lists, records, features, ends, transmittance, grad_image.contiguous(), grad_alpha.contiguous(), ctx.geometry
+                lists,
+                records,
+                features,
+                ends,
+                transmittance,
+                grad_image.contiguous(),
+                grad_alpha.contiguous(),
+                ctx.geometry,
             )
             projected = (means, covariances, opacities, K, w2c, records, moments, ctx.geometry)
             gradients = project_backward(*projected)
-            cameras = camera_backward(*projected) if any(ctx.needs_input_grad[4:6]) else (None, None)
+            cameras = (
+                camera_backward(*projected) if any(ctx.needs_input_grad[4:6]) else (None, None)
+            )
         return *gradients, grad_features, *cameras, None
 
 
-def project(means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, g: Geometry) -> tuple[Tensor, Tensor]:
+def project(
+    means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, g: Geometry
+) -> tuple[Tensor, Tensor]:
     """Records (B, N, 8) and depths (2 B N,), infinite where nothing is seen; the second half is room to sort them."""
     images, count = len(g.state_index), means.shape[1]
     arrays = _Arrays(means.dtype)
@@ -161,22 +180,32 @@ def depth_lists(depths: Tensor, records: Tensor, g: Geometry) -> tuple[Tensor, .
     if g.scan == "tile":
         return tile_lists(depths, records, g.width, g.height)
     images, count, _ = records.shape
-    return (depths[: images * count].view(images, count).argsort(dim=1, stable=True).to(torch.int32),)
+    return (
+        depths[: images * count].view(images, count).argsort(dim=1, stable=True).to(torch.int32),
+    )
 
 
-def composite(lists: tuple[Tensor, ...], records: Tensor, features: Tensor, g: Geometry) -> tuple[Tensor, Tensor, Tensor]:
+def composite(
+    lists: tuple[Tensor, ...], records: Tensor, features: Tensor, g: Geometry
+) -> tuple[Tensor, Tensor, Tensor]:
     """Image (B, H, W, C), final transmittance (B, H, W) and the place in its list where each pixel ended (B, H, W)."""
     images, count, _ = records.shape
     arrays, shape = _Arrays(records.dtype), (images, g.height, g.width)
     if g.scan == "tile":
         kernel, _ = tile_kernels(arrays.scalar, features.shape[-1])
         threads = tile_threads(images, g.width, g.height)
-        transmittance, image = records.new_empty(shape), records.new_empty(*shape, features.shape[-1])
+        transmittance, image = (
+            records.new_empty(shape),
+            records.new_empty(*shape, features.shape[-1]),
+        )
         ends = torch.empty(shape, dtype=torch.int32, device=records.device)
     else:
         kernel, _ = raster_kernels(arrays.scalar, features.shape[-1])
         threads = images
-        transmittance, image = records.new_ones(shape), records.new_zeros(*shape, features.shape[-1])
+        transmittance, image = (
+            records.new_ones(shape),
+            records.new_zeros(*shape, features.shape[-1]),
+        )
         ends = torch.full(shape, count, dtype=torch.int32, device=records.device)
     wp.launch(
         kernel,
@@ -208,7 +237,11 @@ def composite_backward(
     else:
         _, kernel = raster_kernels(arrays.scalar, features.shape[-1])
         threads, state = len(records), (transmittance.clone(), -grad_alpha * transmittance)
-    sums = [torch.zeros(t.numel(), COLUMNS, dtype=torch.int64, device=t.device) for t in found] if exact else []
+    sums = (
+        [torch.zeros(t.numel(), COLUMNS, dtype=torch.int64, device=t.device) for t in found]
+        if exact
+        else []
+    )
     wp.launch(
         kernel,
         dim=threads,
@@ -224,16 +257,30 @@ def composite_backward(
     )
     for target, added in zip(found, sums):
         given = [wp.from_torch(added), arrays.scalars(target)]
-        wp.launch(sum_functions(arrays.scalar).settle, target.numel(), given, device=wp.device_from_torch(records.device))
+        wp.launch(
+            sum_functions(arrays.scalar).settle,
+            target.numel(),
+            given,
+            device=wp.device_from_torch(records.device),
+        )
     return found
 
 
 def project_backward(
-    means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, records: Tensor, moments: Tensor, g: Geometry
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    K: Tensor,
+    w2c: Tensor,
+    records: Tensor,
+    moments: Tensor,
+    g: Geometry,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of means, covariances and opacities."""
     arrays, count = _Arrays(means.dtype), means.shape[1]
-    grad_means, grad_covariances, grad_opacities = (torch.zeros_like(x) for x in (means, covariances, opacities))
+    grad_means, grad_covariances, grad_opacities = (
+        torch.zeros_like(x) for x in (means, covariances, opacities)
+    )
     _, kernel, _ = projection_kernels(arrays.scalar)
     wp.launch(
         kernel,
@@ -247,19 +294,33 @@ def project_backward(
             arrays.vectors(records),
             arrays.vectors(moments),
         ],
-        outputs=[arrays.vectors(grad_means), arrays.matrices(grad_covariances), arrays.scalars(grad_opacities)],
+        outputs=[
+            arrays.vectors(grad_means),
+            arrays.matrices(grad_covariances),
+            arrays.scalars(grad_opacities),
+        ],
         device=wp.device_from_torch(means.device),
     )
     return grad_means, grad_covariances, grad_opacities
 
 
 def camera_backward(
-    means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, records: Tensor, moments: Tensor, g: Geometry
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    K: Tensor,
+    w2c: Tensor,
+    records: Tensor,
+    moments: Tensor,
+    g: Geometry,
 ) -> tuple[Tensor, Tensor]:
     """Gradients of K and w2c; arguments as of project_backward."""
     arrays, images, count = _Arrays(means.dtype), len(records), means.shape[1]
     chunks = min(count, CAMERA_CHUNKS)
-    partial_w2c, partial_K = means.new_empty(images, chunks, 3, 4), means.new_empty(images, chunks, 3, 3)
+    partial_w2c, partial_K = (
+        means.new_empty(images, chunks, 3, 4),
+        means.new_empty(images, chunks, 3, 3),
+    )
     *_, kernel = projection_kernels(arrays.scalar)
     wp.launch(
         kernel,
@@ -283,11 +344,29 @@ def _splats(arrays: _Arrays, records: Tensor, features: Tensor, g: Geometry) -> 
     count = records.shape[1]
     stride = count if features.shape[0] > 1 else 0
     cap = arrays.scalar(g.preset.alpha_max)
-    return [arrays.vectors(records), arrays.vectors(features), stride, cap, count, g.width, g.height]
+    return [
+        arrays.vectors(records),
+        arrays.vectors(features),
+        stride,
+        cap,
+        count,
+        g.width,
+        g.height,
+    ]
 
 
 def _projection(arrays: _Arrays, K: Tensor, w2c: Tensor, count: int, g: Geometry) -> list:
     """What all projection kernels take after the Gaussians."""
     preset = g.preset
-    settings = _vector(4, arrays.scalar)(preset.near, CLAMP_MARGIN, preset.extent, float(preset.square))
-    return [arrays.matrices(K), arrays.matrices(w2c), _integers(g.state_index), settings, count, g.width, g.height]
+    settings = _vector(4, arrays.scalar)(
+        preset.near, CLAMP_MARGIN, preset.extent, float(preset.square)
+    )
+    return [
+        arrays.matrices(K),
+        arrays.matrices(w2c),
+        _integers(g.state_index),
+        settings,
+        count,
+        g.width,
+        g.height,
+    ]

@@ -11,7 +11,16 @@ import functools
 
 import warp as wp
 
-from mosa.rendering.lanes import add_sums, any_lane, ballot, from_lane, highest, lane_count, lane_of, lowest
+from mosa.rendering.lanes import (
+    add_sums,
+    any_lane,
+    ballot,
+    from_lane,
+    highest,
+    lane_count,
+    lane_of,
+    lowest,
+)
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.raster_kernels import STOP
 from mosa.rendering.records import record_functions, record_type
@@ -59,7 +68,10 @@ def reach_function(dtype: type):
             dy = wp.clamp(zero, top, bottom)
             v = wp.clamp(-b * dx / c, top, bottom)
             u = wp.clamp(-b * dy / a, left, right)
-            least = wp.min(a * dx * dx + dtype(2.0) * b * dx * v + c * v * v, a * u * u + dtype(2.0) * b * u * dy + c * dy * dy)
+            least = wp.min(
+                a * dx * dx + dtype(2.0) * b * dx * v + c * v * v,
+                a * u * u + dtype(2.0) * b * u * dy + c * dy * dy,
+            )
             far_x = wp.max(wp.abs(left), wp.abs(right))
             far_y = wp.max(wp.abs(top), wp.abs(bottom))
             slack = dtype(ROUNDING) * (dtype(1.0) + a * far_x * far_x + c * far_y * far_y)
@@ -82,7 +94,9 @@ def tile_kernels(dtype: type, channels: int, exact: bool = False):
     reaches = reach_function(dtype)
     add_to_gradients = add_sums(dtype, channels, exact)
     sums = wp.array2d(dtype=wp.int64)
-    to_records, to_features = (sums, sums) if exact else (wp.array(dtype=record), wp.array(dtype=vecc))
+    to_records, to_features = (
+        (sums, sums) if exact else (wp.array(dtype=record), wp.array(dtype=vecc))
+    )
 
     @wp.func
     def block_of(thread: int, width: int, height: int):
@@ -233,7 +247,9 @@ def tile_kernels(dtype: type, channels: int, exact: bool = False):
                             gq = dtype(-0.5) * alpha * (own * T - behind * unfold)
                         behind += weight * own
                     d = from_center(r, x, y)
-                    moment = gq * vec6(dtype(1.0), d[0], d[1], d[0] * d[0], d[0] * d[1], d[1] * d[1])
+                    moment = gq * vec6(
+                        dtype(1.0), d[0], d[1], d[0] * d[0], d[0] * d[1], d[1] * d[1]
+                    )
                     add_to_gradients(thread, moment, weight, g, moments, k, grad_features, f)
             at -= lane_count()
 

@@ -29,11 +29,20 @@ def list_kernels(dtype: type):
         rect = pixels(r)
         result = wp.vec4i(0, 0, 0, 0)
         if rect[1] > rect[0] and rect[3] > rect[2]:
-            result = wp.vec4i(rect[0] // TILE, (rect[1] - 1) // TILE + 1, rect[2] // TILE, (rect[3] - 1) // TILE + 1)
+            result = wp.vec4i(
+                rect[0] // TILE,
+                (rect[1] - 1) // TILE + 1,
+                rect[2] // TILE,
+                (rect[3] - 1) // TILE + 1,
+            )
         return result
 
     @wp.kernel(enable_backward=False, module="unique")
-    def count(order: wp.array(dtype=wp.int32), records: wp.array(dtype=record), numbers: wp.array(dtype=wp.int32)):
+    def count(
+        order: wp.array(dtype=wp.int32),
+        records: wp.array(dtype=record),
+        numbers: wp.array(dtype=wp.int32),
+    ):
         k = wp.tid()
         tiles = touched(load(records, order[k]))
         numbers[k] = (tiles[1] - tiles[0]) * (tiles[3] - tiles[2])
@@ -74,18 +83,31 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     images, gaussians, _ = records.shape
     number, columns, rows = images * gaussians, -(-width // TILE), -(-height // TILE)
     last = images * rows * columns
-    counted("rasterize: Gaussians, or tiles, of all images", [max(number, last)], "render fewer at once", most=ENTRIES_MAX)  # int32
+    counted(
+        "rasterize: Gaussians, or tiles, of all images",
+        [max(number, last)],
+        "render fewer at once",
+        most=ENTRIES_MAX,
+    )  # int32
     device = wp.device_from_torch(records.device)
     scalar = wp.dtype_from_torch(records.dtype)
     count, emit = list_kernels(scalar)
     order = torch.arange(2 * number, dtype=torch.int32, device=records.device)
     wp.utils.radix_sort_pairs(wp.from_torch(depths), wp.from_torch(order), number)
     numbers = torch.empty(number, dtype=torch.int32, device=records.device)
-    given = [_descriptor(order), wp.from_torch(records.view(-1, 8), dtype=record_type(scalar), return_ctype=True)]
+    given = [
+        _descriptor(order),
+        wp.from_torch(records.view(-1, 8), dtype=record_type(scalar), return_ctype=True),
+    ]
     wp.launch(count, dim=number, inputs=given, outputs=[_descriptor(numbers)], device=device)
     ends = numbers.cumsum(0, dtype=torch.int64)
     total = int(ends[-1])
-    counted("rasterize: pairs of a Gaussian and a tile", [total], "render fewer images at once", most=ENTRIES_MAX)
+    counted(
+        "rasterize: pairs of a Gaussian and a tile",
+        [total],
+        "render fewer images at once",
+        most=ENTRIES_MAX,
+    )
     tiles, entries = torch.empty(2, 2 * total, dtype=torch.int32, device=records.device)
     wp.launch(
         emit,
@@ -94,7 +116,9 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
         outputs=[_descriptor(tiles), _descriptor(entries)],
         device=device,
     )
-    wp.utils.radix_sort_pairs(wp.from_torch(tiles), wp.from_torch(entries), total, end_bit=last.bit_length())
+    wp.utils.radix_sort_pairs(
+        wp.from_torch(tiles), wp.from_torch(entries), total, end_bit=last.bit_length()
+    )
     marks = torch.arange(last + 1, dtype=torch.int32, device=records.device)
     starts = torch.searchsorted(tiles[:total], marks, out_int32=True)
     return entries[:total].clone(), starts  # half as long as what sorting needed

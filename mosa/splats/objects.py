@@ -48,7 +48,11 @@ HALF_CELL = 0.35
 
 
 def read_object(
-    path: str | Path, *, box: Sequence[Sequence[float]] | None = None, opacity: float = 0.1, size: float | None = None
+    path: str | Path,
+    *,
+    box: Sequence[Sequence[float]] | None = None,
+    opacity: float = 0.1,
+    size: float | None = None,
 ) -> Appearance:
     """The Gaussians of a 3DGS PLY that are the object.
 
@@ -60,14 +64,23 @@ def read_object(
     if box is not None:
         corners = numbers("box", box, "two corners [[x, y, z], [x, y, z]], min below max")
         if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
-            raise ConfigError(f"box: expected two corners [[x, y, z], [x, y, z]], min below max, found {box}")
+            raise ConfigError(
+                f"box: expected two corners [[x, y, z], [x, y, z]], min below max, found {box}"
+            )
         chosen &= ((splats.means > corners[0]) & (splats.means < corners[1])).all(1)
     if int(chosen.sum()) < 100:
-        low, high = ([round(v, 3) for v in x.tolist()] for x in (splats.means.amin(0), splats.means.amax(0)))
+        low, high = (
+            [round(v, 3) for v in x.tolist()] for x in (splats.means.amin(0), splats.means.amax(0))
+        )
         where = "" if box is None else " in the box"
-        raise DataError(f"{path}: expected at least 100 Gaussians of an opacity of {opacity:g} or more{where}, found "
-                        f"{int(chosen.sum())} of {len(chosen)}; the file spans {low} to {high}")
-    splats, harmonics = Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats))), harmonics[chosen]
+        raise DataError(
+            f"{path}: expected at least 100 Gaussians of an opacity of {opacity:g} or more{where}, found "
+            f"{int(chosen.sum())} of {len(chosen)}; the file spans {low} to {high}"
+        )
+    splats, harmonics = (
+        Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats))),
+        harmonics[chosen],
+    )
     if size is not None:
         factor = size / float((splats.means.amax(0) - splats.means.amin(0)).max())
         splats = replace(splats, means=factor * splats.means, scales=factor * splats.scales)
@@ -75,8 +88,15 @@ def read_object(
 
 
 def fill_object(
-    appearance: Appearance, *, particles: int | None, dx: float | None = None, per_cell: float = PER_CELL, most: int = FEW,
-    resolution: int = 80, share: float = 0.9, open_below: Tensor | None = None,
+    appearance: Appearance,
+    *,
+    particles: int | None,
+    dx: float | None = None,
+    per_cell: float = PER_CELL,
+    most: int = FEW,
+    resolution: int = 80,
+    share: float = 0.9,
+    open_below: Tensor | None = None,
 ) -> tuple[dict[str, Tensor], Appearance, float]:
     """(tensors of a body of about so many particles inside the Gaussians, the Gaussians that belong to it, grid spacing [m]).
 
@@ -84,9 +104,15 @@ def fill_object(
     resolution, share: as `solid_of` takes them; open_below: up (3,), where the underside is open. Errors: DataError.
     """
     solid = solid_of(appearance.splats, resolution=resolution, share=share, up=open_below)
-    spacing = filling_spacing(solid, particles, per_cell=per_cell, most=most) if dx is None else dx / grid_spacing(1.0, per_cell)
+    spacing = (
+        filling_spacing(solid, particles, per_cell=per_cell, most=most)
+        if dx is None
+        else dx / grid_spacing(1.0, per_cell)
+    )
     found = fill(solid, spacing=spacing)
-    near = torch.from_numpy(cKDTree(found.positions.numpy()).query(appearance.splats.means.numpy())[0])
+    near = torch.from_numpy(
+        cKDTree(found.positions.numpy()).query(appearance.splats.means.numpy())[0]
+    )
     kept = near < NEAR * found.spacing
     splats = Splats(*(getattr(appearance.splats, f.name)[kept] for f in fields(Splats)))
     n = len(found.positions)
@@ -126,8 +152,16 @@ def object_twin(
     if direction.shape != (3,) or not float(direction.norm()) > 0:
         raise ConfigError(f"up: expected a direction (x, y, z), found {list(up)}")
     direction = direction / direction.norm()
-    tensors, shown, cell = fill_object(appearance, particles=particles, dx=dx, per_cell=per_cell, most=most, resolution=resolution,
-                                       share=share, open_below=direction if open_below else None)
+    tensors, shown, cell = fill_object(
+        appearance,
+        particles=particles,
+        dx=dx,
+        per_cell=per_cell,
+        most=most,
+        resolution=resolution,
+        share=share,
+        open_below=direction if open_below else None,
+    )
     rest = tensors["rest"]
     learned = law if isinstance(law, Twin) else None
     cfg = copy.deepcopy(dict(learned.config["cfg"] if learned is not None else law))
@@ -138,7 +172,14 @@ def object_twin(
              "box": [(rest.amin(0) - room).tolist(), (rest.amax(0) + room).tolist()]}  # fmt: skip
     if density is None:
         density = learned.body.density if learned is not None else 1000.0
-    config = {"cfg": cfg, "world": world, "density": density, "dx": cell, "frame_dt": frame_dt, "starts": {}}
+    config = {
+        "cfg": cfg,
+        "world": world,
+        "density": density,
+        "dx": cell,
+        "frame_dt": frame_dt,
+        "starts": {},
+    }
     body = build_body(config, tensors)
     if learned is not None:
         take_law(body, learned.body)
@@ -151,10 +192,16 @@ def object_twin(
 def take_law(body: Body, learned: Body) -> None:
     """Material, adapter and contact of another body, calibrated variants included; a stiffness field stays with its own."""
     foreign = ("heterogeneity", "rest", "volume", "colors", "opacities", "covariances")
-    state = {k: v for k, v in learned.state_dict().items() if not any(part in foreign for part in k.split("."))}
+    state = {
+        k: v
+        for k, v in learned.state_dict().items()
+        if not any(part in foreign for part in k.split("."))
+    }
     missing, unexpected = body.load_state_dict(state, strict=False)
     if unexpected or [name for name in missing if name not in foreign]:
-        raise DataError(f"ckpt_path: expected a law that fits the object, found {unexpected or missing}")
+        raise DataError(
+            f"ckpt_path: expected a law that fits the object, found {unexpected or missing}"
+        )
 
 
 def save_twin(twin: Twin, path: str | Path) -> Path:
@@ -176,7 +223,9 @@ def drop(cfg: DictConfig) -> None:
     """`python -m mosa.splats`: fill the Gaussians of a file, let them fall, write frames, video and a checkpoint of the body."""
     quiet()
     if OmegaConf.is_missing(cfg, "ply"):
-        raise ConfigError("ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply")
+        raise ConfigError(
+            "ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply"
+        )
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
     check_splats(values)
@@ -187,13 +236,23 @@ def drop(cfg: DictConfig) -> None:
     particles = None if simulation["particles"] == "auto" else simulation["particles"]
     grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
             "most": most_particles(device)}  # fmt: skip
-    twin = object_twin(found, law, frame_dt=1 / cfg.rate, **grid, **{name: values[name] for name in names})
+    twin = object_twin(
+        found, law, frame_dt=1 / cfg.rate, **grid, **{name: values[name] for name in names}
+    )
     twin.body.to(device)
     volume, size = float(twin.body.volume.sum()), twin.body.size
-    log.info("object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long", len(twin.body.splats), len(twin.body.rest), 1e6 * volume,
-             size)
+    log.info(
+        "object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long",
+        len(twin.body.splats),
+        len(twin.body.rest),
+        1e6 * volume,
+        size,
+    )
     save_twin(twin, folder / "checkpoints" / "last.ckpt")
-    rollout = twin.simulate(frames=cfg.frames, progress=True,
-                            **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")})
+    rollout = twin.simulate(
+        frames=cfg.frames,
+        progress=True,
+        **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")},
+    )
     twin.export(rollout, folder, video=cfg.video, title="object", formats=values["formats"])
     log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)

@@ -26,7 +26,9 @@ def settle_caches() -> None:
         if not os.path.isabs(os.environ.get(name, os.sep)):
             del os.environ[name]
     name = "WARP_CACHE_PATH" if "WARP_CACHE_PATH" in os.environ else "XDG_CACHE_HOME"
-    place = os.path.join(os.environ.get("WARP_CACHE_PATH", os.path.join(cache_home(), "warp")), version("warp-lang"))
+    place = os.path.join(
+        os.environ.get("WARP_CACHE_PATH", os.path.join(cache_home(), "warp")), version("warp-lang")
+    )
     try:
         os.makedirs(place, exist_ok=True)
     except OSError as error:
@@ -34,5 +36,9 @@ def settle_caches() -> None:
         os.environ[name] = _temporary[-1].name
         print(f"{place}: cannot be made ({error.strerror}): kernels are compiled into a temporary folder, again by every command; "
               f"set {name} to a folder that can be written", file=sys.stderr)  # fmt: skip
-    for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR"):  # by themselves not below XDG_CACHE_HOME
+    for name in (
+        "CUDA_CACHE_PATH",
+        "TRITON_CACHE_DIR",
+        "TORCHINDUCTOR_CACHE_DIR",
+    ):  # by themselves not below XDG_CACHE_HOME
         os.environ.setdefault(name, os.path.join(cache_home(), "mosa", name.lower()))

@@ -29,16 +29,23 @@ def counted(where: str, sizes: Iterable[float], remedy: str, *, each: float = 8,
             error: type[MosaError] = ConfigError) -> tuple[int, ...]:  # fmt: skip
     """Sizes (whole numbers) of an array that is about to be allocated. Their product is compared in floating point, before they
     become integers, which would wrap. It may be `most`, and as many of `each` bytes as fill half of the memory. Errors: `error`."""
-    sizes, most = [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes], min(most, machine_memory() / (2 * each))
+    sizes, most = (
+        [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes],
+        min(most, machine_memory() / (2 * each)),
+    )
     if not math.prod(map(float, sizes)) <= most:  # as NaN is not
-        raise error(f"{where}: expected at most {int(most)}, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}")
+        raise error(
+            f"{where}: expected at most {int(most)}, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}"
+        )
     return tuple(map(int, sizes))
 
 
 def named_device(name: str | torch.device) -> str:
     """The name of a device that torch can use here. Errors: ConfigError."""
     wanted = "device: expected cpu, or cuda on a machine with a GPU, found"
-    if not isinstance(name, (str, torch.device)) or (str(name) != "cpu" and str(name).split(":")[0] != "cuda"):
+    if not isinstance(name, (str, torch.device)) or (
+        str(name) != "cpu" and str(name).split(":")[0] != "cuda"
+    ):
         raise ConfigError(f"{wanted} {name!r}")
     try:
         torch.empty(0, device=name)

@@ -17,12 +17,25 @@ def check_ply(path: Path) -> None:
         head = file.read(HEADER)
     header, end, _ = head.partition(b"end_header")
     if not head.startswith(b"ply") or not end:
-        raise DataError(f"{path}: expected a PLY file, found none (no header from ply to end_header in its first {HEADER} bytes)")
+        raise DataError(
+            f"{path}: expected a PLY file, found none (no header from ply to end_header in its first {HEADER} bytes)"
+        )
     element, properties = b"", 0
     for line in header.splitlines():
         words = line.split()
-        element, properties = (line, 0) if words[:1] == [b"element"] else (element, properties + (words[:1] == [b"property"]))
+        element, properties = (
+            (line, 0)
+            if words[:1] == [b"element"]
+            else (element, properties + (words[:1] == [b"property"]))
+        )
         words = element.split()  # each of its properties takes a byte at least
-        if words and (len(words) != 3 or not words[2].isdigit() or len(words[2]) > 18 or int(words[2]) * max(properties, 1) > size):
-            raise DataError(f"{path}: expected a PLY file whose elements fit into its {size} bytes, found "
-                            f"{element[:80].decode(errors='replace')!r}")
+        if words and (
+            len(words) != 3
+            or not words[2].isdigit()
+            or len(words[2]) > 18
+            or int(words[2]) * max(properties, 1) > size
+        ):
+            raise DataError(
+                f"{path}: expected a PLY file whose elements fit into its {size} bytes, found "
+                f"{element[:80].decode(errors='replace')!r}"
+            )

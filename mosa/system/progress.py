@@ -16,7 +16,12 @@ class tqdm(bar):
     def __init__(self, *args, **options) -> None:
         self.lines, self.said = not (options.get("file") or sys.stderr).isatty(), None
         if self.lines:  # ncols=0: figures without the bar
-            options |= {"mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS, "ncols": 0, "dynamic_ncols": False}
+            options |= {
+                "mininterval": LINE_SECONDS,
+                "maxinterval": LINE_SECONDS,
+                "ncols": 0,
+                "dynamic_ncols": False,
+            }
         super().__init__(*args, **options)
 
     def display(self, msg=None, pos=None) -> bool:

@@ -21,11 +21,15 @@ NO_MEMORY = re.compile(r"can(no|')t allocate memory|out of memory|failed to allo
                        r"insufficient memory|memoryallocation|std::bad_array_new_length", re.IGNORECASE)  # fmt: skip
 """What torch, CUDA's libraries, Warp, OpenCV and the system's loader of libraries say where the machine, or a GPU, has no more:
 errors of types that are also others'."""
-OF_A_GPU = re.compile(r"cuda|cublas|cudnn|cusolver|cusparse|cufft|curand|nvrtc|nccl|\bgpu\b", re.IGNORECASE)
+OF_A_GPU = re.compile(
+    r"cuda|cublas|cudnn|cusolver|cusparse|cufft|curand|nvrtc|nccl|\bgpu\b", re.IGNORECASE
+)
 LEAST = 0.5e9
 """Bytes that are free on a GPU at least, where an error of its libraries that names no memory is about something else: a library's
 handle, a context or a module that finds no room says that it is not initialised, or fails to load."""
-UNLOADABLE = re.compile(r"Failed to (load C(PU|UDA) module|find (forward|backward) kernel)|was not found in the cache")
+UNLOADABLE = re.compile(
+    r"Failed to (load C(PU|UDA) module|find (forward|backward) kernel)|was not found in the cache"
+)
 """What Warp says of a compiled kernel that it cannot use."""
 LAST = Path("checkpoints", "last.ckpt")
 """Of a run, in its folder."""
@@ -35,13 +39,23 @@ def disk_message(error: OSError) -> str | None:
     """One sentence on what the disk refused; None for any other error."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
-    if error.errno == errno.ENOENT and isinstance(error.filename, (str, os.PathLike)) and not Path(error.filename).parent.is_dir():
+    if (
+        error.errno == errno.ENOENT
+        and isinstance(error.filename, (str, os.PathLike))
+        and not Path(error.filename).parent.is_dir()
+    ):
         return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
     if error.errno not in DISK:
         return None
-    keys = "XDG_CACHE_HOME" if str(error.filename).startswith(cache_home()) else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
-    return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
-            f"{keys}")
+    keys = (
+        "XDG_CACHE_HOME"
+        if str(error.filename).startswith(cache_home())
+        else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
+    )
+    return (
+        f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
+        f"{keys}"
+    )
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -55,7 +69,9 @@ def gpu_memory() -> tuple[float, float] | None:
     """Bytes (free, in all) of the GPU that this process computes on; None without one, or where it does not answer any more."""
     torch = sys.modules.get("torch")
     try:
-        return torch.cuda.mem_get_info() if torch is not None and torch.cuda.is_initialized() else None
+        return (
+            torch.cuda.mem_get_info() if torch is not None and torch.cuda.is_initialized() else None
+        )
     except Exception:  # a GPU that has no memory for the question either
         return None
 
@@ -85,21 +101,30 @@ def memory_message(error: BaseException) -> str | None:
         return f"{told}; lower the sizes (simulation.particles, scene.scale)"
     room = gpu_memory()
     free = "" if room is None else f"; {room[0] / 1e9:.1f} of {room[1] / 1e9:.1f} GB are free"
-    return (f"the GPU has no memory left ({told}{free}); stop what else runs there, lower simulation.particles or scene.scale, or "
-            "take trainer=cpu (eval.py and others: device=cpu)")
+    return (
+        f"the GPU has no memory left ({told}{free}); stop what else runs there, lower simulation.particles or scene.scale, or "
+        "take trainer=cpu (eval.py and others: device=cpu)"
+    )
 
 
 def kernels_message(error: BaseException) -> str | None:
     """One sentence on compiled kernels that a killed compiler or a full disk left damaged; None for any other error, as one of the
     compiler is: that is a mistake of the program."""
     for one in causes(error):
-        files = (Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(one.__traceback__))
+        files = (
+            Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(one.__traceback__)
+        )
         said = UNLOADABLE.search(str(one)) or isinstance(one, JSONDecodeError)
         if said and any(file.match("warp/*/context.py") for file in files):
             warp = sys.modules.get("warp")
-            place = getattr(getattr(warp, "config", None), "kernel_cache_dir", None) or "the folder warp of the cache"
-            return (f"{place}: expected kernels as they were compiled, found some that cannot be loaded "
-                    f"({' '.join(str(one).split())[:120]}); remove that folder, and they are compiled again")
+            place = (
+                getattr(getattr(warp, "config", None), "kernel_cache_dir", None)
+                or "the folder warp of the cache"
+            )
+            return (
+                f"{place}: expected kernels as they were compiled, found some that cannot be loaded "
+                f"({' '.join(str(one).split())[:120]}); remove that folder, and they are compiled again"
+            )
     return None
 
 
@@ -116,7 +141,9 @@ def explained(error: Exception, folder: str | Path | None = None) -> str | None:
         return None if kernels is None else f"DataError: {kernels}"
     last = None if folder is None else Path(folder) / LAST
     if last is not None and last.is_file():
-        reason += f"; the fit is kept in {last}, and the same command with resume=auto goes on from there"
+        reason += (
+            f"; the fit is kept in {last}, and the same command with resume=auto goes on from there"
+        )
     return f"MemoryError: {reason}"
 
 

@@ -30,7 +30,9 @@ class Outlived:
             return act()
         except OSError:
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self.stream.fileno())  # also for what runs below this process, and for what is still in the buffer
+            os.dup2(
+                nowhere, self.stream.fileno()
+            )  # also for what runs below this process, and for what is still in the buffer
             os.close(nowhere)
             return otherwise
 
@@ -39,7 +41,9 @@ class Outlived:
 def outlived() -> Iterator[None]:
     """Standard output and error may lose their readers meanwhile; where there are none (`>&-`) there are some that go nowhere."""
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (Outlived(open(os.devnull, "w") if stream is None else stream) for stream in before)
+    sys.stdout, sys.stderr = (
+        Outlived(open(os.devnull, "w") if stream is None else stream) for stream in before
+    )
     try:
         yield
     finally:

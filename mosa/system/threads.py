@@ -20,13 +20,18 @@ def settle_threads() -> None:
     if re.fullmatch(r"[1-9]\d*(\s*,\s*[1-9]\d*)*", given, re.ASCII):
         return
     if given:
-        print(f"OMP_NUM_THREADS: expected a whole number above 0, found {given[:40]!r}: one thread is used", file=sys.stderr)
+        print(
+            f"OMP_NUM_THREADS: expected a whole number above 0, found {given[:40]!r}: one thread is used",
+            file=sys.stderr,
+        )
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
     """function(item) of each item, in their order, on as many threads as this process has cores."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     workers = min(len(items), cores)
     if workers <= 1:
         yield from map(function, items)

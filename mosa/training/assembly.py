@@ -1,8 +1,8 @@
 """A run put together from its configuration, in one place: what train.py fits, and what tests and benchmarks measure.
 
-    run = assemble(cfg)
-    run.module          # the LightningModule, with its body, what it learns from and its stages
-    run.data            # the data module that it was made of; nothing is made before it is asked for
+run = assemble(cfg)
+run.module          # the LightningModule, with its body, what it learns from and its stages
+run.data            # the data module that it was made of; nothing is made before it is asked for
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def assemble(cfg: DictConfig, device: torch.device | str = "cpu", *, held_out: b
 class Run:
     """Data module and module of a run, each made when it is first asked for."""
 
-    def __init__(self, cfg: DictConfig, device: torch.device | str = "cpu", held_out: bool = True) -> None:
+    def __init__(
+        self, cfg: DictConfig, device: torch.device | str = "cpu", held_out: bool = True
+    ) -> None:
         self.cfg, self.device = cfg, device
         self.data = SceneDataModule(cfg, device=device, held_out=held_out)
 

@@ -26,7 +26,9 @@ log = logging.getLogger(__name__)
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes beside the target, flushes to the disk and renames: a run killed while it saves leaves the last checkpoint whole."""
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
@@ -51,13 +53,17 @@ class KeepLast(Checkpoint):
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
         root = Path(trainer.default_root_dir)
-        self.path = (root / "checkpoints" if self.folder is None else Path(self.folder)) / "last.ckpt"
+        self.path = (
+            root / "checkpoints" if self.folder is None else Path(self.folder)
+        ) / "last.ckpt"
 
     def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
         """The figures of an earlier run in this folder go: they would say that this one is complete."""
         (Path(trainer.default_root_dir) / "metrics.json").unlink(missing_ok=True)
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         """Within an epoch; at its end, and at that of a stage, the next hook saves what the next epoch begins with."""
         if not (trainer.fit_loop.epoch_loop.batch_progress.is_last_batch or module.stage_over):
             trainer.save_checkpoint(self.path)
@@ -73,14 +79,24 @@ class FitProgress(L.Callback):
         self.bar: tqdm | None = None
         self.shown: int | None = None  # number of the stage
 
-    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(
+        self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
+    ) -> None:
         if module.stage is not None and self.shown != module.stage_index:
             self._close()
             self.shown = module.stage_index
-            self.bar = tqdm(total=module.stage.iterations, initial=len(module.losses), desc=f"fit {module.stage.name}", unit="it",
-                            dynamic_ncols=True, mininterval=2.0)
+            self.bar = tqdm(
+                total=module.stage.iterations,
+                initial=len(module.losses),
+                desc=f"fit {module.stage.name}",
+                unit="it",
+                dynamic_ncols=True,
+                mininterval=2.0,
+            )
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         if self.bar is not None:
             self.bar.set_postfix(figures_of(module.last), refresh=False)
             self.bar.update()
@@ -100,7 +116,9 @@ class FitProgress(L.Callback):
 def figures_of(last: dict[str, float]) -> dict[str, str]:
     """Loss and parameters of the last step, as they are shown."""
     found = {"loss": f"{last['loss/total']:.5f}"} if "loss/total" in last else {}
-    return found | {k.removeprefix("id/"): f"{v:.4g}" for k, v in last.items() if k.startswith("id/")}
+    return found | {
+        k.removeprefix("id/"): f"{v:.4g}" for k, v in last.items() if k.startswith("id/")
+    }
 
 
 class StageNotes(L.Callback):
@@ -110,7 +128,9 @@ class StageNotes(L.Callback):
         self.stage: Stage | None = None
         self.began, self.steps = 0.0, 0
 
-    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(
+        self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
+    ) -> None:
         if self.stage is not None and module.stage is not self.stage:  # ended by a callback
             self._note(module)
         if module.stage is not None and self.stage is None:
@@ -118,7 +138,9 @@ class StageNotes(L.Callback):
             done = f", going on after {len(module.losses)}" if module.losses else ""
             log.info("stage %s: at most %d steps%s", self.stage.name, self.stage.iterations, done)
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         self.steps += 1
         if self.stage is not None and module.stage_over:
             self._note(module)
@@ -142,14 +164,29 @@ class Pace(L.Callback):
     def __init__(self) -> None:
         self.began, self.rates = 0.0, dict[str, float]()
 
-    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(
+        self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
+    ) -> None:
         self.began = time.perf_counter()
-        self.rates = {} if module.stage is None or module.stage.newton else {
-            f"lr/{group['name']}": group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups}
+        self.rates = (
+            {}
+            if module.stage is None or module.stage.newton
+            else {
+                f"lr/{group['name']}": group["lr"]
+                for optimizer in trainer.optimizers
+                for group in optimizer.param_groups
+            }
+        )
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         values = {"time/step_s": time.perf_counter() - self.began} | self.rates
-        module.log_dict({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
+        module.log_dict(
+            {k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()},
+            on_step=True,
+            on_epoch=False,
+        )
 
 
 class ImageStrips(L.Callback):
@@ -158,10 +195,14 @@ class ImageStrips(L.Callback):
     def __init__(self, every: int) -> None:
         self.every = every
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         shown = [each for each in module.loggers if isinstance(each, PICTURED)]
         if shown and self.every > 0 and module.steps_done % self.every == 0:
-            add_picture(shown, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
+            add_picture(
+                shown, "real_above_rendered_below", enlarged(module.strip()), module.steps_done
+            )
 
 
 LEGIBLE = 320

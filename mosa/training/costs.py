@@ -105,8 +105,13 @@ def particle_bytes(cfg: Mapping[str, Any], size: Size) -> float:
     """Bytes of a particle in that part of the run that takes most."""
     settings = cfg["reconstruction"]
     modes = settings["dynamic"]["modes"]
-    found = PAIR_BYTES * settings["neighbours"] ** 2 + MODE_BYTES * modes + FRAME_BYTES * size.frames
-    kept = FRAME_BYTES * 3 * size.sequences * size.frames + 12 * (DRAWS + len(RIVALS)) * size.sequences * size.frames
+    found = (
+        PAIR_BYTES * settings["neighbours"] ** 2 + MODE_BYTES * modes + FRAME_BYTES * size.frames
+    )
+    kept = (
+        FRAME_BYTES * 3 * size.sequences * size.frames
+        + 12 * (DRAWS + len(RIVALS)) * size.sequences * size.frames
+    )
     return 1500 + max(found, cores() * FRAME_BYTES * size.frames + 1500, kept)
 
 
@@ -125,24 +130,34 @@ def check_memory(cfg: Mapping[str, Any], size: Size) -> float:
     most = int((there - empty) / particle_bytes(cfg, size))
     if most < 8 and empty < 0.5 * there:
         settings = cfg["reconstruction"]
-        raise ConfigError(f"reconstruction.neighbours: {settings['neighbours']}, with reconstruction.dynamic.modes of "
-                          f"{settings['dynamic']['modes']}, take {particle_bytes(cfg, size) / 1e9:.2g} GB for each particle, of "
-                          f"this machine's {there / 1e9:.1f} GB; lower them")
+        raise ConfigError(
+            f"reconstruction.neighbours: {settings['neighbours']}, with reconstruction.dynamic.modes of "
+            f"{settings['dynamic']['modes']}, take {particle_bytes(cfg, size) / 1e9:.2g} GB for each particle, of "
+            f"this machine's {there / 1e9:.1f} GB; lower them"
+        )
     if most < 8:
-        raise ConfigError(f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of {size.pixels} px take "
-                          f"{empty / 1e9:.1f} GB, which this machine's {there / 1e9:.1f} GB do not hold; lower scene.scale, or "
-                          "restrict scene.frames")
+        raise ConfigError(
+            f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of {size.pixels} px take "
+            f"{empty / 1e9:.1f} GB, which this machine's {there / 1e9:.1f} GB do not hold; lower scene.scale, or "
+            "restrict scene.frames"
+        )
     if cfg["simulation"]["dx"] is not None:
         dx = cfg["simulation"]["dx"]
-        raise ConfigError(f"simulation.dx: {dx} m make about {size.particles} particles and take {wanted / 1e9:.1f} GB; this "
-                          f"machine has {there / 1e9:.1f} GB; expected at most {most} particles, a spacing of "
-                          f"{dx * (size.particles / most) ** (1 / 3):.3g} m")
-    raise ConfigError(f"simulation.particles: {size.particles} take about {wanted / 1e9:.1f} GB, this machine has "
-                      f"{there / 1e9:.1f} GB; expected at most {most}")
+        raise ConfigError(
+            f"simulation.dx: {dx} m make about {size.particles} particles and take {wanted / 1e9:.1f} GB; this "
+            f"machine has {there / 1e9:.1f} GB; expected at most {most} particles, a spacing of "
+            f"{dx * (size.particles / most) ** (1 / 3):.3g} m"
+        )
+    raise ConfigError(
+        f"simulation.particles: {size.particles} take about {wanted / 1e9:.1f} GB, this machine has "
+        f"{there / 1e9:.1f} GB; expected at most {most}"
+    )
 
 
 # ------------------------------------------------------------------------------------------------ calibration
-def size_of(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, most: int) -> tuple[Size, float]:
+def size_of(
+    cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, most: int
+) -> tuple[Size, float]:
     """The run's size, and the radius [m] of the object as frame 0 shows it. most: particles where their number is left open."""
     chosen, origins, directions, tangents = lines_of_sight(scene, 0)
     radius = float((scene.box[1] - scene.box[0]).min()) / 6
@@ -152,7 +167,9 @@ def size_of(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, most
     dx = cfg["simulation"]["dx"]
     particles = particles_of(cfg, most)
     if dx is not None:
-        particles = round(4.2 * min(radius / dx, 1e30) ** 3 * cfg["simulation"]["particles_per_cell"])
+        particles = round(
+            4.2 * min(radius / dx, 1e30) ** 3 * cfg["simulation"]["particles_per_cell"]
+        )
     cameras, frames, height, width = scene.images.shape[:4]
     return Size(int(particles), cameras, frames, height * width, 1 + others, taught), radius
 
@@ -160,7 +177,9 @@ def size_of(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, most
 def ball(count: int, radius: float) -> torch.Tensor:
     """(about count, 3) lattice points in a ball about the origin, and as evenly spread as a filling's."""
     spacing = radius * (4.19 / max(count, 8)) ** (1 / 3)
-    along = spacing * (torch.arange(2 * math.ceil(radius / spacing)) + 0.5 - math.ceil(radius / spacing))
+    along = spacing * (
+        torch.arange(2 * math.ceil(radius / spacing)) + 0.5 - math.ceil(radius / spacing)
+    )
     points = torch.cartesian_prod(along, along, along)
     inside = points[points.norm(dim=1) < radius]
     return inside if len(inside) >= 8 else points[:8]
@@ -171,13 +190,20 @@ def body_like(cfg: Mapping[str, Any], scene: Scene, count: int, radius: float) -
     points = ball(count, radius)
     n, spacing = len(points), (4.19 * radius**3 / len(points)) ** (1 / 3)
     covariances = (torch.eye(3) * (0.35 * spacing) ** 2).expand(n, 3, 3)
-    tensors = {"rest": points, "volume": torch.full((n,), spacing**3), "colors": torch.full((n, 3), 0.5),
-               "opacities": torch.full((n,), 0.8), "covariances": covariances}
+    tensors = {
+        "rest": points,
+        "volume": torch.full((n,), spacing**3),
+        "colors": torch.full((n, 3), 0.5),
+        "opacities": torch.full((n,), 0.8),
+        "covariances": covariances,
+    }
     dx = grid_spacing(spacing, cfg["simulation"]["particles_per_cell"])
     return build_body(run_config(dict(cfg), scene, dx), tensors)
 
 
-def speed_of_rollouts(body: Body, frame_dt: float, gravity: torch.Tensor, up: torch.Tensor) -> float:
+def speed_of_rollouts(
+    body: Body, frame_dt: float, gravity: torch.Tensor, up: torch.Tensor
+) -> float:
     """Seconds of a frame of frame_dt [s]: of two in free flight, corrected as the fit's are, after some that load the kernels."""
     world = World(None, gravity, up, torch.tensor([[-1e5] * 3, [1e5] * 3]))
     zero = torch.zeros_like(body.rest[0])
@@ -187,7 +213,15 @@ def speed_of_rollouts(body: Body, frame_dt: float, gravity: torch.Tensor, up: to
     with torch.no_grad():
         for _ in range(2):
             began = time.perf_counter()
-            body.simulate(start, world, 3, frame_dt, model=body.model().only(adapter=False), observed=seen, gain=0.1)
+            body.simulate(
+                start,
+                world,
+                3,
+                frame_dt,
+                model=body.model().only(adapter=False),
+                observed=seen,
+                gain=0.1,
+            )
             if body.rest.is_cuda:
                 torch.cuda.synchronize()
             took = (time.perf_counter() - began) / 2
@@ -197,20 +231,33 @@ def speed_of_rollouts(body: Body, frame_dt: float, gravity: torch.Tensor, up: to
 def speed_of_pictures(count: int, side: int, device: str) -> float:
     """Seconds of a picture of side x side px that a ball of `count` Gaussians nearly fills, forward and backward."""
     side = max(side, 16)
-    K = torch.tensor([[2.5 * side, 0.0, 0.5 * side], [0.0, 2.5 * side, 0.5 * side], [0.0, 0.0, 1.0]])
+    K = torch.tensor(
+        [[2.5 * side, 0.0, 0.5 * side], [0.0, 2.5 * side, 0.5 * side], [0.0, 0.0, 1.0]]
+    )
     w2c = torch.eye(4)
     w2c[2, 3] = 6.0
-    cameras = Cameras(torch.stack([K, K]), torch.stack([w2c, w2c]), side, side, ("a", "b")).to(device)
+    cameras = Cameras(torch.stack([K, K]), torch.stack([w2c, w2c]), side, side, ("a", "b")).to(
+        device
+    )
     points = ball(min(count, MEASURED), 1.0).to(device)
     n, background = len(points), torch.ones(3, device=device)
-    covariances = (torch.eye(3, device=device) * (0.35 * (4.19 / n) ** (1 / 3)) ** 2).expand(n, 3, 3).contiguous()
+    covariances = (
+        (torch.eye(3, device=device) * (0.35 * (4.19 / n) ** (1 / 3)) ** 2)
+        .expand(n, 3, 3)
+        .contiguous()
+    )
     state = torch.zeros(2, dtype=torch.long, device=device)
     took = []
     for _ in range(3):
         means = points.clone().requires_grad_(True)
-        opacities, colors = torch.full((n,), 0.8, device=device), torch.full((1, n, 3), 0.5, device=device).requires_grad_(True)
+        opacities, colors = (
+            torch.full((n,), 0.8, device=device),
+            torch.full((1, n, 3), 0.5, device=device).requires_grad_(True),
+        )
         began = time.perf_counter()
-        image, alpha = rasterize(means[None], covariances[None], opacities, colors, cameras, state, background)
+        image, alpha = rasterize(
+            means[None], covariances[None], opacities, colors, cameras, state, background
+        )
         (image.sum() + alpha.sum()).backward()
         if means.is_cuda:
             torch.cuda.synchronize()
@@ -241,22 +288,43 @@ def before_data(cfg: Mapping[str, Any], most: int) -> str:
     if cfg["simulation"]["dx"] is None:
         pixels = round((film.size * keys["scale"]) ** 2)
         taught = 1 + len(keys.get("also_train") or ())
-        check_memory(cfg, Size(particles_of(cfg, most), film.cameras, film.frames, pixels, len(names), taught))
-    made = [take_file(keys["name"], s, keys["material"], keys["seed"], keys.get("cache")).is_file() for s in names]
+        check_memory(
+            cfg,
+            Size(particles_of(cfg, most), film.cameras, film.frames, pixels, len(names), taught),
+        )
+    made = [
+        take_file(keys["name"], s, keys["material"], keys["seed"], keys.get("cache")).is_file()
+        for s in names
+    ]
     pixels = film.cameras * film.frames * film.size**2
-    seconds = 1.5 + 4e-8 * pixels * len(names) + 2.3e-7 * pixels * made.count(False) + (0 if all(made) else 6)
+    seconds = (
+        1.5
+        + 4e-8 * pixels * len(names)
+        + 2.3e-7 * pixels * made.count(False)
+        + (0 if all(made) else 6)
+    )
     return f"data: {len(names)} sequences, {made.count(False)} of them to be made, about {duration(seconds)}"
 
 
 def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     """About how many rollouts, one after another, a stage of Gauss-Newton takes at most."""
-    planned = Identification(module.body, module.takes, module.world, stage, module.criterion, module.settings, seats=0)
+    planned = Identification(
+        module.body, module.takes, module.world, stage, module.criterion, module.settings, seats=0
+    )
     columns = sum(b.size for b in planned.newton.blocks)
     together = SIDE_BY_SIDE if module.body.rest.is_cuda else planned.threads(columns)
-    each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
+    each = (
+        columns / together + 5
+    )  # the residuals, the noise, one or two steps that are tried, the distance
     begun = planned.calibrating and not stage.looks_again
-    contacts = (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3) if begun and module.ground_is_sought else 0
-    contacts += ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
+    contacts = (
+        (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3)
+        if begun and module.ground_is_sought
+        else 0
+    )
+    contacts += (
+        ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
+    )
     searched = rollouts_of_search(module.body.material.learned, each) if begun else 0
     return len(planned.pairs) * (stage.iterations * each + contacts + searched)
 
@@ -272,12 +340,20 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int) -> float:
     pictures = len(module.takes) * (frames - 1) * speeds.picture
     each = 0.7 * again.get("iterations", 0) * again.get("views", 1) * pictures
     total = KERNELS + looks * each
-    if each and again.get("response", 0) and any(stage.newton and not stage.calibrates for stage in module.stages):
+    if (
+        each
+        and again.get("response", 0)
+        and any(stage.newton and not stage.calibrates for stage in module.stages)
+    ):
         total += each + 0.15 * 3 * MODES * again["response"] * pictures
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0
-        total += newton_rollouts(module, stage) * rollout * stiff if stage.newton else stage.iterations * step * adapted
+        total += (
+            newton_rollouts(module, stage) * rollout * stiff
+            if stage.newton
+            else stage.iterations * step * adapted
+        )
     return total
 
 
@@ -287,23 +363,45 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
     lies in the cache."""
     settings, slow, picture = cfg["reconstruction"], speeds.relative, speeds.picture
     moving, dynamic = size.frames - 1, settings["dynamic"]
-    tracked = dynamic["track_iterations"] * moving * dynamic["track_views"] if dynamic["model"] == "modes" else 0
-    motion = 0.7 * picture * (tracked + dynamic["iterations"] * moving) + 1.2e-3 * slow * size.particles
-    pictures = sum(settings[part]["iterations"] * settings[part]["views"] for part in ("static", "appearance"))
+    tracked = (
+        dynamic["track_iterations"] * moving * dynamic["track_views"]
+        if dynamic["model"] == "modes"
+        else 0
+    )
+    motion = (
+        0.7 * picture * (tracked + dynamic["iterations"] * moving) + 1.2e-3 * slow * size.particles
+    )
+    pictures = sum(
+        settings[part]["iterations"] * settings[part]["views"] for part in ("static", "appearance")
+    )
     free = min(settings["geometry"]["frames"], size.frames // 2)
     still = slow * (5 + 4e-5 * size.cameras * free * window) + picture * pictures
     reconstruction = (1.0 if stored else still + motion) + (size.taught - 1) * motion
-    poses = (size.sequences - 1) * (0.5 + 3e-4 * size.cameras * window) + size.sequences * 4e-5 * size.cameras * window
+    poses = (size.sequences - 1) * (
+        0.5 + 3e-4 * size.cameras * window
+    ) + size.sequences * 4e-5 * size.cameras * window
     rollout = moving * speeds.frame
-    draws = DRAWS + len(RIVALS) if any(stage.newton and stage.learns_adapter for stage in module.stages) else 0
+    draws = (
+        DRAWS + len(RIVALS)
+        if any(stage.newton and stage.learns_adapter for stage in module.stages)
+        else 0
+    )
     count = min(size.particles, cfg["evaluation"]["assignment"])
     distances = 0.6 * size.frames * 0.02 + 4 * 0.4 * (count / 2048) ** 2.4
     shown = 3 * size.sequences * size.cameras * size.frames
     stiff = STIFFNESS_COST if module.body.adapter is not None else 1.0
     evaluation = (3 + cfg["evaluation"]["floor"] + draws) * size.sequences * rollout * stiff
-    evaluation += slow * (2 + 4 * size.sequences * distances / min(cores(), 4) + shown * 1e-7 * size.pixels) + 0.4 * picture * shown
+    evaluation += (
+        slow * (2 + 4 * size.sequences * distances / min(cores(), 4) + shown * 1e-7 * size.pixels)
+        + 0.4 * picture * shown
+    )
     fit = seconds_of_fit(module, speeds, size.frames)
-    return {"reconstruction": reconstruction, "starts": slow * poses, "fit": fit, "evaluation": evaluation}
+    return {
+        "reconstruction": reconstruction,
+        "starts": slow * poses,
+        "fit": fit,
+        "evaluation": evaluation,
+    }
 
 
 def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, device: str, *, stored: bool = False,
@@ -313,16 +411,27 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
     Errors: ConfigError where this machine's memory does not hold the run."""
     size, radius = size_of(cfg, scene, others, taught, most)
     memory = check_memory(cfg, size)
-    windows = object_windows(scene, scene.training_cameras, scene.training_frames[:1], margin=cfg["reconstruction"]["margin"])
+    windows = object_windows(
+        scene,
+        scene.training_cameras,
+        scene.training_frames[:1],
+        margin=cfg["reconstruction"]["margin"],
+    )
     window = windows.images.shape[1] * windows.images.shape[2]
     with torch.random.fork_rng(devices=[]):
         body = body_like(cfg, scene, min(size.particles, MEASURED), radius)
         config = run_config(dict(cfg), scene, body.settings.dx)
-        module = LitMosa.from_config(config, body, takes=[None] * taught, background=scene.background)
+        module = LitMosa.from_config(
+            config, body, takes=[None] * taught, background=scene.background
+        )
         try:
             frame_dt = float(scene.times[1] - scene.times[0])
-            frame = speed_of_rollouts(body.to(device), frame_dt, scene.gravity, scene.up) * max(1.0, size.particles / MEASURED)
-        except MosaError:  # a stand-in for the body: what is wrong with the real one is said where it is simulated
+            frame = speed_of_rollouts(body.to(device), frame_dt, scene.gravity, scene.up) * max(
+                1.0, size.particles / MEASURED
+            )
+        except (
+            MosaError
+        ):  # a stand-in for the body: what is wrong with the real one is said where it is simulated
             frame = math.inf
         reference = speed_of_pictures(3000, 76, device)
         picture = speed_of_pictures(cfg["reconstruction"]["points"], round(window**0.5), device)
@@ -339,7 +448,9 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
 class Costs:
     """Seconds by part, of which those that are done correct the others; memory [bytes] at most; speeds: what they come from."""
 
-    def __init__(self, parts: Mapping[str, float], memory: float, speeds: Speeds | None = None) -> None:
+    def __init__(
+        self, parts: Mapping[str, float], memory: float, speeds: Speeds | None = None
+    ) -> None:
         self.parts, self.memory, self.speeds = dict(parts), memory, speeds
         self.expected, self.took = 0.0, 0.0
 
@@ -358,7 +469,9 @@ class Costs:
     def said(self) -> str:
         """One line on what is still to come."""
         rest = self.rest()
-        return f"about {duration(sum(rest.values()))}: " + ", ".join(f"{name} {duration(s)}" for name, s in rest.items())
+        return f"about {duration(sum(rest.values()))}: " + ", ".join(
+            f"{name} {duration(s)}" for name, s in rest.items()
+        )
 
     def done(self, name: str, seconds: float) -> str:
         """One line when a part is done: what was expected, what is left."""

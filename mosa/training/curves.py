@@ -46,7 +46,10 @@ CURVES = (
 
 def table() -> str:
     """The curves in Markdown, as docs/figures.md has them."""
-    rows = [f"| `{curve.tag}` | {curve.unit} | {curve.what.replace('|', chr(92) + '|')} |" for curve in CURVES]
+    rows = [
+        f"| `{curve.tag}` | {curve.unit} | {curve.what.replace('|', chr(92) + '|')} |"
+        for curve in CURVES
+    ]
     return "\n".join(["| tag | unit | what |", "|---|---|---|", *rows])
 
 
@@ -57,7 +60,9 @@ def described(tag: str, law: str) -> str | None:
         if re.fullmatch(re.sub(r"<\w+>", ".+", curve.tag), tag):
             unit = unit_in(tag, law) if "<" in curve.tag else curve.unit
             name = tag.partition("/")[2]
-            named = curve.what.replace("parameter p ", f"parameter {name} ").replace("figure of ", f"figure {name} of ")
+            named = curve.what.replace("parameter p ", f"parameter {name} ").replace(
+                "figure of ", f"figure {name} of "
+            )
             return named if unit in ("", "-") else f"{named} [{unit}]"
     return None
 

@@ -114,7 +114,9 @@ class SceneDataModule(L.LightningDataModule):
         ]  # fmt: skip
         return served(given)
 
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
         """Sequences and starts stay where they are: what of them is needed on the device is brought there where it is needed."""
         return batch.to(device) if isinstance(batch, MotionBatch) else batch
 
@@ -152,8 +154,15 @@ class SceneDataModule(L.LightningDataModule):
         dx, particles, per_cell = settings.dx, settings.particles, settings.particles_per_cell
         if dx is not None:
             return float(dx / grid_spacing(1.0, per_cell))
-        return spacing_for(self.scene, None if particles == "auto" else particles, self.reconstruction_settings, per_cell=per_cell,
-                           most=most_particles(self.device or "cpu"), cache_dir=self.cache, device=self.device or "cpu")
+        return spacing_for(
+            self.scene,
+            None if particles == "auto" else particles,
+            self.reconstruction_settings,
+            per_cell=per_cell,
+            most=most_particles(self.device or "cpu"),
+            cache_dir=self.cache,
+            device=self.device or "cpu",
+        )
 
     @property
     def dx(self) -> float:
@@ -162,13 +171,25 @@ class SceneDataModule(L.LightningDataModule):
 
     def reconstructed(self) -> bool:
         """Whether the training sequence's reconstruction lies in the cache."""
-        return stored(self.scene, lambda: self.spacing, self.reconstruction_settings, cache_dir=self.cache, seed=self.cfg.seed)
+        return stored(
+            self.scene,
+            lambda: self.spacing,
+            self.reconstruction_settings,
+            cache_dir=self.cache,
+            seed=self.cfg.seed,
+        )
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
         """Of the training sequence."""
-        return reconstruct(self.scene, settings=self.reconstruction_settings, spacing=self.spacing, cache_dir=self.cache,
-                           seed=self.cfg.seed, device=self.device or "cpu")
+        return reconstruct(
+            self.scene,
+            settings=self.reconstruction_settings,
+            spacing=self.spacing,
+            cache_dir=self.cache,
+            seed=self.cfg.seed,
+            device=self.device or "cpu",
+        )
 
     @cached_property
     def shape(self) -> RestShape:
@@ -179,9 +200,18 @@ class SceneDataModule(L.LightningDataModule):
     def followed(self, scene: Scene) -> Reconstruction:
         """Reconstruction of another sequence of the body that was found in the training one."""
         start = self.starts[f"train/{scene.sequence}"]
-        return follow(scene, self.scene, self.reconstruction, rotation=start.rotation, center=start.center,
-                      rest_center=self.shape.center, settings=self.reconstruction_settings, cache_dir=self.cache,
-                      seed=self.cfg.seed, device=self.device or "cpu")
+        return follow(
+            scene,
+            self.scene,
+            self.reconstruction,
+            rotation=start.rotation,
+            center=start.center,
+            rest_center=self.shape.center,
+            settings=self.reconstruction_settings,
+            cache_dir=self.cache,
+            seed=self.cfg.seed,
+            device=self.device or "cpu",
+        )
 
     # ---------------------------------------------------------------- starts
     @cached_property
@@ -206,14 +236,20 @@ class SceneDataModule(L.LightningDataModule):
     def measured(self) -> dict[str, Any]:
         """What a checkpoint keeps of the data, beside the configuration: world, density, spacing, starts."""
         found = run_config(plain(self.cfg), self.scene, self.dx)
-        return found | {"starts": {prefix: start.written() for prefix, start in self.starts.items()}}
+        return found | {
+            "starts": {prefix: start.written() for prefix, start in self.starts.items()}
+        }
 
     # ---------------------------------------------------------------- what a fit reads
     @cached_property
     def takes(self) -> list[Take]:
         """The sequences that are learned from, the training one first."""
         seen = [("train", self.scene, self.reconstruction)]
-        seen += [(f"train/{s.sequence}", s, self.followed(s)) for s in self.scenes[1] if s.sequence in self.taught]
+        seen += [
+            (f"train/{s.sequence}", s, self.followed(s))
+            for s in self.scenes[1]
+            if s.sequence in self.taught
+        ]
         return [self.take(scene, self.starts[prefix], found) for prefix, scene, found in seen]
 
     def take(self, scene: Scene, start: Start, reconstruction: Reconstruction) -> Take:
@@ -245,13 +281,24 @@ class SceneDataModule(L.LightningDataModule):
 
     def batch(self, views: Sequence[int]) -> MotionBatch:
         """These views of all sequences that are learned from, in all frames that may be read."""
-        return MotionBatch(sequences=tuple(self.sequence_batch(i, take, views) for i, take in enumerate(self.takes)))
+        return MotionBatch(
+            sequences=tuple(
+                self.sequence_batch(i, take, views) for i, take in enumerate(self.takes)
+            )
+        )
 
     def sequence_batch(self, index: int, take: Take, views: Sequence[int]) -> SequenceBatch:
         chosen = [view % len(take.observations.cameras) for view in views]
         frames = list(range(len(take.cues.positions)))
-        return SequenceBatch(name=take.name, index=index, views=chosen, frames=frames,
-                             observations=take.observations.select(chosen), cues=take.cues, extra=dict(take.extra))
+        return SequenceBatch(
+            name=take.name,
+            index=index,
+            views=chosen,
+            frames=frames,
+            observations=take.observations.select(chosen),
+            cues=take.cues,
+            extra=dict(take.extra),
+        )
 
     @cached_property
     def held_back(self) -> list[MotionBatch]:
@@ -262,6 +309,19 @@ class SceneDataModule(L.LightningDataModule):
         return [self.seen_in(name, cropped(scene, views, frames, margin), views, frames)
                 for name, (views, frames) in parts.items() if views and frames]  # fmt: skip
 
-    def seen_in(self, name: str, seen: Observations, views: Sequence[int], frames: Sequence[int]) -> MotionBatch:
-        return MotionBatch(sequences=(SequenceBatch(name=name, index=0, views=list(views), frames=list(frames), observations=seen,
-                                                    cues=None, extra={}),))
+    def seen_in(
+        self, name: str, seen: Observations, views: Sequence[int], frames: Sequence[int]
+    ) -> MotionBatch:
+        return MotionBatch(
+            sequences=(
+                SequenceBatch(
+                    name=name,
+                    index=0,
+                    views=list(views),
+                    frames=list(frames),
+                    observations=seen,
+                    cues=None,
+                    extra={},
+                ),
+            )
+        )

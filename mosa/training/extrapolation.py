@@ -38,8 +38,10 @@ def check_can_extrapolate(module: LitMosa) -> None:
     """Errors: ConfigError where a stage is learned by Adam, which says nothing about how sure its numbers are."""
     for stage in module.stages:
         if not stage.newton:
-            raise ConfigError(f"extrapolate: expected Gauss-Newton in every stage, found fit.{stage.name}.optimizer=adam; adapter="
-                              "operator or none and heterogeneity.kind=modes let it learn all")
+            raise ConfigError(
+                f"extrapolate: expected Gauss-Newton in every stage, found fit.{stage.name}.optimizer=adam; adapter="
+                "operator or none and heterogeneity.kind=modes let it learn all"
+            )
 
 
 def identified(module: LitMosa) -> Identified:
@@ -52,8 +54,12 @@ def identified(module: LitMosa) -> Identified:
     for name, raw in body.material.raw.items():
         if not raw.requires_grad or not isinstance(FORMS.get(name), Form):
             continue  # held, or an angle of a direction
-        value = float(body.material.physical_of(name, raw.detach())) * (mean if name in body.material.modulated else 1.0)
-        variance = float(posterior.covariance[posterior.names.index(name), posterior.names.index(name)])
+        value = float(body.material.physical_of(name, raw.detach())) * (
+            mean if name in body.material.modulated else 1.0
+        )
+        variance = float(
+            posterior.covariance[posterior.names.index(name), posterior.names.index(name)]
+        )
         numbers[name] = FORMS[name].inverse(value), INFLATION * math.sqrt(variance)
     return Identified(body.settings.dx, numbers)
 
@@ -62,7 +68,10 @@ def coarser(cfg: DictConfig, run: Run, law: str) -> Identified:
     """The scene of a run identified with a third of its particles, under its `law`. Errors: those of a run."""
     fewer = copy.deepcopy(cfg)
     with open_dict(fewer):
-        fewer.simulation.particles, fewer.simulation.dx = max(1, round(len(run.body.rest) / FEWER)), None
+        fewer.simulation.particles, fewer.simulation.dx = (
+            max(1, round(len(run.body.rest) / FEWER)),
+            None,
+        )
         fewer.prior.law, fewer.ckpt_path = law, None
         fewer.prior.pop("candidates", None)
     module = assemble(fewer, run.device, held_out=False).module
@@ -80,7 +89,10 @@ def continued(fine: Identified, coarse: Identified) -> dict[str, tuple[float, fl
         other, other_sd = coarse.numbers[name]
         raw = torch.tensor(value + weight * (value - other), dtype=torch.float64)
         spread = physical_sd(name, raw, math.hypot((1 + weight) * sd, weight * other_sd))
-        coarse_value, limit = (float(FORMS[name].physical(each)) for each in (torch.tensor(other, dtype=torch.float64), raw))
+        coarse_value, limit = (
+            float(FORMS[name].physical(each))
+            for each in (torch.tensor(other, dtype=torch.float64), raw)
+        )
         found[name] = coarse_value, limit, spread
     return found
 
@@ -94,7 +106,11 @@ def extrapolated(cfg: DictConfig, run: Run, known: Mapping[str, float]) -> dict[
     coarse = coarser(cfg, run, module.body.material.law)
     figures = {"extrapolated/dx_m": fine.dx, "extrapolated/coarse_dx_m": coarse.dx}
     for name, (other, limit, sd) in continued(fine, coarse).items():
-        figures |= {f"extrapolated/{name}": limit, f"extrapolated/{name}_sd": sd, f"extrapolated/{name}_coarse": other}
+        figures |= {
+            f"extrapolated/{name}": limit,
+            f"extrapolated/{name}_sd": sd,
+            f"extrapolated/{name}_coarse": other,
+        }
         if name in known:
             errors = identification_errors(name, limit, known[name])
             figures |= {f"extrapolated/{key}": value for key, value in errors.items()}

@@ -37,9 +37,11 @@ def fit_estimate(module: LitMosa, costs: Costs) -> str:
     speeds = replace(costs.speeds, frame=frame)
     seconds = seconds_of_fit(module, speeds, frames)
     costs.known("fit", seconds)
-    return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
-            f"{sum(s.iterations for s in module.stages)} steps, about {duration(seconds)}; the run takes about "
-            f"{costs.memory / 1e9:.1f} GB")
+    return (
+        f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
+        f"{sum(s.iterations for s in module.stages)} steps, about {duration(seconds)}; the run takes about "
+        f"{costs.memory / 1e9:.1f} GB"
+    )
 
 
 def instantiated(cfg: DictConfig, section: str) -> list[Any]:
@@ -49,7 +51,9 @@ def instantiated(cfg: DictConfig, section: str) -> list[Any]:
         if entry is None:  # switched off: callbacks.pictures=null
             continue
         if not OmegaConf.is_dict(entry) or "_target_" not in entry:
-            raise ConfigError(f"{section}.{name}: expected a section with _target_, the class to make, found {str(entry)[:80]!r}")
+            raise ConfigError(
+                f"{section}.{name}: expected a section with _target_, the class to make, found {str(entry)[:80]!r}"
+            )
         found.append(made(f"{section}.{name}", entry))
     return found
 
@@ -60,23 +64,45 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
     try:
         return instantiate(entry, **arguments)
     except Exception as error:
-        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ is not None else error
-        lines = [line for line in str(cause).splitlines() if line.strip() and not line.startswith("full_key")]
-        way = f"; pip install {cause.name}" if isinstance(cause, ModuleNotFoundError) and cause.name else ""
+        cause = (
+            error.__cause__
+            if isinstance(error, InstantiationException) and error.__cause__ is not None
+            else error
+        )
+        lines = [
+            line
+            for line in str(cause).splitlines()
+            if line.strip() and not line.startswith("full_key")
+        ]
+        way = (
+            f"; pip install {cause.name}"
+            if isinstance(cause, ModuleNotFoundError) and cause.name
+            else ""
+        )
         if where == "trainer" and "gpu" in str(cause):
             way = "; trainer=cpu runs without one"
-        raise ConfigError(f"{where}: expected what {entry.get('_target_')} takes, found: {' '.join(lines)[:300]}{way}") from error
+        raise ConfigError(
+            f"{where}: expected what {entry.get('_target_')} takes, found: {' '.join(lines)[:300]}{way}"
+        ) from error
 
 
 def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     """Lightning's Trainer of conf/trainer, with the callbacks of conf/callbacks and the loggers of conf/logger. Errors: ConfigError
     naming the section."""
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
-    trainer = made("trainer", cfg.trainer, logger=loggers or False, callbacks=callbacks, default_root_dir=str(folder),
-                   plugins=[AtomicCheckpointIO(), LightningEnvironment()])
+    trainer = made(
+        "trainer",
+        cfg.trainer,
+        logger=loggers or False,
+        callbacks=callbacks,
+        default_root_dir=str(folder),
+        plugins=[AtomicCheckpointIO(), LightningEnvironment()],
+    )
     if trainer.num_devices * trainer.num_nodes != 1:
-        raise ConfigError(f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.num_devices}: a fit "
-                          "runs on one device, and the runs of a sweep on several (docs/sweeps.md)")
+        raise ConfigError(
+            f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.num_devices}: a fit "
+            "runs on one device, and the runs of a sweep on several (docs/sweeps.md)"
+        )
     check_monitors(cfg, callbacks)
     return trainer
 
@@ -87,8 +113,10 @@ def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
         return
     for each in callbacks:
         if str(getattr(each, "monitor", None)).startswith("val/"):
-            raise ConfigError(f"callbacks: {type(each).__name__} watches {each.monitor}: expected something that is held out of "
-                              "the training sequence, found nothing; scene.holdout_cameras=[0] or scene.holdout_frames=2")
+            raise ConfigError(
+                f"callbacks: {type(each).__name__} watches {each.monitor}: expected something that is held out of "
+                "the training sequence, found nothing; scene.holdout_cameras=[0] or scene.holdout_frames=2"
+            )
 
 
 def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: str | None) -> None:
@@ -110,16 +138,34 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
     except torch.linalg.LinAlgError as error:
         if lacks_memory(error):
             raise
-        raise SimulationDiverged(f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
-                                 "check the checkpoint that it goes on from, or lower simulation.courant") from error
-    except (ArithmeticError, AttributeError, FileNotFoundError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise SimulationDiverged(
+            f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
+            "check the checkpoint that it goes on from, or lower simulation.courant"
+        ) from error
+    except (
+        ArithmeticError,
+        AttributeError,
+        FileNotFoundError,
+        LookupError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
         if begun or ckpt_path is None or lacks_memory(error):
             raise
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]  # Lightning takes its own entries as they are
-        raise DataError(f"ckpt_path: {ckpt_path}: the fit cannot go on from it ({reason})") from error
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[
+            :300
+        ]  # Lightning takes its own entries as they are
+        raise DataError(
+            f"ckpt_path: {ckpt_path}: the fit cannot go on from it ({reason})"
+        ) from error
     if trainer.interrupted:
         raise KeyboardInterrupt
     if module.stage is not None:
-        log.warning("the trainer ended the fit after %d steps, in stage %s of %s: what follows is of the law as it stands",
-                    module.steps_done, module.stage.name, ", ".join(stage.name for stage in module.stages))
+        log.warning(
+            "the trainer ended the fit after %d steps, in stage %s of %s: what follows is of the law as it stands",
+            module.steps_done,
+            module.stage.name,
+            ", ".join(stage.name for stage in module.stages),
+        )
     module.body.to(device)

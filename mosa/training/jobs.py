@@ -49,7 +49,11 @@ def folder_name(overrides: str) -> str:
     name = overrides.replace("/", "_").replace("\0", "_")
     if len(name.encode()) <= LONGEST:
         return name
-    return name.encode()[:LONGEST].decode(errors="ignore") + "_" + hashlib.sha256(overrides.encode()).hexdigest()[:8]
+    return (
+        name.encode()[:LONGEST].decode(errors="ignore")
+        + "_"
+        + hashlib.sha256(overrides.encode()).hexdigest()[:8]
+    )
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
@@ -59,9 +63,18 @@ def check_arguments(arguments: Sequence[str], conf: Path) -> None:
     """Exit with 2 and a message for <group>=null, to which Hydra answers with a traceback; conf: the folder of the groups."""
     for argument in arguments:
         group, mark, value = argument.lstrip("+").partition("=")
-        if mark and value in ("", "null", "Null", "NULL", "~") and "." not in group and group and (conf / group).is_dir():
+        if (
+            mark
+            and value in ("", "null", "Null", "NULL", "~")
+            and "." not in group
+            and group
+            and (conf / group).is_dir()
+        ):
             options = ", ".join(sorted(file.stem for file in (conf / group).glob("*.yaml")))
-            print(f"\nConfigError: {group}: expected one of {options}, found {argument!r}", file=sys.stderr)
+            print(
+                f"\nConfigError: {group}: expected one of {options}, found {argument!r}",
+                file=sys.stderr,
+            )
             sys.exit(2)
 
 
@@ -85,23 +98,36 @@ def check_folders(arguments: Sequence[str]) -> None:
     try:
         os.getcwd()
     except OSError:
-        print("\nConfigError: the folder that this was started in is no more; change to another one", file=sys.stderr)
+        print(
+            "\nConfigError: the folder that this was started in is no more; change to another one",
+            file=sys.stderr,
+        )
         sys.exit(2)
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key == "hydra.sweep.subdir" and "$" not in value and {"-m", "--multirun"} & set(arguments):
+        if (
+            key == "hydra.sweep.subdir"
+            and "$" not in value
+            and {"-m", "--multirun"} & set(arguments)
+        ):
             print(f"\nConfigError: {key}: expected a name that is another one for each job, as ${{hydra.job.num}} is: {value}: "
                   "each would take the place of the one before", file=sys.stderr)  # fmt: skip
             sys.exit(2)
         if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:
             continue
         if not value.strip("'\" "):
-            print(f"\nConfigError: {key}: expected a folder, found nothing; . is the one that this was started in", file=sys.stderr)
+            print(
+                f"\nConfigError: {key}: expected a folder, found nothing; . is the one that this was started in",
+                file=sys.stderr,
+            )
             sys.exit(2)
         place = Path(value.strip("'\"")).absolute()
         there = next(folder for folder in (place, *place.parents) if os.path.lexists(folder))
         if reason := no_place(there, there != place):
-            print(f"\nConfigError: {key}: expected a folder that can be made, found {value}: {there}: {reason}", file=sys.stderr)
+            print(
+                f"\nConfigError: {key}: expected a folder that can be made, found {value}: {there}: {reason}",
+                file=sys.stderr,
+            )
             sys.exit(2)
         if key == "hydra.run.dir" and (foreign := no_file_of_a_run(place)) is not None:
             print(f"\nConfigError: {key}: {foreign}: expected what a run has there, a file (of checkpoints and .hydra: a folder), "
@@ -127,7 +153,11 @@ def no_file_of_a_run(folder: Path) -> Path | None:
     """What has the name of a run's file and is none: a pipe would be waited for, a folder ends the run when it is written."""
     found = [path for path in folder.glob("*") if path.suffix in WRITTEN and not path.is_file()]
     found += [path for path in folder.glob("checkpoints/*.ckpt") if not path.is_file()]
-    found += [path for name in ("checkpoints", ".hydra") if os.path.lexists(path := folder / name) and not path.is_dir()]
+    found += [
+        path
+        for name in ("checkpoints", ".hydra")
+        if os.path.lexists(path := folder / name) and not path.is_dir()
+    ]
     return min(found, default=None)
 
 
@@ -143,14 +173,25 @@ def check_files(arguments: Sequence[str], conf: Path) -> None:
             named.append((value if mark else following).removesuffix(".yaml"))
         elif mark and not flag.startswith("-"):
             group = flag.lstrip("+").partition("@")[0]
-            named += [f"{group}/{each.strip()}" for each in value.strip("'\"[]").removesuffix(".yaml").split(",")]
-    for file in (folder / f"{name}.yaml" for folder in folders for name in named if "\0" not in name and len(name) < LONGEST):
+            named += [
+                f"{group}/{each.strip()}"
+                for each in value.strip("'\"[]").removesuffix(".yaml").split(",")
+            ]
+    for file in (
+        folder / f"{name}.yaml"
+        for folder in folders
+        for name in named
+        if "\0" not in name and len(name) < LONGEST
+    ):
         try:
             if file.is_file():
                 OmegaConf.load(file)
         except (YAMLError, UnicodeDecodeError, OSError) as error:
             reason = " ".join(str(error).split())[:300]
-            print(f"\nConfigError: {file}: expected YAML, found what cannot be read ({reason})", file=sys.stderr)
+            print(
+                f"\nConfigError: {file}: expected YAML, found what cannot be read ({reason})",
+                file=sys.stderr,
+            )
             sys.exit(2)
 
 
@@ -185,12 +226,16 @@ class Failures(Callback):
     """Of the sweep that ended last in this process."""
 
     def on_multirun_start(self, config: DictConfig, **_) -> None:
-        shutil.rmtree(Path(config.hydra.sweep.dir) / FAILED, ignore_errors=True)  # of an earlier sweep in this folder
+        shutil.rmtree(
+            Path(config.hydra.sweep.dir) / FAILED, ignore_errors=True
+        )  # of an earlier sweep in this folder
         Failures.count = 0
         begun.append(True)
 
     def on_multirun_end(self, config: DictConfig, **_) -> None:
-        files = sorted((Path(config.hydra.sweep.dir) / FAILED).glob("*.txt"), key=lambda file: int(file.stem))
+        files = sorted(
+            (Path(config.hydra.sweep.dir) / FAILED).glob("*.txt"), key=lambda file: int(file.stem)
+        )
         Failures.count = len(files)
         if files:
             listed = "\n".join(f"  {file.stem}: {file.read_text().strip()}" for file in files)
@@ -253,9 +298,13 @@ def held(folder: str | Path, wait: bool = False) -> Iterator[None]:
             fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if not wait:
-                raise ConfigError(f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this "
-                                  "run a folder of its own") from None
-            log.info("another process is at work in %s: waiting until it has ended (resume=auto)", folder)
+                raise ConfigError(
+                    f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this "
+                    "run a folder of its own"
+                ) from None
+            log.info(
+                "another process is at work in %s: waiting until it has ended (resume=auto)", folder
+            )
             fcntl.flock(number, fcntl.LOCK_EX)
         except OSError:  # a file system that knows no locks
             pass
@@ -279,7 +328,9 @@ def held_back() -> Iterator[None]:
         if len(waiting) > 1:
             before[number](number, frame)
 
-    replaced = {number: handler for number, handler in before.items() if callable(handler)}  # not what is ignored, or ends at once
+    replaced = {
+        number: handler for number, handler in before.items() if callable(handler)
+    }  # not what is ignored, or ends at once
     for number in replaced:
         signal.signal(number, wait)
     try:
@@ -299,15 +350,25 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
 
 
 def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
-    if not begun and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:  # a launcher's worker
+    if (
+        not begun and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    ):  # a launcher's worker
         threading.Thread(target=leave_after, args=(os.getppid(),), daemon=True).start()
     begun.append(True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
-    folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
+    folder = (
+        OmegaConf.select(HydraConfig.get(), "runtime.output_dir")
+        if HydraConfig.initialized()
+        else None
+    )
     at_work.set()
     try:
-        with held(folder, wait=(cfg or {}).get("resume") == "auto") if folder is not None else nullcontext():
+        with (
+            held(folder, wait=(cfg or {}).get("resume") == "auto")
+            if folder is not None
+            else nullcontext()
+        ):
             return job(cfg)
     except KeyboardInterrupt:
         resume = "stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun"
@@ -334,5 +395,7 @@ def keep(message: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{hydra.job.num}.txt").write_text(message + "\n")
-    except OSError as error:  # a full disk: the sweep cannot say it at its end, so that it ends here
+    except (
+        OSError
+    ) as error:  # a full disk: the sweep cannot say it at its end, so that it ends here
         raise SystemExit(f"\n{folder}: cannot be written ({error.strerror})") from error

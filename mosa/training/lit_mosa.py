@@ -30,7 +30,15 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import build_body, build_criterion, build_evaluation, build_identification, build_stages, build_world, plain
+from mosa.config.build import (
+    build_body,
+    build_criterion,
+    build_evaluation,
+    build_identification,
+    build_stages,
+    build_world,
+    plain,
+)
 from mosa.config.checkpoints import VERSION, read_checkpoint
 from mosa.config.composition import composed
 from mosa.data.batches import MotionBatch
@@ -85,8 +93,14 @@ def parts_of(config: Mapping[str, Any], body: Body) -> dict[str, Any]:
     stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
     if not (cfg["reconstruction"].get("informed") or {}).get("iterations", 0):
         stages = [stage for stage in stages if not stage.looks_again]
-    return {"world": build_world(config["world"]), "stages": stages, "weights": cfg["losses"], "clip": cfg["fit"]["clip"],
-            "criterion": build_criterion(cfg), "settings": build_identification(cfg)}
+    return {
+        "world": build_world(config["world"]),
+        "stages": stages,
+        "weights": cfg["losses"],
+        "clip": cfg["fit"]["clip"],
+        "criterion": build_criterion(cfg),
+        "settings": build_identification(cfg),
+    }
 
 
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
@@ -95,10 +109,16 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     It has no body until `setup` has asked the data module for its particles, or a checkpoint was loaded.
     """
 
-    def __init__(self, first: str | Mapping[str, Any] | DictConfig | None = None, *overrides: str) -> None:
+    def __init__(
+        self, first: str | Mapping[str, Any] | DictConfig | None = None, *overrides: str
+    ) -> None:
         """first, overrides: a whole configuration (`mosa.compose`), or overrides as on the command line. Errors: ConfigError."""
         super().__init__()
-        whole = dict(first) if isinstance(first, dict) and not overrides else plain(composed(first, overrides))
+        whole = (
+            dict(first)
+            if isinstance(first, dict) and not overrides
+            else plain(composed(first, overrides))
+        )
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
         self._begin({"cfg": self.cfg, "world": None}, None, (), torch.ones(3), (), {})
@@ -116,23 +136,44 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.takes, self.first_takes, self.stages = list(takes), list(takes), list(stages)
         self.weights, self.clip, self.config = dict(weights), clip, config
         self.stage_index, self.losses, self.steps_done, self.stage_over = 0, [], 0, False
-        self.start = takes[0].start.written() if takes and takes[0] is not None else None  # of the training sequence
+        self.start = (
+            takes[0].start.written() if takes and takes[0] is not None else None
+        )  # of the training sequence
         self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
         self.last: dict[str, float] = {}
-        self.criterion, self.settings = criterion or Criterion("free"), settings or IdentificationSettings()
-        self.identification: Identification | None = None  # of the running stage, where it is Gauss-Newton's
-        self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
+        self.criterion, self.settings = (
+            criterion or Criterion("free"),
+            settings or IdentificationSettings(),
+        )
+        self.identification: Identification | None = (
+            None  # of the running stage, where it is Gauss-Newton's
+        )
+        self.saved_identification: dict | None = (
+            None  # its state in the checkpoint that the fit goes on from
+        )
         self.posterior: Posterior | None = None
-        self.retreat, self.saved_retreat, self.taken_back = Retreat(), None, False  # of the running stage, where it is Adam's
+        self.retreat, self.saved_retreat, self.taken_back = (
+            Retreat(),
+            None,
+            False,
+        )  # of the running stage, where it is Adam's
         self.running_optimizer: torch.optim.Optimizer | None = None
         self.norms: dict[str, float] = {}  # of the last step's gradient, by parameter group
         self.terms_of_step: dict[str, Tensor] = {}
         self.saved_cues: tuple | None = None  # those of a checkpoint that was loaded without data
         self.informed = False  # whether the takes have the cues about the calibrated backbone
-        self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
-        self.ground_gains: dict[str, float] = {}  # of other contacts about the learned law, once it has been asked
-        self.untouched = copy.deepcopy(body.state_dict()) if body is not None and self.ground_is_sought else None
-        self.grounds: dict[str, float] = {}  # mean distance [m] of the contacts with the ground that were tried
+        self.compared: dict[
+            str, float
+        ] = {}  # mean distance [m] of the calibrated candidates for the backbone
+        self.ground_gains: dict[
+            str, float
+        ] = {}  # of other contacts about the learned law, once it has been asked
+        self.untouched = (
+            copy.deepcopy(body.state_dict()) if body is not None and self.ground_is_sought else None
+        )
+        self.grounds: dict[
+            str, float
+        ] = {}  # mean distance [m] of the contacts with the ground that were tried
 
     @classmethod
     def of_parts(
@@ -146,10 +187,14 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return module
 
     @classmethod
-    def from_config(cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor) -> LitMosa:
+    def from_config(
+        cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor
+    ) -> LitMosa:
         """The module that fits `body` in the stages of a run. config: what a checkpoint keeps (`mosa.config.run_config`); takes:
         what it learns from, none where it is only used. Errors: ConfigError naming the key."""
-        return cls.of_parts(body, takes=takes, background=background, config=config, **parts_of(config, body))
+        return cls.of_parts(
+            body, takes=takes, background=background, config=config, **parts_of(config, body)
+        )
 
     # ---------------------------------------------------------------- data
     def setup(self, stage: str) -> None:
@@ -158,27 +203,39 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if hasattr(data, "takes") and hasattr(data, "shape"):
             self.attach(data, fitting=stage in ("fit", "validate"))
         elif self.body is None:
-            raise ConfigError("LitMosa: expected a SceneDataModule, which knows the particles of the body "
-                              "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or a module from load_from_checkpoint, "
-                              f"found {type(data).__name__ if data is not None else 'neither'}")
+            raise ConfigError(
+                "LitMosa: expected a SceneDataModule, which knows the particles of the body "
+                "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or a module from load_from_checkpoint, "
+                f"found {type(data).__name__ if data is not None else 'neither'}"
+            )
         # what is saved at the end of an epoch belongs to the stage that comes next
         callbacks = self.trainer.callbacks
         own = [each for each in callbacks if isinstance(each, Stages)]
         others = [each for each in callbacks if not isinstance(each, Stages)]
-        place = next((i for i, each in enumerate(others) if isinstance(each, Checkpoint)), len(others))
+        place = next(
+            (i for i, each in enumerate(others) if isinstance(each, Checkpoint)), len(others)
+        )
         self.trainer.callbacks = [*others[:place], *own, *others[place:]]
 
     def configure_callbacks(self) -> list[L.Callback]:
         """Asked for first of all, before the data take their time."""
         if self.trainer.world_size > 1:
-            raise ConfigError(f"trainer.devices: expected one, found {self.trainer.world_size}: a fit runs on one device, and "
-                              "the runs of a sweep on several (docs/sweeps.md)")
+            raise ConfigError(
+                f"trainer.devices: expected one, found {self.trainer.world_size}: a fit runs on one device, and "
+                "the runs of a sweep on several (docs/sweeps.md)"
+            )
         if self.trainer.precision not in PRECISIONS:
-            raise ConfigError(f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
-                              "simulation is single precision, or double by simulation.precision=64")
-        if self.trainer.accumulate_grad_batches != 1:  # the schedule of views counts a batch as a step
-            raise ConfigError(f"trainer.accumulate_grad_batches: expected 1, found {self.trainer.accumulate_grad_batches}: "
-                              "fit.views says how many views a step reads")
+            raise ConfigError(
+                f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
+                "simulation is single precision, or double by simulation.precision=64"
+            )
+        if (
+            self.trainer.accumulate_grad_batches != 1
+        ):  # the schedule of views counts a batch as a step
+            raise ConfigError(
+                f"trainer.accumulate_grad_batches: expected 1, found {self.trainer.accumulate_grad_batches}: "
+                "fit.views says how many views a step reads"
+            )
         return [Stages()]
 
     def attach(self, data, fitting: bool = True) -> None:
@@ -190,20 +247,33 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             config = measured | {"cfg": self.cfg | {key: measured["cfg"][key] for key in OF_DATA}}
             config["world"] = measured["world"] | (self.cfg.get("world") or {})
             body = body_of(data.shape, config)
-            self._begin(config, body, (), data.scene.background.to(body.rest.device), **parts_of(config, body))
+            self._begin(
+                config,
+                body,
+                (),
+                data.scene.background.to(body.rest.device),
+                **parts_of(config, body),
+            )
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
-            raise ConfigError(f"ckpt_path: expected a scene whose body has {len(self.body.rest)} particles, found "
-                              f"{len(data.shape.rest)}: the checkpoint belongs to another scene, reconstruction or "
-                              "simulation.particles")
+            raise ConfigError(
+                f"ckpt_path: expected a scene whose body has {len(self.body.rest)} particles, found "
+                f"{len(data.shape.rest)}: the checkpoint belongs to another scene, reconstruction or "
+                "simulation.particles"
+            )
         if fitting and not self.takes:
             plastic = lambda: law_named(self.body.material.law).plastic  # noqa: E731
-            self.takes = [replace(take, again=take.again and replace(take.again, plastic=plastic)) for take in data.takes]
+            self.takes = [
+                replace(take, again=take.again and replace(take.again, plastic=plastic))
+                for take in data.takes
+            ]
             self.first_takes = list(self.takes)
             if self.saved_cues is not None:
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
 
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
         """What is no batch of a fit stays where it is: what of it is needed on the device is brought there where it is needed."""
         return batch.to(device) if isinstance(batch, MotionBatch) else batch
 
@@ -214,26 +284,45 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        checkpoint["mosa"] = {"version": VERSION, "config": self.config, "stage": self.stage_index, "losses": list(self.losses),
-                              "steps_done": self.steps_done, "stage_over": self.stage_over,
-                              "particles": len(self.body.rest), "misfit": self.misfit, "start": self.start,
-                              "identification": self.identification.state() if self.identification else None,
-                              "compared": self.compared, "grounds": self.grounds, "ground_gains": self.ground_gains,
-                              "retreat": self.retreat.written(),
-                              "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
-                              "responses": [take.response and take.response.written() for take in self.takes]
-                              if self.informed else None,
-                              "posterior": self.posterior.written() if self.posterior else None,
-                              "splats": self.body.splats.written() if self.body.splats is not None else None}
+        checkpoint["mosa"] = {
+            "version": VERSION,
+            "config": self.config,
+            "stage": self.stage_index,
+            "losses": list(self.losses),
+            "steps_done": self.steps_done,
+            "stage_over": self.stage_over,
+            "particles": len(self.body.rest),
+            "misfit": self.misfit,
+            "start": self.start,
+            "identification": self.identification.state() if self.identification else None,
+            "compared": self.compared,
+            "grounds": self.grounds,
+            "ground_gains": self.ground_gains,
+            "retreat": self.retreat.written(),
+            "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
+            "responses": [take.response and take.response.written() for take in self.takes]
+            if self.informed
+            else None,
+            "posterior": self.posterior.written() if self.posterior else None,
+            "splats": self.body.splats.written() if self.body.splats is not None else None,
+        }
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if "mosa" not in checkpoint:
-            raise ConfigError("ckpt_path: the checkpoint was not written by this program (no entry 'mosa')")
+            raise ConfigError(
+                "ckpt_path: the checkpoint was not written by this program (no entry 'mosa')"
+            )
         saved = checkpoint["mosa"]
         if saved["particles"] != len(self.body.rest):
-            raise ConfigError(f"ckpt_path: expected a body of {len(self.body.rest)} particles, found {saved['particles']}: the "
-                              "checkpoint belongs to another scene, reconstruction or simulation.particles")
-        self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
+            raise ConfigError(
+                f"ckpt_path: expected a body of {len(self.body.rest)} particles, found {saved['particles']}: the "
+                "checkpoint belongs to another scene, reconstruction or simulation.particles"
+            )
+        self.stage_index, self.losses, self.steps_done = (
+            saved["stage"],
+            list(saved["losses"]),
+            saved["steps_done"],
+        )
         self.stage_over, self.start = bool(saved.get("stage_over", False)), saved["start"]
         self.misfit = saved.get("misfit", MISFIT)
         self.saved_identification = saved.get("identification")
@@ -241,12 +330,20 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.compared = dict(saved.get("compared") or {})
         if self.compared and (candidates := self.body.material.candidates):
             if (law := saved["config"]["cfg"]["prior"]["law"]) not in candidates:
-                raise ConfigError(f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
-                                  "the checkpoint: it belongs to another configuration")
-            for material in (self.body.material, *(variant["material"] for variant in self.body.frozen.values())):
+                raise ConfigError(
+                    f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
+                    "the checkpoint: it belongs to another configuration"
+                )
+            for material in (
+                self.body.material,
+                *(variant["material"] for variant in self.body.frozen.values()),
+            ):
                 material.choose(law)
             self.settle_law()
-        self.grounds, self.ground_gains = dict(saved.get("grounds") or {}), dict(saved.get("ground_gains") or {})
+        self.grounds, self.ground_gains = (
+            dict(saved.get("grounds") or {}),
+            dict(saved.get("ground_gains") or {}),
+        )
         if self.ground_is_sought and (written := saved["config"]["world"]["ground"]) is not None:
             self.settle_ground(Ground(**written))
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
@@ -256,8 +353,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
         elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
               and any(take.again for take in self.takes)):  # fmt: skip
-            raise ConfigError("ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
-                              "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it")
+            raise ConfigError(
+                "ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
+                "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it"
+            )
 
     def settle_law(self) -> None:
         """What is written from now on is a run of the law that was chosen."""
@@ -295,8 +394,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.running_optimizer = found["optimizer"]
             return found
         body = self.body
-        numbers = tensors_of(body, adapter=stage.learns_adapter and is_learned(body.adapter),
-                             heterogeneity=stage.learns_heterogeneity and is_learned(body.heterogeneity))
+        numbers = tensors_of(
+            body,
+            adapter=stage.learns_adapter and is_learned(body.adapter),
+            heterogeneity=stage.learns_heterogeneity and is_learned(body.heterogeneity),
+        )
         self.running_optimizer = GaussNewtonOptimizer(numbers, lambda: self.identification)
         return self.running_optimizer
 
@@ -308,7 +410,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """The loss before the step. By Gauss-Newton: minus the logarithm of the posterior; by Adam: the weighted terms of the views
         of `batch`, None where the step before was taken back."""
         stage, iteration = self.stage, len(self.losses)
-        return self.newton_loss(stage, iteration) if stage.newton else self.gradient_loss(stage, iteration, batch)
+        return (
+            self.newton_loss(stage, iteration)
+            if stage.newton
+            else self.gradient_loss(stage, iteration, batch)
+        )
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
         if loss.requires_grad:  # Gauss-Newton's has none
@@ -326,7 +432,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         else:
             self.after_gradient_step(stage, iteration, loss)
         self.steps_done += 1
-        self.stage_over = stage.ended(self.losses) or (stage.newton and self.identification.converged)
+        self.stage_over = stage.ended(self.losses) or (
+            stage.newton and self.identification.converged
+        )
 
     @torch.no_grad()
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
@@ -342,17 +450,26 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             seen, x, F = part.observations, rollout.x[part.frames], rollout.F_tot[part.frames]
             shown = observe(x, deformed_covariances(F, body.covariances), body.opacities, body.colors, seen.cameras,
                             self.background)  # fmt: skip
-            terms = {"image": losses.image_loss(shown.images, seen.images), "mask": losses.mask_loss(shown.mattes, seen.mattes)}
+            terms = {
+                "image": losses.image_loss(shown.images, seen.images),
+                "mask": losses.mask_loss(shown.mattes, seen.mattes),
+            }
             loss = sum(self.weights.get(name, 0.0) * float(value) for name, value in terms.items())
             psnr = metrics.psnr(shown.images.clamp(0, 1).flatten(0, 1), seen.images.flatten(0, 1))
             values = {"loss": loss, "psnr": psnr}
         self.log_dict({f"val/{name}": value for name, value in values.items()}, batch_size=1)
-        self.log_dict({f"val/{part.name}/{name}": value for name, value in values.items()}, batch_size=1)
+        self.log_dict(
+            {f"val/{part.name}/{name}": value for name, value in values.items()}, batch_size=1
+        )
 
     def test_dataloader(self) -> DataLoader:
         """Without a data module: the sequences that the run was evaluated on, from the configuration in its checkpoint. Errors:
         DataError, ConfigError."""
-        return DataLoader(run_sequences(self.config, self.body), batch_size=None, collate_fn=lambda sequence: sequence)
+        return DataLoader(
+            run_sequences(self.config, self.body),
+            batch_size=None,
+            collate_fn=lambda sequence: sequence,
+        )
 
     def test_step(self, batch, batch_idx: int) -> None:
         """Logs the figures of docs/figures.md of one sequence, of every model. batch: `evaluation.Sequence`."""
@@ -370,10 +487,14 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         from mosa.twin.twin import Twin
 
         first = Start.read(self.start, self.body.rest)
-        return Twin(self.body, self.world, self.config["frame_dt"], self.config, first, self.posterior)
+        return Twin(
+            self.body, self.world, self.config["frame_dt"], self.config, first, self.posterior
+        )
 
     @classmethod
-    def load_from_checkpoint(cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **unused) -> LitMosa:
+    def load_from_checkpoint(
+        cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **unused
+    ) -> LitMosa:
         """The module of a checkpoint, in evaluation mode: body, world, configuration, and how far its fit was. `trainer.fit` with
         the scene's data module goes on from there.
 
@@ -393,8 +514,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if stage.start is not None:
             self.body.thaw(stage.start)
         if self.ground_is_sought and not stage.newton:
-            warnings.warn(f"scene.ground.mode: auto asks for fit.{stage.name}.optimizer=gauss_newton, which compares contacts; "
-                          "found adam, and the body sticks to the ground: say sticky, slip, separate or touch", stacklevel=1)
+            warnings.warn(
+                f"scene.ground.mode: auto asks for fit.{stage.name}.optimizer=gauss_newton, which compares contacts; "
+                "found adam, and the body sticks to the ground: say sticky, slip, separate or touch",
+                stacklevel=1,
+            )
             self.settle_ground(self.world.ground)
         if stage.looks_again or not (stage.calibrates or self.informed):
             self.inform(response=stage.newton and not stage.calibrates)
@@ -402,14 +526,19 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if stage.learns_adapter and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
             parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
-            adapter.prepare(material.law, material_states(material.law, parameters, self.body.law_options))
+            adapter.prepare(
+                material.law, material_states(material.law, parameters, self.body.law_options)
+            )
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
 
     def inform(self, response: bool = True) -> None:
         """The cues of the takes once more, about what the calibrated backbone predicts; response: and what they keep of that."""
         if any(take.again for take in self.takes):
-            self.takes, self.informed = [seen_again(take, self.body, self.world, response) for take in self.takes], True
+            self.takes, self.informed = (
+                [seen_again(take, self.body, self.world, response) for take in self.takes],
+                True,
+            )
 
     @torch.no_grad()
     def measure_misfit(self) -> float:
@@ -417,8 +546,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         misfits = []
         for take in self.takes:
             model = self.body.model().only(adapter=False)
-            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
-            misfits.append(float(losses.position_loss(rollout.x, take.cues.positions, self.body.size)))
+            rollout = self.body.simulate(
+                take.start, self.world, len(take.cues.positions), take.frame_dt, model=model
+            )
+            misfits.append(
+                float(losses.position_loss(rollout.x, take.cues.positions, self.body.size))
+            )
         return sum(misfits) / len(misfits)
 
     def finish(self) -> None:
@@ -446,7 +579,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         for name, value in self.body.material.physical().items():
             values[f"id/{name}"] = value.detach()
         values["id/contact_offset"] = self.body.contact.lift(self.world.ground).detach()
-        self.log_dict({k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
+        self.log_dict(
+            {k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()},
+            on_step=True,
+            on_epoch=False,
+        )
         self.last |= {k: float(v) for k, v in values.items()}
 
     @torch.no_grad()
@@ -456,7 +593,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         frames = len(take.cues.positions)
         rollout = body.simulate(take.start, self.world, frames, take.frame_dt)
         targets = take.observations.select([view], frames)
-        seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
-                       targets.cameras, self.background)
+        seen = observe(
+            rollout.x,
+            deformed_covariances(rollout.F_tot, body.covariances),
+            body.opacities,
+            body.colors,
+            targets.cameras,
+            self.background,
+        )
         rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
         return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)

@@ -17,14 +17,24 @@ from torch.utils.tensorboard.summary import scalar
 
 from mosa.training.curves import described
 
-OUTCOME = ("train/rms_m", "test/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "train/psnr_crop", "test/psnr_crop",
-           "camera/psnr_crop", "test/mean_abs_C")
+OUTCOME = (
+    "train/rms_m",
+    "test/rms_m",
+    "prior/test/rms_m",
+    "prior_eta/test/rms_m",
+    "train/psnr_crop",
+    "test/psnr_crop",
+    "camera/psnr_crop",
+    "test/mean_abs_C",
+)
 
 
 class DescribingLogger(TensorBoardLogger):
     """TensorBoard's logger whose scalars carry descriptions (`curves.py`), which TensorBoard shows beside their titles."""
 
-    def __init__(self, save_dir: str | Path, name: str = "tensorboard", version: str = "", **options: Any) -> None:
+    def __init__(
+        self, save_dir: str | Path, name: str = "tensorboard", version: str = "", **options: Any
+    ) -> None:
         super().__init__(save_dir, name=name, version=version, default_hp_metric=False, **options)
         self.law = ""  # of the prior, for the units of its parameters
         self.written: set[str] = set()
@@ -58,14 +68,26 @@ def add_picture(loggers: Sequence[Logger], name: str, picture: Tensor, step: int
             logger.log_image(name, [np.asarray(picture.movedim(0, -1))], step=step)
 
 
-def log_outcome(loggers: Sequence[Logger], cfg: Mapping[str, Any], figures: Mapping[str, float | str]) -> None:
+def log_outcome(
+    loggers: Sequence[Logger], cfg: Mapping[str, Any], figures: Mapping[str, float | str]
+) -> None:
     """The run's configuration beside its final figures, as `final/...`: TensorBoard's table of hyper-parameters, the summary of
     wandb's run, which ends here. A table of steps has no place for them; metrics.json has them all."""
-    final = {f"final/{k}": v for k, v in figures.items() if k in OUTCOME or k.startswith(("id/", "id_prior/"))}
-    parameters = {k: v for k, v in cfg.items() if k not in ("evaluation", "logger", "callbacks", "trainer", "hydra")}
+    final = {
+        f"final/{k}": v
+        for k, v in figures.items()
+        if k in OUTCOME or k.startswith(("id/", "id_prior/"))
+    }
+    parameters = {
+        k: v
+        for k, v in cfg.items()
+        if k not in ("evaluation", "logger", "callbacks", "trainer", "hydra")
+    }
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
-            (Path(logger.log_dir) / "hparams.yaml").unlink(missing_ok=True)  # the fit left an empty one, which would be kept
+            (Path(logger.log_dir) / "hparams.yaml").unlink(
+                missing_ok=True
+            )  # the fit left an empty one, which would be kept
             logger.log_hyperparams(parameters, final)
             logger.finalize("success")
         elif isinstance(logger, WandbLogger):

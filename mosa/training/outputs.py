@@ -41,7 +41,12 @@ log = logging.getLogger(__name__)
 
 
 def figures_of(
-    settings: EvaluationSettings, body: Body, evaluated: list[Sequence], world: World, posterior: Posterior | None, folder: Path
+    settings: EvaluationSettings,
+    body: Body,
+    evaluated: list[Sequence],
+    world: World,
+    posterior: Posterior | None,
+    folder: Path,
 ) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
     """All that is measured on a fitted body, and the rollouts by sequence and variant.
 
@@ -49,13 +54,17 @@ def figures_of(
     scene = evaluated[0].scene
     figures, kept = evaluate(body, evaluated, world, settings)
     figures |= identification(body, scene) | law_figures(body)
-    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, posterior, evaluated, world, folder)
+    figures |= hidden_figures(body, scene, figures) | posterior_figures(
+        body, posterior, evaluated, world, folder
+    )
     if settings.floor:
         figures |= floor_figures(body, evaluated, world, settings) | true_geometry(body, scene)
     return figures, kept
 
 
-def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path) -> dict:
+def posterior_figures(
+    body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path
+) -> dict:
     """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no
     posterior."""
     if posterior is None:
@@ -68,24 +77,39 @@ def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[S
 
 def true_geometry(body: Body, scene: Scene) -> dict[str, float]:
     """Figures of the body against the true shape, where that is known."""
-    return geometry_figures(body.rest, body.volume, scene) if scene.synthetic and scene.truth is not None else {}
+    return (
+        geometry_figures(body.rest, body.volume, scene)
+        if scene.synthetic and scene.truth is not None
+        else {}
+    )
 
 
 def start_figures(start: Start) -> dict[str, float]:
     names = ("x", "y", "z")
     return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
-        f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)}
+        f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)
+    }
 
 
 def write_outputs(
-    folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict, world: World
+    folder: Path,
+    cfg: DictConfig,
+    body: Body,
+    evaluated: list[Sequence],
+    figures: dict,
+    kept: dict,
+    world: World,
 ) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
     all; tables in results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
-        motions = {prefix: variants[variant] for prefix, variants in kept.items() if variant in variants}
+        motions = {
+            prefix: variants[variant] for prefix, variants in kept.items() if variant in variants
+        }
         save_rollout(folder / name, motions, world.colliders)
-    if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
+    if known := {
+        s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None
+    }:
         save_truth(folder / "truth.npz", known)
     if body.splats is not None:
         known = body.splats.appearance
@@ -110,4 +134,6 @@ def optimized(figures: dict[str, float], wanted: str) -> float | None:
     for key in (wanted, "test/rms_m", "train/rms_m"):
         if key in figures:
             return figures[key]
-    return next((-figures[key] for key in ("test/psnr_crop", "train/psnr_crop") if key in figures), None)
+    return next(
+        (-figures[key] for key in ("test/psnr_crop", "train/psnr_crop") if key in figures), None
+    )

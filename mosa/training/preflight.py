@@ -57,7 +57,9 @@ def check_configuration(values: Mapping[str, Any], conf: Path | None = None) -> 
 def check_evaluation(values: Mapping[str, Any]) -> None:
     """All that eval.py's configuration says by itself. Errors: ConfigError naming the key."""
     if (conf := conf_folder()) is not None:
-        check_known({k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
+        check_known(
+            {k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION
+        )
     check(values, EVALUATION, SIMULATION)
     if values["evaluation"]["video"]:
         ffmpeg("evaluation.video")
@@ -103,7 +105,9 @@ def check_begin(cfg: DictConfig) -> None:
         found = read_checkpoint(cfg.ckpt_path)
         check_resumed(found, cfg.ckpt_path)
     except DataError as error:
-        again = "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
+        again = (
+            "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
+        )
         raise DataError(f"{error}{again}") from error
     check_same_scene(found, plain(cfg), cfg.ckpt_path)
 
@@ -114,7 +118,12 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
     world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
-    turn_along([*([ground_plane(world.ground, world.up)] if world.ground is not None else []), *world.planes])
+    turn_along(
+        [
+            *([ground_plane(world.ground, world.up)] if world.ground is not None else []),
+            *world.planes,
+        ]
+    )
     chosen, origins, directions, radii = lines_of_sight(scene, 0)
     if len(chosen) < 2:
         return
@@ -126,18 +135,27 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
         count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
         check_particles("simulation.dx", count)
         if count < FEWEST:
-            raise ConfigError(f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
-                              f"{dx} m")
+            raise ConfigError(
+                f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
+                f"{dx} m"
+            )
 
 
 def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
     """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
     for prefix, start in found.items():
         x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(world.colliders, x, f"the body of {prefix}", spacing=float(body.volume.mean()) ** (1 / 3))
+        check_clear(
+            world.colliders,
+            x,
+            f"the body of {prefix}",
+            spacing=float(body.volume.mean()) ** (1 / 3),
+        )
 
 
-def warn_of_little(world: World, body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]) -> None:
+def warn_of_little(
+    world: World, body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]
+) -> None:
     """A warning for a film that is learned from and ends when the object has hardly begun to deform. found: starts by prefix;
     scenes: theirs, in this order. Silent where something else than the ground may deform it."""
     if world.colliders or world.planes:
@@ -157,9 +175,15 @@ def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
     """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
     from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
     stored = twin.config["cfg"].get("scene")
-    if not cfg.get("scene") and not (isinstance(stored, dict) and all(isinstance(key, str) for key in stored)):
-        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
+    if not cfg.get("scene") and not (
+        isinstance(stored, dict) and all(isinstance(key, str) for key in stored)
+    ):
+        raise DataError(
+            f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>"
+        )
     keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "cache": None}
     if not cfg.get("scene") and keys.get("path") is not None:
-        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
+        print(
+            f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)"
+        )
     return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})

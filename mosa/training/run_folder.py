@@ -49,18 +49,24 @@ def write_figures(folder: Path, figures: dict[str, float | str]) -> None:
         return value
 
     with written_whole(folder / "metrics.json") as partial:
-        partial.write_text(json.dumps({k: strict(figures[k]) for k in sorted(figures)}, indent=1, allow_nan=False))
+        partial.write_text(
+            json.dumps({k: strict(figures[k]) for k in sorted(figures)}, indent=1, allow_nan=False)
+        )
 
 
 def read_figures(path: Path) -> dict[str, float | str]:
     """What `write_figures` wrote: infinite figures and those that are not numbers are floats again."""
     try:
         found = json.loads(path.read_text())
-        if not isinstance(found, dict) or not all(isinstance(v, (int, float, str)) for v in found.values()):
+        if not isinstance(found, dict) or not all(
+            isinstance(v, (int, float, str)) for v in found.values()
+        ):
             raise ValueError("no figures by name")
     except (ValueError, RecursionError, OSError) as error:
-        raise DataError(f"{path}: expected the figures of a complete run, found a damaged file ({error}); remove it and the run is "
-                        "made again") from error
+        raise DataError(
+            f"{path}: expected the figures of a complete run, found a damaged file ({error}); remove it and the run is "
+            "made again"
+        ) from error
     return {k: SPECIAL.get(v, v) if isinstance(v, str) else v for k, v in found.items()}
 
 
@@ -68,7 +74,9 @@ def finished(cfg: DictConfig, folder: Path) -> dict[str, float] | None:
     """The figures of a run that is complete and, with resume=auto, is not made again. Errors: ConfigError where the folder's run is
     one of another configuration."""
     if cfg.resume not in (None, "auto"):
-        raise ConfigError(f"resume: expected null or auto, found {cfg.resume!r}; a checkpoint's path is ckpt_path")
+        raise ConfigError(
+            f"resume: expected null or auto, found {cfg.resume!r}; a checkpoint's path is ckpt_path"
+        )
     path = folder / "metrics.json"
     if cfg.resume != "auto" or not path.is_file():
         return None
@@ -113,8 +121,10 @@ def device_label(name: str) -> str:
 
 def cost(device: str) -> dict[str, float | str]:
     """Device and peak memory of this process: `time/device`, `time/peak_memory_gb`, and of a GPU what torch took."""
-    figures = {"time/device": device_label(device),
-               "time/peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}
+    figures = {
+        "time/device": device_label(device),
+        "time/peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    }
     if device != "cpu":
         figures["time/peak_gpu_memory_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
     return figures

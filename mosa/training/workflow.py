@@ -69,7 +69,9 @@ class StageTimes:
     def measure(self, stage: str):
         began = time.perf_counter()
         yield
-        self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
+        self.figures[f"time/{stage}_s"] = (
+            self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
+        )
         log.info(self.costs.done(stage, time.perf_counter() - began))
 
 
@@ -96,23 +98,42 @@ def train(cfg: DictConfig) -> float | None:
         scene, others = data.scenes
     sequences_taught = 1 + len(data.taught)
     check_seen(cfg, scene)
-    clock.costs = estimate(plain(cfg), scene, len(others), sequences_taught, device, stored=data.reconstructed(),
-                           most=most_particles(device))
+    clock.costs = estimate(
+        plain(cfg),
+        scene,
+        len(others),
+        sequences_taught,
+        device,
+        stored=data.reconstructed(),
+        most=most_particles(device),
+    )
     log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
         shape, dx = data.shape, data.dx
-    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), 1e6 * float(shape.volume.sum()), dx)
+    log.info(
+        "body: %d particles, %.4g cm^3, grid spacing %.4g m",
+        len(shape.rest),
+        1e6 * float(shape.volume.sum()),
+        dx,
+    )
     resolved = resolution(shape.rest, data.reconstruction.spacing, dx)
     if not resolved.enough:
-        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
-                      f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "
-                      f"{resolved.particles} particles would resolve them", stacklevel=1)
+        warnings.warn(
+            f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
+            f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "
+            f"{resolved.particles} particles would resolve them",
+            stacklevel=1,
+        )
     with clock.measure("starts"):
         starts = data.starts
     for prefix, start in starts.items():
-        log.info("start of %s: velocity (%s) m/s", prefix, ", ".join(f"{v:.3f}" for v in start.velocity.tolist()))
+        log.info(
+            "start of %s: velocity (%s) m/s",
+            prefix,
+            ", ".join(f"{v:.3f}" for v in start.velocity.tolist()),
+        )
     with clock.measure("fit"):
         module, world = run.module, run.world
         body = module.body
@@ -125,19 +146,32 @@ def train(cfg: DictConfig) -> float | None:
         fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
-    save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
+    save_observed(
+        folder / "observed.npz",
+        {prefix: take.cues for prefix, take in zip(learned_from, module.takes)},
+    )
     with clock.measure("evaluation"):
         evaluated = run.sequences
-        figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder)
+        figures, kept = figures_of(
+            build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder
+        )
         figures |= start_figures(starts["train"]) | data.reconstruction.geometry
-        figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
+        figures |= {
+            f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()
+        }
         touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
         touched |= {f"{contact}_gain": gain for contact, gain in module.ground_gains.items()}
-        figures |= {f"id_prior/ground/{name}": value for name, value in touched.items() if math.isfinite(value)}
+        figures |= {
+            f"id_prior/ground/{name}": value
+            for name, value in touched.items()
+            if math.isfinite(value)
+        }
     if cfg.extrapolate:
         with clock.measure("extrapolation"):
             figures |= extrapolated(cfg, run, scene.known_parameters)
-    figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    figures |= (
+        clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    )
     figures["geometry/cells_across"] = resolved.cells
     figures |= {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
     log_outcome(trainer.loggers, plain(cfg), figures)
@@ -149,8 +183,10 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     """`eval.py`: reproduce the figures of a run, evaluate on another scene, or simulate from a new start."""
     quiet()
     if OmegaConf.is_missing(cfg, "ckpt_path"):
-        raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
-                          "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
+        raise ConfigError(
+            "ckpt_path: expected the checkpoint of a run, found none; "
+            "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt"
+        )
     load_extensions(plain(cfg).get("extensions"))
     check_evaluation(plain(cfg))
     exact_sums.use(cfg.deterministic)
@@ -165,10 +201,17 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         return -ranked[0].gain
     show(twin.body, cfg.appearance)
     simulate = plain(cfg.simulate)
-    if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
+    if any(
+        simulate[k] is not None
+        for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")
+    ):
         rollout = twin.simulate(**simulate, progress=True)
         given = simulate["colliders"]
-        solids = twin.world.colliders if given is None else colliders_from_config(given, "simulate.colliders")
+        solids = (
+            twin.world.colliders
+            if given is None
+            else colliders_from_config(given, "simulate.colliders")
+        )
         written = twin.export(rollout, folder, colliders=solids, video=cfg.evaluation.video)
         log.info("simulated %d frames into %s", len(rollout.x), written)
         return None
@@ -176,7 +219,10 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     body, world = twin.body, twin.world
     if cfg.get("scene"):
         seen = appearance_of(body)
-        found = {f"test/{s.sequence}": sequence_start(body, seen, s, register=True) for s in (scene, *held_out)}
+        found = {
+            f"test/{s.sequence}": sequence_start(body, seen, s, register=True)
+            for s in (scene, *held_out)
+        }
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
         if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
@@ -186,11 +232,15 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     else:
         found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}
         if len(found) != 1 + len(held_out):
-            raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
-                            f"found {len(found)}: the scene is another one than the run's")
+            raise DataError(
+                f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
+                f"found {len(found)}: the scene is another one than the run's"
+            )
     check_starts(world, body, found)
     evaluated = sequences(body, scene, held_out, found)
-    figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, twin.posterior, folder)
+    figures, kept = figures_of(
+        build_evaluation(plain(cfg)), body, evaluated, world, twin.posterior, folder
+    )
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, "test/rms_m")
 
@@ -198,7 +248,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
 def show(body: Body, appearance: str | None) -> None:
     """What the body's images show from now on: splats or particles, None for what they are. Errors: ConfigError without splats."""
     if appearance == "splats" and body.splats is None:
-        raise ConfigError("appearance: expected particles, found splats: the run kept none (rendering.appearance=particles, or an "
-                          "older one)")
+        raise ConfigError(
+            "appearance: expected particles, found splats: the run kept none (rendering.appearance=particles, or an "
+            "older one)"
+        )
     if appearance == "particles":
         body.splats = None

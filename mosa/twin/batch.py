@@ -31,18 +31,34 @@ class TwinWorlds:
     """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
 
     def __init__(
-        self, body: Body, world: World, frame_dt: float, training_start: Start, count: int, laws: Tensor | None = None
+        self,
+        body: Body,
+        world: World,
+        frame_dt: float,
+        training_start: Start,
+        count: int,
+        laws: Tensor | None = None,
     ) -> None:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
-            shape, fits = (count, len(read_numbers(body))), isinstance(laws, Tensor) and laws.is_floating_point()
+            shape, fits = (
+                (count, len(read_numbers(body))),
+                isinstance(laws, Tensor) and laws.is_floating_point(),
+            )
             if not (fits and laws.shape == shape and bool(torch.isfinite(laws.detach()).all())):
                 found = tuple(laws.shape) if fits and laws.shape != shape else repr(laws)[:80]
-                raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, "
-                                  f"found {found}")
-        self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
+                raise ConfigError(
+                    f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, "
+                    f"found {found}"
+                )
+        self.body, self.world, self.frame_dt, self.training_start = (
+            body,
+            world,
+            frame_dt,
+            training_start,
+        )
         self.count, self.laws = count, laws
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
@@ -68,7 +84,9 @@ class TwinWorlds:
         if gravity is not None:
             gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
             if gravity.shape != (self.count, 3):
-                raise ConfigError(f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}")
+                raise ConfigError(
+                    f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}"
+                )
         self._box = box
         self.episode = Episode(
             self.body, found[0][1], checked_dt(control_dt, self.frame_dt), [start for start, _ in found],
@@ -77,35 +95,70 @@ class TwinWorlds:
         )  # fmt: skip
         return self.episode.state
 
-    def restart(self, which: Sequence[int], starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None) -> TwinState:
+    def restart(
+        self,
+        which: Sequence[int],
+        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
+    ) -> TwinState:
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
         if not isinstance(which, (list, tuple, range)):
-            raise ConfigError(f"restart: expected a list of numbers of worlds, found {str(which)[:80]}")
+            raise ConfigError(
+                f"restart: expected a list of numbers of worlds, found {str(which)[:80]}"
+            )
         which, episode = list(which), self._going()
-        given = None if starts is None else [start for start, _ in self._found(starts, which, (), self._box)]
+        given = (
+            None
+            if starts is None
+            else [start for start, _ in self._found(starts, which, (), self._box)]
+        )
         return episode.restart(which, given)
 
     def _found(
-        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None, which: Sequence[int], colliders: Any, box: Any
+        self,
+        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None,
+        which: Sequence[int],
+        colliders: Any,
+        box: Any,
     ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
-        listed = isinstance(starts, (list, tuple)) and all(isinstance(start, Mapping) for start in starts)
+        listed = isinstance(starts, (list, tuple)) and all(
+            isinstance(start, Mapping) for start in starts
+        )
         if starts is not None and not isinstance(starts, Mapping) and not listed:
-            raise ConfigError(f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}")
-        each = [dict(starts or {})] * len(which) if starts is None or isinstance(starts, Mapping) else list(starts)
+            raise ConfigError(
+                f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}"
+            )
+        each = (
+            [dict(starts or {})] * len(which)
+            if starts is None or isinstance(starts, Mapping)
+            else list(starts)
+        )
         if len(each) != len(which):
-            raise ConfigError(f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}")
+            raise ConfigError(
+                f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"
+            )
         found: list[tuple[Start, World]] = []
         for i, (b, given) in enumerate(zip(which, each)):
             if unknown := sorted(set(given) - set(STARTED)):
-                raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")
+                raise ConfigError(
+                    f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}"
+                )
             if i and given is each[0]:
                 found.append(found[0])
                 continue
             try:
-                found.append(start_in(self.body, self.world, self.training_start, colliders=colliders, box=box, **given))
+                found.append(
+                    start_in(
+                        self.body,
+                        self.world,
+                        self.training_start,
+                        colliders=colliders,
+                        box=box,
+                        **given,
+                    )
+                )
             except ConfigError as error:
                 raise ConfigError(f"starts[{b}]: {error}") from error
         return found

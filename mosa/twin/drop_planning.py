@@ -59,13 +59,17 @@ def drawn_starts(count: int, seed: int) -> list[tuple[float, float, float, float
 
 
 @torch.no_grad()
-def plan(twin: Twin, *, count: int = 8, draws: int = 16, frames: int = 15, seed: int = 0) -> list[Candidate]:
+def plan(
+    twin: Twin, *, count: int = 8, draws: int = 16, frames: int = 15, seed: int = 0
+) -> list[Candidate]:
     """`count` starts, the most telling first: turned at random, thrown down as the training drop was, from where it fell.
 
     Errors: ConfigError where the run kept no posterior, or no start can be simulated.
     """
     if twin.posterior is None:
-        raise ConfigError("plan: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
+        raise ConfigError(
+            "plan: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)"
+        )
     speed = tuple(float(v) for v in twin.training_start.velocity)
     up, ground = twin.world.up, twin.world.ground
     lowest = float((twin.body.rest.cpu() @ up).min())
@@ -76,23 +80,34 @@ def plan(twin: Twin, *, count: int = 8, draws: int = 16, frames: int = 15, seed:
         motions = []
         for _ in each_law(twin.body, numbers):
             try:
-                motions.append(twin.simulate(rotation=rotation, height=height, velocity=speed, frames=frames).x.cpu())
+                motions.append(
+                    twin.simulate(
+                        rotation=rotation, height=height, velocity=speed, frames=frames
+                    ).x.cpu()
+                )
             except SimulationDiverged:
                 continue
         if len(motions) >= LEAST_DRAWS:
             gain = information(torch.stack(motions), max(twin.posterior.model_error, 1e-3))
             ranked.append(Candidate(rotation, height, speed, gain))
     if not ranked:
-        raise ConfigError("plan: none of the candidate starts can be simulated: the body leaves the box of the scene")
+        raise ConfigError(
+            "plan: none of the candidate starts can be simulated: the body leaves the box of the scene"
+        )
     return sorted(ranked, key=lambda each: -each.gain)
 
 
 def plan_text(ranked: list[Candidate]) -> str:
     """What a person does next, in lines."""
-    lines = ["Film this drop next (rotation: axis and degrees from the pose of the training drop's first frame):", ""]
+    lines = [
+        "Film this drop next (rotation: axis and degrees from the pose of the training drop's first frame):",
+        "",
+    ]
     for i, each in enumerate(ranked):
         x, y, z, degrees = each.rotation
         speed = ", ".join(f"{v:.2f}" for v in each.velocity)
-        lines.append(f"{i + 1}. {each.gain:6.2f} nats: turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f}), lowest "
-                     f"point {each.height:.3f} m above the ground, thrown at ({speed}) m/s")
+        lines.append(
+            f"{i + 1}. {each.gain:6.2f} nats: turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f}), lowest "
+            f"point {each.height:.3f} m above the ground, thrown at ({speed}) m/s"
+        )
     return "\n".join(lines)

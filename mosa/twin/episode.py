@@ -1,8 +1,8 @@
 """A twin in motion, step by step: one body, or the same one in many worlds, among colliders that actions drive.
 
-    twin.reset(height=0.2, colliders=[{"type": "box", "name": "paddle", "size": [0.1, 0.1, 0.1], "position": [-0.2, 0.1, 0]}])
-    for _ in range(50):
-        state, reactions = twin.step({"paddle": {"velocity": (0.3, 0, 0)}})
+twin.reset(height=0.2, colliders=[{"type": "box", "name": "paddle", "size": [0.1, 0.1, 0.1], "position": [-0.2, 0.1, 0]}])
+for _ in range(50):
+    state, reactions = twin.step({"paddle": {"velocity": (0.3, 0, 0)}})
 """
 
 from __future__ import annotations
@@ -19,7 +19,13 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Ready, Start, World
 from mosa.modules.fitting.parameters import each_law
 from mosa.physics.contact.colliders import reach
-from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector, turning
+from mosa.physics.contact.motion import (
+    Poses,
+    exponential,
+    rotation_matrices,
+    rotation_vector,
+    turning,
+)
 from mosa.physics.contact.overlap import check_clear
 from mosa.physics.engine.axes import entered
 from mosa.physics.engine.numerics import State, flat
@@ -69,7 +75,9 @@ class TwinState:
         """Errors: DataError naming what is missing or unknown."""
         names = {f.name for f in fields(cls)}
         if set(tensors) != names:
-            raise DataError(f"state: expected {', '.join(sorted(names))}, found {', '.join(sorted(tensors))}")
+            raise DataError(
+                f"state: expected {', '.join(sorted(names))}, found {', '.join(sorted(tensors))}"
+            )
         return cls(**tensors)
 
 
@@ -94,12 +102,24 @@ class Episode:
         frames: int = 30, substeps: int | None = None, laws: Tensor | None = None, gravity: Tensor | None = None,
         differentiable: bool = False, together: int | None = None,
     ) -> None:  # fmt: skip
-        self.world, self.colliders, self.frame_dt, self.differentiable = world, world.colliders, frame_dt, differentiable
+        self.world, self.colliders, self.frame_dt, self.differentiable = (
+            world,
+            world.colliders,
+            frame_dt,
+            differentiable,
+        )
         self.worlds = None if isinstance(starts, Start) else len(starts)
         self.names = [collider.name or str(i) for i, collider in enumerate(world.colliders)]
         if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
-            raise ConfigError(f"colliders: expected names of their own, found {', '.join(twice)} more than once")
-        options = {"frames": frames, "frame_dt": frame_dt, "model": body.model(variant), "substeps": substeps}
+            raise ConfigError(
+                f"colliders: expected names of their own, found {', '.join(twice)} more than once"
+            )
+        options = {
+            "frames": frames,
+            "frame_dt": frame_dt,
+            "model": body.model(variant),
+            "substeps": substeps,
+        }
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)
@@ -108,7 +128,9 @@ class Episode:
                 ready, self._begin = _worlds(body, world, starts, laws, gravity, options)
                 more = {"gravity": gravity, "together": together}
             self._lifts, motions = ready.lift, ready.motions(self.colliders)
-            self._raised = ready.lift.double().cpu()  # once: a step shall not wait for a GPU to say it
+            self._raised = (
+                ready.lift.double().cpu()
+            )  # once: a step shall not wait for a GPU to say it
             self._motions = motions if ready.lift.ndim > 1 else [motions]
             self._stepper, moment = ready.simulator.stepper(
                 ready.state, **ready.arguments, motions=motions, steps=frames, **more
@@ -139,22 +161,44 @@ class Episode:
     @state.setter
     def state(self, state: TwinState) -> None:
         if not isinstance(state, TwinState):
-            raise ConfigError(f"state: expected a TwinState (TwinState.read makes one of tensors), found {type(state).__name__}")
+            raise ConfigError(
+                f"state: expected a TwinState (TwinState.read makes one of tensors), found {type(state).__name__}"
+            )
         now = self.state
         for f in fields(TwinState):
             found, known = getattr(state, f.name), getattr(now, f.name)
-            if not isinstance(found, Tensor) or found.shape != known.shape or found.dtype != known.dtype:
-                what = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
-                raise ConfigError(f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}")
+            if (
+                not isinstance(found, Tensor)
+                or found.shape != known.shape
+                or found.dtype != known.dtype
+            ):
+                what = (
+                    f"{found.dtype} {tuple(found.shape)}"
+                    if isinstance(found, Tensor)
+                    else repr(found)
+                )
+                raise ConfigError(
+                    f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}"
+                )
             if not bool(torch.isfinite(found.detach()).all()):
-                raise ConfigError(f"state.{f.name}: expected finite numbers, found {found[~torch.isfinite(found)][0]}")
+                raise ConfigError(
+                    f"state.{f.name}: expected finite numbers, found {found[~torch.isfinite(found)][0]}"
+                )
         if self.colliders:
             rotation_matrices(state.rotation, state.rotation.ndim - 2)
         for name in ("frames", "substeps"):
-            if not 0 <= int(found := getattr(state, name)) <= 2**53:  # as far as times have them exactly
-                raise ConfigError(f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}")
-        particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
-        particles = entered(particles, self._stepper.axes, particles.v.dtype, self._stepper.prepared.numerics.dx)
+            if (
+                not 0 <= int(found := getattr(state, name)) <= 2**53
+            ):  # as far as times have them exactly
+                raise ConfigError(
+                    f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}"
+                )
+        particles = ParticleState(
+            *(getattr(state, name).to(now.x.device) for name in State._fields)
+        )
+        particles = entered(
+            particles, self._stepper.axes, particles.v.dtype, self._stepper.prepared.numerics.dx
+        )
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
@@ -175,7 +219,9 @@ class Episode:
                 after.append(ends)
                 return found
 
-            moment, reactions, _ = self._stepper.step(self._moment, poses if self.colliders else None, speed)
+            moment, reactions, _ = self._stepper.step(
+                self._moment, poses if self.colliders else None, speed
+            )
             self._moment, self._driven = moment, driven
             self._poses = after[0] if after else self._poses
             return Stepped(self.state, reactions)
@@ -185,27 +231,47 @@ class Episode:
         is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
         """
         if self.worlds is None or not all(type(b) is int and 0 <= b < self.worlds for b in which):
-            raise ConfigError(f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}")
+            raise ConfigError(
+                f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}"
+            )
         if starts is not None and len(starts) != len(which):
-            raise ConfigError(f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}")
+            raise ConfigError(
+                f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}"
+            )
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
-        again = dict(zip(which, starts if starts is not None else [self._starts[b] for b in which], strict=True))
+        again = dict(
+            zip(
+                which,
+                starts if starts is not None else [self._starts[b] for b in which],
+                strict=True,
+            )
+        )
         with self._gradients():
             moved = chosen[:, None] & self._driven  # solids that are back
             poses = tuple(torch.where(moved.view(*moved.shape, *(1,) * (first.ndim - 2)), first, now)
                           for first, now in zip(self._first, self._poses))  # fmt: skip
-            now, spacing = moment.state.worlds(), float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3)
+            now, spacing = (
+                moment.state.worlds(),
+                float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3),
+            )
             for b in again:
                 begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
                 check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
                             tuple(part[b] for part in poses))  # fmt: skip
-                now[b] = entered(begun, self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx)
+                now[b] = entered(
+                    begun, self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx
+                )
             fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
-            state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in State._fields))
+            state = ParticleState(
+                *(
+                    _where(chosen, getattr(fresh, n), getattr(moment.state, n))
+                    for n in State._fields
+                )
+            )
             self._poses = poses
             self._moment = moment._replace(state=state)
             return self.state
@@ -219,30 +285,40 @@ class Episode:
     def _placed(self, moment: Moment, after: int, dt: float | None = None) -> tuple[Tensor, Tensor]:
         """(position, rotation) of all colliders on their own motions, `after` substeps after `moment`, where they are seen."""
         if not self.colliders:
-            return torch.zeros(*self._leading(), 0, 3).double(), torch.zeros(*self._leading(), 0, 3, 3).double()
+            return torch.zeros(*self._leading(), 0, 3).double(), torch.zeros(
+                *self._leading(), 0, 3, 3
+            ).double()
         found = self._own(moment, 1, self._stepper.clock.dt if dt is None else dt, after)
         return found.position[0] - self._up(), found.rotation[0]
 
     def _own(self, moment: Moment, count: int, dt: float, after: int = 0) -> Poses:
         """(S, [B,] K, ...) of the colliders' own motions, where the simulation sees them."""
-        each = [self._stepper.sample(moment, count, dt, motions, after) for motions in self._motions]
+        each = [
+            self._stepper.sample(moment, count, dt, motions, after) for motions in self._motions
+        ]
         if self.worlds is None:
             return each[0]
         if len(each) == 1:
-            return Poses(*(part[:, None].expand(-1, self.worlds, *part.shape[1:]) for part in each[0]))
+            return Poses(
+                *(part[:, None].expand(-1, self.worlds, *part.shape[1:]) for part in each[0])
+            )
         return Poses(*(torch.stack(parts, 1) for parts in zip(*each)))
 
     def _up(self) -> Tensor:
         """The lifts, to be added to positions ([B,] K, 3)."""
         return self._raised.unsqueeze(-2)
 
-    def _along(self, commands: dict[int, dict], driven: Tensor, count: int, dt: float) -> tuple[Poses, tuple[Tensor, Tensor]]:
+    def _along(
+        self, commands: dict[int, dict], driven: Tensor, count: int, dt: float
+    ) -> tuple[Poses, tuple[Tensor, Tensor]]:
         """(poses at the step's substeps, (position, rotation) after it)."""
         own, ends = None, None
         if not bool(driven.all()):
             own, ends = self._own(self._moment, count, dt), self._placed(self._moment, count, dt)
         columns, last = [], []
-        times = dt * torch.arange(count, dtype=torch.float64).view(-1, *(1,) * (1 + len(self._leading())))
+        times = dt * torch.arange(count, dtype=torch.float64).view(
+            -1, *(1,) * (1 + len(self._leading()))
+        )
         for k in range(len(self.colliders)):
             if not driven[k]:
                 columns.append([part.select(1 + len(self._leading()), k) for part in own])
@@ -252,15 +328,29 @@ class Episode:
             v, w, end = self._twist(commands.get(k, {}), x, R)
             turns = w.requires_grad or bool((w != 0).any())
             turned = exponential(times * w) @ R if turns else R.expand(count, *R.shape)
-            columns.append([x + times * v + self._raised, turned, v.expand(count, *x.shape), w.expand(count, *x.shape)])
+            columns.append(
+                [
+                    x + times * v + self._raised,
+                    turned,
+                    v.expand(count, *x.shape),
+                    w.expand(count, *x.shape),
+                ]
+            )
             after = exponential(self.frame_dt * w) @ R if turns else R
             last.append([end.get("position", x + self.frame_dt * v), end.get("rotation", after)])
         axis = 1 + len(self._leading())
         # of one collider without a copy: what is the same at all substeps stays one row
-        poses = Poses(*(torch.stack(parts, axis) if len(parts) > 1 else parts[0].unsqueeze(axis) for parts in zip(*columns)))
+        poses = Poses(
+            *(
+                torch.stack(parts, axis) if len(parts) > 1 else parts[0].unsqueeze(axis)
+                for parts in zip(*columns)
+            )
+        )
         return poses, tuple(torch.stack(parts, axis - 1) for parts in zip(*last))
 
-    def _twist(self, command: dict[str, Tensor], x: Tensor, R: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    def _twist(
+        self, command: dict[str, Tensor], x: Tensor, R: Tensor
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """(velocity, angular velocity, pose after the step where it was said) of a driven collider at x (3,), R (3, 3)."""
         zero = torch.zeros_like(x)
         v, w, end = command.get("velocity", zero), command.get("angular_velocity", zero), {}
@@ -269,7 +359,11 @@ class Episode:
             v = (end["position"] - x) / self.frame_dt
         if "rotation" in command:
             end["rotation"] = command["rotation"].expand_as(R)
-            w = (rotation_vector(end["rotation"] @ R.mT) if "turn" not in command else command["turn"]) / self.frame_dt
+            w = (
+                rotation_vector(end["rotation"] @ R.mT)
+                if "turn" not in command
+                else command["turn"]
+            ) / self.frame_dt
         return v.expand_as(x), w.expand_as(x), end
 
     def _speed(self, commands: dict[int, dict], driven: Tensor) -> float:
@@ -280,14 +374,21 @@ class Episode:
             if not driven[k]:
                 fastest = max(fastest, collider.motion.max_speed(far))
             elif k in commands:
-                v, w, _ = self._twist(commands[k], *(part.select(len(self._leading()), k).detach() for part in self._poses))
-                fastest = max(fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max()))
+                v, w, _ = self._twist(
+                    commands[k],
+                    *(part.select(len(self._leading()), k).detach() for part in self._poses),
+                )
+                fastest = max(
+                    fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max())
+                )
         return fastest
 
     def _checked(self, action: Mapping[str, Any]) -> dict[int, dict[str, Tensor]]:
         """By the collider's number: float64 tensors on the CPU. Errors: ConfigError."""
         if not isinstance(action, Mapping):
-            raise ConfigError(f"action: expected commands by the names of colliders, found {action!r}")
+            raise ConfigError(
+                f"action: expected commands by the names of colliders, found {action!r}"
+            )
         commands = {}
         for name, command in action.items():
             if name not in self.names:
@@ -302,14 +403,20 @@ class Episode:
                     f"{', '.join(map(str, command)) or 'nothing'}"
                 )
             k, given = self.names.index(name), command.get("rotation")
-            commands[k] = {key: self._vector(f"{where}.{key}", value) for key, value in command.items()}
+            commands[k] = {
+                key: self._vector(f"{where}.{key}", value) for key, value in command.items()
+            }
             said = None if given is None else torch.as_tensor(given, dtype=torch.float64).cpu()
             if said is None or said.shape[-2:] == (3, 3):
                 continue
             if bool((said.detach().norm(dim=-1) > math.pi - 1e-6).any()):
                 # half a turn or more, from what was said last where that is where the solid is
                 R, last = self._poses[1].select(len(self._leading()), k), self._said.get(k)
-                last = last if last is not None and torch.allclose(exponential(last).expand_as(R), R) else rotation_vector(R)
+                last = (
+                    last
+                    if last is not None and torch.allclose(exponential(last).expand_as(R), R)
+                    else rotation_vector(R)
+                )
                 commands[k]["turn"] = turning(last, said)
             self._said[k] = said
         return commands
@@ -325,7 +432,11 @@ class Episode:
         except (TypeError, ValueError, RuntimeError) as error:
             raise ConfigError(f"{expected}, found {str(value)[:80]}") from error
         if tuple(found.shape) not in shapes or not bool(torch.isfinite(found.detach()).all()):
-            what = f"shape {tuple(found.shape)}" if tuple(found.shape) not in shapes else f"{found.tolist()}"
+            what = (
+                f"shape {tuple(found.shape)}"
+                if tuple(found.shape) not in shapes
+                else f"{found.tolist()}"
+            )
             raise ConfigError(f"{expected}, found {what}")
         if not where.endswith(".rotation"):
             return found
@@ -344,35 +455,63 @@ def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 def _fastest(body: Body, starts: Sequence[Start]) -> Start:
     """The start for which the time step must be smallest."""
-    return max(starts, key=lambda s: float(s.velocity.detach().norm() + s.angular_velocity.detach().norm() * body.size))
+    return max(
+        starts,
+        key=lambda s: float(
+            s.velocity.detach().norm() + s.angular_velocity.detach().norm() * body.size
+        ),
+    )
 
 
 def _worlds(
-    body: Body, world: World, starts: Sequence[Start], laws: Tensor | None, gravity: Tensor | None, options: dict
+    body: Body,
+    world: World,
+    starts: Sequence[Start],
+    laws: Tensor | None,
+    gravity: Tensor | None,
+    options: dict,
 ) -> tuple[Ready, Callable[[int, Start], ParticleState]]:
     """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
-        raise ConfigError("simulation.adaptive: expected false with many worlds, which take the same substeps")
+        raise ConfigError(
+            "simulation.adaptive: expected false with many worlds, which take the same substeps"
+        )
     if laws is not None and (len(laws) != len(starts) or options["model"] != body.model()):
-        raise ConfigError(f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
-                          f"{'' if options['model'] == body.model() else ' of another variant'}")
-    pulls = [world.gravity.to(body.rest)] * len(starts) if gravity is None else list(gravity.to(body.rest))
+        raise ConfigError(
+            f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
+            f"{'' if options['model'] == body.model() else ' of another variant'}"
+        )
+    pulls = (
+        [world.gravity.to(body.rest)] * len(starts)
+        if gravity is None
+        else list(gravity.to(body.rest))
+    )
     # the time step is one for all
     quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
-    hardest = max((replace(world, gravity=pull) for pull in pulls), key=lambda each: each.fastest(quick, body.size, time))
+    hardest = max(
+        (replace(world, gravity=pull) for pull in pulls),
+        key=lambda each: each.fastest(quick, body.size, time),
+    )
     if laws is None:
         found = [body.ready(quick, hardest, **options)]
     else:
-        counts = [body.ready(quick, hardest, **options).simulator.substeps for _ in each_law(body, laws)]
+        counts = [
+            body.ready(quick, hardest, **options).simulator.substeps for _ in each_law(body, laws)
+        ]
         fixed = {**options, "substeps": max(counts)}
         found = [body.ready(quick, hardest, **fixed).answered() for _ in each_law(body, laws)]
     first = found[0].simulator
-    simulator = body.simulator(first.law.name, first.substeps, first.frame_dt, world, first.numerics.strain)
+    simulator = body.simulator(
+        first.law.name, first.substeps, first.frame_dt, world, first.numerics.strain
+    )
 
     def begin(b: int, start: Start) -> ParticleState:
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
         return state.to(simulator.dtype)
 
-    ready, states = found[0] if laws is None else Ready.stack(found), [begin(b, start) for b, start in enumerate(starts)]
+    ready, states = (
+        found[0] if laws is None else Ready.stack(found),
+        [begin(b, start) for b, start in enumerate(starts)],
+    )
     return replace(ready, simulator=simulator, state=ParticleState.stack(states)), begin

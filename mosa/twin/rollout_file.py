@@ -15,7 +15,9 @@ from mosa.system.npz import write_npz
 from mosa.types import MotionCues, Rollout
 
 
-def save_rollout(path: str | Path, parts: Mapping[str, Rollout], colliders: Sequence[Collider] = ()) -> None:
+def save_rollout(
+    path: str | Path, parts: Mapping[str, Rollout], colliders: Sequence[Collider] = ()
+) -> None:
     """npz of rollouts under `<name>/...`: x, v [T, N, 3] (m, m/s), F, F_tot [T, N, 3, 3], times [T] (s), counts [T - 1].
 
     Where there are K colliders also reactions [T - 1, substeps, K, 6]: force (N) and torque about each one's origin (N m) of
@@ -29,7 +31,9 @@ def save_rollout(path: str | Path, parts: Mapping[str, Rollout], colliders: Sequ
         if rollout.reactions is not None:
             tensors["reactions"] = rollout.reactions
         if colliders:
-            tensors["collider_position"], tensors["collider_rotation"] = poses(colliders, rollout.times)
+            tensors["collider_position"], tensors["collider_rotation"] = poses(
+                colliders, rollout.times
+            )
         arrays |= {f"{name}/{key}": t.detach().cpu().numpy() for key, t in tensors.items()}
     write_npz(path, arrays)
 
@@ -39,21 +43,33 @@ def poses(colliders: Sequence[Collider], times: Tensor) -> tuple[Tensor, Tensor]
     frames = len(times)
     frame_dt = float(times[1] - times[0]) if frames > 1 else 1.0
     found = [pose(collider.motion, frames, frame_dt) for collider in colliders]
-    return torch.stack([position for position, _ in found], 1), torch.stack([rotation for _, rotation in found], 1)
+    return torch.stack([position for position, _ in found], 1), torch.stack(
+        [rotation for _, rotation in found], 1
+    )
 
 
 def pose(motion: Motion | Trajectory, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
     """(position (T, 3), rotation (T, 3, 3)) of one collider at its frames; of a trajectory, which ends before the last one, the
     last pose it has."""
     if isinstance(motion, Trajectory):
-        index = (torch.arange(frames) * (len(motion.position) // max(frames - 1, 1))).clamp(max=len(motion.position) - 1)
-        return motion.position.detach().double().cpu()[index], rotation_matrices(motion.rotation, 1).detach().double().cpu()[index]
+        index = (torch.arange(frames) * (len(motion.position) // max(frames - 1, 1))).clamp(
+            max=len(motion.position) - 1
+        )
+        return motion.position.detach().double().cpu()[index], rotation_matrices(
+            motion.rotation, 1
+        ).detach().double().cpu()[index]
     return motion.timed(max(frames - 1, 1), frame_dt).sample(frames, 1, frame_dt)[:2]
 
 
 def save_observed(path: str | Path, parts: Mapping[str, MotionCues]) -> None:
     """npz with x [T, N, 3] and covariances [T, N, 3, 3] of the motions learned from, under `<name>/...` as `save_rollout`."""
-    save_parts(path, {name: {"x": cues.positions, "covariances": cues.covariances} for name, cues in parts.items()})
+    save_parts(
+        path,
+        {
+            name: {"x": cues.positions, "covariances": cues.covariances}
+            for name, cues in parts.items()
+        },
+    )
 
 
 def save_spread(path: str | Path, parts: Mapping[str, Tensor]) -> None:

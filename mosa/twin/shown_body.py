@@ -37,7 +37,9 @@ class ShownBody:
     def of(cls, body: Body, world: World) -> ShownBody:
         with torch.no_grad():
             factor = body.factor(body.heterogeneity)
-        return cls(body.rest, body.colors, body.opacities, body.covariances, factor, body.splats, world)
+        return cls(
+            body.rest, body.colors, body.opacities, body.covariances, factor, body.splats, world
+        )
 
     @classmethod
     def read(cls, path: Path) -> ShownBody:
@@ -46,22 +48,39 @@ class ShownBody:
         found = {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
         try:
             check_tensors({name: found.get(name) for name in TENSORS}, path)
-            written = {name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)}
+            written = {
+                name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)
+            }
             known = checked_splats({"mosa": {"splats": written or None}}, path)
             splats = None if known is None else CarriedSplats.read(known, found["rest"])
         except MosaError as error:
             raise DataError(str(error).removeprefix("ckpt_path: ")) from error
         count = len(found["rest"])
-        for name, shape in (("factor", (count,)), ("up", (3,)), *([("ground", ())] if "ground" in found else [])):
+        for name, shape in (
+            ("factor", (count,)),
+            ("up", (3,)),
+            *([("ground", ())] if "ground" in found else []),
+        ):
             part = found.get(name)
-            if part is None or tuple(part.shape) != shape or not part.is_floating_point() or not bool(part.isfinite().all()):
-                raise DataError(f"{path}: {name}: expected finite numbers of shape {shape}, found "
-                                f"{'none' if part is None else f'{part.dtype} {tuple(part.shape)}'}")
+            if (
+                part is None
+                or tuple(part.shape) != shape
+                or not part.is_floating_point()
+                or not bool(part.isfinite().all())
+            ):
+                raise DataError(
+                    f"{path}: {name}: expected finite numbers of shape {shape}, found "
+                    f"{'none' if part is None else f'{part.dtype} {tuple(part.shape)}'}"
+                )
         if not float(found["up"].norm()) > 0:
             raise DataError(f"{path}: up: expected a direction, found {found['up'].tolist()}")
         up, ground = found["up"].float() / float(found["up"].norm()), found.get("ground")
-        world = World(None if ground is None else Ground(float(ground)), torch.zeros(3), up, torch.zeros(2, 3))
-        parts = (found[name].float() for name in ("rest", "colors", "opacities", "covariances", "factor"))
+        world = World(
+            None if ground is None else Ground(float(ground)), torch.zeros(3), up, torch.zeros(2, 3)
+        )
+        parts = (
+            found[name].float() for name in ("rest", "colors", "opacities", "covariances", "factor")
+        )
         return cls(*parts, splats, world)
 
 
@@ -69,7 +88,10 @@ def save_body(path: str | Path, body: Body, world: World) -> None:
     """npz of the tensors of a body (rest [m], volume [m^3], colors, opacities, covariances [m^2]), factor (N,), up (3,), ground ()
     [m] where there is one, and of the splats that it carries under `splats/`."""
     shown = ShownBody.of(body, world)
-    tensors = {name: getattr(body, name) for name in TENSORS} | {"factor": shown.factor, "up": world.up.float()}
+    tensors = {name: getattr(body, name) for name in TENSORS} | {
+        "factor": shown.factor,
+        "up": world.up.float(),
+    }
     if world.ground is not None:
         tensors["ground"] = torch.tensor(float(world.ground.height))
     if body.splats is not None:

@@ -24,22 +24,35 @@ SOLID = (150, 160, 175)
 def lattice(a: float, b: float, pitch: float) -> Tensor:
     """(K, 2) points of a rectangle with edges a and b [m] about 0."""
     ends = [max(2, round(edge / pitch)) for edge in (a, b)]
-    return torch.cartesian_prod(*(torch.linspace(-0.5 * edge, 0.5 * edge, n) for edge, n in zip((a, b), ends)))
+    return torch.cartesian_prod(
+        *(torch.linspace(-0.5 * edge, 0.5 * edge, n) for edge, n in zip((a, b), ends))
+    )
 
 
 def surface(shape: Shape, pitch: float) -> Tensor:
     """(K, 3) points about `pitch` [m] apart on a solid, in its own axes; none on a half space or a mesh."""
     if isinstance(shape, Box):
-        return torch.cat([_face(shape.size, axis, side, pitch) for axis in range(3) for side in (-0.5, 0.5)])
+        return torch.cat(
+            [_face(shape.size, axis, side, pitch) for axis in range(3) for side in (-0.5, 0.5)]
+        )
     if not isinstance(shape, (Sphere, Capsule, Cylinder)):
         return torch.zeros(0, 3)
     length, radius = getattr(shape, "length", 0.0), shape.radius
-    rings = [(radius, z) for z in torch.linspace(-0.5 * length, 0.5 * length, max(1, round(length / pitch))).tolist() if length]
+    rings = [
+        (radius, z)
+        for z in torch.linspace(-0.5 * length, 0.5 * length, max(1, round(length / pitch))).tolist()
+        if length
+    ]
     if isinstance(shape, Cylinder):
-        caps = [(r, 0.5 * length) for r in torch.linspace(0, radius, max(2, round(radius / pitch))).tolist()]
+        caps = [
+            (r, 0.5 * length)
+            for r in torch.linspace(0, radius, max(2, round(radius / pitch))).tolist()
+        ]
     else:
         angles = torch.linspace(0, 0.5 * math.pi, max(2, round(0.5 * math.pi * radius / pitch)))
-        caps = [(radius * math.cos(a), 0.5 * length + radius * math.sin(a)) for a in angles.tolist()]
+        caps = [
+            (radius * math.cos(a), 0.5 * length + radius * math.sin(a)) for a in angles.tolist()
+        ]
     rings += caps + [(r, -z) for r, z in caps]
     return torch.cat([_ring(r, z, pitch) for r, z in rings])
 
@@ -60,10 +73,15 @@ def _ring(radius: float, z: float, pitch: float) -> Tensor:
 def shaded(points: Tensor, up: Tensor, color: Tensor) -> Tensor:
     """(K, 3) a colour (3,) that is a little darker below: edges then show without a light."""
     high = points @ up
-    return color * (0.8 + 0.2 * (high - high.min()) / (high.max() - high.min()).clamp_min(1e-6))[:, None]
+    return (
+        color
+        * (0.8 + 0.2 * (high - high.min()) / (high.max() - high.min()).clamp_min(1e-6))[:, None]
+    )
 
 
-def with_solids(body: Seen, colliders: Sequence[Collider], times: Tensor, up: Tensor, pitch: float) -> Seen:
+def with_solids(
+    body: Seen, colliders: Sequence[Collider], times: Tensor, up: Tensor, pitch: float
+) -> Seen:
     """A body over T frames among solids where their motions have them at times (T,) [s]. pitch [m]: between Gaussians."""
     parts, wide, colors = [], [], []
     at, turned = (t.to(body.means) for t in poses(colliders, times)) if colliders else (None, None)

@@ -33,7 +33,12 @@ def check_frames(frames: int, particles: int) -> None:
     """Errors: ConfigError where frames are no whole number, or are more than the machine can hold."""
     if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
         raise ConfigError(f"frames: expected a whole number of at least 1, found {frames!r}")
-    counted("frames", (frames, particles), "frames times particles, of which this machine can hold fewer", each=STORED_BYTES)
+    counted(
+        "frames",
+        (frames, particles),
+        "frames times particles, of which this machine can hold fewer",
+        each=STORED_BYTES,
+    )
 
 
 def check_variant(variant: str) -> None:
@@ -46,7 +51,9 @@ def checked_dt(value: float | None, default: float) -> float:
     if value is None:
         return default
     if not is_number(value) or not 0 < value <= 100:
-        raise ConfigError(f"control_dt: expected a positive number of at most 100 [s], found {value!r}")
+        raise ConfigError(
+            f"control_dt: expected a positive number of at most 100 [s], found {value!r}"
+        )
     return float(value)
 
 
@@ -63,8 +70,10 @@ def check_wants_no_gradients(**given: Any) -> None:
         return
     for name, value in given.items():
         if asks_for_gradients(value):
-            raise ConfigError(f"{name}: expected a tensor without gradients, found one that requires them: they come through "
-                              "reset(differentiable=True) and step alone; else pass tensor.detach(), or call it in torch.no_grad()")
+            raise ConfigError(
+                f"{name}: expected a tensor without gradients, found one that requires them: they come through "
+                "reset(differentiable=True) and step alone; else pass tensor.detach(), or call it in torch.no_grad()"
+            )
 
 
 def asks_for_gradients(value: Any) -> bool:
@@ -81,8 +90,12 @@ def asks_for_gradients(value: Any) -> bool:
 
 
 def checked_substeps(value: int | None) -> int | None:
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_SUBSTEPS):
-        raise ConfigError(f"substeps: expected a whole number of at least 1 and at most {MOST_SUBSTEPS}, or None, found {value!r}")
+    if value is not None and (
+        isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_SUBSTEPS
+    ):
+        raise ConfigError(
+            f"substeps: expected a whole number of at least 1 and at most {MOST_SUBSTEPS}, or None, found {value!r}"
+        )
     return value
 
 
@@ -90,7 +103,9 @@ def placed(position: Sequence[float | None] | Tensor, center: Tensor) -> Tensor:
     """(3,) the centre with the numbers of `position` that are not None. Errors: ConfigError."""
     if isinstance(position, Sequence) and not isinstance(position, str) and len(position) == 3:
         kept = [number is None for number in position]
-        found = vector("position", [0.0 if number is None else number for number in position]).to(center)
+        found = vector("position", [0.0 if number is None else number for number in position]).to(
+            center
+        )
         return torch.where(torch.tensor(kept, device=center.device), center, found)
     return vector("position", position).to(center)
 
@@ -101,7 +116,11 @@ def numbers(name: str, value: Sequence[float] | Tensor, expected: str) -> Tensor
         result = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
-    if result.dtype == torch.bool or result.is_complex() or not bool(torch.isfinite(result.detach().float()).all()):
+    if (
+        result.dtype == torch.bool
+        or result.is_complex()
+        or not bool(torch.isfinite(result.detach().float()).all())
+    ):
         raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
     return result if result.dtype == torch.float64 else result.float()
 
@@ -114,13 +133,17 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
         R = value.detach().double()
         defect = float((R @ R.T - torch.eye(3).double()).abs().max())
         if defect > 1e-3 or float(torch.linalg.det(R)) < 0:
-            raise ConfigError(f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
-                              f"{float(torch.linalg.det(R)):.3g}: scaled, sheared or mirrored bodies are not what was learned")
+            raise ConfigError(
+                f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
+                f"{float(torch.linalg.det(R)):.3g}: scaled, sheared or mirrored bodies are not what was learned"
+            )
         return value
     if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:
         raise ConfigError(f"rotation: expected {expected}, found {value.tolist()}")
     axis = (value[:3].double() / value[:3].double().norm()).numpy()
-    return torch.tensor(Rotation.from_rotvec(axis * math.radians(float(value[3]))).as_matrix(), dtype=torch.float32)
+    return torch.tensor(
+        Rotation.from_rotvec(axis * math.radians(float(value[3]))).as_matrix(), dtype=torch.float32
+    )
 
 
 def vector(name: str, value: Sequence[float]) -> Tensor:
@@ -136,7 +159,11 @@ def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
     """(2, 3) [m] the corners of a box. Errors: ConfigError."""
     expected = f"[low, high] corners, (2, 3) finite numbers within {FASTEST:g} [m] with low below high on every axis"
     result = numbers("box", value, expected).detach()
-    if result.shape != (2, 3) or float(result.abs().max()) > FASTEST or not bool((result[0] < result[1]).all()):
+    if (
+        result.shape != (2, 3)
+        or float(result.abs().max()) > FASTEST
+        or not bool((result[0] < result[1]).all())
+    ):
         raise ConfigError(f"box: expected {expected}, found {str(value)[:120]}")
     return result
 
@@ -151,7 +178,11 @@ def start_in(
     Q = first.rotation if rotation is None else rotation_matrix(rotation)
     Q = Q.to(body.rest)
     velocity_ = first.velocity if velocity is None else vector("velocity", velocity)
-    spin = first.angular_velocity if angular_velocity is None else vector("angular_velocity", angular_velocity)
+    spin = (
+        first.angular_velocity
+        if angular_velocity is None
+        else vector("angular_velocity", angular_velocity)
+    )
     center = first.center.to(body.rest)
     if position is not None:
         center = placed(position, center)
@@ -159,10 +190,18 @@ def start_in(
     arms = (body.rest - body.center) @ Q.T
     if height is not None:
         if not is_number(height) or (height < 0 and world.ground is not None):
-            raise ConfigError(f"height: expected metres above the ground, a finite number >= 0, found {height!r}")
+            raise ConfigError(
+                f"height: expected metres above the ground, a finite number >= 0, found {height!r}"
+            )
         ground, low = world.ground.height if world.ground is not None else 0.0, arms @ up
-        if world.ground is not None and world.ground.mode == "touch":  # it is met by balls, where it was found to be
-            low = low - 0.5 * body.volume.to(low) ** (1 / 3) + body.contact.lift(world.ground).detach()
+        if (
+            world.ground is not None and world.ground.mode == "touch"
+        ):  # it is met by balls, where it was found to be
+            low = (
+                low
+                - 0.5 * body.volume.to(low) ** (1 / 3)
+                + body.contact.lift(world.ground).detach()
+            )
         center = center + up * (ground + height - low.min() - center @ up)
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
     if colliders is not None:
@@ -172,13 +211,22 @@ def start_in(
         x, (low, high) = (center + arms).detach(), world.box.to(arms)
         outside = float(((x < low) | (x > high)).any(1).double().mean())
         if outside > 0:
-            raise ConfigError(f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
-                              f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m")
-    field, spacing = "world.colliders" if colliders is None else "colliders", float(body.volume.mean()) ** (1 / 3)
+            raise ConfigError(
+                f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
+                f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m"
+            )
+    field, spacing = (
+        "world.colliders" if colliders is None else "colliders",
+        float(body.volume.mean()) ** (1 / 3),
+    )
     check_clear(world.colliders, center + arms, "the body", field, spacing)
     if world.ground is not None:
-        below = float((((center + arms) @ up).detach() < world.ground.height - 0.25 * spacing).double().mean())
+        below = float(
+            (((center + arms) @ up).detach() < world.ground.height - 0.25 * spacing).double().mean()
+        )
         if below > UNDER:
-            raise ConfigError(f"position: expected a body that starts above the ground of {world.ground.height:g} m, "
-                              f"found {below:.0%} of it below (height is that of its lowest point above the ground)")
+            raise ConfigError(
+                f"position: expected a body that starts above the ground of {world.ground.height:g} m, "
+                f"found {below:.0%} of it below (height is that of its lowest point above the ground)"
+            )
     return start, world

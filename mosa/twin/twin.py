@@ -1,9 +1,9 @@
 """The learned twin in use: load a checkpoint, roll its law out from a new start or step by step, export particles and a video.
 
-    from mosa.twin import Twin
-    twin = Twin.load("outputs/train/.../checkpoints/last.ckpt")
-    rollout = twin.simulate(rotation=(1, 0, 0, 45), height=0.2, velocity=(0.5, -2, 0), frames=30)
-    twin.export(rollout, "falling/")
+from mosa.twin import Twin
+twin = Twin.load("outputs/train/.../checkpoints/last.ckpt")
+rollout = twin.simulate(rotation=(1, 0, 0, 45), height=0.2, velocity=(0.5, -2, 0), frames=30)
+twin.export(rollout, "falling/")
 """
 
 from __future__ import annotations
@@ -18,12 +18,25 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from mosa.config.build import build_body, build_world
-from mosa.config.checkpoints import TENSORS, check_kinds, checked, checked_posterior, checked_splats, read_checkpoint
+from mosa.config.checkpoints import (
+    TENSORS,
+    check_kinds,
+    checked,
+    checked_posterior,
+    checked_splats,
+    read_checkpoint,
+)
 from mosa.data.io.splat_formats import check_formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation.analysis.comparison import ground_lines, on_ground
 from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_video
-from mosa.evaluation.uncertainty import DRAWS, among_forms, drawn_motions, rival_motions, total_spread
+from mosa.evaluation.uncertainty import (
+    DRAWS,
+    among_forms,
+    drawn_motions,
+    rival_motions,
+    total_spread,
+)
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
@@ -77,9 +90,15 @@ class Twin:
             if splats is not None:
                 body.splats = CarriedSplats.read(splats, body.rest)
             world, start = build_world(config["world"]), Start.read(begun)
-        except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
-            reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
-            raise DataError(f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})") from error
+        except (
+            Exception
+        ) as error:  # every part has been checked; a file of a stranger may still fit no body
+            reason = (
+                str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
+            )
+            raise DataError(
+                f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})"
+            ) from error
         known = checked_posterior(checkpoint, len(read_numbers(body)), path)
         posterior = None if known is None else Posterior.read(known)
         return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
@@ -91,14 +110,23 @@ class Twin:
         (a fit by Adam), or where fewer than two of the draws can be simulated.
         """
         if self.posterior is None:
-            raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
-        rollout, laws = self.simulate(**start), self.posterior.draws(draws, torch.Generator().manual_seed(seed))
+            raise ConfigError(
+                "predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)"
+            )
+        rollout, laws = (
+            self.simulate(**start),
+            self.posterior.draws(draws, torch.Generator().manual_seed(seed)),
+        )
         found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
-            raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
-                              f"found {len(found)}")
+            raise ConfigError(
+                f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
+                f"found {len(found)}"
+            )
         others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
-        return rollout, total_spread(torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others))
+        return rollout, total_spread(
+            torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others)
+        )
 
     def simulate(
         self,
@@ -130,10 +158,15 @@ class Twin:
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
         check_wants_no_gradients(**given)
-        with torch.no_grad(), tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
+        with (
+            torch.no_grad(),
+            tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar,
+        ):
             start, world = start_in(self.body, self.world, self.training_start, **given)
             model = self.body.model(variant)
-            return self.body.simulate(start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update())
+            return self.body.simulate(
+                start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update()
+            )
 
     def reset(
         self,
@@ -209,7 +242,12 @@ class Twin:
         return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
 
     @torch.no_grad()
-    def render(self, rollout: Rollout, size: int = 400, colliders: Sequence[Collider | Mapping[str, Any]] | None = None) -> Tensor:
+    def render(
+        self,
+        rollout: Rollout,
+        size: int = 400,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+    ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
         rollout was simulated with (None: the world's). Half spaces and meshes are not drawn."""
         body, up = self.body, self.world.up.to(self.body.rest)
@@ -218,28 +256,55 @@ class Twin:
         # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
         for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
             if 0 < (far := reach(solid.shape)) < body.size:
-                low, high = torch.minimum(low, at.amin(0).to(low) - far), torch.maximum(high, at.amax(0).to(high) + far)
+                low, high = (
+                    torch.minimum(low, at.amin(0).to(low) - far),
+                    torch.maximum(high, at.amax(0).to(high) + far),
+                )
         target = 0.5 * (low + high)
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
-        side = side - (side @ up) * up if float((side - (side @ up) * up).norm()) > 1e-3 else torch.roll(up, 1)
+        side = (
+            side - (side @ up) * up
+            if float((side - (side @ up) * up).norm()) > 1e-3
+            else torch.roll(up, 1)
+        )
         focal = 1.6 * size
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
         eye = target + distance * (side / side.norm() + 0.25 * up)
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-        camera = Cameras(K[None].to(body.rest), look_at(eye, target, up)[None].to(body.rest), size, size, ("view",))
-        shown = with_solids(seen(body, rollout.x, rollout.F_tot), solids, rollout.times, up, body.size / 30)
+        camera = Cameras(
+            K[None].to(body.rest),
+            look_at(eye, target, up)[None].to(body.rest),
+            size,
+            size,
+            ("view",),
+        )
+        shown = with_solids(
+            seen(body, rollout.x, rollout.F_tot), solids, rollout.times, up, body.size / 30
+        )
         images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
         lines = ground_lines(self.world, camera, body.size)
-        drawn = [on_ground(to_uint8(image), lines, 1, torch.ones(3)) for image in images] if lines else []
+        drawn = (
+            [on_ground(to_uint8(image), lines, 1, torch.ones(3)) for image in images]
+            if lines
+            else []
+        )
         return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
 
-    def _met(self, rollout: Rollout, colliders: Sequence[Collider | Mapping[str, Any]] | None) -> tuple[Collider, ...]:
+    def _met(
+        self, rollout: Rollout, colliders: Sequence[Collider | Mapping[str, Any]] | None
+    ) -> tuple[Collider, ...]:
         """The solids of a rollout, None for the world's. Errors: ConfigError where they are not as many as it has reactions of."""
         met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
-        solids = self.world.colliders if met and colliders is None else colliders_from_config(colliders or (), "colliders")
+        solids = (
+            self.world.colliders
+            if met and colliders is None
+            else colliders_from_config(colliders or (), "colliders")
+        )
         if met != len(solids):
-            raise ConfigError(f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
-                              f"{len(solids)}")
+            raise ConfigError(
+                f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
+                f"{len(solids)}"
+            )
         return tuple(solids)
 
     def export(
@@ -258,11 +323,19 @@ class Twin:
             folder = Path(folder)
             (folder / "ply").mkdir(parents=True, exist_ok=True)
         except (OSError, TypeError, ValueError) as error:
-            raise ConfigError(f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})") from error
+            raise ConfigError(
+                f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
+            ) from error
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
         write_frames(folder / "ply", rollout.x.cpu().numpy(), self.body.colors.cpu().numpy())
-        save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
+        save_frames(
+            seen(self.body, rollout.x, rollout.F_tot),
+            folder / "splats",
+            formats,
+            rate=1 / self.frame_dt,
+            up=self.world.up,
+        )
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             frames = side_by_side({title: self.render(rollout, colliders=solids)}, footer=moments)
@@ -280,7 +353,17 @@ def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
     """Binary PLY with x y z [m] and 8-bit colours."""
-    vertex = np.empty(len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    vertex = np.empty(
+        len(points),
+        dtype=[
+            ("x", "f4"),
+            ("y", "f4"),
+            ("z", "f4"),
+            ("red", "u1"),
+            ("green", "u1"),
+            ("blue", "u1"),
+        ],
+    )
     for i, name in enumerate(("x", "y", "z")):
         vertex[name] = points[:, i]
     for i, name in enumerate(("red", "green", "blue")):

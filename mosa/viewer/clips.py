@@ -49,14 +49,18 @@ class Scale:
 
     def paint(self, values: np.ndarray) -> np.ndarray:
         """(N, 3) colours in [0, 1] of (N,) values."""
-        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[:, :3]
+        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[
+            :, :3
+        ]
 
     def legend(self) -> np.ndarray:
         """(H, W, 3) picture of the colour bar, 8 bit."""
         figure = Figure(figsize=(3.2, 0.7), dpi=200, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         shown = ScalarMappable(Normalize(self.low, self.high), self.colors)
-        bar = figure.colorbar(shown, cax=figure.add_subplot(), orientation="horizontal", extend=self.beyond)
+        bar = figure.colorbar(
+            shown, cax=figure.add_subplot(), orientation="horizontal", extend=self.beyond
+        )
         bar.set_label(self.label, fontsize=9)
         bar.ax.tick_params(labelsize=8)
         canvas.draw()
@@ -150,28 +154,50 @@ class Clip:
     def side(self) -> np.ndarray:
         """(3,) shift of a body beside the one before it [m]."""
         along = [motion.centers @ self.across for motion in self.bodies.values()]
-        widths = [np.ptp(np.concatenate([x[t] for x in along if t < len(x)])) for t in range(len(self.times))]
+        widths = [
+            np.ptp(np.concatenate([x[t] for x in along if t < len(x)]))
+            for t in range(len(self.times))
+        ]
         return DISTANCE * float(max(widths)) * self.across
 
     def deviation(self, frame: int, model: str = "learned") -> np.ndarray | None:
         """(N,) distance [m] of a model's particles from those of the reference; None where it has no such frame."""
         if self.reference is None or frame >= len(self.bodies[self.reference].centers):
             return None
-        return np.linalg.norm(self.bodies[model].centers[frame] - self.bodies[self.reference].centers[frame], axis=-1)
+        return np.linalg.norm(
+            self.bodies[model].centers[frame] - self.bodies[self.reference].centers[frame], axis=-1
+        )
 
     @cached_property
     def scales(self) -> dict[str, Scale]:
         """Of each quantity, one for all frames and models: a colour means one value while the sequence plays, in both bodies."""
-        span = max(float(np.abs(self.factor - 1).max()), 0.01)  # what differs by less than 1 % shall not look like a contrast
-        found = {"heterogeneity": Scale(r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span)}
+        span = max(
+            float(np.abs(self.factor - 1).max()), 0.01
+        )  # what differs by less than 1 % shall not look like a contrast
+        found = {
+            "heterogeneity": Scale(
+                r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span
+            )
+        }
         if self.reference is not None:
             frames = range(len(self.bodies[self.reference].centers))
-            high = max(float(np.quantile(self.deviation(t, model), 0.99)) for t in frames for model in self.models)
-            label = {"observed": "distance to the observed motion [mm]", "truth": "distance to the true motion [mm]"}
-            found["deviation"] = Scale(label[self.reference], "viridis", 0, max(1e3 * high, 1e-3), "max")
+            high = max(
+                float(np.quantile(self.deviation(t, model), 0.99))
+                for t in frames
+                for model in self.models
+            )
+            label = {
+                "observed": "distance to the observed motion [mm]",
+                "truth": "distance to the true motion [mm]",
+            }
+            found["deviation"] = Scale(
+                label[self.reference], "viridis", 0, max(1e3 * high, 1e-3), "max"
+            )
         if self.spread is not None:
             high = float(np.quantile(self.spread, 0.99, axis=1).max())
-            found["uncertainty"] = Scale("predicted standard deviation [mm]", "magma", 0, max(1e3 * high, 1e-3), "max")
+            found["uncertainty"] = Scale(
+                "predicted standard deviation [mm]", "magma", 0, max(1e3 * high, 1e-3), "max"
+            )
         return found
 
     def paint(self, frame: int, by: str, model: str = "learned") -> np.ndarray:
@@ -183,14 +209,24 @@ class Clip:
         if by == "appearance":
             return self.appearance
         if by == "heterogeneity":
-            return self.scales[by].paint(self.factor if model == "learned" else np.ones_like(self.factor))
+            return self.scales[by].paint(
+                self.factor if model == "learned" else np.ones_like(self.factor)
+            )
         if by == "uncertainty":
             known = self.spread is not None and model == "learned"
-            return self.scales[by].paint(1e3 * self.spread[frame]) if known else np.full_like(self.appearance, GRAY)
+            return (
+                self.scales[by].paint(1e3 * self.spread[frame])
+                if known
+                else np.full_like(self.appearance, GRAY)
+            )
         far = self.deviation(frame, model)
-        return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
+        return (
+            np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
+        )
 
-    def splats(self, name: str, frame: int, by: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def splats(
+        self, name: str, frame: int, by: str
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centers (M, 3) [m], covariances (M, 3, 3) [m^2], colours (M, 3) and opacities (M,) of a body's splats: those it carries,
         where it carries some, painted as the particles nearest to them at rest; else the particles themselves."""
         motion = self.bodies[name]
@@ -199,7 +235,12 @@ class Clip:
         if motion.carried is None:
             return motion.centers[frame], motion.covariances[frame], colors, self.opacities
         colors = motion.carried.colors[frame] if plain else colors[self.splat_particles]
-        return motion.carried.centers[frame], motion.carried.covariances[frame], colors, self.splat_opacities
+        return (
+            motion.carried.centers[frame],
+            motion.carried.covariances[frame],
+            colors,
+            self.splat_opacities,
+        )
 
     def caption(self, frame: int) -> str:
         """What a frame is, and what the scene leaves out."""
@@ -209,14 +250,21 @@ class Clip:
         elif self.deviation(frame) is None:
             said += "Not observed in this frame."
         else:
-            far = {model: 1e3 * float(np.sqrt(np.square(self.deviation(frame, model)).mean())) for model in self.models}
+            far = {
+                model: 1e3 * float(np.sqrt(np.square(self.deviation(frame, model)).mean()))
+                for model in self.models
+            }
             motion = {"observed": "observed", "truth": "true"}[self.reference]
-            said += f"rms distance to the {motion} motion: " + ", ".join(f"{model} {value:.1f} mm" for model, value in far.items())
+            said += f"rms distance to the {motion} motion: " + ", ".join(
+                f"{model} {value:.1f} mm" for model, value in far.items()
+            )
         if self.world.ground is not None:
             said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
         hidden = {"walls": len(self.world.planes), "colliders": len(self.world.colliders)}
         if any(hidden.values()):
-            said += "  \nNot drawn: " + ", ".join(f"{kind} ({count})" for kind, count in hidden.items() if count)
+            said += "  \nNot drawn: " + ", ".join(
+                f"{kind} ({count})" for kind, count in hidden.items() if count
+            )
         return said
 
 
@@ -227,29 +275,46 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
     the folder's own, or else its body.npz. Errors: DataError naming the file that is missing or of another run."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
-                        f"found no folder {folder}")
+        raise DataError(
+            f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
+            f"found no folder {folder}"
+        )
     rollouts = arrays(folder / "rollout.npz")  # first: it is what a run that has not ended lacks
     body = shown_body(folder, checkpoint)
     paths = {kind: folder / f"{'rollout' if kind == 'learned' else kind}.npz" for kind in BODIES}
-    files = {kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()} | {"learned": rollouts}
+    files = {
+        kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()
+    } | {"learned": rollouts}
     spreads = arrays(folder / "uncertainty.npz") if (folder / "uncertainty.npz").is_file() else {}
     clips = []
     for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
         check_motion(rollouts, name, paths["learned"], ("x",))
         bodies, shape = {}, (len(rollouts[f"{name}/x"]), len(body.rest))
         times = rollouts.get(f"{name}/times")
-        if times is None or times.shape != shape[:1] or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise DataError(f"{paths['learned']}: {name}/times: expected {shape[0]} increasing times, found "
-                            f"{'none' if times is None else times.tolist()[:8]}")
+        if (
+            times is None
+            or times.shape != shape[:1]
+            or not np.isfinite(times).all()
+            or (np.diff(times) <= 0).any()
+        ):
+            raise DataError(
+                f"{paths['learned']}: {name}/times: expected {shape[0]} increasing times, found "
+                f"{'none' if times is None else times.tolist()[:8]}"
+            )
         for kind, stored in files.items():
             if f"{name}/x" not in stored or (kind == "truth" and "observed" in bodies):
                 continue
             check_motion(stored, name, paths[kind], ("x",))
             frames, particles = stored[f"{name}/x"].shape[:2]
-            if particles != shape[1] or frames > shape[0] or (kind != "observed" and frames < shape[0]):
-                raise DataError(f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
-                                f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run")
+            if (
+                particles != shape[1]
+                or frames > shape[0]
+                or (kind != "observed" and frames < shape[0])
+            ):
+                raise DataError(
+                    f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
+                    f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run"
+                )
             check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
             x = stored[f"{name}/x"]
             bodies[kind] = ShownMotion(x, covariances(stored, name, body), carried_by(body, x))
@@ -267,8 +332,10 @@ def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
     if checkpoint is None and not path.is_file() and (folder / FILE).is_file():
         return ShownBody.read(folder / FILE)
     if checkpoint is None and not folder.joinpath("checkpoints").is_dir():
-        raise DataError(f"{folder}: expected checkpoints/last.ckpt of a run, or body.npz of an exported motion, found neither; "
-                        "checkpoint=<run folder>/checkpoints/last.ckpt names the run's")
+        raise DataError(
+            f"{folder}: expected checkpoints/last.ckpt of a run, or body.npz of an exported motion, found neither; "
+            "checkpoint=<run folder>/checkpoints/last.ckpt names the run's"
+        )
     twin = Twin.load(path)
     return ShownBody.of(twin.body, twin.world)
 
@@ -278,7 +345,9 @@ def carried_by(body: ShownBody, x: np.ndarray) -> ShownSplats | None:
     if body.splats is None:
         return None
     shown = seen(body, torch.from_numpy(x).to(body.rest), None)
-    return ShownSplats(*(value.numpy() for value in (shown.means, shown.covariances, shown.colors())))
+    return ShownSplats(
+        *(value.numpy() for value in (shown.means, shown.covariances, shown.colors()))
+    )
 
 
 def splat_keys(body: ShownBody) -> dict[str, np.ndarray]:
@@ -289,24 +358,42 @@ def splat_keys(body: ShownBody) -> dict[str, np.ndarray]:
     return {"splat_opacities": body.splats.opacities.numpy(), "splat_particles": nearest}
 
 
-def spread_of(stored: dict[str, np.ndarray], name: str, shape: tuple[int, int], path: Path) -> np.ndarray | None:
+def spread_of(
+    stored: dict[str, np.ndarray], name: str, shape: tuple[int, int], path: Path
+) -> np.ndarray | None:
     """(T, N) [m], None where the file has none for this sequence. Errors: DataError naming file and entry."""
     found = stored.get(f"{name}/sd")
     if found is None:
         return None
-    if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all() or found.min() < 0:
-        raise DataError(f"{path}: {name}/sd: expected {shape} finite standard deviations, found {found.dtype} {found.shape}")
+    if (
+        found.shape != shape
+        or found.dtype.kind != "f"
+        or not np.isfinite(found).all()
+        or found.min() < 0
+    ):
+        raise DataError(
+            f"{path}: {name}/sd: expected {shape} finite standard deviations, found {found.dtype} {found.shape}"
+        )
     return found
 
 
-def check_motion(stored: dict[str, np.ndarray], name: str, path: Path, keys: tuple[str, ...]) -> None:
+def check_motion(
+    stored: dict[str, np.ndarray], name: str, path: Path, keys: tuple[str, ...]
+) -> None:
     """What there is of a motion is finite, and of the positions' frames and particles. Errors: DataError naming file and entry."""
     frames = stored[f"{name}/x"].shape[:2]
     for key in (key for key in keys if f"{name}/{key}" in stored):
         found, each = stored[f"{name}/{key}"], (3,) if key == "x" else (3, 3)
-        if found.dtype.kind != "f" or found.shape != (*frames, *each) or len(frames) != 2 or 0 in frames:
-            raise DataError(f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames "
-                            f"and particles as {name}/x has, found {found.dtype} {found.shape}")
+        if (
+            found.dtype.kind != "f"
+            or found.shape != (*frames, *each)
+            or len(frames) != 2
+            or 0 in frames
+        ):
+            raise DataError(
+                f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames "
+                f"and particles as {name}/x has, found {found.dtype} {found.shape}"
+            )
         if not np.isfinite(found).all():
             raise DataError(f"{path}: {name}/{key}: expected finite numbers")
 
@@ -328,6 +415,8 @@ def covariances(stored: dict[str, np.ndarray], name: str, body: ShownBody) -> np
 def arrays(path: Path) -> dict[str, np.ndarray]:
     """Contents of an npz file. Errors: DataError naming it."""
     if not path.is_file():
-        raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
-                        "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt")
+        raise DataError(
+            f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
+            "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt"
+        )
     return read_npz(path)

@@ -64,7 +64,11 @@ class Live:
         self.up = self.up / np.linalg.norm(self.up)
         self.across = horizontal(self.up)
         self.arms = (body.rest - body.center).double().cpu().numpy()
-        self.reach, self.size, self.dt = float(np.linalg.norm(self.arms, axis=1).max()), body.size, twin.frame_dt
+        self.reach, self.size, self.dt = (
+            float(np.linalg.norm(self.arms, axis=1).max()),
+            body.size,
+            twin.frame_dt,
+        )
         self.ground = 0.0 if world.ground is None else float(world.ground.height)
         # at least two cells thick, that no material on both sides of it touches
         self.radius = max(0.12 * self.size, 1.25 * body.settings.dx)
@@ -72,7 +76,9 @@ class Live:
         self.hand = "hand"
         while self.hand in self.names:
             self.hand += "_"
-        corners = np.stack(np.meshgrid(*world.box.double().numpy().T, indexing="ij"), -1).reshape(-1, 3)
+        corners = np.stack(np.meshgrid(*world.box.double().numpy().T, indexing="ij"), -1).reshape(
+            -1, 3
+        )
         self.highest = max(float((corners @ self.up).max()) - self.ground - 2 * self.reach, 0.0)
         begun = twin.training_start
         Q, middle = begun.rotation.double().cpu().numpy(), begun.center.double().cpu().numpy()
@@ -112,11 +118,20 @@ class Live:
     def begin(self, drop: Release) -> bool:
         """Let the body go from `drop`, at rest in time until `running`; whether it could be. The ball begins at its target, or at
         home where the body is."""
-        self.message, self.running, self.others, self.spread, self.force = "", False, None, None, np.zeros(3)
+        self.message, self.running, self.others, self.spread, self.force = (
+            "",
+            False,
+            None,
+            None,
+            np.zeros(3),
+        )
         twin, given = self.twin, self.start(drop)
         try:
             start, _ = start_in(twin.body, twin.world, twin.training_start, **given)
-            x = self.arms @ start.rotation.double().cpu().numpy().T + start.center.double().cpu().numpy()
+            x = (
+                self.arms @ start.rotation.double().cpu().numpy().T
+                + start.center.double().cpu().numpy()
+            )
             if np.linalg.norm(x - self.target, axis=1).min() < self.radius + twin.body.settings.dx:
                 self.target = self.home()
             solids = [*twin.world.colliders, self.ball(self.target)]
@@ -172,7 +187,13 @@ class Live:
         if self.others is not None:
             try:
                 x = self.others.step(action).state.positions
-                self.spread = total_spread(x[:, None], self.twin.posterior.model_error)[0].detach().double().cpu().numpy()
+                self.spread = (
+                    total_spread(x[:, None], self.twin.posterior.model_error)[0]
+                    .detach()
+                    .double()
+                    .cpu()
+                    .numpy()
+                )
             except (MosaError, RuntimeError) as error:
                 self.others = self.spread = None
                 self.message = f"No uncertainty from here on: {error}"
@@ -190,8 +211,10 @@ class Live:
         """Stop and say why; False."""
         self.running = False
         if isinstance(error, SimulationDiverged):
-            self.message = (f"The simulation diverged at {self.time:.3f} s; what is shown is the last state before. Drop the body "
-                            f"again, from lower or slower, or push more gently. ({error})")
+            self.message = (
+                f"The simulation diverged at {self.time:.3f} s; what is shown is the last state before. Drop the body "
+                f"again, from lower or slower, or push more gently. ({error})"
+            )
         else:
             self.message = f"{type(error).__name__}: {error}"
         return False
@@ -204,20 +227,29 @@ class Live:
     @property
     def hand_position(self) -> np.ndarray:
         """(3,) [m] of the ball now."""
-        return np.asarray(self.target, np.float64) if self.state is None else self.state.position[-1].numpy()
+        return (
+            np.asarray(self.target, np.float64)
+            if self.state is None
+            else self.state.position[-1].numpy()
+        )
 
     def poses(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """((3,) position [m], (3, 3) rotation) of the twin's own colliders now."""
         if self.state is None:
             return []
-        return [(x.numpy(), R.numpy()) for x, R in zip(self.state.position[:-1], self.state.rotation[:-1])]
+        return [
+            (x.numpy(), R.numpy())
+            for x, R in zip(self.state.position[:-1], self.state.rotation[:-1])
+        ]
 
     @property
     def positions(self) -> Tensor:
         """(N, 3) [m] of the particles; as the training began where no drop could be made yet."""
         if self.state is None:
             begun, rest = self.twin.training_start, self.twin.body.rest
-            return (rest - self.twin.body.center) @ begun.rotation.to(rest).T + begun.center.to(rest)
+            return (rest - self.twin.body.center) @ begun.rotation.to(rest).T + begun.center.to(
+                rest
+            )
         return self.state.positions.detach().to(self.twin.body.rest)
 
     @property
@@ -238,7 +270,11 @@ class Live:
     def nearest(self) -> np.ndarray | None:
         """(M,) particle nearest to each carried splat at rest; None where the particles are what is shown."""
         body = self.twin.body
-        return None if body.splats is None else cKDTree(body.rest.cpu().numpy()).query(body.splats.means.cpu().numpy())[1]
+        return (
+            None
+            if body.splats is None
+            else cKDTree(body.rest.cpu().numpy()).query(body.splats.means.cpu().numpy())[1]
+        )
 
     def stretch(self) -> np.ndarray:
         """(N,) [-] largest principal stretch less 1: by how much the material's longest fibre there is longer than at rest."""
@@ -256,8 +292,12 @@ class Live:
     def scale(self, by: str, values: np.ndarray) -> Scale:
         """Of `values`: of the stretch and the uncertainty it only grows until the next drop."""
         if by == "heterogeneity":
-            span = max(float(np.abs(values - 1).max()), 0.01)  # what differs by less than 1 % shall not look like a contrast
-            return Scale(r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span)
+            span = max(
+                float(np.abs(values - 1).max()), 0.01
+            )  # what differs by less than 1 % shall not look like a contrast
+            return Scale(
+                r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span
+            )
         high = float(np.quantile(values, 0.99))
         high = next((step for step in STEPS if step >= high), STEPS[-1])
         self._highs[by] = high = max(high, self._highs.get(by, 0.0))
@@ -276,7 +316,9 @@ class Live:
         return scale.paint(values), scale
 
     @torch.no_grad()
-    def splats(self, by: str, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def splats(
+        self, by: str, colors: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centers (M, 3) [m], covariances (M, 3, 3) [m^2], colours (M, 3) and opacities (M,) of what the body shows now; `colors`
         (N, 3) are those of `paint(by)`, which the splats take from the particles nearest to them at rest."""
         shown: Seen = seen(self.twin.body, self.positions[None], self.F_tot[None])
@@ -284,7 +326,12 @@ class Live:
             colors = shown.colors()[0].cpu().numpy()
         elif self.nearest is not None:
             colors = colors[self.nearest]
-        return shown.means[0].cpu().numpy(), shown.covariances[0].cpu().numpy(), colors, shown.opacities.cpu().numpy()
+        return (
+            shown.means[0].cpu().numpy(),
+            shown.covariances[0].cpu().numpy(),
+            colors,
+            shown.opacities.cpu().numpy(),
+        )
 
     def caption(self) -> str:
         """Of the moment."""

@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 
 from mosa.viewer.live import COLORS, Live
-from mosa.viewer.pages import add_ground, add_solid, aim, beside_panel, cell, offered, open_server, turn, view_of
+from mosa.viewer.pages import (
+    add_ground,
+    add_solid,
+    aim,
+    beside_panel,
+    cell,
+    offered,
+    open_server,
+    turn,
+    view_of,
+)
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +51,9 @@ class LiveViewer:
             }  # fmt: skip
             self.uncertain = gui.add_checkbox("uncertainty", False, disabled=live.twin.posterior is None,
                                               hint=f"{live.draws} drawn laws are simulated along: slower")  # fmt: skip
-        self.slowdown = gui.add_slider("speed of time", 0.05, 1.0, 0.05, 1.0, hint="at most: a slow machine is slower")
+        self.slowdown = gui.add_slider(
+            "speed of time", 0.05, 1.0, 0.05, 1.0, hint="at most: a slow machine is slower"
+        )
         self.geometry = gui.add_dropdown("geometry", GEOMETRY, initial_value=GEOMETRY[0])
         self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0])
         self.legend = gui.add_image(np.full((1, 1, 3), 255, np.uint8), format="png", visible=False)
@@ -56,12 +68,17 @@ class LiveViewer:
         self.points = scene.add_point_cloud("/body", live.positions.cpu().numpy(), live.paint("appearance")[0].astype(np.float32),
                                             point_size=0.5 * live.size / len(body.rest) ** (1 / 3), point_shape="circle",
                                             precision="float32")  # fmt: skip
-        self.solids = [add_solid(scene, f"/collider_{i}", c.shape) for i, c in enumerate(live.twin.world.colliders)]
+        self.solids = [
+            add_solid(scene, f"/collider_{i}", c.shape)
+            for i, c in enumerate(live.twin.world.colliders)
+        ]
         self.ball = scene.add_icosphere("/ball", live.radius, BALL, position=ball)
         self.gizmo = scene.add_transform_controls("/push", 2.5 * live.radius, disable_rotations=True, depth_test=False,
                                                   position=ball)  # fmt: skip
         self.gizmo.on_update(lambda _: self.pushed(self.gizmo.position))
-        self.draggable = hasattr(self.ball, "on_drag")  # newer viser: the ball itself follows the mouse, in the screen's plane
+        self.draggable = hasattr(
+            self.ball, "on_drag"
+        )  # newer viser: the ball itself follows the mouse, in the screen's plane
         if self.draggable:
             self.ball.on_drag("left")(self.dragged)
         self.buttons["drop"].on_click(lambda _: self.drop())
@@ -80,17 +97,34 @@ class LiveViewer:
         scene.set_up_direction(tuple(map(float, live.up)))
         x = live.positions.double().cpu().numpy()
         ground = live.twin.world.ground
-        around = np.concatenate([x, x + 1.5 * live.size * live.across, x - 1.5 * live.size * live.across, live.hand_position[None]])
+        around = np.concatenate(
+            [
+                x,
+                x + 1.5 * live.size * live.across,
+                x - 1.5 * live.size * live.across,
+                live.hand_position[None],
+            ]
+        )
         eye, target = view_of(around, live.up, live.across, None if ground is None else live.ground)
         aim(*beside_panel(eye, target, live.up), self.server.initial_camera)
         if ground is not None:
-            add_ground(scene, live.up, live.across, live.ground, live.size, target, float(np.linalg.norm(eye - target)))
+            add_ground(
+                scene,
+                live.up,
+                live.across,
+                live.ground,
+                live.size,
+                target,
+                float(np.linalg.norm(eye - target)),
+            )
 
     def drop(self) -> None:
         """Let the body go as the sliders say."""
         with self.busy:
             self.live.uncertain = bool(self.uncertain.value)
-            self.live.change(**{name: float(offered(slider)) for name, slider in self.sliders.items()})
+            self.live.change(
+                **{name: float(offered(slider)) for name, slider in self.sliders.items()}
+            )
             self.live.drop()
             self.follow()
             self.draw()
@@ -125,7 +159,11 @@ class LiveViewer:
 
     def dragged(self, event: Any) -> None:
         """The ball is dragged: from the point where it was taken to the mouse."""
-        self.pushed(self.live.hand_position + np.asarray(event.end_position) - np.asarray(event.start_position))
+        self.pushed(
+            self.live.hand_position
+            + np.asarray(event.end_position)
+            - np.asarray(event.start_position)
+        )
         self.follow()
 
     def draw(self) -> None:
@@ -135,9 +173,16 @@ class LiveViewer:
             colors, scale = live.paint(by)
             if offered(self.geometry) == "splats":
                 means, covariances, painted, opacities = live.splats(by, colors)
-                parts = (means / self.unit).astype(np.float32), covariances / self.unit**2, painted, opacities[:, None]
+                parts = (
+                    (means / self.unit).astype(np.float32),
+                    covariances / self.unit**2,
+                    painted,
+                    opacities[:, None],
+                )
                 if self.splats is None:
-                    self.splats = self.server.scene.add_gaussian_splats("/splats", *parts, scale=self.unit)
+                    self.splats = self.server.scene.add_gaussian_splats(
+                        "/splats", *parts, scale=self.unit
+                    )
                 else:
                     self.splats.set_gaussians(*parts)
             else:

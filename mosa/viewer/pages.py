@@ -29,22 +29,30 @@ def open_server(host: str, port: int) -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
-                          "pip install viser elsewhere") from error
+        raise ConfigError(
+            "viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
+            "pip install viser elsewhere"
+        ) from error
     try:  # viser's own server would try port after port and then wait for ever
         with socket.create_server((host, 0)):
             pass
         if not host:  # all addresses of the machine, which nobody asked for by name
             raise ValueError("an empty name")
     except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})") from error
+        raise ConfigError(
+            f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})"
+        ) from error
     import websockets.asyncio.server as sockets  # viser brings it
 
-    def serve(*arguments: Any, process_request: Any, begin: Any = sockets.serve, **options: Any) -> Any:
+    def serve(
+        *arguments: Any, process_request: Any, begin: Any = sockets.serve, **options: Any
+    ) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             if own_page(request.headers.get("Origin"), request.headers.get("Host"), host):
                 return process_request(connection, request)
-            return connection.respond(403, f"expected a page of this server, by its address or the name {host}\n")
+            return connection.respond(
+                403, f"expected a page of this server, by its address or the name {host}\n"
+            )
 
         return begin(*arguments, process_request=answer, **options)
 
@@ -77,7 +85,9 @@ def horizontal(up: np.ndarray) -> np.ndarray:
     return across / np.linalg.norm(across)
 
 
-def view_of(points: np.ndarray, up: np.ndarray, across: np.ndarray, ground: float | None) -> tuple[np.ndarray, np.ndarray]:
+def view_of(
+    points: np.ndarray, up: np.ndarray, across: np.ndarray, ground: float | None
+) -> tuple[np.ndarray, np.ndarray]:
     """((3,) camera, (3,) point looked at) [m] that hold points (M, 3) and the ground below them, from the front and a little above.
     ground: its height along `up` [m], None where there is none."""
     axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
@@ -87,8 +97,12 @@ def view_of(points: np.ndarray, up: np.ndarray, across: np.ndarray, ground: floa
         low[1] = min(low[1], ground)
     corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
     toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
-    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up
-    distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
+    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(
+        0
+    )  # to the right, and up
+    distance = (
+        corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)
+    ).max()  # all in a square window, and a margin
     target = 0.5 * (low + high) @ axes
     return target + distance * toward @ axes, target
 
@@ -101,11 +115,20 @@ def aim(eye: np.ndarray, target: np.ndarray, *cameras: Any) -> None:
         camera.near = 1e-3 * float(np.linalg.norm(eye - target))
 
 
-def beside_panel(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def beside_panel(
+    eye: np.ndarray, target: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """A first view (camera (3,), point looked at (3,)) moved to the right by `PANEL`, so that the panel covers nothing of it in a
     window of 1280 x 800."""
     right = np.cross(target - eye, up)
-    move = PANEL * 2 * math.tan(FIELD_OF_VIEW / 2) * np.linalg.norm(target - eye) * right / np.linalg.norm(right)
+    move = (
+        PANEL
+        * 2
+        * math.tan(FIELD_OF_VIEW / 2)
+        * np.linalg.norm(target - eye)
+        * right
+        / np.linalg.norm(right)
+    )
     return eye + move, target + move
 
 
@@ -114,13 +137,32 @@ def cell(size: float) -> float:
     return 10.0 ** math.floor(math.log10(size))
 
 
-def add_ground(scene: Any, up: np.ndarray, across: np.ndarray, height: float, size: float, target: np.ndarray, far: float) -> None:
+def add_ground(
+    scene: Any,
+    up: np.ndarray,
+    across: np.ndarray,
+    height: float,
+    size: float,
+    target: np.ndarray,
+    far: float,
+) -> None:
     """A grid at `height` along `up` [m] in cells for a body of `size` [m], about `target` (3,), `far` [m] to each side."""
     axes = np.stack([across, np.cross(up, across), up], axis=1)  # the grid's x, y and normal
     at, width = target + (height - target @ up) * up, cell(size)
-    at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ up])  # lines at multiples of the width
+    at = axes @ np.array(
+        [*(width * np.round(axes.T[:2] @ at / width)), at @ up]
+    )  # lines at multiples of the width
     extent = 2 * width * math.ceil(far / width)
-    scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at, wxyz=turn(axes))
+    scene.add_grid(
+        "/ground",
+        extent,
+        extent,
+        plane="xy",
+        cell_size=width,
+        section_size=10 * width,
+        position=at,
+        wxyz=turn(axes),
+    )
 
 
 def turn(rotation: np.ndarray) -> np.ndarray:
@@ -128,7 +170,9 @@ def turn(rotation: np.ndarray) -> np.ndarray:
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
 
 
-def add_solid(scene: Any, name: str, shape: Shape, color: tuple[int, int, int] = SOLID, **options) -> Any | None:
+def add_solid(
+    scene: Any, name: str, shape: Shape, color: tuple[int, int, int] = SOLID, **options
+) -> Any | None:
     """A node for a collider's shape; None for half spaces and meshes, which are not drawn."""
     import trimesh  # viser brings it
 

@@ -31,12 +31,18 @@ GEOMETRY = ("splats", "particles")
 def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
     """((3,) camera, (3,) point looked at) [m]: a clip's motions side by side, seen from the front and a little above."""
     seen = np.concatenate([clip.moved, clip.moved + (len(clip.bodies) - 1) * clip.side])
-    return view_of(seen, clip.up, clip.across, None if clip.world.ground is None else clip.world.ground.height)
+    return view_of(
+        seen, clip.up, clip.across, None if clip.world.ground is None else clip.world.ground.height
+    )
 
 
 def layouts(clip: Clip) -> tuple[str, ...]:
     """All bodies side by side, two of them over each other, or one alone."""
-    return ("side by side", *clip.overlays, *clip.bodies) if len(clip.bodies) > 1 else tuple(clip.bodies)
+    return (
+        ("side by side", *clip.overlays, *clip.bodies)
+        if len(clip.bodies) > 1
+        else tuple(clip.bodies)
+    )
 
 
 class Viewer:
@@ -44,7 +50,11 @@ class Viewer:
     Errors: ConfigError without viser, or for a host that is no address of this machine."""
 
     def __init__(self, clips: Sequence[Clip], *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.clips, self.ended, self.drawing = {clip.name: clip for clip in clips}, threading.Event(), threading.RLock()
+        self.clips, self.ended, self.drawing = (
+            {clip.name: clip for clip in clips},
+            threading.Event(),
+            threading.RLock(),
+        )
         self.server = open_server(host, port)
         first = clips[0]
         gui = self.server.gui
@@ -55,7 +65,9 @@ class Viewer:
         self.play = gui.add_checkbox("play", False)
         self.rate = gui.add_slider("frames per second", 1, 30, 1, 5)
         self.geometry = gui.add_dropdown("geometry", GEOMETRY, initial_value=GEOMETRY[0])
-        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint="of the prior and the learned body")
+        self.color = gui.add_dropdown(
+            "color", COLORS, initial_value=COLORS[0], hint="of the prior and the learned body"
+        )
         self.legend = gui.add_image(np.full((1, 1, 3), 255, np.uint8), format="png", visible=False)
         self.caption = gui.add_markdown("")
         self.sequence.on_update(lambda _: self.choose())
@@ -74,19 +86,44 @@ class Viewer:
         self.look(self.server.initial_camera)
         if clip.world.ground is not None:
             far = max(float(np.linalg.norm(first_view(each)[0] - target)) for each in clips)
-            add_ground(scene, clip.up, clip.across, clip.world.ground.height, clip.size, target, far)
+            add_ground(
+                scene, clip.up, clip.across, clip.world.ground.height, clip.size, target, far
+            )
         # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
-        self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.splats("learned", 0, "appearance")[1]).max()))
+        self.unit = float(
+            np.sqrt(np.linalg.eigvalsh(clip.splats("learned", 0, "appearance")[1]).max())
+        )
         self.nodes = {}
         for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
-            centers, colors = clip.learned.centers[0].astype(np.float32), clip.appearance.astype(np.float32)
+            centers, colors = (
+                clip.learned.centers[0].astype(np.float32),
+                clip.appearance.astype(np.float32),
+            )
             means, covariances, painted, opacities = clip.splats("learned", 0, "appearance")
-            splats = scene.add_gaussian_splats(f"/{name}/splats", means.astype(np.float32), covariances, painted,
-                                               opacities[:, None], scale=self.unit, visible=False)
+            splats = scene.add_gaussian_splats(
+                f"/{name}/splats",
+                means.astype(np.float32),
+                covariances,
+                painted,
+                opacities[:, None],
+                scale=self.unit,
+                visible=False,
+            )
             spacing = 0.5 * clip.size / len(centers) ** (1 / 3)
-            points = scene.add_point_cloud(f"/{name}/particles", centers, colors, point_size=spacing, point_shape="circle",
-                                           precision="float32", visible=False)
-            self.nodes[name] = splats, points, scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False)
+            points = scene.add_point_cloud(
+                f"/{name}/particles",
+                centers,
+                colors,
+                point_size=spacing,
+                point_shape="circle",
+                precision="float32",
+                visible=False,
+            )
+            self.nodes[name] = (
+                splats,
+                points,
+                scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
+            )
 
     def look(self, *cameras) -> None:
         """The current sequence's first view, for what viser calls cameras."""
@@ -106,7 +143,10 @@ class Viewer:
             self.frame.max, self.frame.value = len(self.clip.times) - 1, 0
             self.explain()
             self.draw()
-            self.look(self.server.initial_camera, *(client.camera for client in self.server.get_clients().values()))
+            self.look(
+                self.server.initial_camera,
+                *(client.camera for client in self.server.get_clients().values()),
+            )
 
     def explain(self) -> None:
         """The colours' legend."""
@@ -124,7 +164,14 @@ class Viewer:
             for name, nodes in self.nodes.items():
                 shown = name in clip.bodies and (layout == "side by side" or name in (above, below))
                 shown = shown and frame < len(clip.bodies[name].centers)
-                for node, wanted in zip(nodes, (offered(self.geometry) == "splats", offered(self.geometry) == "particles", True)):
+                for node, wanted in zip(
+                    nodes,
+                    (
+                        offered(self.geometry) == "splats",
+                        offered(self.geometry) == "particles",
+                        True,
+                    ),
+                ):
                     node.visible = shown and wanted
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
@@ -137,13 +184,26 @@ class Viewer:
         centers = clip.bodies[name].centers[frame] + shift
         if splats.visible:
             means, covariances, colors, opacities = clip.splats(name, frame, offered(self.color))
-            colors, opacities = (np.full_like(colors, GRAY), FAINT * opacities) if under else (colors, opacities)
-            splats.set_gaussians(((means + shift) / self.unit).astype(np.float32), covariances / self.unit**2, colors,
-                                 opacities[:, None])
+            colors, opacities = (
+                (np.full_like(colors, GRAY), FAINT * opacities) if under else (colors, opacities)
+            )
+            splats.set_gaussians(
+                ((means + shift) / self.unit).astype(np.float32),
+                covariances / self.unit**2,
+                colors,
+                opacities[:, None],
+            )
         else:
-            colors = clip.appearance if name == clip.reference else clip.paint(frame, offered(self.color), name)
+            colors = (
+                clip.appearance
+                if name == clip.reference
+                else clip.paint(frame, offered(self.color), name)
+            )
             colors = np.full_like(colors, GRAY) if under else colors
-            points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
+            points.points, points.colors = (
+                centers.astype(np.float32),
+                (255 * colors).astype(np.uint8),
+            )
         label.text = f"{name} (gray)" if under else name
         top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size
         middle = 0.5 * (centers.min(0) + centers.max(0))
@@ -156,7 +216,9 @@ class Viewer:
             try:
                 pause = 1 / offered(self.rate)
                 if self.play.value:
-                    self.frame.value = (int(offered(self.frame)) + 1) % len(self.clip.times)  # draws
+                    self.frame.value = (int(offered(self.frame)) + 1) % len(
+                        self.clip.times
+                    )  # draws
             except Exception:  # the page outlives whatever a message, or a picture, meets
                 logging.getLogger(__name__).exception("the viewer: a picture is left out")
 
@@ -186,29 +248,48 @@ Needs the package viser: pip install viser."""
 def options(arguments: Sequence[str]) -> dict[str, str | None]:
     """run= (or the path alone), live=, checkpoint=, host=, port=, device= of the command line. Errors: ConfigError naming what is
     wrong."""
-    known = {"run": None, "checkpoint": None, "live": "false", "host": "127.0.0.1", "port": "8080", "device": "cpu"}
+    known = {
+        "run": None,
+        "checkpoint": None,
+        "live": "false",
+        "host": "127.0.0.1",
+        "port": "8080",
+        "device": "cpu",
+    }
     for argument in arguments:
         argument = "live=true" if argument == "--live" else argument
         key, mark, value = argument.partition("=")
         if key not in known and known["run"] is None and Path(argument).exists():
             key, mark, value = "run", "=", argument
         if not mark and not argument.startswith("-") and key not in known and known["run"] is None:
-            raise ConfigError(f"run: expected the folder of a run, found no file or folder {argument!r}; the options are written "
-                              "key=value, and python -m mosa.viewer --help lists them")
+            raise ConfigError(
+                f"run: expected the folder of a run, found no file or folder {argument!r}; the options are written "
+                "key=value, and python -m mosa.viewer --help lists them"
+            )
         if not mark or key not in known:
-            raise ConfigError("viewer: expected run=<folder>, --live, checkpoint=<file>, host=<address>, port=<number>, "
-                              f"device=<name>, found {argument!r}")
+            raise ConfigError(
+                "viewer: expected run=<folder>, --live, checkpoint=<file>, host=<address>, port=<number>, "
+                f"device=<name>, found {argument!r}"
+            )
         known[key] = value
     if known["run"] is None:
         if known["live"] != "true" or known["checkpoint"] is None:
-            raise ConfigError("run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>")
+            raise ConfigError(
+                "run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>"
+            )
         known["run"] = known["checkpoint"]
-    if not known["port"].isdecimal() or not known["port"].isascii() or not 0 < int(known["port"]) < 65536:
+    if (
+        not known["port"].isdecimal()
+        or not known["port"].isascii()
+        or not 0 < int(known["port"]) < 65536
+    ):
         raise ConfigError(f"port: expected a number from 1 to 65535, found {known['port']!r}")
     if known["live"] not in ("true", "false"):
         raise ConfigError(f"live: expected true or false, found {known['live']!r}")
     if known["live"] == "false" and Path(known["run"]).is_file():
-        raise ConfigError(f"run: expected a folder, found the file {known['run']!r}; --live shows the twin of a checkpoint")
+        raise ConfigError(
+            f"run: expected a folder, found the file {known['run']!r}; --live shows the twin of a checkpoint"
+        )
     return known
 
 
@@ -217,8 +298,10 @@ def checkpoint_of(run: str, checkpoint: str | None) -> Path:
     path = Path(checkpoint or run)
     path = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
     if not path.is_file():
-        raise DataError(f"run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no file {path}; of "
-                        "a folder that was exported the checkpoint is given by checkpoint=")
+        raise DataError(
+            f"run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no file {path}; of "
+            "a folder that was exported the checkpoint is given by checkpoint="
+        )
     return path
 
 
@@ -226,7 +309,9 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
     """The page that `options` ask for, served. Errors: ConfigError, DataError."""
     place = {"host": chosen["host"], "port": int(chosen["port"])}
     if chosen["live"] == "true":
-        twin = Twin.load(checkpoint_of(chosen["run"], chosen["checkpoint"]), named_device(chosen["device"]))
+        twin = Twin.load(
+            checkpoint_of(chosen["run"], chosen["checkpoint"]), named_device(chosen["device"])
+        )
         return LiveViewer(Live(twin), **place)
     return Viewer(read_run(chosen["run"], chosen["checkpoint"]), **place)
 

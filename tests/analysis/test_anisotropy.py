@@ -98,7 +98,9 @@ def trained(seed: int, size: float = 0.05) -> StressAdapter:
 
 @pytest.mark.parametrize("law", ["neo_hookean", "stvk"])
 def test_prior_has_youngs_modulus_in_every_direction(law):
-    E_n = anisotropy.directional_modulus(material_states(law, {"mu": MU, "lam": LAM}), None, DIRECTIONS, strain=1e-3)
+    E_n = anisotropy.directional_modulus(
+        material_states(law, {"mu": MU, "lam": LAM}), None, DIRECTIONS, strain=1e-3
+    )
     torch.testing.assert_close(E_n, torch.full_like(E_n, E), rtol=2e-6, atol=0)
 
 
@@ -106,7 +108,9 @@ def test_adapter_at_initialisation_is_the_prior(states):
     adapter = StressAdapter()
     adapter.switch_on(E, NU)
     E_n = anisotropy.directional_modulus(states, adapter, DIRECTIONS[:5])
-    torch.testing.assert_close(E_n, anisotropy.directional_modulus(states, None, DIRECTIONS[:5]), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        E_n, anisotropy.directional_modulus(states, None, DIRECTIONS[:5]), rtol=1e-12, atol=0
+    )
 
 
 def test_modulus_of_a_fibre_law_is_that_of_its_compliance(states):
@@ -122,8 +126,12 @@ def modulus_ratio(states, adapter, axis, strain=5e-3) -> float:
     """E along `axis` over the mean of E across it (18 directions); 1 for an isotropic law."""
     along = axis / axis.norm()
     first = torch.linalg.cross(along, torch.eye(3).double()[int(along.abs().argmin())])
-    _, across = anisotropy.directions_in_plane(first.tolist(), torch.linalg.cross(along, first).tolist(), 19)
-    modulus = anisotropy.directional_modulus(states, adapter, torch.cat([along[None], across[:-1]]), strain)
+    _, across = anisotropy.directions_in_plane(
+        first.tolist(), torch.linalg.cross(along, first).tolist(), 19
+    )
+    modulus = anisotropy.directional_modulus(
+        states, adapter, torch.cat([along[None], across[:-1]]), strain
+    )
     return float(modulus[0] / modulus[1:].mean())
 
 
@@ -142,10 +150,16 @@ def test_large_stretch_against_a_scalar_equation(states):
     mu, lam = float(MU), float(LAM)
     for strain in (0.2, -0.2):
         a = math.exp(strain)
-        side = brentq(lambda l, a=a: mu * (l**2 - 1) + lam * math.log(a * l**2), 0.5, 2.0, xtol=1e-14)
+        side = brentq(
+            lambda l, a=a: mu * (l**2 - 1) + lam * math.log(a * l**2), 0.5, 2.0, xtol=1e-14
+        )
         expected = mu * (a**2 - 1) + lam * math.log(a * side**2)
-        found = anisotropy.uniaxial_stress(anisotropy.response_of(states, None), DIRECTIONS[:4], strain)
-        torch.testing.assert_close(found, torch.full((4,), expected, dtype=torch.float64), rtol=1e-9, atol=0)
+        found = anisotropy.uniaxial_stress(
+            anisotropy.response_of(states, None), DIRECTIONS[:4], strain
+        )
+        torch.testing.assert_close(
+            found, torch.full((4,), expected, dtype=torch.float64), rtol=1e-9, atol=0
+        )
 
 
 def test_drawn_weights_leave_the_lateral_faces_free(states):
@@ -160,7 +174,13 @@ def test_drawn_weights_leave_the_lateral_faces_free(states):
     y = torch.zeros(5, dtype=torch.float64)
     for _ in range(30):  # Newton on differences, another way than the tested one
         residual = lambda y: complement @ response((0.05 * N + y @ complement)[None])[0]  # noqa: E731
-        J = torch.stack([(residual(y + 1e-6 * e) - residual(y - 1e-6 * e)) / 2e-6 for e in torch.eye(5).double()], 1)
+        J = torch.stack(
+            [
+                (residual(y + 1e-6 * e) - residual(y - 1e-6 * e)) / 2e-6
+                for e in torch.eye(5).double()
+            ],
+            1,
+        )
         y = y - torch.linalg.solve(J, residual(y))
     stress = response((0.05 * N + y @ complement)[None])[0]
     assert float((stress - (stress @ N) * N).norm()) < 1e-8 * E
@@ -186,12 +206,16 @@ def test_redistribution_by_hand():
 
 def test_prior_has_no_redistribution_and_an_isotropic_one_no_direction():
     assert anisotropy.redistribution_response(EYE6, DIRECTIONS).abs().max() == 0
-    isotropic = 1.2 * EYE6 + 0.3 * torch.outer(ONE, ONE)  # the same on vech components as in Mandel scaling
+    isotropic = 1.2 * EYE6 + 0.3 * torch.outer(
+        ONE, ONE
+    )  # the same on vech components as in Mandel scaling
     w = anisotropy.redistribution_response(isotropic, DIRECTIONS)
     expected = math.hypot(0.2 + 0.3, 0.3, 0.3)  # |0.2 n n^T + 0.3 I|
     torch.testing.assert_close(w, torch.full_like(w, expected), rtol=1e-12, atol=0)
     plain = (0.2 * anisotropy.dyads(DIRECTIONS) / SCALE + 0.3 * ONE).norm(dim=-1)
-    assert plain.max() / plain.min() > 1.005  # a plain 6-vector shows an anisotropy that is not there
+    assert (
+        plain.max() / plain.min() > 1.005
+    )  # a plain 6-vector shows an anisotropy that is not there
 
 
 def test_redistribution_turns_with_the_material():
@@ -201,12 +225,17 @@ def test_redistribution_turns_with_the_material():
     R = on_mandel(Q)
     turned = (R @ anisotropy.mandel_matrix(A) @ R.T) / SCALE[:, None] * SCALE
     w = anisotropy.redistribution_response(A, DIRECTIONS)
-    torch.testing.assert_close(anisotropy.redistribution_response(turned, DIRECTIONS @ Q.T), w, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(
+        anisotropy.redistribution_response(turned, DIRECTIONS @ Q.T), w, rtol=1e-12, atol=1e-14
+    )
 
 
 def test_jacobian_against_differences():
     adapter = trained(1, size=0.3)
-    w, s = (0.1 * torch.randn(4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(k)) for k in (1, 2))
+    w, s = (
+        0.1 * torch.randn(4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(k))
+        for k in (1, 2)
+    )
     jacobian = anisotropy.stress_jacobian(adapter, w, s)
     assert not torch.allclose(jacobian, EYE6.expand(4, 6, 6), atol=1e-2)
     double = adapter.in_double()
@@ -225,7 +254,9 @@ def test_jacobian_of_prior_and_of_a_fixed_operator():
     fresh.switch_on(E, NU)
     assert torch.equal(anisotropy.stress_jacobian(fresh, w, s), EYE6.expand(2, 6, 6))
     G = 0.1 * torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(anisotropy.stress_jacobian(Fixed(G), w, s), (EYE6 + G).expand(2, 6, 6))
+    torch.testing.assert_close(
+        anisotropy.stress_jacobian(Fixed(G), w, s), (EYE6 + G).expand(2, 6, 6)
+    )
 
 
 def test_analysis_leaves_the_adapter_alone(states):

@@ -51,8 +51,16 @@ def body() -> Body:
     n = len(grid())
     splats = {"colors": torch.full((n, 3), 0.3), "opacities": torch.full((n,), 0.9),
               "covariances": 4e-4 * torch.eye(3).expand(n, 3, 3)}  # fmt: skip
-    return Body(rest=grid(), volume=torch.full((n,), 1e-5), **splats, density=1000.0, heterogeneity=None, adapter=None,
-                material=Material("neo_hookean", {"E": 1e5, "nu": 0.3}), settings=SimulationSettings(dx=0.1))
+    return Body(
+        rest=grid(),
+        volume=torch.full((n,), 1e-5),
+        **splats,
+        density=1000.0,
+        heterogeneity=None,
+        adapter=None,
+        material=Material("neo_hookean", {"E": 1e5, "nu": 0.3}),
+        settings=SimulationSettings(dx=0.1),
+    )
 
 
 def camera(eye=(0.9, 0.8, 1.2), target=(0.0, 0.3, 0.0)) -> Cameras:
@@ -66,13 +74,31 @@ def scene(truth: bool = True) -> Scene:
     mattes[:, :, 12:36, 12:36] = 1
     known = Truth(grid(), fall(), torch.eye(3), torch.zeros(3)) if truth else None
     images, up = 1 - 0.7 * mattes[..., None].expand(-1, -1, -1, -1, 3), torch.tensor([0.0, 1, 0])
-    return Scene("cube", "test", images, mattes, camera(), torch.arange(T) / 24, -9.8 * up, up, Ground(HEIGHT),
-                 torch.tensor([[-1.0] * 3, [1.0] * 3]), 1000.0, torch.ones(3), False, truth=known)
+    return Scene(
+        "cube",
+        "test",
+        images,
+        mattes,
+        camera(),
+        torch.arange(T) / 24,
+        -9.8 * up,
+        up,
+        Ground(HEIGHT),
+        torch.tensor([[-1.0] * 3, [1.0] * 3]),
+        1000.0,
+        torch.ones(3),
+        False,
+        truth=known,
+    )
 
 
 def shown(body, truth=True):
     start = Start(torch.eye(3), torch.zeros(3), torch.zeros(3), torch.zeros(3))
-    return compare(body, Sequence("test/drop", scene(truth), start, 2), {"prior": rollout(SHIFT), "adapted": rollout(0.0)})
+    return compare(
+        body,
+        Sequence("test/drop", scene(truth), start, 2),
+        {"prior": rollout(SHIFT), "adapted": rollout(0.0)},
+    )
 
 
 def test_lines_lie_on_the_ground_half_the_bodys_size_apart():
@@ -98,18 +124,32 @@ def test_lines_lie_on_the_ground_half_the_bodys_size_apart():
 def test_no_ground_no_lines():
     assert ground_lines(replace(scene(), ground=None), camera(), 0.4) == []
     assert ground_lines(scene(), camera(eye=(0.5, 0.0, 1.0)), 0.4) == []  # below it
-    assert ground_lines(scene(), camera(eye=(0.5, 0.5, 1.0), target=(0.0, 2.0, 0.0)), 0.4) == []  # looks up
+    assert (
+        ground_lines(scene(), camera(eye=(0.5, 0.5, 1.0), target=(0.0, 2.0, 0.0)), 0.4) == []
+    )  # looks up
 
 
 def test_lines_are_behind_what_is_seen():
     image = np.full((60, 60, 3), 255, np.uint8)
     image[20:40, 20:40] = (200, 30, 30)
-    found = on_ground(image, [np.array([[0.0, 15.0], [30.0, 15.0]]), np.array([[0.0, 25.0], [30.0, 25.0]])], 2, torch.ones(3))
+    found = on_ground(
+        image,
+        [np.array([[0.0, 15.0], [30.0, 15.0]]), np.array([[0.0, 25.0], [30.0, 25.0]])],
+        2,
+        torch.ones(3),
+    )
     assert (found[20:40, 20:40] == image[20:40, 20:40]).all()
-    assert (found[30, [5, 50]] < 250).all() and (found[50, [5, 30, 50]] < 250).all() and (found[10] == 255).all()
+    assert (
+        (found[30, [5, 50]] < 250).all()
+        and (found[50, [5, 30, 50]] < 250).all()
+        and (found[10] == 255).all()
+    )
 
 
-@pytest.mark.parametrize("value, limit", [(0.0, 1e-3), (0.0011, 2e-3), (0.02, 0.02), (0.021, 0.05), (0.07, 0.1), (3.0, 5.0)])
+@pytest.mark.parametrize(
+    "value, limit",
+    [(0.0, 1e-3), (0.0011, 2e-3), (0.02, 0.02), (0.021, 0.05), (0.07, 0.1), (3.0, 5.0)],
+)
 def test_a_scale_ends_at_a_round_number(value, limit):
     assert round_up(value) == pytest.approx(limit)
 
@@ -122,9 +162,14 @@ def test_the_distance_to_the_truth_is_painted(body):
     for title, share in (("prior", SHIFT / 0.05), ("adapted (MoSA)", 0.0)):
         wanted = 255 * np.array(viridis(share)[:3])
         for image in found.errors[title]:
-            inside = np.abs(image - wanted).max(-1) <= 3  # splats are opaque to a percent in the middle of the cube
+            inside = (
+                np.abs(image - wanted).max(-1) <= 3
+            )  # splats are opaque to a percent in the middle of the cube
             assert 0.03 < inside.mean() < 0.5
-    assert found.images["real"].shape == found.errors["prior"].shape and found.images["real"].shape[0] == T
+    assert (
+        found.images["real"].shape == found.errors["prior"].shape
+        and found.images["real"].shape[0] == T
+    )
 
 
 def test_without_truth_the_difference_of_the_images_is_painted(body):
@@ -160,16 +205,27 @@ def test_every_frame_has_its_own_caption(tmp_path):
     assert all(frame.shape == (30 + 26 + 26, 400, 3) for frame in frames)
     for first, second in pairwise(frames):
         assert (first[:56] == second[:56]).all() and (first[56:] != second[56:]).any()
-    plain, noted = (iio.imread(write_strip(tmp_path / f"{len(notes)}.png", {"a": images, "b": images}, notes=notes))
-                    for notes in ({}, {"a": [f"frame {t}" for t in range(T)]}))
+    plain, noted = (
+        iio.imread(
+            write_strip(tmp_path / f"{len(notes)}.png", {"a": images, "b": images}, notes=notes)
+        )
+        for notes in ({}, {"a": [f"frame {t}" for t in range(T)]})
+    )
     assert noted.shape[0] == plain.shape[0] + 22
-    assert (noted[26 + 22 :] == plain[26:]).all() and cv2.absdiff(noted[26:48, :200], noted[26:48, 200:400]).any()
+    assert (noted[26 + 22 :] == plain[26:]).all() and cv2.absdiff(
+        noted[26:48, :200], noted[26:48, 200:400]
+    ).any()
 
 
 def test_the_legend_s_words_fit_beside_a_narrow_image():
     """Of an image of 120 px: what it would lose at its edge is written smaller."""
     images = {"real": np.full((1, 200, 120, 3), 255, np.uint8)}
     wide = {"real": np.full((1, 200, 400, 3), 255, np.uint8)}
-    found = [legend(Comparison(each, {}, "distance to the true motion", "5 mm", "viridis", [0.0])) for each in (images, wide)]
-    columns = [np.flatnonzero((picture[60:95] < 200).any((0, 2))) for picture in found]  # of the words above the colours
+    found = [
+        legend(Comparison(each, {}, "distance to the true motion", "5 mm", "viridis", [0.0]))
+        for each in (images, wide)
+    ]
+    columns = [
+        np.flatnonzero((picture[60:95] < 200).any((0, 2))) for picture in found
+    ]  # of the words above the colours
     assert 105 < columns[0].max() < 119 and columns[1].max() < 240

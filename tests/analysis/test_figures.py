@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.evaluation.analysis.figures import LEFT, SMALLEST, bar, fitted, text_width, write_strip, write_video
+from mosa.evaluation.analysis.figures import (
+    LEFT,
+    SMALLEST,
+    bar,
+    fitted,
+    text_width,
+    write_strip,
+    write_video,
+)
 
 
 def test_a_strip_takes_rows_of_different_sizes(tmp_path):
@@ -15,7 +23,9 @@ def test_a_strip_takes_rows_of_different_sizes(tmp_path):
     picture = imageio.imread(write_strip(tmp_path / "strip.png", rows, frames=5))
     height = picture.shape[0] // 2
     assert picture.shape[1] == 5 * 50
-    assert (picture[height - 1, : 5 * 30] == 0).all() and (picture[height - 1, 5 * 30 :] == 255).all()
+    assert (picture[height - 1, : 5 * 30] == 0).all() and (
+        picture[height - 1, 5 * 30 :] == 255
+    ).all()
     assert (abs(picture[-1].astype(int) - 128) <= 1).all()
 
 
@@ -34,16 +44,24 @@ def test_an_ffmpeg_that_writes_nothing_is_said(tmp_path, monkeypatch, program):
     other.write_text(f"#!/bin/sh\n{program}\n")
     other.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(other))
-    with pytest.raises(OSError, match=r"(ffmpeg has ended while it wrote|of 5 pictures are in it).*a\.mp4"):
+    with pytest.raises(
+        OSError, match=r"(ffmpeg has ended while it wrote|of 5 pictures are in it).*a\.mp4"
+    ):
         write_video(tmp_path / "a.mp4", [np.zeros((400, 600, 3), np.uint8)] * 5)
     assert [file.name for file in tmp_path.iterdir()] == ["ffmpeg"]
 
 
-@pytest.mark.parametrize("text", ["real", "adapted (MoSA): distance to the true motion, blue 0, yellow 20 mm", "x" * 300])
+@pytest.mark.parametrize(
+    "text", ["real", "adapted (MoSA): distance to the true motion, blue 0, yellow 20 mm", "x" * 300]
+)
 def test_a_caption_fits_into_its_share(text):
     """Three columns of 230 px, as in the rabbit's strip: no caption ends in its neighbour's or beyond the picture."""
     shown, scale = fitted(text, 230 - 2 * LEFT)
     assert text_width(shown, scale) <= 230 - 2 * LEFT and scale >= SMALLEST
     assert shown == text or (shown.endswith("...") and text.startswith(shown[:-3]))
     alone = bar(690, ["", text, ""])
-    assert (alone[:, :230] == 245).all() and (alone[:, 460:] == 245).all() and (alone[:, 230:460] < 245).any()
+    assert (
+        (alone[:, :230] == 245).all()
+        and (alone[:, 460:] == 245).all()
+        and (alone[:, 230:460] < 245).any()
+    )

@@ -15,7 +15,9 @@ from mosa.evaluation.analysis.flow_colors import color_wheel, flow_colors
 def test_against_colorsys(angle, length):
     vector = length * torch.tensor([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
     found = flow_colors(vector.expand(2, 3, 4, 2), largest=4.0)
-    wanted = torch.tensor(colorsys.hsv_to_rgb(angle / 360, min(length / 4, 1), 1.0), dtype=torch.float32)
+    wanted = torch.tensor(
+        colorsys.hsv_to_rgb(angle / 360, min(length / 4, 1), 1.0), dtype=torch.float32
+    )
     torch.testing.assert_close(found, wanted.expand(2, 3, 4, 3), rtol=0, atol=2e-6)
 
 
@@ -32,7 +34,9 @@ def test_wheel_is_white_in_the_middle_and_outside():
     wheel = color_wheel(65)
     assert wheel.shape == (65, 65, 3)
     assert float(wheel[32, 32].min()) > 0.95 and torch.equal(wheel[0, 0], torch.ones(3))
-    assert wheel[32, 63].argmax() == 0 and wheel[32, 1].argmin() == 0  # red to the right, cyan to the left
+    assert (
+        wheel[32, 63].argmax() == 0 and wheel[32, 1].argmin() == 0
+    )  # red to the right, cyan to the left
 
 
 def test_broken_flow_is_named():

@@ -5,7 +5,12 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from mosa.evaluation.analysis.tables import columns_text, continued_text, determined_text, parameter_table
+from mosa.evaluation.analysis.tables import (
+    columns_text,
+    continued_text,
+    determined_text,
+    parameter_table,
+)
 from mosa.modules.body import material
 from mosa.modules.body.material import LOG, register_form, unit_of
 
@@ -21,7 +26,10 @@ def test_both_stages_have_their_error_where_the_truth_is_known():
                "id_prior/E_ratio": 1.1, "id_prior/contact_offset_m": 0.01}  # fmt: skip
     rows = cells_of(parameter_table(figures, "neo_hookean"))
     assert rows[0] == ["parameter", "prior", "joint", "error of prior", "error of joint"]
-    assert rows[2:] == [["E [Pa]", "1.1e+05", "95000", "10.0%", "5.0%"], ["contact_offset_m", "0.01", "nan", "", ""]]
+    assert rows[2:] == [
+        ["E [Pa]", "1.1e+05", "95000", "10.0%", "5.0%"],
+        ["contact_offset_m", "0.01", "nan", "", ""],
+    ]
 
 
 @pytest.mark.parametrize("file", sorted(PRIORS.glob("*.yaml")), ids=lambda file: file.stem)
@@ -34,11 +42,16 @@ def test_every_parameter_of_every_law_has_the_unit_that_its_configuration_says(f
     assert len(units) == len(names)
     assert [unit_of(law, name) or "-" for name in names] == units
     rows = cells_of(parameter_table({f"id_prior/{name}": 1.0 for name in names}, law))[2:]
-    assert [row[0] for row in rows] == [name if unit == "-" else f"{name} [{unit}]" for name, unit in zip(names, units)]
+    assert [row[0] for row in rows] == [
+        name if unit == "-" else f"{name} [{unit}]" for name, unit in zip(names, units)
+    ]
 
 
 def test_the_same_name_is_measured_as_the_law_of_a_mixture_has_it():
-    assert unit_of("herschel_bulkley+stvk", "mu") == "Pa" and unit_of("herschel_bulkley+stvk", "viscosity") == "Pa s"
+    assert (
+        unit_of("herschel_bulkley+stvk", "mu") == "Pa"
+        and unit_of("herschel_bulkley+stvk", "viscosity") == "Pa s"
+    )
     assert unit_of("newtonian+herschel_bulkley", "kappa") == "Pa"
 
 
@@ -47,14 +60,19 @@ def test_a_parameter_of_another_package_has_the_unit_that_it_was_registered_with
     monkeypatch.setattr(material, "UNITS", dict(material.UNITS))
     register_form("fibre_stiffness", LOG, unit="Pa")
     register_form("exponent", LOG)
-    rows = cells_of(parameter_table({"id_prior/fibre_stiffness": 1.0, "id_prior/exponent": 1.0}, "stvk"))[2:]
+    rows = cells_of(
+        parameter_table({"id_prior/fibre_stiffness": 1.0, "id_prior/exponent": 1.0}, "stvk")
+    )[2:]
     assert [row[0] for row in rows] == ["fibre_stiffness [Pa]", "exponent"]
 
 
 def test_what_is_continued_to_a_fine_grid_has_its_unit():
     figures = {"extrapolated/dx_m": 0.01, "extrapolated/coarse_dx_m": 0.014, "id/mu": 200.0, "extrapolated/mu": 190.0,
                "extrapolated/mu_coarse": 210.0, "extrapolated/mu_sd": 5.0}  # fmt: skip
-    assert continued_text(figures, "newtonian").splitlines()[-1] == "- mu [Pa s]: 200, 210, **190** +- 5"
+    assert (
+        continued_text(figures, "newtonian").splitlines()[-1]
+        == "- mu [Pa s]: 200, 210, **190** +- 5"
+    )
 
 
 @pytest.mark.parametrize(("law", "figures", "said"), [
@@ -70,8 +88,17 @@ def test_what_is_determined_has_its_unit(law, figures, said):
 
 
 def test_the_recording_that_no_column_names_is_said():
-    figures = {f"{part}/psnr_crop": 30.0 for part in ("train", "train/drop_2", "test", "test/drop_3")}
-    assert columns_text(figures, "drop_1") == ("Columns: `train` is the recording drop_1, `train/...` the others that were learned "
-                                               "from, `test/...` those held out, `test` their mean.")
-    assert columns_text({"train/psnr_crop": 30.0}, "drop_1") == "Columns: `train` is the recording drop_1."
-    assert columns_text({"test/a/psnr_crop": 30.0}, "a") == ""  # of another scene than the one that was learned from
+    figures = {
+        f"{part}/psnr_crop": 30.0 for part in ("train", "train/drop_2", "test", "test/drop_3")
+    }
+    assert columns_text(figures, "drop_1") == (
+        "Columns: `train` is the recording drop_1, `train/...` the others that were learned "
+        "from, `test/...` those held out, `test` their mean."
+    )
+    assert (
+        columns_text({"train/psnr_crop": 30.0}, "drop_1")
+        == "Columns: `train` is the recording drop_1."
+    )
+    assert (
+        columns_text({"test/a/psnr_crop": 30.0}, "a") == ""
+    )  # of another scene than the one that was learned from

@@ -6,7 +6,11 @@ import pytest
 import torch
 
 from mosa.evaluation.analysis.vibration import GROWTH_LIMIT, vibration_growth
-from mosa.modules.adapters.hyperelastic import HyperelasticAdapter, anisotropic_basis, root_stiffness
+from mosa.modules.adapters.hyperelastic import (
+    HyperelasticAdapter,
+    anisotropic_basis,
+    root_stiffness,
+)
 from mosa.modules.adapters.microplane import isotropic_stiffness
 from mosa.modules.adapters.stress import StressAdapter
 from mosa.modules.body.material import Material
@@ -18,7 +22,9 @@ YOUNG, DENSITY = 1e5, 1000.0
 
 def linear(size: float, nu: float) -> StressAdapter:
     """One operator on the prior's stress with major symmetry and entries +-size."""
-    adapter = StressAdapter(alpha=0.2, state_dependence="constant", major_symmetry=True, no_pre=True, no_post=True)
+    adapter = StressAdapter(
+        alpha=0.2, state_dependence="constant", major_symmetry=True, no_pre=True, no_post=True
+    )
     signs = torch.tensor([1.0 if sign == "+" else -1.0 for sign in SIGNS]).reshape(4, 12)
     with torch.no_grad():
         adapter.operator.free.copy_(signs * math.atanh(size / 0.2) / 10)
@@ -70,7 +76,9 @@ def same_to_first_order(size: float, nu: float) -> torch.Tensor:
     inner = torch.linalg.inv(root_stiffness(poisson))
     A = inner @ G @ isotropic_stiffness(poisson) @ inner
     A = 0.5 * (A + A.T)
-    assert torch.linalg.eigvalsh(torch.eye(6).double() + A)[0] < 0  # to first order alone it would be indefinite
+    assert (
+        torch.linalg.eigvalsh(torch.eye(6).double() + A)[0] < 0
+    )  # to first order alone it would be indefinite
     return torch.einsum("kij,ij->k", anisotropic_basis(torch.float64, torch.device("cpu")), A)
 
 
@@ -84,7 +92,9 @@ def test_large_numbers_of_a_law_with_an_energy_pass(strain, pattern):
         if isinstance(pattern, str):
             adapter.numbers.copy_(same_to_first_order(0.16, 0.4))
         else:
-            adapter.numbers.copy_(0.6 * torch.sign(torch.randn(19, generator=torch.Generator().manual_seed(pattern))))
+            adapter.numbers.copy_(
+                0.6 * torch.sign(torch.randn(19, generator=torch.Generator().manual_seed(pattern)))
+            )
     assert growth(solid(0.4), adapter) <= GROWTH_LIMIT
 
 

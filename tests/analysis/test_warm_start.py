@@ -4,7 +4,11 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.evaluation.analysis.anisotropy import directional_modulus, directions_on_sphere, response_of
+from mosa.evaluation.analysis.anisotropy import (
+    directional_modulus,
+    directions_on_sphere,
+    response_of,
+)
 from mosa.modules.adapters.stress import StressAdapter
 from mosa.modules.adapters.warm_start import drawn_stretches, warm_start
 from mosa.modules.body.material import material_states
@@ -64,17 +68,24 @@ def test_rest_stays_exactly_stress_free(states):
     assert response_of(states, model)(torch.zeros(3, 6, dtype=torch.float64)).abs().max() == 0
     literal = adapter(rest_free=False)
     warm_start(literal, states)
-    assert response_of(states, literal)(torch.zeros(3, 6, dtype=torch.float64)).abs().max() < 1e-5 * E
+    assert (
+        response_of(states, literal)(torch.zeros(3, 6, dtype=torch.float64)).abs().max() < 1e-5 * E
+    )
 
 
 def test_body_falls_and_bounces_like_the_prior(states):
     """A block of 0.1 m dropped on the ground; asked at every substep, so that nothing but the fit differs."""
     mu, lam = lame(torch.tensor(E, dtype=torch.float64), torch.tensor(NU, dtype=torch.float64))
     spacing = 0.02
-    x = torch.cartesian_prod(*[0.2 + spacing * torch.arange(5, dtype=torch.float64)] * 3) + torch.tensor([0, 0.02, 0]).double()
+    x = (
+        torch.cartesian_prod(*[0.2 + spacing * torch.arange(5, dtype=torch.float64)] * 3)
+        + torch.tensor([0, 0.02, 0]).double()
+    )
     eye = torch.eye(3, dtype=torch.float64).expand(len(x), 3, 3).contiguous()
     v = torch.tensor([0, -1.5, 0], dtype=torch.float64).expand(len(x), 3).contiguous()
-    simulator = Simulator("neo_hookean", dx=0.04, substeps=80, frame_dt=0.02, ground=Ground(0.2), dtype=torch.float64)
+    simulator = Simulator(
+        "neo_hookean", dx=0.04, substeps=80, frame_dt=0.02, ground=Ground(0.2), dtype=torch.float64
+    )
 
     def positions(model) -> torch.Tensor:
         volume = torch.full((len(x),), spacing**3, dtype=torch.float64)

@@ -60,14 +60,22 @@ class Filmed:
         hull = cv2.convexHull(self.corners(k).astype(np.float32))[:, 0]
         big = np.zeros((4 * height, 4 * width), np.uint8)
         cv2.fillConvexPoly(big, np.round((4 * hull - 0.5) * 16).astype(np.int32), 255, shift=4)
-        return cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        return (
+            cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        )
 
 
 def cameras(count: int = 6, size: tuple[int, int] = (160, 120)) -> list[Camera]:
     found = []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * (i + 0.1) / count, (0.1, 0.45)[i % 2]
-        back = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(elevation), np.sin(azimuth) * np.cos(elevation)])
+        back = np.array(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+            ]
+        )
         right = np.cross(-back, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         w2c = np.eye(4)
@@ -85,7 +93,9 @@ def filmed(seed: int = 0, **how) -> list[Filmed]:
     found = []
     for camera in cameras(**how):
         begin = -0.3 * rng.uniform()
-        found.append(Filmed(camera, begin, rng.uniform(0.008, 0.02), 60.0, int((0.72 - begin) * 60)))
+        found.append(
+            Filmed(camera, begin, rng.uniform(0.008, 0.02), 60.0, int((0.72 - begin) * 60))
+        )
     return found
 
 
@@ -130,18 +140,32 @@ def write_films(films: list[Filmed], folder, noise: float = 0.01) -> None:
         gain = 1 + 0.1 * rng.normal(size=3)
 
         def developed(picture, gain=gain):
-            return np.round(255 * np.clip(picture * gain + rng.normal(0, noise, picture.shape), 0, 1)).astype(np.uint8)
+            return np.round(
+                255 * np.clip(picture * gain + rng.normal(0, noise, picture.shape), 0, 1)
+            ).astype(np.uint8)
 
         plate = np.broadcast_to(np.array(BEHIND), (height, width, 3))
         iio.imwrite(folder / "plates" / f"phone{i}.png", developed(plate, 0.95 * gain))
-        with iio.get_writer(folder / "videos" / f"phone{i}.mp4", fps=film.fps, codec="libx264", quality=None, pixelformat="yuv420p",
-                            macro_block_size=2, output_params=["-crf", "16", "-preset", "ultrafast"]) as writer:
+        with iio.get_writer(
+            folder / "videos" / f"phone{i}.mp4",
+            fps=film.fps,
+            codec="libx264",
+            quality=None,
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            output_params=["-crf", "16", "-preset", "ultrafast"],
+        ) as writer:
             for k in range(film.count):
                 mask = film.mask(k)[..., None]
                 writer.append_data(developed(mask * COLOR + (1 - mask) * BEHIND))
         camera = in_world(film.camera)
         q = np.roll(Rotation.from_matrix(camera.w2c[:3, :3]).as_quat(), 1)
-        cams.append(f"{i + 1} PINHOLE {width} {height} {camera.K[0, 0]} {camera.K[1, 1]} {camera.K[0, 2]} {camera.K[1, 2]}")
-        images += [f"{i + 1} " + " ".join(map(str, [*q, *camera.w2c[:3, 3]])) + f" {i + 1} phone{i}.jpg", ""]
+        cams.append(
+            f"{i + 1} PINHOLE {width} {height} {camera.K[0, 0]} {camera.K[1, 1]} {camera.K[0, 2]} {camera.K[1, 2]}"
+        )
+        images += [
+            f"{i + 1} " + " ".join(map(str, [*q, *camera.w2c[:3, 3]])) + f" {i + 1} phone{i}.jpg",
+            "",
+        ]
     (folder / "sparse" / "cameras.txt").write_text("# cameras\n" + "\n".join(cams) + "\n")
     (folder / "sparse" / "images.txt").write_text("# images\n" + "\n".join(images) + "\n")

@@ -21,7 +21,11 @@ def model(folder, *, binary: bool, count: int = 3, lens: str = "OPENCV") -> list
     """Write a model of the first cameras; returns them."""
     made = [in_world(camera) for camera in cameras()[:count]]
     number = MODELS[lens][0]
-    cams, images, points = [struct.pack("<Q", count)], [struct.pack("<Q", count)], [struct.pack("<Q", 2)]
+    cams, images, points = (
+        [struct.pack("<Q", count)],
+        [struct.pack("<Q", count)],
+        [struct.pack("<Q", 2)],
+    )
     text = [["# one", ""], ["# one"], ["# one"]]
     for i, camera in enumerate(made):
         values = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], *LENS]
@@ -30,8 +34,14 @@ def model(folder, *, binary: bool, count: int = 3, lens: str = "OPENCV") -> list
         cams.append(struct.pack("<iiQQ8d", 10 + i, number, *camera.size, *values))
         images.append(struct.pack("<i7di", 5 + i, *q, *t, 10 + i) + name.encode() + b"\0" + struct.pack("<Q", 1)
                       + struct.pack("<ddq", 1.0, 2.0, -1))  # fmt: skip
-        text[0].append(f"{10 + i} {lens} {camera.size[0]} {camera.size[1]} " + " ".join(map(repr, map(float, values))))
-        text[1] += [f"{5 + i} " + " ".join(repr(float(x)) for x in [*q, *t]) + f" {10 + i} {name}", "1.0 2.0 -1" if i else ""]
+        text[0].append(
+            f"{10 + i} {lens} {camera.size[0]} {camera.size[1]} "
+            + " ".join(map(repr, map(float, values)))
+        )
+        text[1] += [
+            f"{5 + i} " + " ".join(repr(float(x)) for x in [*q, *t]) + f" {10 + i} {name}",
+            "1.0 2.0 -1" if i else "",
+        ]
     for i, xyz in enumerate(([0.1, 0.2, 0.3], [4.0, 5.0, 6.0])):
         points.append(struct.pack("<Q3d3BdQii", i, *xyz, 1, 2, 3, 0.5, 1, 5, 0))
         text[2].append(f"{i} " + " ".join(map(str, xyz)) + " 1 2 3 0.5 5 0")
@@ -51,7 +61,9 @@ def test_a_model_is_read_as_it_was_written(tmp_path, binary):
     for camera, other in zip(made, found.values()):
         np.testing.assert_allclose(other.K, camera.K)
         np.testing.assert_allclose(other.w2c, camera.w2c, atol=1e-12)
-        assert other.size == camera.size and dict(other.coefficients) == dict(zip(("k1", "k2", "p1", "p2"), LENS))
+        assert other.size == camera.size and dict(other.coefficients) == dict(
+            zip(("k1", "k2", "p1", "p2"), LENS)
+        )
     np.testing.assert_array_equal(read_points(tmp_path), [[0.1, 0.2, 0.3], [4, 5, 6]])
     np.testing.assert_array_equal(scene_points(tmp_path), read_points(tmp_path))
 
@@ -59,10 +71,18 @@ def test_a_model_is_read_as_it_was_written(tmp_path, binary):
 def test_rays_undo_the_projection_through_a_lens():
     plain = cameras()[0]
     points = np.random.default_rng(0).uniform([-0.2, 0.1, -0.2], [0.2, 0.5, 0.2], (20, 3))
-    for lens, fisheye in (({}, False), ({"k1": 0.1, "p2": 0.01}, False), ({"k1": 0.05, "k3": 0.01}, True)):
+    for lens, fisheye in (
+        ({}, False),
+        ({"k1": 0.1, "p2": 0.01}, False),
+        ({"k1": 0.05, "k3": 0.01}, True),
+    ):
         camera = Camera(plain.K, plain.w2c, plain.size, "", lens, fisheye)
         way = points - camera.centre
-        np.testing.assert_allclose(camera.rays(camera.project(points)), way / np.linalg.norm(way, axis=1, keepdims=True), atol=1e-6)
+        np.testing.assert_allclose(
+            camera.rays(camera.project(points)),
+            way / np.linalg.norm(way, axis=1, keepdims=True),
+            atol=1e-6,
+        )
 
 
 @pytest.mark.parametrize("name, damage, said", [
@@ -109,8 +129,12 @@ def test_damaged_points_are_named(tmp_path, content, said):
 
 
 def test_a_model_that_claims_more_than_any_memory_is_damaged(tmp_path):
-    (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 2) + bytes(43) + struct.pack("<Q", 2**62) + bytes(100))
-    with pytest.raises(DataError, match=r"points3D\.bin: expected points of a COLMAP model, found a damaged file"):
+    (tmp_path / "points3D.bin").write_bytes(
+        struct.pack("<Q", 2) + bytes(43) + struct.pack("<Q", 2**62) + bytes(100)
+    )
+    with pytest.raises(
+        DataError, match=r"points3D\.bin: expected points of a COLMAP model, found a damaged file"
+    ):
         read_points(tmp_path)
 
 
@@ -122,7 +146,15 @@ def test_a_lens_that_cannot_be_is_refused_before_any_video_is_read(tmp_path, cha
     frames = []
     for i, camera in enumerate(cameras()[:3]):
         pose = np.linalg.inv(camera.w2c) @ OPENGL_TO_OPENCV
-        frames.append({"file_path": f"phone{i}.jpg", "transform_matrix": pose.tolist(), "fl_x": 200.0, "w": 160, "h": 120})
+        frames.append(
+            {
+                "file_path": f"phone{i}.jpg",
+                "transform_matrix": pose.tolist(),
+                "fl_x": 200.0,
+                "w": 160,
+                "h": 120,
+            }
+        )
     sizes = {f"phone{i}.mp4": (160, 120) for i in range(3)}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     assert len(read_phones(tmp_path, tmp_path, sizes)) == 3
@@ -140,27 +172,50 @@ def test_transforms_and_colmap_say_the_same(tmp_path):
         frames.append({"file_path": f"images/phone {i}.jpg", "transform_matrix": pose.tolist(), "fl_x": camera.K[0, 0],
                        "fl_y": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]})  # fmt: skip
     (tmp_path / "ns").mkdir()
-    document = {"w": 160, "h": 120, "camera_model": "OPENCV", **dict(zip(("k1", "k2", "p1", "p2"), LENS)), "frames": frames}
+    document = {
+        "w": 160,
+        "h": 120,
+        "camera_model": "OPENCV",
+        **dict(zip(("k1", "k2", "p1", "p2"), LENS)),
+        "frames": frames,
+    }
     (tmp_path / "ns" / "transforms.json").write_text(json.dumps(document))
     for one, other in zip(read_poses(tmp_path).values(), read_poses(tmp_path / "ns").values()):
         np.testing.assert_allclose(one.w2c, other.w2c, atol=1e-9)
-        np.testing.assert_allclose(one.project(np.array([[0.1, 0.2, 0.3]])), other.project(np.array([[0.1, 0.2, 0.3]])))
+        np.testing.assert_allclose(
+            one.project(np.array([[0.1, 0.2, 0.3]])), other.project(np.array([[0.1, 0.2, 0.3]]))
+        )
 
 
 def test_a_pose_belongs_to_the_video_of_its_name():
-    mine = ("phone1.jpg", "a/phone1.png", "phone1/0001.jpg", "phone1_12.jpg", "phone1 frame 3.png", "phone1-frame0003.png")
+    mine = (
+        "phone1.jpg",
+        "a/phone1.png",
+        "phone1/0001.jpg",
+        "phone1_12.jpg",
+        "phone1 frame 3.png",
+        "phone1-frame0003.png",
+    )
     assert all(belongs(name, "phone1") for name in mine)
-    assert not any(belongs(name, "phone1") for name in ("phone12.jpg", "phone.jpg", "phone1b.jpg", "phone10/1.jpg", "1.jpg"))
+    assert not any(
+        belongs(name, "phone1")
+        for name in ("phone12.jpg", "phone.jpg", "phone1b.jpg", "phone10/1.jpg", "1.jpg")
+    )
 
 
 def test_poses_that_do_not_fit_the_videos_are_named(tmp_path):
     model(tmp_path, binary=False)
     sizes = {f"phone {i}.mp4": (320, 240) for i in range(3)}
     phones = read_phones(tmp_path, tmp_path, sizes)
-    np.testing.assert_allclose(phones[1].camera.K[:2], 2 * read_model(tmp_path)["shots/phone 1.jpg"].K[:2])
+    np.testing.assert_allclose(
+        phones[1].camera.K[:2], 2 * read_model(tmp_path)["shots/phone 1.jpg"].K[:2]
+    )
     with pytest.raises(DataError, match=r"no pose for .*other\.mp4"):
         read_phones(tmp_path, tmp_path, {**sizes, "other.mp4": (320, 240)})
-    with pytest.raises(DataError, match=r"frames of 320x180: expected the poses of images with the video's field of view"):
+    with pytest.raises(
+        DataError,
+        match=r"frames of 320x180: expected the poses of images with the video's field of view",
+    ):
         read_phones(tmp_path, tmp_path, {**sizes, "phone 1.mp4": (320, 180)})
     with pytest.raises(DataError, match="at least 3 videos"):
         read_phones(tmp_path, tmp_path, {"phone 1.mp4": (320, 240)})
@@ -168,6 +223,8 @@ def test_poses_that_do_not_fit_the_videos_are_named(tmp_path):
     (tmp_path / "images.txt").write_text(text)
     with pytest.raises(DataError, match=r"phone 1 stands elsewhere than in"):
         read_phones(tmp_path, tmp_path, {k: v for k, v in sizes.items() if "2" not in k})
-    with pytest.raises(DataError, match=r"expected a COLMAP model .* or transforms.json, found neither"):
+    with pytest.raises(
+        DataError, match=r"expected a COLMAP model .* or transforms.json, found neither"
+    ):
         (tmp_path / "empty").mkdir()
         read_poses(tmp_path / "empty")

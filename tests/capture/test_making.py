@@ -38,16 +38,31 @@ def filmed_folder(tmp_path_factory):
 def test_scale_up_and_clocks_are_found_and_the_scene_can_be_read(filmed_folder):
     folder, films, found = filmed_folder
     true = np.array([film.begin for film in films]) - films[0].begin
-    assert abs(found["scale"] / WORLD[0] - 1) < 0.03 and np.degrees(np.arccos(np.array(found["up"]) @ WORLD[1][:, 1])) < 1
+    assert (
+        abs(found["scale"] / WORLD[0] - 1) < 0.03
+        and np.degrees(np.arccos(np.array(found["up"]) @ WORLD[1][:, 1])) < 1
+    )
     assert np.abs(np.array([p["offset"] for p in found["phones"]]) - true).max() < 3e-3
     scene = load_scene(format="transforms", path=str(folder / "scene"), up=[0, 1, 0], gravity=[0, -9.81, 0], box=found["box"],
                        ground={"height": 0.0}, scale=1.0)  # fmt: skip
-    assert scene.frames == found["frames"] >= 15 and found["free_frames"] >= 4 and len(scene.cameras) == 6
+    assert (
+        scene.frames == found["frames"] >= 15
+        and found["free_frames"] >= 4
+        and len(scene.cameras) == 6
+    )
     # the cone is 0.2 m high and stands on the floor at contact
-    contact = int(np.searchsorted(np.arange(scene.frames) / found["rate"], CONTACT - films[0].begin - found["start"]))
+    contact = int(
+        np.searchsorted(
+            np.arange(scene.frames) / found["rate"], CONTACT - films[0].begin - found["start"]
+        )
+    )
     assert abs(scene.times[1] - 1 / 60) < 1e-6 and 0 < contact < scene.frames
     page = (folder / "scene" / "capture.md").read_text()
-    assert "phone5" in page and found["command"] in page and (folder / "scene" / "contact.png").stat().st_size > 1000
+    assert (
+        "phone5" in page
+        and found["command"] in page
+        and (folder / "scene" / "contact.png").stat().st_size > 1000
+    )
     assert (folder / "scene" / "fall.png").is_file()
     assert json.loads((folder / "scene" / "capture.json").read_text()) == found
 
@@ -58,16 +73,34 @@ def test_the_ground_is_where_the_cone_lands(filmed_folder):
     world = read_world(folder / "scene")
     scale, R, shift = WORLD
     floor = world.points(R @ np.zeros(3) / scale + shift)[1]
-    assert abs(floor) < 0.015 and found["ground"]["from"] == "lowest contact" and found["ground"]["sd"] < 0.03
+    assert (
+        abs(floor) < 0.015
+        and found["ground"]["from"] == "lowest contact"
+        and found["ground"]["sd"] < 0.03
+    )
     assert BODY[-1, 1] == 0.2 and HEIGHT == 0.45
 
 
 def test_a_second_drop_gets_the_first_ones_world_and_points_give_the_floor(filmed_folder, tmp_path):
     folder, _, found = filmed_folder
-    again = capture(keys(folder, output=str(tmp_path), like=str(folder / "scene"), interpolation="none", rate=30.0))
-    assert again["world"] == found["world"] and again["rate"] == pytest.approx(30) and again["scale_sd"] is None
+    again = capture(
+        keys(
+            folder,
+            output=str(tmp_path),
+            like=str(folder / "scene"),
+            interpolation="none",
+            rate=30.0,
+        )
+    )
+    assert (
+        again["world"] == found["world"]
+        and again["rate"] == pytest.approx(30)
+        and again["scale_sd"] is None
+    )
     rng = np.random.default_rng(0)
-    points = np.concatenate([rng.uniform(-1, 1, (60, 3)) * [1, 0.001, 1] + [0, 0.02, 0], rng.uniform(-1, 1, (60, 3))])
+    points = np.concatenate(
+        [rng.uniform(-1, 1, (60, 3)) * [1, 0.001, 1] + [0, 0.02, 0], rng.uniform(-1, 1, (60, 3))]
+    )
     height, sd, tilt = floor_of_points(points, 0.1, 0.01, 0.05)
     assert abs(height - 0.02) < 1e-3 and sd < 1e-3 and tilt < 0.5
     assert floor_of_points(points[60:66], 0.1, 0.01, 0.05) is None
@@ -79,7 +112,9 @@ def test_mistakes_are_named(filmed_folder, tmp_path):
     folder, _, _ = filmed_folder
     with pytest.raises(ConfigError, match=r"phones\.phone9: no video of that name"):
         capture(keys(folder, phones={"phone9": {"fps": 60}}))
-    with pytest.raises(ConfigError, match=r"phones\.phone1\.speed: expected the keys fps, scan, readout"):
+    with pytest.raises(
+        ConfigError, match=r"phones\.phone1\.speed: expected the keys fps, scan, readout"
+    ):
         capture(keys(folder, phones={"phone1": {"speed": 60}}))
     with pytest.raises(DataError, match=r"plates: folder .* not found"):
         capture(keys(folder, plates=str(tmp_path / "none")))
@@ -87,14 +122,19 @@ def test_mistakes_are_named(filmed_folder, tmp_path):
         (tmp_path / "capture.json").write_text("{}")
         read_world(tmp_path)
     world = {"scale": 0.3, "rotation": np.eye(3).tolist(), "origin": [0, 0, 0]}
-    for wrong, said in (({"scale": 0}, r"world\.scale"), ({"rotation": np.diag([1, 1, -1]).tolist()}, r"world\.rotation")):
+    for wrong, said in (
+        ({"scale": 0}, r"world\.scale"),
+        ({"rotation": np.diag([1, 1, -1]).tolist()}, r"world\.rotation"),
+    ):
         (tmp_path / "capture.json").write_text(json.dumps({"world": world | wrong}))
         with pytest.raises(DataError, match=said):
             read_world(tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match=r"output: .*expected a folder that can be written"):
         capture(keys(folder, output=str(tmp_path / "file")))
-    with pytest.raises(ConfigError, match=r"output: expected a folder of its own, found that of videos"):
+    with pytest.raises(
+        ConfigError, match=r"output: expected a folder of its own, found that of videos"
+    ):
         capture(keys(folder, output=str(folder / "videos")))
 
 

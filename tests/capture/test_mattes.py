@@ -69,7 +69,13 @@ def test_plates_and_masks_are_asked_for_by_name(tmp_path):
 def test_rembg_is_named_where_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rembg", None)
     with pytest.raises(ConfigError, match=r"pip install 'mosa\[rembg\]'"):
-        matting_of("rembg", Clip(tmp_path, np.arange(5) / 60, (8, 6), 0, 0.0), plates=None, plate_seconds=None, masks=None)
+        matting_of(
+            "rembg",
+            Clip(tmp_path, np.arange(5) / 60, (8, 6), 0, 0.0),
+            plates=None,
+            plate_seconds=None,
+            masks=None,
+        )
 
 
 def test_mask_videos_are_read_with_their_frames(tmp_path):
@@ -78,12 +84,20 @@ def test_mask_videos_are_read_with_their_frames(tmp_path):
     film = filmed()[0]
     for folder, of in (("videos", lambda m: 0.4 + 0.4 * m), ("masks", lambda m: m)):
         (tmp_path / folder).mkdir()
-        with iio.get_writer(tmp_path / folder / "phone0.mp4", fps=60, codec="libx264", quality=8, macro_block_size=2) as writer:
+        with iio.get_writer(
+            tmp_path / folder / "phone0.mp4", fps=60, codec="libx264", quality=8, macro_block_size=2
+        ) as writer:
             for k in range(12):
-                writer.append_data(np.repeat(np.round(255 * of(film.mask(k + 20)))[..., None], 3, -1).astype(np.uint8))
+                writer.append_data(
+                    np.repeat(np.round(255 * of(film.mask(k + 20)))[..., None], 3, -1).astype(
+                        np.uint8
+                    )
+                )
     clip = open_clip(tmp_path / "videos" / "phone0.mp4")
     assert clip.size == film.camera.size and np.allclose(np.diff(clip.times), 1 / 60)
-    track = follow(clip, matting_of("masks", clip, plates=None, plate_seconds=None, masks=tmp_path / "masks"))
+    track = follow(
+        clip, matting_of("masks", clip, plates=None, plate_seconds=None, masks=tmp_path / "masks")
+    )
     true = np.array([centre_of(film.mask(k + 20))[0] for k in range(12)])
     np.testing.assert_allclose(track.centres, true, atol=0.15)
     assert all(track.shows(5, true[5:6])) and not any(track.shows(5, true[5:6] + 60))

@@ -2,7 +2,18 @@
 
 import numpy as np
 import pytest
-from filming import BODY, COLOR, CONTACT, HEIGHT, RELEASE, WORLD, G, filmed, lifted, phones_and_tracks
+from filming import (
+    BODY,
+    COLOR,
+    CONTACT,
+    HEIGHT,
+    RELEASE,
+    WORLD,
+    G,
+    filmed,
+    lifted,
+    phones_and_tracks,
+)
 
 import mosa.capture.resampling as resampling
 from mosa.capture.fall import Fall, Knowledge
@@ -19,7 +30,9 @@ def made(tmp_path, monkeypatch):
     phone, track = phones[0], tracks[0]
     scale, R, shift = WORLD
     high, down = R @ [0, HEIGHT + 0.07, 0] / scale + shift, R @ [0, -G, 0] / scale
-    begins, readouts = (np.array([getattr(f, name) for f in films]) for name in ("begin", "readout"))
+    begins, readouts = (
+        np.array([getattr(f, name) for f in films]) for name in ("begin", "readout")
+    )
     fall = Fall(RELEASE, high, np.zeros(3), down, begins, readouts, np.zeros((3, 2)), (0.15, CONTACT), scale, R[:, 1], 0.1, 1,
                 np.zeros(3), np.zeros(3), 0.0, 0.0)  # fmt: skip
 
@@ -95,7 +108,14 @@ def squashed(when: np.ndarray, radius: float = 30.0) -> np.ndarray:
     scale = 1 + 0.2 * np.cos(2 * np.pi * when * 120 / 5)[:, None]
     u, v = x / radius, y / (radius * scale)
     alpha = np.clip(radius * (1 - np.hypot(u, v)) + 0.5, 0, 1)
-    color = np.stack([0.5 + 0.4 * np.sin(7 * u) * np.cos(6 * v), 0.5 + 0.3 * np.cos(9 * v), 0.4 + 0.3 * np.sin(8 * u + 5 * v)], -1)
+    color = np.stack(
+        [
+            0.5 + 0.4 * np.sin(7 * u) * np.cos(6 * v),
+            0.5 + 0.3 * np.cos(9 * v),
+            0.4 + 0.3 * np.sin(8 * u + 5 * v),
+        ],
+        -1,
+    )
     return np.concatenate([color * alpha[..., None], alpha[..., None]], -1).astype(np.float32)
 
 
@@ -114,10 +134,16 @@ def test_a_deformation_is_read_line_by_line_and_bends_between_frames():
 
     middle = np.array([80.0, 80.0])
     whole = resampling.blended(pictures, when, [1, 2], time, 1, middle, 30.0)
-    plain = resampling.blended(pictures[1:3], np.repeat(frames[1:3, None], 160, 1), [0, 1], time, 1, middle, 30.0)
+    plain = resampling.blended(
+        pictures[1:3], np.repeat(frames[1:3, None], 160, 1), [0, 1], time, 1, middle, 30.0
+    )
     across = [np.ascontiguousarray(p.transpose(1, 0, 2)) for p in pictures]
     turned = resampling.blended(across, when, [1, 2], time, 0, middle, 30.0).transpose(1, 0, 2)
-    assert wrong(whole) < 0.45 * wrong(plain) and wrong(turned) < 0.45 * wrong(plain), (wrong(whole), wrong(turned), wrong(plain))
+    assert wrong(whole) < 0.45 * wrong(plain) and wrong(turned) < 0.45 * wrong(plain), (
+        wrong(whole),
+        wrong(turned),
+        wrong(plain),
+    )
     # a time that is one of the frames' own: its centre line stays, the others are brought to it
     own = resampling.blended(pictures[:3], when[:3], [1], 0.0, 1, middle, 30.0)
     still = squashed(np.zeros(160))

@@ -23,7 +23,16 @@ def drawn_states(seed: int = 0) -> torch.Tensor:
     for i, (a, b) in enumerate(((0, 1), (1, 2), (2, 0))):
         shear[i, a, b] = 0.4
     U, V = drawn_rotations(6, seed + 1), drawn_rotations(6, seed + 2)
-    values = torch.tensor([[1.2, 1.2, 1.2], [1.3, 0.8, 0.8], [1.1, 1.1 + 1e-9, 0.9], [1.5, 1.1, 0.6], [1.0, 1.0, 0.7], [1.6, 1, 1]])
+    values = torch.tensor(
+        [
+            [1.2, 1.2, 1.2],
+            [1.3, 0.8, 0.8],
+            [1.1, 1.1 + 1e-9, 0.9],
+            [1.5, 1.1, 0.6],
+            [1.0, 1.0, 0.7],
+            [1.6, 1, 1],
+        ]
+    )
     spectral = U @ torch.diag_embed(values.double()) @ V.mT
     generic = eye + 0.25 * torch.randn(40, 3, 3, generator=generator, dtype=torch.float64)
     generic = generic[torch.linalg.det(generic) > 0.3]
@@ -37,7 +46,9 @@ def simulator(law: str) -> Simulator:
 def stress(law: str, F: torch.Tensor, parameters: dict) -> torch.Tensor:
     """Kirchhoff stress (N, 3, 3) through the simulator's own kernel, differentiable; F: (N, 3, 3) with J > 0."""
     R = polar(F)
-    return R @ unvech(simulator(law).material_state(F, torch.zeros_like(F), parameters).stress) @ R.mT
+    return (
+        R @ unvech(simulator(law).material_state(F, torch.zeros_like(F), parameters).stress) @ R.mT
+    )
 
 
 def mapped(law: str, F: torch.Tensor, parameters: dict) -> torch.Tensor:
@@ -46,7 +57,9 @@ def mapped(law: str, F: torch.Tensor, parameters: dict) -> torch.Tensor:
     return first_advance(sim.numerics, F, torch.zeros_like(F), sim.pack(parameters, len(F)))
 
 
-def check_gradients(function, leaves: dict[str, torch.Tensor], seed: int, steps: tuple[float, float] = (4e-4, 1e-4)) -> None:
+def check_gradients(
+    function, leaves: dict[str, torch.Tensor], seed: int, steps: tuple[float, float] = (4e-4, 1e-4)
+) -> None:
     """Gradients of function(**leaves) (one number per particle) against differences, rtol 1e-6 per particle.
 
     A particle whose two differences disagree lies within a step of a switch, where there is no derivative to compare with.
@@ -57,7 +70,9 @@ def check_gradients(function, leaves: dict[str, torch.Tensor], seed: int, steps:
     for (name, value), gradient in zip(leaves.items(), gradients, strict=True):
         n = len(value)
         direction = torch.randn(value.shape, generator=generator, dtype=torch.float64)
-        direction = direction / direction.reshape(n, -1).norm(dim=1).reshape(n, *[1] * (value.ndim - 1))
+        direction = direction / direction.reshape(n, -1).norm(dim=1).reshape(
+            n, *[1] * (value.ndim - 1)
+        )
 
         def difference(h, name=name, value=value, direction=direction):
             f = lambda s: function(**{**leaves, name: value + s * direction}).detach()  # noqa: E731

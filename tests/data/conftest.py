@@ -26,7 +26,9 @@ def block_scene(views: int = 3, frames: int = 5, size: int = 32) -> Scene:
             mattes[v, t, top, 10 + v : 22 + v] = round(0.4 * 255) / 255
     color = torch.randint(0, 256, (views, frames, size, size, 3), generator=rng) / 255
     images = color * mattes[..., None] + 1 - mattes[..., None]
-    rig = ring_of_cameras(views, size, target=(0, 0.2, 0), distance=1.5, elevations=(0.2, 0.6), field=0.3, turn=0.4)
+    rig = ring_of_cameras(
+        views, size, target=(0, 0.2, 0), distance=1.5, elevations=(0.2, 0.6), field=0.3, turn=0.4
+    )
     up = torch.tensor([0.0, 1.0, 0.0])
     return Scene(
         "blocks",
@@ -74,6 +76,8 @@ def clouds_of(scene: Scene, count: int = 9, frames: int | None = None) -> torch.
     """(T, count, 3) [m] drawn particles where the cameras see the object of each frame; of more frames where it is seen last."""
     track = track_of(scene)
     spread = 1.5 * track.radius * (torch.rand(frames or scene.frames, count, 3) - 0.5)
-    spread[:, :2] = 0.75 * track.radius * torch.tensor([[-1.0], [1.0]])  # the cloud's extent, whatever was drawn
+    spread[:, :2] = (
+        0.75 * track.radius * torch.tensor([[-1.0], [1.0]])
+    )  # the cloud's extent, whatever was drawn
     points = track.points[torch.arange(len(spread)).clamp(max=scene.frames - 1)].float()
     return points[:, None] + spread - spread.mean(1, keepdim=True)

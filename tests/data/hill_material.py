@@ -27,7 +27,9 @@ class HillMaterial:
 
     def __post_init__(self) -> None:
         if len(self.coefficients) != 6 or not all(c > 0 for c in self.coefficients):
-            raise ConfigError(f"hill material: coefficients: expected six positive numbers, found {self.coefficients}")
+            raise ConfigError(
+                f"hill material: coefficients: expected six positive numbers, found {self.coefficients}"
+            )
 
     def parameters(self) -> dict[str, Tensor]:
         """What the law `hill` takes, () each, axes (3,)."""

@@ -86,8 +86,14 @@ def orthotropic_energy(F: Tensor, axes: Tensor, **moduli: Tensor) -> Tensor:
     e = Q.mT @ (W - torch.eye(3, dtype=F.dtype, device=F.device)) @ Q
     d, m = e.diagonal(dim1=-2, dim2=-1), moduli
     normal = m["C11"] * d[..., 0] ** 2 + m["C22"] * d[..., 1] ** 2 + m["C33"] * d[..., 2] ** 2
-    coupled = m["C23"] * d[..., 1] * d[..., 2] + m["C13"] * d[..., 0] * d[..., 2] + m["C12"] * d[..., 0] * d[..., 1]
-    shear = m["C44"] * e[..., 1, 2] ** 2 + m["C55"] * e[..., 0, 2] ** 2 + m["C66"] * e[..., 0, 1] ** 2
+    coupled = (
+        m["C23"] * d[..., 1] * d[..., 2]
+        + m["C13"] * d[..., 0] * d[..., 2]
+        + m["C12"] * d[..., 0] * d[..., 1]
+    )
+    shear = (
+        m["C44"] * e[..., 1, 2] ** 2 + m["C55"] * e[..., 0, 2] ** 2 + m["C66"] * e[..., 0, 1] ** 2
+    )
     return 0.5 * normal + coupled + 2 * shear
 
 
@@ -131,14 +137,30 @@ class OrthotropicMaterial:
     def _compliance(self) -> Tensor:
         (E1, E2, E3), (nu23, nu13, nu12) = self.E, self.nu
         if min(self.E) <= 0:
-            raise ConfigError(f"orthotropic material: E: expected positive numbers [Pa], found {self.E}")
-        rows = [[1 / E1, -nu12 / E1, -nu13 / E1], [-nu12 / E1, 1 / E2, -nu23 / E2], [-nu13 / E1, -nu23 / E2, 1 / E3]]
+            raise ConfigError(
+                f"orthotropic material: E: expected positive numbers [Pa], found {self.E}"
+            )
+        rows = [
+            [1 / E1, -nu12 / E1, -nu13 / E1],
+            [-nu12 / E1, 1 / E2, -nu23 / E2],
+            [-nu13 / E1, -nu23 / E2, 1 / E3],
+        ]
         return torch.tensor(rows, dtype=torch.float64)
 
     def parameters(self) -> dict[str, Tensor]:
         """What the law `orthotropic_linear` takes: the nine of MODULI, () each, and axes (3,)."""
         C = torch.linalg.inv(self._compliance())
-        values = {"C11": C[0, 0], "C22": C[1, 1], "C33": C[2, 2], "C23": C[1, 2], "C13": C[0, 2], "C12": C[0, 1]}
-        values |= {name: torch.tensor(g, dtype=torch.float64) for name, g in zip(("C44", "C55", "C66"), self.G, strict=True)}
+        values = {
+            "C11": C[0, 0],
+            "C22": C[1, 1],
+            "C33": C[2, 2],
+            "C23": C[1, 2],
+            "C13": C[0, 2],
+            "C12": C[0, 1],
+        }
+        values |= {
+            name: torch.tensor(g, dtype=torch.float64)
+            for name, g in zip(("C44", "C55", "C66"), self.G, strict=True)
+        }
         axes = torch.eye(3, dtype=torch.float64) if self.axes is None else self.axes
         return {**values, "axes": axes_parameter(axes)}

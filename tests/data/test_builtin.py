@@ -63,7 +63,10 @@ def test_shapes_have_their_height_and_closed_surfaces(name):
     assert (count == 2).all()
     corner = surface.vertices[surface.triangles]
     volume = (np.cross(corner[:, 0], corner[:, 1]) * corner[:, 2]).sum() / 6
-    assert volume == pytest.approx(len(fill(SHAPES[name], 0.004 * size, np.random.default_rng(0))) * (0.004 * size) ** 3, rel=0.01)
+    assert volume == pytest.approx(
+        len(fill(SHAPES[name], 0.004 * size, np.random.default_rng(0))) * (0.004 * size) ** 3,
+        rel=0.01,
+    )
 
 
 SECOND_FIVE = ("gorilla", "calf", "chick2", "rainbowball", "ring")
@@ -76,7 +79,9 @@ def test_limbs_are_two_cells_of_the_truth_s_grid_thick(name):
     pitch, radius = 0.004, 2 * body.spacing
     points = fill(SHAPES[body.shape], pitch, np.random.default_rng(0))
     deep = points[SHAPES[body.shape].distance(points) < -radius]
-    lost = cKDTree(deep).query(points)[0] > radius + pitch  # a lattice point may lie a pitch off the ball's centre
+    lost = (
+        cKDTree(deep).query(points)[0] > radius + pitch
+    )  # a lattice point may lie a pitch off the ball's centre
     assert lost.mean() < 2e-3
 
 
@@ -96,7 +101,10 @@ def test_the_second_five_differ_in_material_and_start_above_the_ground_in_every_
         for b in fibres[:i]:
             assert abs(a @ b) < math.cos(math.radians(20))
     for name in SECOND_FIVE:
-        body, points = OBJECTS[name], fill(SHAPES[OBJECTS[name].shape], 0.012, np.random.default_rng(0))
+        body, points = (
+            OBJECTS[name],
+            fill(SHAPES[OBJECTS[name].shape], 0.012, np.random.default_rng(0)),
+        )
         assert len(body.drops) == 3
         for drop in body.drops.values():
             start, _ = place(points, points.mean(0) * [0, 1, 0], drop, points)
@@ -126,25 +134,44 @@ def test_rays_hit_a_sphere_where_it_is():
     """Coverage of a sphere seen from far is its silhouette's ellipse: area pi r^2 f^2/(d^2 - r^2) to first order."""
     angle = np.linspace(0, np.pi, 65)[:, None], np.linspace(0, 2 * np.pi, 129)[None, :-1]
     ball = 0.1 * np.stack(
-        [np.sin(angle[0]) * np.cos(angle[1]), np.cos(angle[0]) + 0 * angle[1], np.sin(angle[0]) * np.sin(angle[1])], -1
+        [
+            np.sin(angle[0]) * np.cos(angle[1]),
+            np.cos(angle[0]) + 0 * angle[1],
+            np.sin(angle[0]) * np.sin(angle[1]),
+        ],
+        -1,
     )
     index = np.arange(65 * 128).reshape(65, 128)
     a, b = index[:-1], index[1:]
-    quads = [np.stack([a, np.roll(a, -1, 1), b], -1), np.stack([np.roll(a, -1, 1), np.roll(b, -1, 1), b], -1)]
+    quads = [
+        np.stack([a, np.roll(a, -1, 1), b], -1),
+        np.stack([np.roll(a, -1, 1), np.roll(b, -1, 1), b], -1),
+    ]
     triangles = np.concatenate([q.reshape(-1, 3) for q in quads]).astype(np.int32)
     vertices = ball.reshape(-1, 3) + np.array([0.02, 0.01, 0.0])
     surface = Surface(vertices, triangles, np.full_like(vertices, 0.5))
-    cameras = ring_of_cameras(2, 96, target=(0, 0, 0), distance=2.0, elevations=(0.0,), field=0.3, turn=0.3)
+    cameras = ring_of_cameras(
+        2, 96, target=(0, 0, 0), distance=2.0, elevations=(0.0,), field=0.3, turn=0.3
+    )
     pictures = render_surface(surface, vertices, cameras)
     matte = torch.from_numpy(pictures[..., 3] / 255.0)
     grid = torch.arange(96) + 0.5
     for v in range(2):
         f, d = (
             float(cameras.K[v, 0, 0]),
-            float((cameras.w2c[v, :3, :3] @ torch.tensor([0.02, 0.01, 0.0]) + cameras.w2c[v, :3, 3])[2]),
+            float(
+                (cameras.w2c[v, :3, :3] @ torch.tensor([0.02, 0.01, 0.0]) + cameras.w2c[v, :3, 3])[
+                    2
+                ]
+            ),
         )
-        assert float(matte[v].sum()) == pytest.approx(np.pi * 0.01 * f * f / (d * d - 0.01), rel=0.01)
-        center = torch.stack([(matte[v] * grid).sum(), (matte[v] * grid[:, None]).sum()]) / matte[v].sum()
+        assert float(matte[v].sum()) == pytest.approx(
+            np.pi * 0.01 * f * f / (d * d - 0.01), rel=0.01
+        )
+        center = (
+            torch.stack([(matte[v] * grid).sum(), (matte[v] * grid[:, None]).sum()])
+            / matte[v].sum()
+        )
         pixel, _ = project(torch.tensor([[0.02, 0.01, 0.0]]), cameras.select([v]))
         assert (center - pixel[0, 0]).abs().max() < 0.1
 
@@ -180,7 +207,9 @@ def test_seed_changes_the_footage_and_material_changes_the_motion_alone(training
     assert difference.mean() > 2e-3
 
 
-def test_rest_is_frame_0_of_training_and_held_out_starts_are_turned_copies_of_it(training, held_out):
+def test_rest_is_frame_0_of_training_and_held_out_starts_are_turned_copies_of_it(
+    training, held_out
+):
     truth = training.truth
     assert torch.allclose(truth.rest, truth.positions[0], atol=1e-6)
     assert torch.equal(truth.rotation, torch.eye(3))
@@ -188,7 +217,9 @@ def test_rest_is_frame_0_of_training_and_held_out_starts_are_turned_copies_of_it
     for scene, degrees in zip(held_out, (60.0, 40.0)):
         assert torch.equal(scene.truth.rest, truth.rest)
         Q = scene.truth.rotation
-        assert torch.rad2deg(torch.acos((Q.trace() - 1) / 2)).item() == pytest.approx(degrees, abs=1e-3)
+        assert torch.rad2deg(torch.acos((Q.trace() - 1) / 2)).item() == pytest.approx(
+            degrees, abs=1e-3
+        )
         arms = truth.rest - truth.rest.mean(0)
         start = scene.truth.positions[0] - scene.truth.positions[0].mean(0)
         assert torch.allclose(start, arms @ Q.T, atol=2e-6)
@@ -211,7 +242,9 @@ def test_free_flight_follows_the_parabola_until_contact_and_then_does_not(traini
 def test_the_pictures_show_the_truth_and_nothing_is_cut_off(training, held_out):
     for scene in (training, *held_out):
         m = scene.mattes
-        border = torch.stack([m[..., 0, :].amax(), m[..., -1, :].amax(), m[..., 0].amax(), m[..., -1].amax()])
+        border = torch.stack(
+            [m[..., 0, :].amax(), m[..., -1, :].amax(), m[..., 0].amax(), m[..., -1].amax()]
+        )
         assert border.amax() == 0
         for t in (0, scene.frames - 1):
             pixel, depth = project(scene.truth.positions[t], scene.cameras)
@@ -234,7 +267,9 @@ def test_keys_of_built_in_scenes(cache, training):
     assert scene.training_frames == [0, 1, 2, 3]
     assert scene.synthetic
     assert scene.known_parameters == {"E": 2e5, "nu": 0.3}
-    assert scene.truth.parameters["E_along"] / scene.truth.parameters["E_across"] == pytest.approx(1.6)
+    assert scene.truth.parameters["E_along"] / scene.truth.parameters["E_across"] == pytest.approx(
+        1.6
+    )
     for keys, message in (
         ({"sequence": "test_90"}, "scene.sequence: tiny has train, test_60, test_40, not 'test_90'"),
         ({"material": "wood"}, "scene.material"), ({"seed": -1}, "scene.seed"), ({"seed": 0.5}, "scene.seed"),
@@ -249,7 +284,9 @@ def test_keys_of_built_in_scenes(cache, training):
 
 def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, training, monkeypatch):
     (tmp_path / "file").write_text("")
-    take = takes.make("tiny", "train", cache=None if training is None else tmp_path / "ok", progress=False)
+    take = takes.make(
+        "tiny", "train", cache=None if training is None else tmp_path / "ok", progress=False
+    )
     monkeypatch.setattr(takes, "film_drop", lambda *a: take)
     with pytest.raises(ConfigError, match=r"scene\.cache: cannot write"):
         tiny(tmp_path / "file")
@@ -274,14 +311,18 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     assert (coarse - scene.truth.positions).norm(dim=-1).max() > 1e-3
     # a shelf in the way, and a wall beside the body that its spreading pushes against
     shelf = float(scene.truth.positions[0][:, 1].min()) - 0.02
-    plate = Collider(HalfSpace(), "sticky", motion=Motion((0.0, shelf, 0.0), (-0.5 * math.pi, 0.0, 0.0)))
+    plate = Collider(
+        HalfSpace(), "sticky", motion=Motion((0.0, shelf, 0.0), (-0.5 * math.pi, 0.0, 0.0))
+    )
     held = floor_rollout(body, scene, replace(world, colliders=(plate,)))
     sunk = 0.25 * body.settings.dx  # what an impact presses particles into a grid's contact
     assert held[..., 1].min() > shelf - sunk > coarse[..., 1].min() + sunk
     right = float(scene.truth.positions[0][:, 0].max())
     wall = Plane((right, 0.0, 0.0), (-1.0, 0.0, 0.0), "separate")
     walled = floor_rollout(body, scene, replace(world, planes=(wall,)))
-    assert walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005  # spreading by 13 mm is held within 2
+    assert (
+        walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005
+    )  # spreading by 13 mm is held within 2
 
 
 def test_an_object_of_another_spacing_is_filled_anew(monkeypatch):
@@ -312,7 +353,9 @@ def test_pictures_are_composited_on_white_at_every_size(size):
         picture = pictures[v, t].astype(np.float32) / 255
         plain = composite(picture[..., :3], picture[..., 3], np.ones(3, np.float32))
         assert np.array_equal(images[v, t].numpy(), resize(plain, *size))
-        assert np.array_equal(mattes[v, t].numpy(), resize(np.ascontiguousarray(picture[..., 3]), *size))
+        assert np.array_equal(
+            mattes[v, t].numpy(), resize(np.ascontiguousarray(picture[..., 3]), *size)
+        )
 
 
 def test_a_built_in_scene_without_a_name_is_refused(cache):

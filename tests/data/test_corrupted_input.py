@@ -126,7 +126,12 @@ def entries(change):
 
 def moved(offset):
     """All cameras moved along x [m]."""
-    return entries(lambda d: [e["transform_matrix"][0].__setitem__(3, e["transform_matrix"][0][3] + offset) for e in d["frames"]])
+    return entries(
+        lambda d: [
+            e["transform_matrix"][0].__setitem__(3, e["transform_matrix"][0][3] + offset)
+            for e in d["frames"]
+        ]
+    )
 
 
 TRANSFORMS = {
@@ -177,7 +182,9 @@ def test_masks_of_another_size(blocks, tmp_path):
 
     folder = export_transforms(blocks, tmp_path / "capture", masks=True)
     iio.imwrite(folder / "images" / "0_000_mask.png", np.zeros((8, 8), np.uint8))
-    with pytest.raises(DataError, match=r"0_000_mask.png: expected 32x32 px \(as 0_000.png\), found 8x8"):
+    with pytest.raises(
+        DataError, match=r"0_000_mask.png: expected 32x32 px \(as 0_000.png\), found 8x8"
+    ):
         load_scene(format="transforms", path=str(folder), **WORLD)
 
 
@@ -194,10 +201,15 @@ def cut_particles(folder):
 
 
 PARTICLES = {
-    "NaN": (nan_particle, "003.ply: expected finite positions, found NaN or infinity in 1 of 9, first at 4"),
+    "NaN": (
+        nan_particle,
+        "003.ply: expected finite positions, found NaN or infinity in 1 of 9, first at 4",
+    ),
     "truncated": (cut_particles, "002.ply: expected a PLY file"),
-    "too few": (lambda f: export_particles(torch.rand(4, 9, 3), f),
-                "expected 5 PLY files, one per frame, numbered 0 to 4 as the frames are, found 4"),
+    "too few": (
+        lambda f: export_particles(torch.rand(4, 9, 3), f),
+        "expected 5 PLY files, one per frame, numbered 0 to 4 as the frames are, found 4",
+    ),
     "no PLY": (
         lambda f: (f.mkdir(), [(f / f"{t}.ply").write_text("hello") for t in range(5)]),
         "0.ply: expected a PLY file",
@@ -211,11 +223,16 @@ def test_corrupted_particles(pacnerf_folder, tmp_path, name):
     corrupt, message = PARTICLES[name]
     corrupt(tmp_path / "ply")
     with pytest.raises(DataError, match=message):
-        load_scene(format="pacnerf", path=str(pacnerf_folder), particles=str(tmp_path / "ply"), **WORLD)
+        load_scene(
+            format="pacnerf", path=str(pacnerf_folder), particles=str(tmp_path / "ply"), **WORLD
+        )
 
 
 KEYS = [
-    ({"format": "nerf"}, "scene.format: expected one of builtin, pacnerf, spring_gaus, transforms, found 'nerf'"),
+    (
+        {"format": "nerf"},
+        "scene.format: expected one of builtin, pacnerf, spring_gaus, transforms, found 'nerf'",
+    ),
     ({"path": None}, "scene.path: expected the folder"),
     ({"colour": "red"}, "scene.colour: not a key of this format"),
     ({"scale": 2.0}, r"scene.scale: expected a number in \(0, 1\]"),
@@ -226,7 +243,10 @@ KEYS = [
     ({"box": [0, 1]}, "scene.box: expected three numbers"),
     ({"density": -5.0}, "scene.density: expected a positive number"),
     ({"fps": 0.0}, "scene.fps: expected a positive number"),
-    ({"ground": {"height": 0.0, "mode": "rubber"}}, "scene.ground.mode: expected sticky, slip, separate, touch or auto"),
+    (
+        {"ground": {"height": 0.0, "mode": "rubber"}},
+        "scene.ground.mode: expected sticky, slip, separate, touch or auto",
+    ),
     ({"ground": {"hight": 0.0}}, "scene.ground.hight"),
     ({"ground": {"mode": "slip"}}, "scene.ground.height: expected a height"),
     ({"ground": {"height": 0.0, "friction": -1.0}}, "scene.ground.friction"),
@@ -236,15 +256,23 @@ KEYS = [
     ({"up": [0, 0, 1]}, "scene.gravity: expected a pull towards the ground, against scene.up"),
     ({"ground": 0.0}, "scene.ground: expected the keys height, mode and friction"),
     ({"ground": {"height": 0.0, "friction": "some"}}, "scene.ground.friction"),
-    ({"ground": {"height": 0.0, "mode": "slip", "friction": 0.2}},
-     "scene.ground.friction: acts with modes separate and touch only"),
+    (
+        {"ground": {"height": 0.0, "mode": "slip", "friction": 0.2}},
+        "scene.ground.friction: acts with modes separate and touch only",
+    ),
     ({"fps": "many"}, "scene.fps: expected a positive number, found 'many'"),
     ({"scale": "half"}, "scene.scale: expected a number"),
     ({"holdout_cameras": 2}, "scene.holdout_cameras: expected a list of cameras like"),
-    ({"holdout_frames": "last"}, "scene.holdout_frames: expected a list of frame numbers or how many"),
+    (
+        {"holdout_frames": "last"},
+        "scene.holdout_frames: expected a list of frame numbers or how many",
+    ),
     ({"holdout_frames": -1}, "scene.holdout_frames: expected a number >= 0"),
     ({"frames": [0, 1]}, "scene.frames: expected at least three frames"),
-    ({"holdout_cameras": ["seven"]}, "scene.holdout_cameras: no camera 'seven'; the scene has 0, 1, 2"),
+    (
+        {"holdout_cameras": ["seven"]},
+        "scene.holdout_cameras: no camera 'seven'; the scene has 0, 1, 2",
+    ),
     ({"holdout_cameras": [0, 1]}, "scene.holdout_cameras: 2 of 3 held out"),
     ({"holdout_frames": [1]}, "scene.holdout_frames: expected the last frames"),
     ({"holdout_frames": [7]}, "scene.holdout_frames: no frame 7"),
@@ -264,7 +292,10 @@ def test_mistaken_keys(pacnerf_folder, keys, message):
     [
         (
             lambda s: replace(
-                s, images=s.images.masked_fill(torch.arange(5)[None, :, None, None, None] == 3, float("nan"))
+                s,
+                images=s.images.masked_fill(
+                    torch.arange(5)[None, :, None, None, None] == 3, float("nan")
+                ),
             ),
             "images: NaN or infinite pixels in camera 0, frame 3",
         ),
@@ -273,7 +304,10 @@ def test_mistaken_keys(pacnerf_folder, keys, message):
             r"mattes: expected shape \(3, 5, 32, 32\), found \(3, 4, 32, 32\)",
         ),
         (lambda s: replace(s, times=s.times[:2]), r"times: expected shape \(5,\)"),
-        (lambda s: replace(s, cameras=replace(s.cameras, w2c=-s.cameras.w2c)), "expected a rotation"),
+        (
+            lambda s: replace(s, cameras=replace(s.cameras, w2c=-s.cameras.w2c)),
+            "expected a rotation",
+        ),
     ],
 )
 def test_validation_of_scenes_from_anywhere(blocks, change, message):
@@ -283,10 +317,14 @@ def test_validation_of_scenes_from_anywhere(blocks, change, message):
 
 def test_uneven_times_can_be_overridden(pacnerf_folder, transforms_folder):
     """The way out that the message names."""
-    listing(lambda d: [e.update(time=0.5) for e in d if e["file_path"].endswith("_4.png")])(pacnerf_folder)
+    listing(lambda d: [e.update(time=0.5) for e in d if e["file_path"].endswith("_4.png")])(
+        pacnerf_folder
+    )
     scene = load_scene(format="pacnerf", path=str(pacnerf_folder), fps=24.0, **WORLD)
     assert torch.allclose(scene.times, torch.arange(5) / 24)
-    entries(lambda d: [e.update(time=0.2) for e in d["frames"] if e["file_path"].endswith("_004.png")])(transforms_folder)
+    entries(
+        lambda d: [e.update(time=0.2) for e in d["frames"] if e["file_path"].endswith("_004.png")]
+    )(transforms_folder)
     scene = load_scene(format="transforms", path=str(transforms_folder), fps=24.0, **WORLD)
     assert torch.allclose(scene.times, torch.arange(5) / 24)
 

@@ -22,26 +22,49 @@ RADIUS, REBOUND, FPS, FRAMES = 0.1, 0.6, 30, 12
 def height(t: float) -> float:
     """Of the centre [m]: a fall from 0.55 m, and a bounce with a share of the speed."""
     touch = (2 * (0.55 - RADIUS) / 9.8) ** 0.5
-    return 0.55 - 4.9 * t * t if t < touch else RADIUS + REBOUND * 9.8 * touch * (t - touch) - 4.9 * (t - touch) ** 2
+    return (
+        0.55 - 4.9 * t * t
+        if t < touch
+        else RADIUS + REBOUND * 9.8 * touch * (t - touch) - 4.9 * (t - touch) ** 2
+    )
 
 
 def ball(views: int = 4, size: int = 64, shift=(0.0, 0.0)) -> Scene:
     """shift [m]: of the object's path, sideways."""
-    rig = ring_of_cameras(views, size, target=(0, 0.3, 0), distance=1.5, elevations=(0.2, 0.6), field=0.7, turn=0.4)
+    rig = ring_of_cameras(
+        views, size, target=(0, 0.3, 0), distance=1.5, elevations=(0.2, 0.6), field=0.7, turn=0.4
+    )
     origins, directions = rays(rig)
     mattes = []
     for t in range(FRAMES):
-        arm = torch.tensor([0.02 * t + shift[0], height(t / FPS), shift[1]]) - origins[:, None, None]
+        arm = (
+            torch.tensor([0.02 * t + shift[0], height(t / FPS), shift[1]]) - origins[:, None, None]
+        )
         along = (arm * directions).sum(-1, keepdim=True)
         distance = (arm - along * directions).norm(dim=-1)
         pixel = along[..., 0] / rig.K[:, 0, 0].view(-1, 1, 1)
-        mattes.append(((RADIUS - distance) / pixel + 0.5).clamp(0, 1))  # coverage of a pixel by the rim
+        mattes.append(
+            ((RADIUS - distance) / pixel + 0.5).clamp(0, 1)
+        )  # coverage of a pixel by the rim
     mattes = torch.stack(mattes, 1)
     images = (1 - 0.5 * mattes[..., None]).expand(-1, -1, -1, -1, 3)
     up = torch.tensor([0.0, 1.0, 0.0])
     box = torch.tensor([[-1.0, -0.1, -1.0], [1.0, 1.0, 1.0]])
-    return Scene("ball", "train", images, mattes, rig, torch.arange(FRAMES) / FPS, -9.8 * up, up, Ground(0.0), box, 1000.0,
-                 torch.ones(3), True)
+    return Scene(
+        "ball",
+        "train",
+        images,
+        mattes,
+        rig,
+        torch.arange(FRAMES) / FPS,
+        -9.8 * up,
+        up,
+        Ground(0.0),
+        box,
+        1000.0,
+        torch.ones(3),
+        True,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +88,9 @@ def test_a_film_of_a_falling_ball_passes_and_shows_its_gravity(scene):
         assert validate(scene) is scene
     track = track_of(scene)
     truth = torch.tensor([[0.02 * t, height(t / FPS), 0.0] for t in range(FRAMES)])
-    assert float((track.points - truth).norm(dim=1).max()) < track.noise and track.radius == pytest.approx(RADIUS, rel=0.05)
+    assert float(
+        (track.points - truth).norm(dim=1).max()
+    ) < track.noise and track.radius == pytest.approx(RADIUS, rel=0.05)
     a, error = parabola(track, 8)  # contact is after 9 frames
     assert float((a - torch.tensor([0, -9.8, 0])).norm()) < error < 5
 
@@ -78,7 +103,9 @@ def test_a_frame_rate_that_contradicts_free_fall_is_refused(scene, factor):
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_a_frame_rate_that_is_nearly_right_is_a_warning(scene, factor):
-    with pytest.warns(UserWarning, match=r"falls with .* under a stated gravity of 9\.8: check scene\.fps"):
+    with pytest.warns(
+        UserWarning, match=r"falls with .* under a stated gravity of 9\.8: check scene\.fps"
+    ):
         validate(replace(scene, times=scene.times / factor))
 
 
@@ -91,7 +118,9 @@ def test_a_world_in_other_units_is_refused(scene, unit):
 def test_a_gravity_that_the_object_does_not_follow_is_refused(scene):
     aside = torch.tensor([-9.8, 0.0, 0.0])
     with pytest.raises(DataError, match=r"moves with 9.* across"):
-        check_fall(replace(scene, gravity=aside, up=-aside / 9.8, ground=None, last_free_frame=7), "scene")
+        check_fall(
+            replace(scene, gravity=aside, up=-aside / 9.8, ground=None, last_free_frame=7), "scene"
+        )
 
 
 def test_a_film_that_runs_backwards_is_refused(scene):
@@ -101,17 +130,27 @@ def test_a_film_that_runs_backwards_is_refused(scene):
 
 def test_a_film_that_begins_after_contact_is_named_as_that(scene):
     """Pressed flat, it is thrown up by what it has stored."""
-    heights = torch.tensor([0.1, 0.11, 0.15, 0.23, 0.30, 0.36, 0.41, 0.45, 0.47, 0.49, 0.5, 0.5]).double()
+    heights = torch.tensor(
+        [0.1, 0.11, 0.15, 0.23, 0.30, 0.36, 0.41, 0.45, 0.47, 0.49, 0.5, 0.5]
+    ).double()
     track = track_of(scene)
-    late = track._replace(points=torch.stack([0 * heights, heights, 0 * heights], 1), low=heights - RADIUS)
-    with pytest.raises(DataError, match=r"a film that begins after contact \(start it earlier, scene\.frames\), or"):
+    late = track._replace(
+        points=torch.stack([0 * heights, heights, 0 * heights], 1), low=heights - RADIUS
+    )
+    with pytest.raises(
+        DataError, match=r"a film that begins after contact \(start it earlier, scene\.frames\), or"
+    ):
         check_direction(scene, late, "scene", 9.8)
     with pytest.raises(DataError, match="a film that runs backwards"):
-        check_direction(scene, late._replace(points=late.points + 0.2, low=late.low + 0.2), "scene", 9.8)
+        check_direction(
+            scene, late._replace(points=late.points + 0.2, low=late.low + 0.2), "scene", 9.8
+        )
 
 
 def test_doubled_frames_are_named_as_that(scene):
-    with pytest.raises(DataError, match=r"the same in frames 0 to 1 of all cameras, .* \(6 such stretches\)"):
+    with pytest.raises(
+        DataError, match=r"the same in frames 0 to 1 of all cameras, .* \(6 such stretches\)"
+    ):
         validate(reordered(scene, [t // 2 for t in range(FRAMES)]))
 
 
@@ -139,7 +178,12 @@ def test_swapped_frames_are_named(scene):
             assert not far, (i, j)
         except DataError as error:
             named = f"frames {i} and {j} seem" in str(error)
-            assert named or "other's place" not in str(error) or min(i, j) == 0 or max(i, j) == FRAMES - 1, (i, j, str(error))
+            assert (
+                named
+                or "other's place" not in str(error)
+                or min(i, j) == 0
+                or max(i, j) == FRAMES - 1
+            ), (i, j, str(error))
 
 
 @pytest.mark.parametrize("frame", [0, 5])
@@ -151,7 +195,9 @@ def test_one_opaque_matte_is_named(scene, frame):
 
 
 def test_an_object_that_the_border_cuts_is_named(scene):
-    with pytest.raises(DataError, match="the image's border cuts the object in frame 0 of the cameras 0, 1, 2, 3"):
+    with pytest.raises(
+        DataError, match="the image's border cuts the object in frame 0 of the cameras 0, 1, 2, 3"
+    ):
         left = scene.mattes.clone()
         left[..., :12, :] = left.amax(-2, keepdim=True)[..., :12, :]  # up to the upper border
         validate(replace(scene, mattes=left))
@@ -161,7 +207,10 @@ def test_a_camera_that_is_a_frame_late_is_named(scene):
     order = [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
     mattes = scene.mattes.clone()
     mattes[1] = scene.mattes[1, order]
-    with pytest.raises(DataError, match=r"camera 1, frames 4 to 11: .* as pictures of frames 3 to 10 they fit to 0.0"):
+    with pytest.raises(
+        DataError,
+        match=r"camera 1, frames 4 to 11: .* as pictures of frames 3 to 10 they fit to 0.0",
+    ):
         validate(replace(scene, mattes=mattes))
 
 
@@ -176,7 +225,12 @@ def test_built_in_scenes_pass(name, tmp_path):
 def test_the_bird_passes(reference_data):
     if not (reference_data / "pacnerf" / "bird").is_dir():
         pytest.skip("no bird")
-    keys = {"gravity": [0, -9.8, 0], "box": [[-1, -0.1, -1], [1, 1.6, 1]], "ground": {"height": 0.0}, "scale": 0.25}
+    keys = {
+        "gravity": [0, -9.8, 0],
+        "box": [[-1, -0.1, -1], [1, 1.6, 1]],
+        "ground": {"height": 0.0},
+        "scale": 0.25,
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scene = load_scene(format="pacnerf", path=str(reference_data / "pacnerf" / "bird"), **keys)

@@ -5,7 +5,12 @@ import torch
 import warp as wp
 
 from mosa.data.synthetic.bodies.objects import OBJECTS, PEANUT, RABBIT
-from mosa.data.synthetic.materials.hidden_material import LAW, fibre_energy, fibre_neo_hookean, fibre_stiffness
+from mosa.data.synthetic.materials.hidden_material import (
+    LAW,
+    fibre_energy,
+    fibre_neo_hookean,
+    fibre_stiffness,
+)
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import LawParameters, law_named
 
@@ -13,7 +18,9 @@ wp.config.quiet = True
 
 
 @wp.kernel(enable_backward=False)
-def evaluate(F: wp.array(dtype=wp.mat33d), p: wp.array(dtype=LawParameters), tau: wp.array(dtype=wp.mat33d)):
+def evaluate(
+    F: wp.array(dtype=wp.mat33d), p: wp.array(dtype=LawParameters), tau: wp.array(dtype=wp.mat33d)
+):
     i = wp.tid()
     zero = wp.identity(n=3, dtype=wp.float64)
     tau[i] = fibre_neo_hookean(F[i], zero, zero, p[i])
@@ -42,7 +49,9 @@ def stress(F: torch.Tensor, parameters: dict[str, torch.Tensor]) -> torch.Tensor
 @pytest.fixture(scope="module")
 def states():
     generator = torch.Generator().manual_seed(0)
-    F = torch.eye(3, dtype=torch.float64) + 0.25 * torch.randn(50, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3, dtype=torch.float64) + 0.25 * torch.randn(
+        50, 3, 3, generator=generator, dtype=torch.float64
+    )
     return F[torch.linalg.det(F) > 0.3]
 
 
@@ -63,7 +72,9 @@ def test_undeformed_is_stress_free_and_rotations_only_turn_the_stress(states):
     parameters = RABBIT.parameters(torch.zeros(len(states), 3, dtype=torch.float64))
     one = torch.eye(3, dtype=torch.float64).expand(len(states), 3, 3)
     assert stress(one, parameters).abs().max() < 1e-9
-    Q = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))).Q
+    Q = torch.linalg.qr(
+        torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    ).Q
     Q = Q * torch.linalg.det(Q)
     turned, plain = stress(Q @ states, parameters), Q @ stress(states, parameters) @ Q.T
     assert (turned - plain).abs().max() < 1e-12 * plain.abs().max()
@@ -72,7 +83,9 @@ def test_undeformed_is_stress_free_and_rotations_only_turn_the_stress(states):
 def young_modulus(material, direction: torch.Tensor, strain: float = 1e-6) -> float:
     """Uniaxial test: stretch along `direction` with free sides and shear, by Newton on F = I + sym, no closed form."""
     n = direction / direction.norm()
-    parameters = {k: v[:1] for k, v in material.parameters(torch.zeros(1, 3, dtype=torch.float64)).items()}
+    parameters = {
+        k: v[:1] for k, v in material.parameters(torch.zeros(1, 3, dtype=torch.float64)).items()
+    }
     first = torch.linalg.qr(torch.stack([n, *torch.eye(3, dtype=torch.float64)[:2]], 1)).Q
     first[:, 0] = n
 
@@ -94,7 +107,11 @@ def young_modulus(material, direction: torch.Tensor, strain: float = 1e-6) -> fl
         residual, _ = local(e)
         h = 1e-7
         J = torch.stack(
-            [(local(e + h * d)[0] - local(e - h * d)[0]) / (2 * h) for d in torch.eye(5, dtype=torch.float64)], 1
+            [
+                (local(e + h * d)[0] - local(e - h * d)[0]) / (2 * h)
+                for d in torch.eye(5, dtype=torch.float64)
+            ],
+            1,
         )
         e = e - torch.linalg.solve(J, residual)
     return float(local(e)[1]) / strain
@@ -113,14 +130,26 @@ def test_young_modulus_along_the_fibre_over_across(material):
 
 
 def test_the_rabbit_is_what_data_formats_fixes():
-    assert (RABBIT.E, RABBIT.nu, RABBIT.ratio, RABBIT.fibre, RABBIT.density) == (2e5, 0.3, 1.6, (1.0, 0.3, 0.0), 1000.0)
-    X = torch.tensor([[0.0, 0.4, 0.1], [0.03125, 0.0, 0.0], [-0.03125, 0.2, 0.0], [0.125 + 0.03125, 0.0, 0.0]])
+    assert (RABBIT.E, RABBIT.nu, RABBIT.ratio, RABBIT.fibre, RABBIT.density) == (
+        2e5,
+        0.3,
+        1.6,
+        (1.0, 0.3, 0.0),
+        1000.0,
+    )
+    X = torch.tensor(
+        [[0.0, 0.4, 0.1], [0.03125, 0.0, 0.0], [-0.03125, 0.2, 0.0], [0.125 + 0.03125, 0.0, 0.0]]
+    )
     assert torch.allclose(RABBIT.factor(X), torch.tensor([1.0, 1.2, 0.8, 1.2]), atol=1e-6)
     drops = OBJECTS["rabbit"].drops
     assert [(d.speed, d.degrees) for d in drops.values()] == [(2.5, 0.0), (2.5, 60.0), (3.2, 40.0)]
     assert (drops["test_60"].axis, drops["test_40"].axis) == ((0.3, 0.2, 1.0), (1.0, 0.4, 0.2))
     assert OBJECTS["rabbit"].height == 0.25
-    assert (OBJECTS["rabbit"].footage.cameras, OBJECTS["rabbit"].footage.frames, OBJECTS["rabbit"].footage.fps) == (
+    assert (
+        OBJECTS["rabbit"].footage.cameras,
+        OBJECTS["rabbit"].footage.frames,
+        OBJECTS["rabbit"].footage.fps,
+    ) == (
         12,
         15,
         50.0,
@@ -133,7 +162,9 @@ def test_the_twin_has_no_fibre_and_one_stiffness():
     assert parameters["kf"].abs().max() == 0
     assert parameters["mu"].max() == parameters["mu"].min() == pytest.approx(2e5 / 2.6)
     assert fibre_stiffness(1.0, 0.3, 1.0) == 0
-    with pytest.raises(ConfigError, match=r"scene\.material: expected anisotropic or isotropic, found 'wood'"):
+    with pytest.raises(
+        ConfigError, match=r"scene\.material: expected anisotropic or isotropic, found 'wood'"
+    ):
         RABBIT.variant("wood")
 
 

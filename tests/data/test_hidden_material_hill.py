@@ -15,7 +15,9 @@ from .anisotropic_states import check_gradients, drawn_rotations, drawn_states, 
 from .hill_material import HillMaterial
 
 AXES = drawn_rotations(1, 31)[0]
-CLAY = HillMaterial(E=8.0, nu=0.3, yield_stress=0.8, coefficients=(0.6, 1.5, 2.2, 0.7, 1.9, 0.5), axes=AXES)
+CLAY = HillMaterial(
+    E=8.0, nu=0.3, yield_stress=0.8, coefficients=(0.6, 1.5, 2.2, 0.7, 1.9, 0.5), axes=AXES
+)
 
 
 def in_axes(F):
@@ -27,7 +29,11 @@ def equivalent(e, material):
     """Hill's equivalent stress [Pa] of a deviatoric strain (N, 3, 3) in the axes, from its definition."""
     f, g, h, l, m, n = material.coefficients
     s = 2 * float(material.parameters()["mu"]) * e
-    normal = f * (s[:, 1, 1] - s[:, 2, 2]) ** 2 + g * (s[:, 2, 2] - s[:, 0, 0]) ** 2 + h * (s[:, 0, 0] - s[:, 1, 1]) ** 2
+    normal = (
+        f * (s[:, 1, 1] - s[:, 2, 2]) ** 2
+        + g * (s[:, 2, 2] - s[:, 0, 0]) ** 2
+        + h * (s[:, 0, 0] - s[:, 1, 1]) ** 2
+    )
     shear = l * s[:, 1, 2] ** 2 + m * s[:, 0, 2] ** 2 + n * s[:, 0, 1] ** 2
     return torch.sqrt(normal / 3 + 2 * shear)
 
@@ -41,7 +47,10 @@ def operator(e, material):
 
 
 def test_return_is_admissible_associated_and_idempotent():
-    F, p = torch.cat([drawn_states(), torch.eye(3) + 0.1 * (drawn_states(4) - torch.eye(3))]), CLAY.parameters()
+    F, p = (
+        torch.cat([drawn_states(), torch.eye(3) + 0.1 * (drawn_states(4) - torch.eye(3))]),
+        CLAY.parameters(),
+    )
     before, A = in_axes(F), mapped(HILL, F, p)
     after = in_axes(A)
     trial = equivalent(before, CLAY)
@@ -99,15 +108,22 @@ def test_shear_strength_in_each_plane(pair, coefficient):
     F = torch.linalg.matrix_exp(AXES @ e @ AXES.T)[None]
     A = mapped(HILL, F, CLAY.parameters())
     s = 2 * float(CLAY.parameters()["mu"]) * in_axes(A)[0][pair]
-    assert float(s) == pytest.approx(CLAY.yield_stress / math.sqrt(2 * CLAY.coefficients[coefficient]), rel=1e-12)
+    assert float(s) == pytest.approx(
+        CLAY.yield_stress / math.sqrt(2 * CLAY.coefficients[coefficient]), rel=1e-12
+    )
 
 
 def test_gradient():
     F = drawn_states()
-    leaves = {"F": F, **{k: v.expand(len(F), *v.shape).contiguous() for k, v in CLAY.parameters().items()}}
+    leaves = {
+        "F": F,
+        **{k: v.expand(len(F), *v.shape).contiguous() for k, v in CLAY.parameters().items()},
+    }
     del leaves["lam"]  # the flow is deviatoric and does not know it
     lam = CLAY.parameters()["lam"]
-    weights = torch.randn(len(F), 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights = torch.randn(
+        len(F), 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
 
     def loss(F, **parameters):
         return (weights * mapped(HILL, F, {**parameters, "lam": lam})).sum((1, 2))
@@ -117,13 +133,23 @@ def test_gradient():
 
 def test_a_body_of_it_stays_admissible_in_the_simulator():
     """A cube driven into the ground: no particle is outside the criterion, and the plastic strain shows in F_tot."""
-    material = HillMaterial(E=8e4, nu=0.3, yield_stress=1e3, coefficients=CLAY.coefficients, axes=AXES)
-    index = torch.stack(torch.meshgrid(*(torch.arange(5),) * 3, indexing="ij"), -1).reshape(-1, 3).double()
+    material = HillMaterial(
+        E=8e4, nu=0.3, yield_stress=1e3, coefficients=CLAY.coefficients, axes=AXES
+    )
+    index = (
+        torch.stack(torch.meshgrid(*(torch.arange(5),) * 3, indexing="ij"), -1)
+        .reshape(-1, 3)
+        .double()
+    )
     n, eye = len(index), torch.eye(3).double().expand(len(index), 3, 3).contiguous()
     v = torch.tensor([0.3, -2.0, 0.1]).double().expand(n, 3).contiguous()
     state = ParticleState(0.02 * index + 0.03, v, torch.zeros_like(eye), eye, eye)
-    sim = Simulator(HILL, dx=0.04, substeps=100, frame_dt=0.04, ground=Ground(0.0), dtype=torch.float64)
-    final = sim.rollout(state, material.parameters(), torch.full((n,), 8e-6).double(), 1000.0, 2).final
+    sim = Simulator(
+        HILL, dx=0.04, substeps=100, frame_dt=0.04, ground=Ground(0.0), dtype=torch.float64
+    )
+    final = sim.rollout(
+        state, material.parameters(), torch.full((n,), 8e-6).double(), 1000.0, 2
+    ).final
     assert equivalent(in_axes(final.F), material).max() < material.yield_stress * (1 + 1e-12)
     assert (final.F_tot - final.F).abs().max() > 0.05
 

@@ -13,7 +13,9 @@ from .orthotropic import MODULI, ORTHOTROPIC, OrthotropicMaterial, orthotropic_e
 
 AXES = drawn_rotations(1, 21)[0]
 WOOD = OrthotropicMaterial(E=(8.0, 3.0, 1.5), nu=(0.25, 0.3, 0.35), G=(0.9, 1.1, 1.6), axes=AXES)
-TURNS = [torch.diag(torch.tensor(d).double()) for d in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
+TURNS = [
+    torch.diag(torch.tensor(d).double()) for d in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])
+]
 
 
 def spread(parameters, n):
@@ -21,8 +23,13 @@ def spread(parameters, n):
 
 
 def isotropic(mu, lam):
-    values = dict.fromkeys(("C11", "C22", "C33"), lam + 2 * mu) | dict.fromkeys(("C23", "C13", "C12"), lam)
-    return {k: torch.tensor(v).double() for k, v in {**values, **dict.fromkeys(("C44", "C55", "C66"), mu)}.items()}
+    values = dict.fromkeys(("C11", "C22", "C33"), lam + 2 * mu) | dict.fromkeys(
+        ("C23", "C13", "C12"), lam
+    )
+    return {
+        k: torch.tensor(v).double()
+        for k, v in {**values, **dict.fromkeys(("C44", "C55", "C66"), mu)}.items()
+    }
 
 
 def test_stress_is_the_gradient_of_the_energy():
@@ -31,7 +38,9 @@ def test_stress_is_the_gradient_of_the_energy():
     (P,) = torch.autograd.grad(orthotropic_energy(F, **parameters).sum(), F)
     F = F.detach()
     expected = P @ F.mT
-    assert (stress(ORTHOTROPIC, F, parameters) - expected).abs().max() < 1e-12 * expected.abs().max()
+    assert (
+        stress(ORTHOTROPIC, F, parameters) - expected
+    ).abs().max() < 1e-12 * expected.abs().max()
     assert law_named(ORTHOTROPIC).energy is orthotropic_energy
 
 
@@ -51,7 +60,9 @@ def test_half_turns_about_its_axes_are_its_symmetry_and_quarter_turns_are_not():
         H = AXES @ turn @ AXES.T
         assert (stress(ORTHOTROPIC, F @ H, p) - plain).abs().max() < 1e-12 * plain.abs().max()
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
-    assert (stress(ORTHOTROPIC, F @ AXES @ quarter @ AXES.T, p) - plain).abs().max() > 1e-2 * plain.abs().max()
+    assert (
+        stress(ORTHOTROPIC, F @ AXES @ quarter @ AXES.T, p) - plain
+    ).abs().max() > 1e-2 * plain.abs().max()
 
 
 @pytest.mark.parametrize("lam", [0.0, 5.0])
@@ -61,7 +72,9 @@ def test_equal_coefficients_are_the_isotropic_law(lam):
     found = stress(ORTHOTROPIC, F, {**isotropic(mu, lam), "axes": axes_parameter(AXES)})
     R = polar(F)
     e = R.mT @ F - eye
-    expected = R @ (2 * mu * e + lam * e.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * eye) @ F.mT
+    expected = (
+        R @ (2 * mu * e + lam * e.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * eye) @ F.mT
+    )
     assert (found - expected).abs().max() < 1e-12 * expected.abs().max()
     if lam == 0:
         corotated = stress("corotated", F, {"mu": mu, "lam": 0.0})
@@ -73,7 +86,11 @@ def test_a_pull_along_an_axis_meets_its_modulus(axis):
     """Strain of the compliance under a uniaxial stress, in the axes; at 1e-6 the curvature of the law moves it by about 1e-6."""
     nu23, nu13, nu12 = WOOD.nu
     E1, E2, E3 = WOOD.E
-    lateral = [[1, -nu12, -nu13], [-nu12 * E2 / E1, 1, -nu23], [-nu13 * E3 / E1, -nu23 * E3 / E2, 1]][axis]
+    lateral = [
+        [1, -nu12, -nu13],
+        [-nu12 * E2 / E1, 1, -nu23],
+        [-nu13 * E3 / E1, -nu23 * E3 / E2, 1],
+    ][axis]
     F = torch.eye(3).double() + 1e-6 * AXES @ torch.diag(torch.tensor(lateral).double()) @ AXES.T
     tau = AXES.T @ stress(ORTHOTROPIC, F[None], WOOD.parameters())[0] @ AXES / 1e-6
     expected = torch.zeros(3, 3).double()
@@ -84,7 +101,9 @@ def test_a_pull_along_an_axis_meets_its_modulus(axis):
 def test_gradient():
     F = drawn_states()
     leaves = {"F": F, **spread(WOOD.parameters(), len(F))}
-    weights = torch.randn(len(F), 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights = torch.randn(
+        len(F), 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
 
     def loss(F, **parameters):
         return (weights * stress(ORTHOTROPIC, F, parameters)).sum((1, 2))

@@ -28,7 +28,11 @@ def falls():
     particles = fill(SHAPES["rabbit"], SMALL.spacing, np.random.default_rng(0))
     drop = SMALL.drops["train"]
     found = {}
-    for name, material in {"clay": CLAY, "twin": CLAY.variant("isotropic"), "elastic": RABBIT}.items():
+    for name, material in {
+        "clay": CLAY,
+        "twin": CLAY.variant("isotropic"),
+        "elastic": RABBIT,
+    }.items():
         body = replace(SMALL, material=material)
         found[name] = simulate(body, material, particles, particles, drop, drop).positions
     return found
@@ -45,7 +49,9 @@ def test_it_yields_in_directions_and_its_twin_does_not(falls):
     assert np.sqrt(np.square(falls["clay"][-1] - falls["twin"][-1]).sum(-1).mean()) > 2e-3
     rest = torch.rand(40, 3, dtype=torch.float64)
     values, alike = CLAY.parameters(rest), CLAY.variant("isotropic").parameters(rest)
-    assert all((alike[name] == 1).all() for name in COEFFICIENTS) and alike["yield_stress"].unique().tolist() == [1.5e4]
+    assert all((alike[name] == 1).all() for name in COEFFICIENTS) and alike[
+        "yield_stress"
+    ].unique().tolist() == [1.5e4]
     assert float(values["yield_stress"].max() / values["yield_stress"].min()) > 1.2
     assert values["axes"].shape == (40, 3) and float(values["axes"].abs().max()) > 0.1
     with pytest.raises(ConfigError, match=r"scene\.material: expected anisotropic or isotropic"):
@@ -56,8 +62,12 @@ def test_it_is_a_scene_with_a_floor(tmp_path, monkeypatch):
     """In the small: film, truth, held-out drops, and the true law on another's particles, which meets itself."""
     monkeypatch.setitem(OBJECTS, "rabbit_plastic", replace(OBJECTS["tiny"], material=CLAY))
     for kind in ("anisotropic", "isotropic"):
-        scene = load_scene(format="builtin", name="rabbit_plastic", cache=str(tmp_path), material=kind)
-        assert scene.known_parameters == {"E": 2e5, "nu": 0.3} | ({"yield_stress": 1.5e4} if kind == "isotropic" else {})
+        scene = load_scene(
+            format="builtin", name="rabbit_plastic", cache=str(tmp_path), material=kind
+        )
+        assert scene.known_parameters == {"E": 2e5, "nu": 0.3} | (
+            {"yield_stress": 1.5e4} if kind == "isotropic" else {}
+        )
         world, truth = World(scene.ground, scene.gravity, scene.up, scene.box), scene.truth
         settings = SimpleNamespace(dx=2 * SMALL.spacing, courant=0.3)
         contact = ContactOffset(settings.dx)

@@ -34,7 +34,13 @@ def bent(points: np.ndarray, c: dict, fisheye: bool) -> np.ndarray:
         t = np.arctan(r)
         return points * (t / r * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8))[..., None]
     s = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return np.stack([s * x + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), s * y + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y], -1)
+    return np.stack(
+        [
+            s * x + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+            s * y + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+        ],
+        -1,
+    )
 
 
 def straight(points: np.ndarray, c: dict, fisheye: bool) -> np.ndarray:
@@ -63,14 +69,23 @@ def photograph(picture: np.ndarray, seen: np.ndarray, reach: float) -> np.ndarra
 def rabbit():
     """The built-in rabbit's surface in three frames, and three cameras around it."""
     surface = extract_surface(SHAPES["rabbit"], 0.008, np.random.default_rng(0))
-    rig = ring_of_cameras(3, SIZE, target=(0, 0.2, 0), distance=0.6, elevations=(0.2, 0.6), field=0.23, turn=0.4)
-    return surface, [surface.vertices + np.array([0.02, lift, 0.01]) for lift in (0.09, 0.07, 0.05)], rig
+    rig = ring_of_cameras(
+        3, SIZE, target=(0, 0.2, 0), distance=0.6, elevations=(0.2, 0.6), field=0.23, turn=0.4
+    )
+    return (
+        surface,
+        [surface.vertices + np.array([0.02, lift, 0.01]) for lift in (0.09, 0.07, 0.05)],
+        rig,
+    )
 
 
 def capture(folder, rabbit, c: dict, fisheye: bool, camera_model: str | None):
     """A folder with transforms.json of the rabbit seen through a lens."""
     surface, frames, rig = rabbit
-    focal, sight = float(rig.K[0, 0, 0]), 0.75  # tangent of half the angle that the fine pinhole images see
+    focal, sight = (
+        float(rig.K[0, 0, 0]),
+        0.75,
+    )  # tangent of half the angle that the fine pinhole images see
     wide = scale_cameras(rig, FINE * 1.5)
     wide.K[:, 0, 0] = wide.K[:, 1, 1] = wide.width / 2 / sight
     (folder / "images").mkdir(parents=True)
@@ -84,14 +99,31 @@ def capture(folder, rabbit, c: dict, fisheye: bool, camera_model: str | None):
             name = f"images/{v}_{t}.png"
             iio.imwrite(folder / name, np.round(255 * taken.clip(0, 1)).astype(np.uint8))
             pose = opengl_pose(rig.w2c[v]).tolist()
-            entries.append({"file_path": name, "time": t / 24, "camera": str(v), "transform_matrix": pose})
-    document = {"fl_x": focal, "fl_y": focal, "cx": SIZE / 2, "cy": SIZE / 2, "w": SIZE, "h": SIZE, "frames": entries, **c}
-    (folder / "transforms.json").write_text(json.dumps(document | ({"camera_model": camera_model} if camera_model else {})))
+            entries.append(
+                {"file_path": name, "time": t / 24, "camera": str(v), "transform_matrix": pose}
+            )
+    document = {
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": SIZE / 2,
+        "cy": SIZE / 2,
+        "w": SIZE,
+        "h": SIZE,
+        "frames": entries,
+        **c,
+    }
+    (folder / "transforms.json").write_text(
+        json.dumps(document | ({"camera_model": camera_model} if camera_model else {}))
+    )
     return folder
 
 
 def load(folder, **keys):
-    world = {"gravity": [0, -9.8, 0], "box": [[-1.0, -0.1, -1.0], [1.0, 1.0, 1.0]], "ground": {"height": 0.0}}
+    world = {
+        "gravity": [0, -9.8, 0],
+        "box": [[-1.0, -0.1, -1.0], [1.0, 1.0, 1.0]],
+        "ground": {"height": 0.0},
+    }
     return load_scene(format="transforms", path=str(folder), **world, **keys)
 
 
@@ -112,10 +144,14 @@ def agreement(scene, rabbit) -> tuple[float, float]:
 @pytest.fixture(scope="module")
 def unbent(rabbit, tmp_path_factory):
     """(overlap, PSNR) of footage without any distortion: what pixels and 8 bits cost."""
-    return agreement(load(capture(tmp_path_factory.mktemp("lens") / "plain", rabbit, {}, False, None)), rabbit)
+    return agreement(
+        load(capture(tmp_path_factory.mktemp("lens") / "plain", rabbit, {}, False, None)), rabbit
+    )
 
 
-@pytest.mark.parametrize(("c", "model"), [(BARREL, None), (PINCUSHION, "OPENCV"), (FISHEYE, "OPENCV_FISHEYE")])
+@pytest.mark.parametrize(
+    ("c", "model"), [(BARREL, None), (PINCUSHION, "OPENCV"), (FISHEYE, "OPENCV_FISHEYE")]
+)
 def test_a_scene_seen_through_a_lens_is_that_of_a_pinhole(rabbit, unbent, tmp_path, c, model):
     """One interpolation more than plain footage: 0.5 % of the silhouette, a fifteenth of a pixel all around it, and 4 dB (measured:
     0.1 to 0.4 %, 2.1 to 2.8 dB). Left bent, footage fails by far."""
@@ -125,10 +161,14 @@ def test_a_scene_seen_through_a_lens_is_that_of_a_pinhole(rabbit, unbent, tmp_pa
     assert overlap > unbent[0] - 0.005
     assert psnr > unbent[1] - 4
     assert torch.allclose(scene.cameras.w2c, rabbit[2].w2c, atol=1e-6)
-    assert float((scene.images[scene.mattes == 0] - 1).abs().max()) < 1.5 / 255  # no rim of a colour that was behind no matte
+    assert (
+        float((scene.images[scene.mattes == 0] - 1).abs().max()) < 1.5 / 255
+    )  # no rim of a colour that was behind no matte
     document = folder / "transforms.json"
     left = json.loads(document.read_text())
-    document.write_text(json.dumps({k: v for k, v in left.items() if k not in c and k != "camera_model"}))
+    document.write_text(
+        json.dumps({k: v for k, v in left.items() if k not in c and k != "camera_model"})
+    )
     overlap, psnr = agreement(load(folder), rabbit)
     assert overlap < unbent[0] - 0.03 and psnr < unbent[1] - 10
 
@@ -147,7 +187,14 @@ def test_a_pinhole_s_pixels_lie_where_the_formulas_put_them(c, fisheye):
 
 
 def test_what_the_straight_image_does_not_show_is_counted():
-    lens = lens_of(np.array([[80.0, 0, 80], [0, 80, 80], [0, 0, 1]]), {"k1": 0.2}, 160, 160, fisheye=False, where="here")
+    lens = lens_of(
+        np.array([[80.0, 0, 80], [0, 80, 80], [0, 0, 1]]),
+        {"k1": 0.2},
+        160,
+        160,
+        fisheye=False,
+        where="here",
+    )
     edge, middle = np.zeros((160, 160), np.float32), np.zeros((160, 160), np.float32)
     edge[70:90, :6] = 1
     middle[60:100, 60:100] = 1
@@ -158,12 +205,17 @@ def test_what_the_straight_image_does_not_show_is_counted():
 
 def test_an_object_that_is_cut_is_said(rabbit, tmp_path):
     folder = capture(tmp_path / "close", rabbit, PINCUSHION | {"k2": 6.0}, False, None)
-    with pytest.warns(UserWarning, match=r"camera 0: undoing its lens distortion cuts off up to .*% of the object"):
+    with pytest.warns(
+        UserWarning, match=r"camera 0: undoing its lens distortion cuts off up to .*% of the object"
+    ):
         load(folder)
 
 
 def test_no_coefficients_are_no_lens():
-    assert lens_of(np.eye(3), {"k1": 0.0, "p2": 0.0, "fl_x": 3.0}, 16, 16, fisheye=False, where="here") is None
+    assert (
+        lens_of(np.eye(3), {"k1": 0.0, "p2": 0.0, "fl_x": 3.0}, 16, 16, fisheye=False, where="here")
+        is None
+    )
 
 
 @pytest.mark.parametrize(("change", "message"), [

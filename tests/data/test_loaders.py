@@ -34,7 +34,11 @@ def test_pacnerf_round_trip(blocks, pacnerf_folder):
 def test_a_point_lands_where_the_opengl_pose_puts_it(pacnerf_folder):
     """Independent of our exporter's inverse: u = K diag(1, -1, -1) R^T (X - t) with the file's own c2w."""
     scene = pacnerf(pacnerf_folder)
-    entry = next(e for e in json.loads((pacnerf_folder / "all_data.json").read_text()) if "r_1_" in e["file_path"])
+    entry = next(
+        e
+        for e in json.loads((pacnerf_folder / "all_data.json").read_text())
+        if "r_1_" in e["file_path"]
+    )
     c2w, K = np.array(entry["c2w"]), np.array(entry["intrinsic"])
     point = np.array([0.07, 0.21, -0.05])
     seen = K @ (np.diag([1, -1, -1]) @ c2w[:, :3].T @ (point - c2w[:, 3]))
@@ -52,7 +56,9 @@ def test_list_order_does_not_matter(blocks, pacnerf_folder):
     assert_same_footage(pacnerf(pacnerf_folder), blocks)
 
 
-def test_files_of_kinds_that_are_not_used_need_not_exist_and_negative_frames_are_no_footage(blocks, pacnerf_folder):
+def test_files_of_kinds_that_are_not_used_need_not_exist_and_negative_frames_are_no_footage(
+    blocks, pacnerf_folder
+):
     listing = pacnerf_folder / "all_data.json"
     entries = json.loads(listing.read_text())
     entries += [{**entries[0], "file_path": "./data/r_0_-1.png", "time": -1.0}]
@@ -88,7 +94,9 @@ def test_transforms_round_trip(blocks, tmp_path, masks):
     assert scene.name == "capture"
 
 
-def test_transforms_without_labels_times_extensions_and_with_a_field_of_view(blocks, transforms_folder):
+def test_transforms_without_labels_times_extensions_and_with_a_field_of_view(
+    blocks, transforms_folder
+):
     file = transforms_folder / "transforms.json"
     document = json.loads(file.read_text())
     K = blocks.cameras.K[0]
@@ -109,8 +117,12 @@ def test_scaling_halves_images_and_intrinsics(blocks, pacnerf_folder):
     assert torch.allclose(scene.mattes, mean, atol=1e-6)
 
 
-def test_frames_cameras_and_the_last_free_frame_are_chosen_by_the_numbers_in_the_files(blocks, pacnerf_folder):
-    scene = pacnerf(pacnerf_folder, frames=[1, 4], holdout_cameras=[2], holdout_frames=[4], last_free_frame=2)
+def test_frames_cameras_and_the_last_free_frame_are_chosen_by_the_numbers_in_the_files(
+    blocks, pacnerf_folder
+):
+    scene = pacnerf(
+        pacnerf_folder, frames=[1, 4], holdout_cameras=[2], holdout_frames=[4], last_free_frame=2
+    )
     assert torch.allclose(scene.times, blocks.times[1:])
     assert scene.last_free_frame == 1
     assert scene.training_cameras == [0, 1]
@@ -137,7 +149,13 @@ def test_fingerprint_follows_everything_learning_depends_on(pacnerf_folder):
     assert pacnerf(pacnerf_folder).fingerprint == plain
     changed = [
         pacnerf(pacnerf_folder, **k).fingerprint
-        for k in ({"holdout_cameras": [1]}, {"frames": [0, 3]}, {"fps": 25.0}, {"density": 900.0}, {"scale": 0.5})
+        for k in (
+            {"holdout_cameras": [1]},
+            {"frames": [0, 3]},
+            {"fps": 25.0},
+            {"density": 900.0},
+            {"scale": 0.5},
+        )
     ]
     file = pacnerf_folder / "data" / "a_2_4.png"
     pixels = np.array(iio.imread(file))
@@ -156,7 +174,12 @@ def test_the_real_bird(reference_data):
     if not (reference_data / "pacnerf" / "bird" / "data").is_dir():
         pytest.skip("no pacnerf/bird in the reference data")
     scene = load_scene(
-        format="pacnerf", root=str(reference_data), path="pacnerf/bird", frames=[0, 6], scale=0.125, **WORLD
+        format="pacnerf",
+        root=str(reference_data),
+        path="pacnerf/bird",
+        frames=[0, 6],
+        scale=0.125,
+        **WORLD,
     )
     assert scene.images.shape == (11, 7, 100, 100, 3)
     assert torch.allclose(scene.times.diff(), torch.full((6,), 1 / 24), atol=1e-6)
@@ -194,4 +217,7 @@ def meeting_spread(scene, frame):
 def test_particles_beside_the_images_are_found(blocks, pacnerf_folder, tmp_path):
     positions = clouds_of(blocks)
     export_particles(positions, pacnerf_folder / "ply")
-    assert torch.equal(pacnerf(pacnerf_folder, particles="ply", root=str(tmp_path / "elsewhere")).particles[2], positions[2])
+    assert torch.equal(
+        pacnerf(pacnerf_folder, particles="ply", root=str(tmp_path / "elsewhere")).particles[2],
+        positions[2],
+    )

@@ -33,7 +33,10 @@ def test_palettes_become_colours_and_keep_transparency(tmp_path):
     assert np.allclose(written(picture, tmp_path / "plain.png"), wanted, atol=1e-6)
     found = written(picture, tmp_path / "clear.png", transparency=3)
     assert found.shape == (5, 6, 4)
-    assert np.array_equal(found[..., 3], (np.asarray(picture) != 3).astype(np.float32)) and found[..., 3].min() == 0
+    assert (
+        np.array_equal(found[..., 3], (np.asarray(picture) != 3).astype(np.float32))
+        and found[..., 3].min() == 0
+    )
     assert np.allclose(found[..., :3], wanted, atol=1e-6)
 
 
@@ -41,7 +44,9 @@ def test_grey_with_alpha_and_bits(tmp_path):
     found = written(Image.fromarray(COLORS[..., :2], "LA"), tmp_path / "grey.png")
     assert np.allclose(found, COLORS[..., [0, 0, 0, 1]] / 255, atol=1e-6)
     bits = COLORS[..., 0] > 100
-    assert np.array_equal(written(Image.fromarray(bits), tmp_path / "bits.png")[..., 0], bits.astype(np.float32))
+    assert np.array_equal(
+        written(Image.fromarray(bits), tmp_path / "bits.png")[..., 0], bits.astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -88,7 +93,8 @@ def test_a_hole_is_said_and_filled_where_asked_for(blocks, pacnerf_folder, recwa
     assert not recwarn.list
     punch(pacnerf_folder)
     with pytest.warns(
-        UserWarning, match=r"1 small enclosed holes in 1 of 15 mattes, the largest of 1 px in camera 1, frame 2.*fill_holes"
+        UserWarning,
+        match=r"1 small enclosed holes in 1 of 15 mattes, the largest of 1 px in camera 1, frame 2.*fill_holes",
     ):
         load_scene(format="pacnerf", path=str(pacnerf_folder), **WORLD)
     recwarn.clear()
@@ -103,14 +109,20 @@ def test_only_small_enclosed_holes_are_filled():
     matte[5:7, 5:7] = 0.2
     matte[12:16, 12:16] = 0
     found = fill_holes(matte, 4)
-    assert (found[5:7, 5:7] == 1).all() and (found[12:16, 12:16] == 0).all() and (found[0, 5:8] == 0).all()
+    assert (
+        (found[5:7, 5:7] == 1).all()
+        and (found[12:16, 12:16] == 0).all()
+        and (found[0, 5:8] == 0).all()
+    )
     assert fill_holes(matte, 0) is matte
 
 
 def ball_scene(views=6):
     """A ball of 0.15 m radius that falls from (0.1, 0.3, 0), seen by a ring of cameras; five frames, 24 per second."""
     scene = block_scene(views)
-    rig = ring_of_cameras(views, 32, target=(0.0, 0.3, 0), distance=1.5, elevations=(0.2, 0.6), field=0.6, turn=0.4)
+    rig = ring_of_cameras(
+        views, 32, target=(0.0, 0.3, 0), distance=1.5, elevations=(0.2, 0.6), field=0.6, turn=0.4
+    )
     origins, directions = rays(rig)
     mattes = []
     for t in range(5):
@@ -118,7 +130,12 @@ def ball_scene(views=6):
         distance = (arm - (arm * directions).sum(-1, keepdim=True) * directions).norm(dim=-1)
         mattes.append((distance < 0.15).float())
     mattes = torch.stack(mattes, 1)
-    return replace(scene, cameras=rig, mattes=mattes, images=1 - 0.5 * mattes[..., None].expand(-1, -1, -1, -1, 3))
+    return replace(
+        scene,
+        cameras=rig,
+        mattes=mattes,
+        images=1 - 0.5 * mattes[..., None].expand(-1, -1, -1, -1, 3),
+    )
 
 
 def posed(scene, camera, w2c):
@@ -132,7 +149,12 @@ def test_the_camera_that_does_not_fit_is_named():
     assert validate(scene) is scene
     turn = torch.eye(4)
     angle = torch.tensor(0.15)
-    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = (
+        angle.cos(),
+        angle.sin(),
+        -angle.sin(),
+        angle.cos(),
+    )
     shown = r"camera 4 does not fit the others: they see the object at \[0.1.*, 0.3.*\] m in frame 0, .* passes 0.2"
     with pytest.raises(DataError, match=shown):
         validate(posed(scene, 4, turn @ scene.cameras.w2c[4]))
@@ -155,7 +177,8 @@ def test_an_object_outside_of_the_box_is_said():
     poses[:, :3, 3] *= 1000
     far = replace(scene, cameras=replace(scene.cameras, w2c=poses))
     with pytest.raises(
-        DataError, match=r"scene.box: expected the object inside .*found it at \[10[0-9].*, 30[0-9].*the box, or the unit"
+        DataError,
+        match=r"scene.box: expected the object inside .*found it at \[10[0-9].*, 30[0-9].*the box, or the unit",
     ):
         validate(far)
 
@@ -164,11 +187,17 @@ def painted(shadow=0.6):
     """A red disc in front of a textured wall, on which it throws a shadow: image, plate, coverage."""
     y, x = np.mgrid[0:60, 0:80] + 0.5
     grain = np.random.default_rng(2).normal(0, 0.01, (60, 80, 3))
-    plate = np.clip(np.stack([0.5 + 0.004 * x, 0.45 + 0.002 * y, 0.4 + 0.1 * np.sin(x / 3)], -1) + grain, 0, 1).astype(np.float32)
+    plate = np.clip(
+        np.stack([0.5 + 0.004 * x, 0.45 + 0.002 * y, 0.4 + 0.1 * np.sin(x / 3)], -1) + grain, 0, 1
+    ).astype(np.float32)
     cover = np.clip(15.5 - np.hypot(x - 36, y - 28), 0, 1)[..., None].astype(np.float32)
     dark = np.where(np.hypot((x - 50) / 20, (y - 45) / 8) < 1, shadow, 1)[..., None]
     disc = np.array([0.8, 0.25, 0.2], np.float32)
-    image = cover * disc + (1 - cover) * plate * dark + np.random.default_rng(3).normal(0, 0.005, (60, 80, 3))
+    image = (
+        cover * disc
+        + (1 - cover) * plate * dark
+        + np.random.default_rng(3).normal(0, 0.005, (60, 80, 3))
+    )
     return np.clip(image, 0, 1).astype(np.float32), plate, cover[..., 0], disc
 
 
@@ -181,7 +210,9 @@ def test_matte_from_a_plate_ignores_the_shadow():
     # noise of 0.005 in a residual of about 0.3 is a coverage off by 5 % at three sigma, of colours 0.5 apart
     error = np.abs(color[cover == 1] - disc)
     assert error.max() < 0.1 and error.mean() < 0.01
-    assert np.abs(color[(matte > 0.3) & (cover < 1)] - disc).mean() < 0.05  # the wall is taken out of the rim
+    assert (
+        np.abs(color[(matte > 0.3) & (cover < 1)] - disc).mean() < 0.05
+    )  # the wall is taken out of the rim
     nothing = matte_from_plate(plate, plate)[1]
     assert nothing.max() == 0
 

@@ -51,7 +51,11 @@ def test_an_animation_is_no_picture(tmp_path):
     first, second = Image.fromarray(disc(255)), Image.fromarray(disc(200))
     for kind in ("PNG", "GIF"):
         first.save(tmp_path / "a.png", kind, save_all=True, append_images=[second])
-        with pytest.raises(DataError, match=r"a\.png: expected one picture, found an animation of 2"):
+        with pytest.raises(
+            DataError, match=r"a\.png: expected one picture, found an animation of 2"
+        ):
             read_image(tmp_path / "a.png")
-    first.save(tmp_path / "a.png", "TIFF", save_all=True, append_images=[second])  # pages: a small copy beside the picture
+    first.save(
+        tmp_path / "a.png", "TIFF", save_all=True, append_images=[second]
+    )  # pages: a small copy beside the picture
     assert read_image(tmp_path / "a.png").shape == (40, 40, 1)

@@ -12,14 +12,22 @@ from mosa.data.formats.export import export_pacnerf, export_particles, export_tr
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 
-WORLD = {"gravity": [0, -9.8, 0], "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]], "ground": {"height": 0.0}}
+WORLD = {
+    "gravity": [0, -9.8, 0],
+    "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]],
+    "ground": {"height": 0.0},
+}
 
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory):
     """The smallest built-in scene as a capture: its folder, and the true positions."""
     scene = load_scene(format="builtin", name="tiny", scale=0.5)
-    return export_transforms(scene, tmp_path_factory.mktemp("film") / "capture"), scene.truth.positions, scene
+    return (
+        export_transforms(scene, tmp_path_factory.mktemp("film") / "capture"),
+        scene.truth.positions,
+        scene,
+    )
 
 
 def changed(folder, change, **keys):
@@ -46,7 +54,10 @@ def exchanged(a, b):
 
 def moved(matrix):
     """Poses M P."""
-    return lambda entries: [e.update(transform_matrix=(np.array(matrix) @ e["transform_matrix"]).tolist()) for e in entries]
+    return lambda entries: [
+        e.update(transform_matrix=(np.array(matrix) @ e["transform_matrix"]).tolist())
+        for e in entries
+    ]
 
 
 def mirrored(entries):
@@ -89,26 +100,71 @@ def moving(entries):
 
 Z_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 WRONG = {
-    "exchanged": (exchanged("0", "2"), "camera 0, frames 0 to 4: .* as pictures of camera 2 they fit to 0.0"),
+    "exchanged": (
+        exchanged("0", "2"),
+        "camera 0, frames 0 to 4: .* as pictures of camera 2 they fit to 0.0",
+    ),
     "mirrored": (mirrored, "the outlines of frame"),
-    "another axis is up": (moved(Z_UP), "scene.ground.height: expected the object above the ground"),
-    "the ground is higher": (shifted(-0.15), "scene.ground.height: expected the object above the ground"),
+    "another axis is up": (
+        moved(Z_UP),
+        "scene.ground.height: expected the object above the ground",
+    ),
+    "the ground is higher": (
+        shifted(-0.15),
+        "scene.ground.height: expected the object above the ground",
+    ),
     "the ground is lower": (shifted(0.08), "the object falls with -"),
-    "the ground is a little higher": (shifted(-0.06), "turns round in frame 2 with its lowest point .* below the ground"),
-    "stretched": (lambda entries: [e.update(fl_x=1.3 * e["fl_x"]) for e in entries], "expected focal lengths of square pixels"),
-    "a rational lens": (lambda entries: [e.update(k6=0.1) for e in entries], "k6: expected a lens of k1, k2, k3, p1, p2"),
-    "a camera's name": (lambda entries: [e.update(camera=f"a\n{e['camera']}") for e in entries], "at most 100 printable"),
+    "the ground is a little higher": (
+        shifted(-0.06),
+        "turns round in frame 2 with its lowest point .* below the ground",
+    ),
+    "stretched": (
+        lambda entries: [e.update(fl_x=1.3 * e["fl_x"]) for e in entries],
+        "expected focal lengths of square pixels",
+    ),
+    "a rational lens": (
+        lambda entries: [e.update(k6=0.1) for e in entries],
+        "k6: expected a lens of k1, k2, k3, p1, p2",
+    ),
+    "a camera's name": (
+        lambda entries: [e.update(camera=f"a\n{e['camera']}") for e in entries],
+        "at most 100 printable",
+    ),
     "a moving camera": (moving, "see every frame; a single moving camera cannot be used"),
-    "moving cameras": (jittered(0.05), r"camera 0 has another pose than in .*; cameras must not move"),
-    "jitter without names": (jittered(1e-3, labels=False), "poses solved for each image: name the camera of each entry"),
-    "jitter": (jittered(1e-3), r"camera 0 has another pose than in .*: solved for each image\? The pose nearest to the mean"),
-    "zoom": (lambda entries: entries[7].update(fl_x=1.01 * entries[7]["fl_x"]), "has fl_x = .*: expected one lens, focus and zoom"),
+    "moving cameras": (
+        jittered(0.05),
+        r"camera 0 has another pose than in .*; cameras must not move",
+    ),
+    "jitter without names": (
+        jittered(1e-3, labels=False),
+        "poses solved for each image: name the camera of each entry",
+    ),
+    "jitter": (
+        jittered(1e-3),
+        r"camera 0 has another pose than in .*: solved for each image\? The pose nearest to the mean",
+    ),
+    "zoom": (
+        lambda entries: entries[7].update(fl_x=1.01 * entries[7]["fl_x"]),
+        "has fl_x = .*: expected one lens, focus and zoom",
+    ),
     "zoom without names": (
-        lambda entries: [(e.pop("camera"), e.update(cx=e["cx"] + 1e-3 * i)) for i, e in enumerate(entries)], "has cx = .*one lens"),
-    "cx from the centre": (lambda entries: [e.update(cx=0.0, cy=-0.5) for e in entries], r"outside .*measured from their centre\?"),
+        lambda entries: [
+            (e.pop("camera"), e.update(cx=e["cx"] + 1e-3 * i)) for i, e in enumerate(entries)
+        ],
+        "has cx = .*one lens",
+    ),
+    "cx from the centre": (
+        lambda entries: [e.update(cx=0.0, cy=-0.5) for e in entries],
+        r"outside .*measured from their centre\?",
+    ),
     "cx from the centre, a little more": (
-        lambda entries: [e.update(cx=0.5, cy=0.7) for e in entries], r"\(0.5, 0.7\) px lies in the corner of .* their centre\?"),
-    "no affine pose": (lambda entries: entries[0]["transform_matrix"][3].__setitem__(3, 2.0), "0, 0, 0, 1 in the fourth row"),
+        lambda entries: [e.update(cx=0.5, cy=0.7) for e in entries],
+        r"\(0.5, 0.7\) px lies in the corner of .* their centre\?",
+    ),
+    "no affine pose": (
+        lambda entries: entries[0]["transform_matrix"][3].__setitem__(3, 2.0),
+        "0, 0, 0, 1 in the fourth row",
+    ),
 }
 
 
@@ -129,22 +185,30 @@ def test_poses_that_jitter_are_one_camera(film):
     assert float((scene.cameras.w2c - film[2].cameras.w2c).abs().max()) < 5e-3
 
 
-@pytest.mark.parametrize("name", ["{camera}_{frame:03d}_v2", "v2_{camera}_{frame}", "shot{frame:05d}"])
+@pytest.mark.parametrize(
+    "name", ["{camera}_{frame:03d}_v2", "v2_{camera}_{frame}", "shot{frame:05d}"]
+)
 def test_the_number_that_counts_frames_is_one_that_differs(film, tmp_path, name):
     def change(entries):
         for e in entries:
             place = tmp_path / e["camera"]
             place.mkdir(exist_ok=True)
-            file = place / (name.format(camera=e["camera"], frame=round(50 * e.pop("time"))) + ".png")
+            file = place / (
+                name.format(camera=e["camera"], frame=round(50 * e.pop("time"))) + ".png"
+            )
             file.write_bytes((film[0] / e["file_path"]).read_bytes())
             e.update(file_path=str(file))
 
     scene = changed(film[0], change, fps=50.0)
-    assert torch.allclose(scene.times, torch.arange(5) / 50) and torch.equal(scene.mattes, changed(film[0], lambda e: None).mattes)
+    assert torch.allclose(scene.times, torch.arange(5) / 50) and torch.equal(
+        scene.mattes, changed(film[0], lambda e: None).mattes
+    )
 
 
 def test_times_of_a_clock_are_as_good_as_any(film):
-    scene = changed(film[0], lambda entries: [e.update(time=e["time"] + 1764155129.5) for e in entries])
+    scene = changed(
+        film[0], lambda entries: [e.update(time=e["time"] + 1764155129.5) for e in entries]
+    )
     assert torch.allclose(scene.times, torch.arange(5) / 50, atol=1e-6)
 
 
@@ -170,7 +234,13 @@ def test_true_particles_are_where_the_object_is_seen(film, tmp_path, change, mes
 def test_particles_of_some_frames_are_those_frames(film, tmp_path):
     folder, positions, _ = film
     export_particles(positions, tmp_path / "ply")
-    scene = load_scene(format="transforms", path=str(folder), **WORLD, particles=str(tmp_path / "ply"), frames=[1, 4])
+    scene = load_scene(
+        format="transforms",
+        path=str(folder),
+        **WORLD,
+        particles=str(tmp_path / "ply"),
+        frames=[1, 4],
+    )
     assert torch.equal(scene.particles[0], positions[1])
 
 

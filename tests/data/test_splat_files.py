@@ -19,9 +19,17 @@ M, T = 30, 3
 def drawn(degree: int = 2) -> Seen:
     g = torch.Generator().manual_seed(degree)
     A = 0.01 * torch.randn(T, M, 3, 3, generator=g)
-    turns = torch.as_tensor(Rotation.random(T * M, random_state=1).as_matrix()).float().view(T, M, 3, 3)
-    return Seen(torch.randn(T, M, 3, generator=g), A @ A.mT + 1e-6 * torch.eye(3), 0.05 + 0.9 * torch.rand(M, generator=g),
-                0.2 * torch.randn(M, (degree + 1) ** 2, 3, generator=g), turns, 0.5 + torch.rand(T, M, generator=g))
+    turns = (
+        torch.as_tensor(Rotation.random(T * M, random_state=1).as_matrix()).float().view(T, M, 3, 3)
+    )
+    return Seen(
+        torch.randn(T, M, 3, generator=g),
+        A @ A.mT + 1e-6 * torch.eye(3),
+        0.05 + 0.9 * torch.rand(M, generator=g),
+        0.2 * torch.randn(M, (degree + 1) ** 2, 3, generator=g),
+        turns,
+        0.5 + torch.rand(T, M, generator=g),
+    )
 
 
 def covariance(vertex) -> np.ndarray:
@@ -40,13 +48,22 @@ def test_plyfile_reads_what_is_seen(tmp_path):
         assert np.allclose(np.stack([vertex[a] for a in "xyz"], -1), shown.means[t].numpy())
         assert np.allclose(covariance(vertex), shown.covariances[t].numpy(), rtol=1e-3, atol=1e-8)
         assert np.allclose(1 / (1 + np.exp(-vertex["opacity"])), shown.opacities.numpy(), atol=1e-5)
-        channels = [[vertex[f"f_dc_{k}"], *(vertex[f"f_rest_{8 * k + i}"] for i in range(8))] for k in range(3)]
+        channels = [
+            [vertex[f"f_dc_{k}"], *(vertex[f"f_rest_{8 * k + i}"] for i in range(8))]
+            for k in range(3)
+        ]
         c = np.stack([np.stack(channel, -1) for channel in channels], -1)
         found = 0.5 + np.einsum("dk,mkc->dmc", basis(directions, 2).numpy(), c)
         back = (directions[:, None, None, :] @ shown.rotations[t])[:, :, 0]  # (d, M, 3)
-        wanted = (0.5 + torch.einsum("dmk,mkc->dmc", basis(back, 2), shown.harmonics)) * shown.shades[t][:, None]
+        wanted = (
+            0.5 + torch.einsum("dmk,mkc->dmc", basis(back, 2), shown.harmonics)
+        ) * shown.shades[t][:, None]
         assert np.allclose(found, wanted.numpy(), atol=1e-5)
-        assert np.allclose(np.maximum(found, 0), colors_in(torch.as_tensor(c), directions[:, None].expand(-1, M, -1)), atol=1e-5)
+        assert np.allclose(
+            np.maximum(found, 0),
+            colors_in(torch.as_tensor(c), directions[:, None].expand(-1, M, -1)),
+            atol=1e-5,
+        )
 
 
 def test_splat_files_have_32_bytes_a_gaussian(tmp_path):
@@ -56,7 +73,9 @@ def test_splat_files_have_32_bytes_a_gaussian(tmp_path):
     raw = (tmp_path / "splat" / "001.splat").read_bytes()
     assert len(raw) == 32 * M
     order = (-frame.scales.prod(1) * frame.opacities).argsort()
-    position = np.frombuffer(raw, "<f4").reshape(M, 8)[:, :3]  # a reader of one's own: position, scale, rgba, rotation
+    position = np.frombuffer(raw, "<f4").reshape(M, 8)[
+        :, :3
+    ]  # a reader of one's own: position, scale, rgba, rotation
     assert np.array_equal(position, frame.means[order].numpy())
     rgba = np.frombuffer(raw, np.uint8).reshape(M, 32)[:, 24:28] / 255
     assert np.allclose(rgba[:, :3], frame.colors[order].numpy(), atol=0.5 / 255 + 1e-6)
@@ -69,7 +88,9 @@ def test_splat_files_have_32_bytes_a_gaussian(tmp_path):
 
 def test_damaged_splat_files_are_named(tmp_path):
     (tmp_path / "a.splat").write_bytes(b"x" * 33)
-    with pytest.raises(DataError, match=r"a\.splat: expected a \.splat file of 32 bytes a Gaussian, found 33 bytes"):
+    with pytest.raises(
+        DataError, match=r"a\.splat: expected a \.splat file of 32 bytes a Gaussian, found 33 bytes"
+    ):
         load_splat(tmp_path / "a.splat")
     (tmp_path / "a.splat").write_bytes(b"\xff" * 64)
     with pytest.raises(DataError, match="expected finite positions"):
@@ -79,7 +100,9 @@ def test_damaged_splat_files_are_named(tmp_path):
 
 
 def test_another_format_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="formats: expected some of ply, splat, spz, usd, found 'obj'"):
+    with pytest.raises(
+        ConfigError, match="formats: expected some of ply, splat, spz, usd, found 'obj'"
+    ):
         save_frames(drawn(0), tmp_path, ("ply", "obj"))
     assert not (tmp_path / "ply").exists()
 
@@ -92,12 +115,18 @@ def test_a_usd_stage_has_the_gaussians_of_every_frame(tmp_path):
     save_frames(shown, tmp_path, ("usd",), rate=24, up=torch.tensor([0.0, 0, 1]))
     stage = Usd.Stage.Open(str(tmp_path / "splats.usdc"))
     field = pxr.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
-    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode(), UsdGeom.GetStageUpAxis(stage)) == (24, T - 1, "Z")
+    assert (
+        stage.GetTimeCodesPerSecond(),
+        stage.GetEndTimeCode(),
+        UsdGeom.GetStageUpAxis(stage),
+    ) == (24, T - 1, "Z")
     for t in range(T):
         frame = splats_at(shown, t)
         assert np.allclose(np.array(field.GetPositionsAttr().Get(t)), frame.splats.means.numpy())
         assert np.allclose(np.array(field.GetScalesAttr().Get(t)), frame.splats.scales.numpy())
-        found = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(t)).reshape(M, 4, 3)
+        found = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(t)).reshape(
+            M, 4, 3
+        )
         assert np.allclose(found, frame.harmonics.numpy(), atol=1e-6)
 
 
@@ -116,7 +145,10 @@ def test_spz_files_are_read_back(tmp_path):
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     import sys
 
-    for name, message in (("gsply", "spz needs the package gsply"), ("pxr", "usd needs the package usd-core")):
+    for name, message in (
+        ("gsply", "spz needs the package gsply"),
+        ("pxr", "usd needs the package usd-core"),
+    ):
         monkeypatch.setitem(sys.modules, name, None)
         with pytest.raises(ConfigError, match=message):
             save_frames(drawn(0), tmp_path, ("spz" if name == "gsply" else "usd",))

@@ -30,13 +30,17 @@ def drawn(seed=0):
 
 def assert_same(found, wanted):
     for f in fields(Splats):
-        torch.testing.assert_close(getattr(found, f.name), getattr(wanted, f.name), rtol=2e-6, atol=2e-6, msg=f.name)
+        torch.testing.assert_close(
+            getattr(found, f.name), getattr(wanted, f.name), rtol=2e-6, atol=2e-6, msg=f.name
+        )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_round_trip(tmp_path, degree):
     splats = drawn()
-    coefficients = torch.randn(COUNT, (degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(1))
+    coefficients = torch.randn(
+        COUNT, (degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(1)
+    )
     coefficients[:, 0] = (splats.colors - 0.5) * math.sqrt(4 * math.pi)
     found, harmonics = load_ply(save_ply(tmp_path / "new" / "splats.ply", splats, coefficients))
     assert_same(found, splats)
@@ -59,17 +63,27 @@ def test_layout_is_the_published_one(tmp_path):
     assert names == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45)),
                      "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
     assert all(vertex[name].dtype == np.dtype("<f4") for name in names)
-    assert vertex["f_rest_0"][2] == coefficients[2, 1, 0] and vertex["f_rest_14"][2] == coefficients[2, 15, 0]
-    assert vertex["f_rest_15"][2] == coefficients[2, 1, 1] and vertex["f_dc_2"][2] == coefficients[2, 0, 2]
+    assert (
+        vertex["f_rest_0"][2] == coefficients[2, 1, 0]
+        and vertex["f_rest_14"][2] == coefficients[2, 15, 0]
+    )
+    assert (
+        vertex["f_rest_15"][2] == coefficients[2, 1, 1]
+        and vertex["f_dc_2"][2] == coefficients[2, 0, 2]
+    )
     opacity = float(splats.opacities[3])
     assert vertex["opacity"][3] == pytest.approx(math.log(opacity / (1 - opacity)), rel=1e-5)
     assert vertex["scale_1"][3] == pytest.approx(math.log(float(splats.scales[3, 1])), rel=1e-5)
-    assert [vertex[f"rot_{i}"][3] for i in range(4)] == pytest.approx(splats.rotations[3].tolist(), rel=1e-6)
+    assert [vertex[f"rot_{i}"][3] for i in range(4)] == pytest.approx(
+        splats.rotations[3].tolist(), rel=1e-6
+    )
 
 
 def test_extremes_that_have_no_logarithm_stay_finite(tmp_path):
     splats = drawn()
-    splats = replace(splats, opacities=torch.tensor([0.0, 1.0] + [0.5] * 5), scales=splats.scales * 0)
+    splats = replace(
+        splats, opacities=torch.tensor([0.0, 1.0] + [0.5] * 5), scales=splats.scales * 0
+    )
     found, _ = load_ply(save_ply(tmp_path / "splats.ply", splats))
     torch.testing.assert_close(found.opacities, splats.opacities, atol=2e-6, rtol=0)
     assert float(found.scales.max()) < 1e-8
@@ -87,7 +101,10 @@ def test_frames_carry_the_deformed_covariances(tmp_path):
         torch.testing.assert_close(found.means, positions[t])
         axes = quaternion_to_matrix(found.rotations)
         torch.testing.assert_close(
-            axes @ torch.diag_embed(found.scales**2) @ axes.transpose(1, 2), covariances[t], rtol=1e-4, atol=1e-7
+            axes @ torch.diag_embed(found.scales**2) @ axes.transpose(1, 2),
+            covariances[t],
+            rtol=1e-4,
+            atol=1e-7,
         )
 
 
@@ -95,7 +112,9 @@ def rewrite(change):
     def apply(path):
         data = PlyData.read(path)["vertex"].data
         data = change({name: np.array(data[name]) for name in data.dtype.names})
-        array = np.empty(len(data["x"]) if "x" in data else COUNT, dtype=[(name, "f4") for name in data])
+        array = np.empty(
+            len(data["x"]) if "x" in data else COUNT, dtype=[(name, "f4") for name in data]
+        )
         for name, values in data.items():
             array[name] = values
         PlyData([PlyElement.describe(array, "vertex")]).write(path)
@@ -153,7 +172,9 @@ def test_mistakes_name_file_and_field(tmp_path, name):
 def test_nothing_broken_is_written(tmp_path):
     splats = drawn()
     splats.means[2, 1] = float("nan")
-    with pytest.raises(DataError, match=r"splats.ply: field y: expected finite numbers, to write NaN .* vertex 2"):
+    with pytest.raises(
+        DataError, match=r"splats.ply: field y: expected finite numbers, to write NaN .* vertex 2"
+    ):
         save_ply(tmp_path / "splats.ply", splats)
     assert not (tmp_path / "splats.ply").exists()
     with pytest.raises(ConfigError, match="K = 1, 4, 9 or 16"):

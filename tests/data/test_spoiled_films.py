@@ -21,12 +21,19 @@ from mosa.errors import DataError
 from mosa.rendering.cameras import look_at
 from mosa.types import Cameras
 
-WORLD = {"gravity": [0, -9.8, 0], "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]], "ground": {"height": 0.0}}
+WORLD = {
+    "gravity": [0, -9.8, 0],
+    "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]],
+    "ground": {"height": 0.0},
+}
 
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory):
-    return export_transforms(load_scene(format="builtin", name="tiny", scale=0.5), tmp_path_factory.mktemp("film") / "capture")
+    return export_transforms(
+        load_scene(format="builtin", name="tiny", scale=0.5),
+        tmp_path_factory.mktemp("film") / "capture",
+    )
 
 
 def spoiled(film, place, change=lambda pixels: None, camera=None, frame=None, **keys):
@@ -68,25 +75,46 @@ def test_a_focal_length_that_is_off_is_no_other_moment():
     K = torch.tensor([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1.0]])
     angles = 2 * math.pi * torch.arange(6) / 6 + 0.3
     eyes = torch.stack([2 * angles.cos(), 0.45 + 0.25 * (torch.arange(6) % 3), 2 * angles.sin()], 1)
-    w2c = torch.stack([look_at(eye, torch.tensor([0, 0.45, 0.0]), torch.tensor([0, 1.0, 0])) for eye in eyes])
+    w2c = torch.stack(
+        [look_at(eye, torch.tensor([0, 0.45, 0.0]), torch.tensor([0, 1.0, 0])) for eye in eyes]
+    )
     pixel = torch.arange(size) + 0.5
-    rays = torch.stack([*torch.meshgrid(pixel, pixel, indexing="xy"), torch.ones(size, size)], -1) @ torch.linalg.inv(K).T
+    rays = (
+        torch.stack([*torch.meshgrid(pixel, pixel, indexing="xy"), torch.ones(size, size)], -1)
+        @ torch.linalg.inv(K).T
+    )
     times = torch.arange(count) / 60
-    centres = torch.tensor([0, 0.85, 0.0]) - (4.9 * times**2 + 0.3 * times)[:, None] * torch.tensor([0, 1.0, 0])
+    centres = torch.tensor([0, 0.85, 0.0]) - (4.9 * times**2 + 0.3 * times)[:, None] * torch.tensor(
+        [0, 1.0, 0]
+    )
     away = centres @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]  # (cameras, frames, 3)
-    cosine = torch.einsum("hwi,vti->vthw", rays / rays.norm(dim=-1, keepdim=True), away / away.norm(dim=-1, keepdim=True))
+    cosine = torch.einsum(
+        "hwi,vti->vthw",
+        rays / rays.norm(dim=-1, keepdim=True),
+        away / away.norm(dim=-1, keepdim=True),
+    )
     mattes = (cosine > (1 - (0.1 / away.norm(dim=-1)) ** 2).sqrt()[..., None, None]).float()
     shades = torch.linspace(0, 0.9, 6)[:, None] + 0.1 * torch.linspace(0, 1, count)
     known = Cameras(K.repeat(6, 1, 1), w2c, size, size, tuple("012345"))
-    scene = replace(scene, images=shades[:, :, None, None, None].expand(6, count, size, size, 3), mattes=mattes, cameras=known)
+    scene = replace(
+        scene,
+        images=shades[:, :, None, None, None].expand(6, count, size, size, 3),
+        mattes=mattes,
+        cameras=known,
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_pictures(scene, "film")
     known.K[0, :2, :2] *= 0.98
-    with pytest.warns(UserWarning, match=r"camera 0, .* focal length that is off\? At a .* [123] % larger they fit"):
+    with pytest.warns(
+        UserWarning,
+        match=r"camera 0, .* focal length that is off\? At a .* [123] % larger they fit",
+    ):
         check_pictures(scene, "film")
     late = replace(scene, mattes=torch.cat([mattes[:3], mattes[3:4].roll(2, 1), mattes[4:]]))
-    with pytest.raises(DataError, match=r"camera 3, .*; as pictures of frames .* put the right pictures there"):
+    with pytest.raises(
+        DataError, match=r"camera 3, .*; as pictures of frames .* put the right pictures there"
+    ):
         check_pictures(late, "film")
 
 
@@ -103,7 +131,10 @@ def test_what_is_suspicious_is_said(film, tmp_path, change, where, message):
 
 def test_a_matte_below_half_coverage_is_refused(film, tmp_path):
     """No pixel of it counts as the object's."""
-    with pytest.raises(DataError, match="found 127 at most: the number of a label, or a matte that is half transparent"):
+    with pytest.raises(
+        DataError,
+        match="found 127 at most: the number of a label, or a matte that is half transparent",
+    ):
         spoiled(film, tmp_path, halved, camera="0", frame=3)
 
 
@@ -111,7 +142,9 @@ def test_a_rate_that_contradicts_the_files_times_is_said(film, tmp_path):
     document = json.loads((film / "transforms.json").read_text())
     times = sorted({entry["time"] for entry in document["frames"]})
     rate = 1 / (times[1] - times[0])
-    with pytest.warns(UserWarning, match=r"scene\.fps = .* takes the place of the file's own times, which say"):
+    with pytest.warns(
+        UserWarning, match=r"scene\.fps = .* takes the place of the file's own times, which say"
+    ):
         spoiled(film, tmp_path, fps=0.97 * rate)
     shutil.rmtree(tmp_path / "capture")
     with warnings.catch_warnings():
@@ -151,7 +184,10 @@ def test_an_exposure_that_changes_over_a_film_is_said(film, tmp_path, factors, s
 
 
 def test_a_frame_that_no_camera_shows_is_refused_where_a_later_one_is_seen(film, tmp_path):
-    with pytest.raises(DataError, match="0 of 6 cameras have a matte of the object in frame 2, and more of them in a later one"):
+    with pytest.raises(
+        DataError,
+        match="0 of 6 cameras have a matte of the object in frame 2, and more of them in a later one",
+    ):
         spoiled(film, tmp_path, empty, frame=2)
 
 
@@ -194,7 +230,9 @@ def test_what_the_other_cameras_contradict_is_named(scene, name):
 def test_a_stretch_of_another_camera_is_named(scene):
     images, mattes = scene.images.clone(), scene.mattes.clone()
     images[1, 2:], mattes[1, 2:] = scene.images[2, 2:], scene.mattes[2, 2:]
-    with pytest.raises(DataError, match=r"camera 1, frames 2 to 4: .* as pictures of camera 2 they fit to 0\.0"):
+    with pytest.raises(
+        DataError, match=r"camera 1, frames 2 to 4: .* as pictures of camera 2 they fit to 0\.0"
+    ):
         validate(replace(scene, images=images, mattes=mattes))
 
 
@@ -205,7 +243,10 @@ def test_a_camera_that_is_held_out_may_be_wrong(scene):
         warnings.simplefilter("always")
         assert validate(spoiled_one) is spoiled_one
     assert len(found) == 1
-    assert re.search("camera 3, frames 1, 2, 4: .*nothing is learned from cameras that are held out", str(found[0].message))
+    assert re.search(
+        "camera 3, frames 1, 2, 4: .*nothing is learned from cameras that are held out",
+        str(found[0].message),
+    )
 
 
 def test_a_body_at_rest_may_look_the_same_to_the_bit(scene):
@@ -215,7 +256,13 @@ def test_a_body_at_rest_may_look_the_same_to_the_bit(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_still(frozen, track._replace(points=track.points[[3, 3, 3, 3, 3]]), "scene")
-        released = track.points[0] + torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, -0.00196, 0], [0, -0.00784, 0], [0, -0.0176, 0]])
-        check_still(with_pictures(scene, range(6), lambda x: x[[0, 0, 1, 2, 3]]), track._replace(points=released), "scene")
+        released = track.points[0] + torch.tensor(
+            [[0.0, 0, 0], [0, 0, 0], [0, -0.00196, 0], [0, -0.00784, 0], [0, -0.0176, 0]]
+        )
+        check_still(
+            with_pictures(scene, range(6), lambda x: x[[0, 0, 1, 2, 3]]),
+            track._replace(points=released),
+            "scene",
+        )
     with pytest.raises(DataError, match="found the same in frames 3 to 4"):
         check_still(frozen, track, "scene")

@@ -30,7 +30,11 @@ def read(folder, **keys):
 def test_round_trip(blocks, folder):
     scene = read(folder)
     assert_same_footage(scene, blocks)
-    assert scene.name == "torus" and scene.cameras.names == ("camera_0", "camera_1", "camera_2") and not scene.synthetic
+    assert (
+        scene.name == "torus"
+        and scene.cameras.names == ("camera_0", "camera_1", "camera_2")
+        and not scene.synthetic
+    )
     assert read(folder, frames=[1, 4]).frames == 4
     assert read(folder, scale=0.5).images.shape[2:4] == (16, 16)
 
@@ -42,7 +46,14 @@ def test_a_point_lands_where_the_opengl_pose_puts_it(folder):
     point = np.array([0.07, 0.21, -0.05])
     seen = K @ (np.diag([1, -1, -1]) @ c2w[:3, :3].T @ (point - c2w[:3, 3]))
     w2c = scene.cameras.w2c[1].double().numpy()
-    assert np.allclose(scene.cameras.K[1].double().numpy() @ (w2c[:3, :3] @ point + w2c[:3, 3]), seen, atol=1e-4) and seen[2] > 0
+    assert (
+        np.allclose(
+            scene.cameras.K[1].double().numpy() @ (w2c[:3, :3] @ point + w2c[:3, 3]),
+            seen,
+            atol=1e-4,
+        )
+        and seen[2] > 0
+    )
 
 
 def test_alpha_is_straight_and_what_is_behind_becomes_white(folder):
@@ -51,7 +62,9 @@ def test_alpha_is_straight_and_what_is_behind_becomes_white(folder):
     pixels[pixels[..., 3] == 0] = 0  # black where nothing is, as published
     iio.imwrite(file, pixels)
     image, matte = read(folder).images[0, 0], read(folder).mattes[0, 0]
-    assert bool((image[matte == 0] == 1).all()) and bool((matte == torch.tensor(pixels[..., 3]) / 255).all())
+    assert bool((image[matte == 0] == 1).all()) and bool(
+        (matte == torch.tensor(pixels[..., 3]) / 255).all()
+    )
 
 
 def test_true_particles_are_found_beside_the_pictures(blocks, folder):
@@ -61,10 +74,14 @@ def test_true_particles_are_found_beside_the_pictures(blocks, folder):
 
 def test_the_scene_of_the_configuration_reads_it(folder):
     with initialize_config_dir(str(Path(__file__).parents[2] / "conf"), version_base=None):
-        composed = compose("train", overrides=["scene=spring_gaus", f"scene.path={folder}", "scene.scale=1"])
+        composed = compose(
+            "train", overrides=["scene=spring_gaus", f"scene.path={folder}", "scene.scale=1"]
+        )
     keys = OmegaConf.to_container(composed.scene, resolve=True)
     assert keys["ground"]["height"] == 0.3 and keys["holdout_frames"] == 10
-    assert keys.pop("also_train") == keys.pop("test") == []  # further folders are read by held_out_sequences
+    assert (
+        keys.pop("also_train") == keys.pop("test") == []
+    )  # further folders are read by held_out_sequences
     world = {"ground": WORLD["ground"], "box": WORLD["box"], "holdout_frames": 2}
     assert load_scene(**keys | world).training_frames == [0, 1, 2]
 

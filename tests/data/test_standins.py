@@ -18,10 +18,14 @@ from mosa.modules.body.material import Material
 def test_a_stand_in_has_the_published_parameters_cameras_and_frames(name):
     body = OBJECTS[name]
     assert body.material.known == PUBLISHED[name]
-    assert body.footage.cameras == 11 and body.footage.fps == (50.0 if name == "toothpaste" else 24.0)
+    assert body.footage.cameras == 11 and body.footage.fps == (
+        50.0 if name == "toothpaste" else 24.0
+    )
     taken = body.material.parameters(torch.zeros(3, 3))
     law = Material(body.material.law, dict(body.material.values)).per_particle()
-    assert taken.keys() == law.keys() and all(torch.equal(taken[k], law[k].detach().expand(3)) for k in law)
+    assert taken.keys() == law.keys() and all(
+        torch.equal(taken[k], law[k].detach().expand(3)) for k in law
+    )
     assert body.material.variant("isotropic") is body.material
 
 
@@ -35,7 +39,9 @@ def test_the_surface_of_particles_is_that_of_the_body_they_fill():
     radius = np.linalg.norm(found.vertices, axis=-1)
     assert radius.mean() == pytest.approx(0.15, abs=0.5 * spacing) and radius.std() < 0.3 * spacing
     red = found.vertices[:, 0] > spacing
-    assert (found.colors[red, 0] > 0.7).all() and (found.colors[found.vertices[:, 0] < -spacing, 2] > 0.7).all()
+    assert (found.colors[red, 0] > 0.7).all() and (
+        found.colors[found.vertices[:, 0] < -spacing, 2] > 0.7
+    ).all()
 
 
 @pytest.fixture

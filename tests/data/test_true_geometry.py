@@ -35,7 +35,9 @@ def test_the_shape_lies_where_the_truth_of_the_scene_says(scene):
 def test_a_lattice_of_the_true_shape_has_no_error(scene, particles):
     found = {k.rsplit("/", 1)[1]: v for k, v in geometry_figures(*particles, scene).items()}
     assert found["outside_share"] == 0 and found["missing_share"] < 1e-3
-    assert abs(found["volume_error"]) < 0.01  # a lattice's count: half a layer of cells at random, over 5000 cells
+    assert (
+        abs(found["volume_error"]) < 0.01
+    )  # a lattice's count: half a layer of cells at random, over 5000 cells
     assert found["center_error_m"] < 2e-4
 
 
@@ -43,8 +45,14 @@ def test_what_is_wrong_with_a_body_is_counted(scene, particles):
     points, volume = particles
     half = points[:, 0] < points[:, 0].mean()
     figures = geometry_figures(points[half], volume[half], scene)
-    assert figures["floor/geometry/missing_share"] > 0.3 and figures["floor/geometry/outside_share"] == 0
-    assert figures["floor/geometry/volume_error"] < -0.4 and figures["floor/geometry/center_error_m"] > 0.02
+    assert (
+        figures["floor/geometry/missing_share"] > 0.3
+        and figures["floor/geometry/outside_share"] == 0
+    )
+    assert (
+        figures["floor/geometry/volume_error"] < -0.4
+        and figures["floor/geometry/center_error_m"] > 0.02
+    )
     shifted = geometry_figures(points + torch.tensor([0.02, 0, 0]), volume, scene)
     assert shifted["floor/geometry/outside_share"] > 0.05
     assert shifted["floor/geometry/center_error_m"] == pytest.approx(0.02, rel=0.02)
@@ -53,8 +61,15 @@ def test_what_is_wrong_with_a_body_is_counted(scene, particles):
 
 
 def test_a_person_reads_how_sure_the_body_is(scene, particles):
-    figures = {"geometry/carved_share": 0.031, "geometry/uncertain_share": 0.072, "geometry/free_frames": 4.0}
-    assert "3.1% of the visual hull is air. 7.2% of the surface is not told by the images" in geometry_lines(figures)
+    figures = {
+        "geometry/carved_share": 0.031,
+        "geometry/uncertain_share": 0.072,
+        "geometry/free_frames": 4.0,
+    }
+    assert (
+        "3.1% of the visual hull is air. 7.2% of the surface is not told by the images"
+        in geometry_lines(figures)
+    )
     assert "rounded away; no colours were asked" in geometry_lines({"geometry/carved_share": 0.02})
     assert "0.00% of the particles outside" in geometry_lines(geometry_figures(*particles, scene))
     assert geometry_lines({}) == ""

@@ -24,8 +24,20 @@ def experiment(**changes) -> Experiment:
                    Option("ours", ("adapter=operator",))),
         "scene": (Option("a", ("scene=a",)), Option("b", ("scene=b",))),
     }  # fmt: skip
-    figures = (Figure("PSNR", "test/psnr_crop", best="most"), Figure("rms [mm]", "test/rms_m", 1e3, 1, "least"))
-    made = Experiment("made", "Made up", axes, "method", "scene", figures, seeds=(0, 1), minutes={"cpu": 3.0, "gpu": 1.0})
+    figures = (
+        Figure("PSNR", "test/psnr_crop", best="most"),
+        Figure("rms [mm]", "test/rms_m", 1e3, 1, "least"),
+    )
+    made = Experiment(
+        "made",
+        "Made up",
+        axes,
+        "method",
+        "scene",
+        figures,
+        seeds=(0, 1),
+        minutes={"cpu": 3.0, "gpu": 1.0},
+    )
     return replace(made, **changes)
 
 

@@ -34,7 +34,9 @@ def test_every_kind_of_picture_is_drawn_also_where_cells_are_missing(tmp_path, p
 def test_a_map_has_the_figure_s_decimals_and_bars_say_where_they_begin(tmp_path):
     found, jobs = made_up(tmp_path / "runs")
     tables = {figure.label: table(found, records_of(jobs), figure) for figure in found.figures}
-    for place, figure in zip(draw(replace(found, plot="map"), tables).axes, found.figures):  # colour bars come after the maps
+    for place, figure in zip(
+        draw(replace(found, plot="map"), tables).axes, found.figures
+    ):  # colour bars come after the maps
         written = [text.get_text() for text in place.texts]
         assert written and {len(text.partition(".")[2]) for text in written} == {figure.decimals}
     close = {"method": {"a": Cell(98.0, None, 1)}, "other": {"a": Cell(99.0, None, 1)}}
@@ -43,15 +45,25 @@ def test_a_map_has_the_figure_s_decimals_and_bars_say_where_they_begin(tmp_path)
     low, high = place.get_ylim()
     assert 99 < high <= 100 and 90 < low < 98 and place.get_ylabel() == f"axis cut at {low:.4g}"
     alone = {"method": {"a": Cell(1.0, None, 1)}, "other": {"a": Cell(30.0, None, 1)}}
-    place = draw(replace(found, figures=(replace(ssim, figure="test/psnr_crop"),), plot="bars"), {"SSIM x100": alone}).axes[0]
+    place = draw(
+        replace(found, figures=(replace(ssim, figure="test/psnr_crop"),), plot="bars"),
+        {"SSIM x100": alone},
+    ).axes[0]
     assert place.get_ylim()[0] == 0 and place.get_ylabel() == ""
 
 
 def test_a_method_of_which_nothing_was_run_takes_no_bar_and_no_colour(tmp_path):
     """It had the first one's colour in the legend."""
     found, _ = made_up(tmp_path / "runs")
-    figures = (Figure("a", "test/rms_m", 1, 1, "least"), Figure("b", "test/psnr_crop", 1, 1, "least"))
-    rows = {"first": {"x": Cell(1.0, None, 1)}, "not run": {"x": None}, "last": {"x": Cell(2.0, None, 1)}}
+    figures = (
+        Figure("a", "test/rms_m", 1, 1, "least"),
+        Figure("b", "test/psnr_crop", 1, 1, "least"),
+    )
+    rows = {
+        "first": {"x": Cell(1.0, None, 1)},
+        "not run": {"x": None},
+        "last": {"x": Cell(2.0, None, 1)},
+    }
     partly = rows | {"last": {"x": None}}
     canvas = draw(replace(found, figures=figures, plot="bars"), {"a": partly, "b": rows})
     assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["first", "last"]
@@ -61,15 +73,24 @@ def test_a_method_of_which_nothing_was_run_takes_no_bar_and_no_colour(tmp_path):
 
 def test_every_method_of_the_paper_has_a_colour_of_its_own_in_every_picture():
     """Whatever else is in the picture, and whether it is bars or lines."""
-    names = [option.name for option in load_experiment(PAPER, "table_generalisation").axes["method"]]
-    assert set(names) <= set(STYLES) and len({STYLES[name]["color"] for name in names}) == len(names)
+    names = [
+        option.name for option in load_experiment(PAPER, "table_generalisation").axes["method"]
+    ]
+    assert set(names) <= set(STYLES) and len({STYLES[name]["color"] for name in names}) == len(
+        names
+    )
     assert not {style["color"] for style in STYLES.values()} & set(FURTHER)
     value = Cell(2.0, None, 1)
     few = {"box": {"a": value}, "ours": {"a": value}}
     many = {"NeuMA": {"a": value}, "box": {"a": None}, "ours": {"a": value}, "other": {"a": value}}
     figures = (Figure("rms", "test/rms_m", 1, 1, "least"),)
-    first, second = (draw(experiment(figures=figures), {"rms": rows}).axes[0] for rows in (few, many))
-    colours = [{bar.get_label(): bar[0].get_facecolor() for bar in place.containers} for place in (first, second)]
+    first, second = (
+        draw(experiment(figures=figures), {"rms": rows}).axes[0] for rows in (few, many)
+    )
+    colours = [
+        {bar.get_label(): bar[0].get_facecolor() for bar in place.containers}
+        for place in (first, second)
+    ]
     assert colours[0]["ours"] == colours[1]["ours"] and len(set(colours[1].values())) == 3
     lines = draw(experiment(figures=figures, plot="lines", rows="scene", columns="method"),
                  {"rms": {scene: {name: value for name in ("prior", "box", "ours")} for scene in "ab"}}).axes[0]  # fmt: skip
@@ -79,14 +100,29 @@ def test_every_method_of_the_paper_has_a_colour_of_its_own_in_every_picture():
 
 def test_what_diverged_what_failed_and_what_was_not_run_differ():
     cells = {"x": Cell(1.0, None, 1), "y": Cell(math.inf, None, 1), "z": Cell(math.nan, None, 0)}
-    rows = {"ours": cells, "box": {"x": None, "y": Cell(2.0, None, 1), "z": None}, "prior": dict.fromkeys("xyz")}
+    rows = {
+        "ours": cells,
+        "box": {"x": None, "y": Cell(2.0, None, 1), "z": None},
+        "prior": dict.fromkeys("xyz"),
+    }
     canvas = draw(experiment(figures=(Figure("rms", "test/rms_m", 1, 1, "least"),)), {"rms": rows})
     (place,) = canvas.axes
-    assert [(round(float(line.get_xdata()[0])), line.get_marker()) for line in place.lines] == [(1, "x"), (2, "+")]
+    assert [(round(float(line.get_xdata()[0])), line.get_marker()) for line in place.lines] == [
+        (1, "x"),
+        (2, "+"),
+    ]
     assert {line.get_color() for line in place.lines} == {style_of("ours")["color"]}
-    assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["ours", "box", "diverged", "failed"]
+    assert [text.get_text() for text in canvas.legends[0].get_texts()] == [
+        "ours",
+        "box",
+        "diverged",
+        "failed",
+    ]
     assert canvas.get_supxlabel() == "gap: not run; not run: prior"
-    assert draw(experiment(figures=(Figure("rms", "test/rms_m"),)), {"rms": {"ours": {"x": None}}}) is None
+    assert (
+        draw(experiment(figures=(Figure("rms", "test/rms_m"),)), {"rms": {"ours": {"x": None}}})
+        is None
+    )
 
 
 @pytest.mark.parametrize("plot", ["bars", "lines"])
@@ -99,9 +135,15 @@ def test_every_axis_without_its_zero_says_so_and_errors_over_a_decade_are_logari
     made = experiment(figures=figures, plot=plot)
     if plot == "lines":
         made = replace(made, rows="scene", columns="method")
-        tables = {label: {column: {row: rows[row][column] for row in rows} for column in "ab"} for label, rows in tables.items()}
+        tables = {
+            label: {column: {row: rows[row][column] for row in rows} for column in "ab"}
+            for label, rows in tables.items()
+        }
     psnr, wide, rms = draw(made, tables).axes
-    assert 20 < psnr.get_ylim()[0] < 25 and psnr.get_ylabel() == f"axis cut at {psnr.get_ylim()[0]:.4g}"
+    assert (
+        20 < psnr.get_ylim()[0] < 25
+        and psnr.get_ylabel() == f"axis cut at {psnr.get_ylim()[0]:.4g}"
+    )
     assert wide.get_yscale() == "log" and wide.get_ylabel() == "logarithmic axis from 1"
     assert rms.get_yscale() == "linear" and rms.get_ylim()[0] == 0 and rms.get_ylabel() == ""
     if plot == "lines":  # a bar of an error for the one point with two seeds
@@ -115,9 +157,15 @@ def test_every_axis_without_its_zero_says_so_and_errors_over_a_decade_are_logari
 def test_a_map_is_lighter_where_it_is_better_and_frames_the_default_of_the_configuration():
     made = load_experiment(PAPER, "figure_alpha")
     defaults = yaml.safe_load((CONF / "adapter" / "mosa.yaml").read_text())["adapter"]
-    assert defaults["alpha_normal"] is None and MARKED["alpha", "alpha_normal"]["default"] == (defaults["alpha"], defaults["alpha"])
+    assert defaults["alpha_normal"] is None and MARKED["alpha", "alpha_normal"]["default"] == (
+        defaults["alpha"],
+        defaults["alpha"],
+    )
     names = [option.name for option in made.axes["alpha"]]
-    cells = {row: {column: Cell(i + j, None, 1) for j, column in enumerate(names)} for i, row in enumerate(names)}
+    cells = {
+        row: {column: Cell(i + j, None, 1) for j, column in enumerate(names)}
+        for i, row in enumerate(names)
+    }
     cells["0.30"] |= {"0.30": None, "0.20": Cell(-math.inf, None, 1)}
     canvas = draw(made, {figure.label: cells for figure in made.figures})
     psnr, rms = canvas.axes[:2]
@@ -125,14 +173,20 @@ def test_a_map_is_lighter_where_it_is_better_and_frames_the_default_of_the_confi
         assert [tuple(patch.get_xy()) for patch in place.patches] == [(0.52, 0.53), (1.52, 1.53)]
         words = [text.get_text() for text in place.texts]
         assert {"default", "the paper's", "diverged"} <= set(words) and len(words) == 2 + 24
-    shades = [place.images[0].cmap(place.images[0].norm(np.array([0.0, 7.0]))).sum(1) for place in (psnr, rms)]
+    shades = [
+        place.images[0].cmap(place.images[0].norm(np.array([0.0, 7.0]))).sum(1)
+        for place in (psnr, rms)
+    ]
     assert shades[0][0] < shades[0][1] and shades[1][0] > shades[1][1]
     assert canvas.get_supxlabel() == "white: not run"
 
 
 def test_many_bars_have_a_row_for_each_figure_and_no_picture_is_wider_than_a_page():
     for bars_of_a_part, down in ((2, 2), (9, 4)):
-        rows = {name: {column: Cell(1.0, None, 1) for column in "abcdefghi"[:bars_of_a_part]} for name in ("ours", "NeuMA")}
+        rows = {
+            name: {column: Cell(1.0, None, 1) for column in "abcdefghi"[:bars_of_a_part]}
+            for name in ("ours", "NeuMA")
+        }
         figures = tuple(Figure(label, "test/rms_m", best="least") for label in "pqrs")
         canvas = draw(experiment(figures=figures), dict.fromkeys("pqrs", rows))
         canvas.draw_without_rendering()
@@ -156,19 +210,36 @@ def test_the_factors_of_all_bodies_have_one_range_about_one(tmp_path, monkeypatc
     parts = [place.collections[0] for place in drawn[0].axes[:2]]
     (limits,) = {part.get_clim() for part in parts}
     assert sum(limits) == pytest.approx(2.0) and limits[1] >= float(factors["b"].max())
-    assert drawn[0].axes[-1].get_xlabel().startswith("factor on the stiffness, 1: as the calibrated law")
+    assert (
+        drawn[0]
+        .axes[-1]
+        .get_xlabel()
+        .startswith("factor on the stiffness, 1: as the calibrated law")
+    )
     assert [drawn[0].axes[i].get_ylabel() for i in (0, 2)] == ["learned", "truth"]
 
 
 @pytest.mark.parametrize("columns", [["a"], ["a", "b"]])
-def test_the_rounding_of_an_isotropic_law_is_no_curve_and_a_response_of_zero_is_seen(tmp_path, monkeypatch, columns):
+def test_the_rounding_of_an_isotropic_law_is_no_curve_and_a_response_of_zero_is_seen(
+    tmp_path, monkeypatch, columns
+):
     """Beside one with a ratio of 1.6 and alone; the ripples of each part have a range of their own, E in kPa begins at 0."""
     found = narrowed(experiment(), {"method": ["ours"], "scene": columns}, (0,))
     records = records_of(jobs_of(found, tmp_path))
-    laws = {"a": lambda n: 1e5 * (1 + 1e-4 * n[:, 0]), "b": lambda n: 1e5 * (1 + 0.6 * n[:, 0] ** 2)}
-    twins = [SimpleNamespace(body=record.place["scene"].name, config={"cfg": {"scene": {"name": "rabbit"}}}) for record in records]
+    laws = {
+        "a": lambda n: 1e5 * (1 + 1e-4 * n[:, 0]),
+        "b": lambda n: 1e5 * (1 + 0.6 * n[:, 0] ** 2),
+    }
+    twins = [
+        SimpleNamespace(
+            body=record.place["scene"].name, config={"cfg": {"scene": {"name": "rabbit"}}}
+        )
+        for record in records
+    ]
     monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
-    monkeypatch.setattr(analyses, "redistribution", lambda body, n: (0.1 if body == "b" else 0.0) * n[:, 0].abs())
+    monkeypatch.setattr(
+        analyses, "redistribution", lambda body, n: (0.1 if body == "b" else 0.0) * n[:, 0].abs()
+    )
     monkeypatch.setattr(analyses, "learned_modulus", lambda body, n: laws[body](n))
     monkeypatch.setattr(analyses, "true_modulus", lambda *_: None)
     drawn = []
@@ -182,5 +253,9 @@ def test_the_rounding_of_an_isotropic_law_is_no_curve_and_a_response_of_zero_is_
     low, high = places[0, 0].get_ylim()
     assert low < -0.02 * high  # w of 0 lies beside the axis, not on it
     for place in places[2]:
-        assert place.get_ylim()[0] == 0 and place.lines[0].get_ydata().mean() > 90 and place.get_ylabel() == "E [kPa]"
+        assert (
+            place.get_ylim()[0] == 0
+            and place.lines[0].get_ydata().mean() > 90
+            and place.get_ylabel() == "E [kPa]"
+        )
     assert all(place.lines[0].get_color() == style_of("ours")["color"] for place in places.ravel())

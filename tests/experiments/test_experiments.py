@@ -52,7 +52,10 @@ def options_once(name: str, quick: bool) -> set[tuple[str, ...]]:
     found = load_experiment(PAPER, name, quick)
     first = {axis: options[0] for axis, options in found.axes.items()}
     places = [first | {axis: option} for axis, options in found.axes.items() for option in options]
-    return {(*found.common, *(each for option in place.values() for each in option.overrides)) for place in places}
+    return {
+        (*found.common, *(each for option in place.values() for each in option.overrides))
+        for place in places
+    }
 
 
 def test_every_option_of_every_experiment_composes_and_passes_the_checks_before_a_run():
@@ -60,7 +63,9 @@ def test_every_option_of_every_experiment_composes_and_passes_the_checks_before_
     wanted = set().union(*(options_once(name, quick) for name in NAMES for quick in (False, True)))
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for overrides in sorted(wanted):
-            config = OmegaConf.to_container(compose("train", overrides=list(overrides)), resolve=False)
+            config = OmegaConf.to_container(
+                compose("train", overrides=list(overrides)), resolve=False
+            )
             check(config, TRAINING, EVALUATION)
             rehearse(config)
 
@@ -90,7 +95,9 @@ def test_the_paper_s_figures_are_those_of_its_tables():
     row = next(line for line in text.splitlines() if line.startswith("| MoSA"))
     values = [[float(v) for v in cell.split("/")] for cell in row.split("|")[2:-1]]
     assert values[-1] == [31.35, 92.3]  # printed beside them
-    assert np.mean([psnr for psnr, _ in values[:-1]]) == pytest.approx(31.52, abs=0.01)  # the paper's own mean is not theirs
+    assert np.mean([psnr for psnr, _ in values[:-1]]) == pytest.approx(
+        31.52, abs=0.01
+    )  # the paper's own mean is not theirs
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -115,7 +122,10 @@ def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
         (["table_time", "--jobs", "0"], "--jobs"),
         (["table_time", "--seeds", "a"], "--seeds: expected whole numbers"),
         (["table_time", "--only", "shoe=1"], "--only: expected AXIS=NAME"),
-        (["table_time", "--only", "scene=boat"], "--only scene: expected some of rabbit, found 'boat'"),
+        (
+            ["table_time", "--only", "scene=boat"],
+            "--only scene: expected some of rabbit, found 'boat'",
+        ),
     ):
         with pytest.raises(ConfigError, match=message):
             run(arguments([*words, "--dry-run", "--runs", str(tmp_path)]))
@@ -124,11 +134,16 @@ def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
 # ------------------------------------------------------------------------------------------------ jobs
 def test_cells_that_need_the_same_run_share_it(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert len(jobs) == 2 * 2 * 2 and len({job.folder for job in jobs}) == 8  # operator and direct, scenes, seeds
+    assert (
+        len(jobs) == 2 * 2 * 2 and len({job.folder for job in jobs}) == 8
+    )  # operator and direct, scenes, seeds
     shared = [job for job in jobs if len(job.places) == 2]
     assert len(shared) == 4 and {p["method"].name for p in shared[0].places} == {"prior", "ours"}
     again = jobs_of(experiment(common=("x=1",)), tmp_path, ["y=2"])
-    assert all("x=1" in job.overrides and "y=2" in job.overrides and job.overrides[-1].startswith("seed=") for job in again)
+    assert all(
+        "x=1" in job.overrides and "y=2" in job.overrides and job.overrides[-1].startswith("seed=")
+        for job in again
+    )
     assert not {job.folder for job in again} & {job.folder for job in jobs}
 
 
@@ -149,26 +164,47 @@ def test_what_is_said_of_one_experiment_holds_for_that_one(tmp_path):
     only = pairs(["method=box", "other:method=ours", "scene=a"], both)
     assert [[job.overrides[0] for job in jobs_of(narrowed(each, only, (0,)), tmp_path)] for each in both] == [
         ["adapter=direct"], ["adapter=operator"]]  # fmt: skip
-    with pytest.raises(ConfigError, match=r"--only: expected AXIS=NAME,NAME with an axis of method, scene, or EXPERIMENT:AXIS"):
+    with pytest.raises(
+        ConfigError,
+        match=r"--only: expected AXIS=NAME,NAME with an axis of method, scene, or EXPERIMENT:AXIS",
+    ):
         pairs(["nothing:method=ours"], both)
 
 
 def test_the_estimate_learns_from_the_jobs_that_are_complete(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert estimate(jobs, [None], 1)[0][-1] == "8 jobs, 8 to run, about 36.0 minutes with 1 side by side"  # 4 of 3, 4 of 6
+    assert (
+        estimate(jobs, [None], 1)[0][-1]
+        == "8 jobs, 8 to run, about 36.0 minutes with 1 side by side"
+    )  # 4 of 3, 4 of 6
     assert "about 6.0 minutes with 2" in estimate(jobs, [0, 1], 1)[0][-1]
     write_metrics(jobs[0], **{"time/fit_s": 300.0})  # six minutes in place of three
-    assert estimate(jobs, [None], 1)[0][-1] == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
+    assert (
+        estimate(jobs, [None], 1)[0][-1]
+        == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
+    )
 
 
 def test_the_estimate_knows_the_longest_job_and_what_shares_a_gpu(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[0][-1]  # none is shorter for the others
+    assert (
+        "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[0][-1]
+    )  # none is shorter for the others
     assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 8" in estimate(jobs, [0, 1], 4)[0][-1]
-    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 40" in estimate(jobs, [0, 1], 20)[0][-1]  # there are four on each
-    own = experiment(axes={**experiment().axes, "method": (Option("box", ("adapter=direct",), cost={"gpu": 5.0}),)})
+    assert (
+        f"about {2 * (1 + 3 * CROWD):.1f} minutes with 40" in estimate(jobs, [0, 1], 20)[0][-1]
+    )  # there are four on each
+    own = experiment(
+        axes={
+            **experiment().axes,
+            "method": (Option("box", ("adapter=direct",), cost={"gpu": 5.0}),),
+        }
+    )
     one = jobs_of(narrowed(own, {"scene": ["a"]}, (0,)), tmp_path / "own")
-    assert "about 3.0 minutes" in estimate(one, [None], 1)[0][-1] and "about 5.0 minutes" in estimate(one, [0], 1)[0][-1]
+    assert (
+        "about 3.0 minutes" in estimate(one, [None], 1)[0][-1]
+        and "about 5.0 minutes" in estimate(one, [0], 1)[0][-1]
+    )
 
 
 def test_what_runs_alone_comes_last_and_without_a_crowd(tmp_path):
@@ -181,7 +217,9 @@ def test_what_runs_alone_comes_last_and_without_a_crowd(tmp_path):
     assert f"about {crowded + 3:.1f} minutes with 8" in estimate(both, [0, 1], 4)[0][-1]
 
 
-def test_the_jobs_of_what_is_named_first_begin_first_and_those_of_one_word_the_longest_first(tmp_path):
+def test_the_jobs_of_what_is_named_first_begin_first_and_those_of_one_word_the_longest_first(
+    tmp_path,
+):
     jobs = [replace(job, turn=int(job.seed == 0)) for job in jobs_of(experiment(), tmp_path)]
     order = [(job.seed, job.minutes["gpu"]) for job in in_turn(jobs, [0])]
     assert order == [(seed, minutes) for seed in (1, 0) for minutes in (2.0, 2.0, 1.0, 1.0)]
@@ -230,7 +268,9 @@ def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_
     for line in (tmp_path / "log.txt").read_text().splitlines():
         word, name = line.split()
         if word == "begin":
-            assert firsts[name] in done or firsts[name] not in [firsts[other] for other in now], "two make the same reconstruction"
+            assert firsts[name] in done or firsts[name] not in [firsts[other] for other in now], (
+                "two make the same reconstruction"
+            )
             now.append(name)
         else:
             now.remove(name)
@@ -263,7 +303,9 @@ def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, f
 
     begun = processes.begun
     monkeypatch.setattr(running, "begun", stopped)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that put pytest into the background had it ignored
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell that put pytest into the background had it ignored
     try:
         with pytest.raises(KeyboardInterrupt):
             running.run_jobs(jobs_of(experiment(), tmp_path), [None], 1)
@@ -273,9 +315,18 @@ def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, f
 
 
 def test_what_is_held_out_or_learned_from_changes_no_film(tmp_path):
-    scenes = tuple(Option(name, ("scene=a", *more)) for name, more in (
-        ("all", ()), ("future", ("scene.holdout_frames=5",)), ("two", ("scene.also_train=[b]",)), ("other", ("scene.material=c",))))
-    made = experiment(axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,))
+    scenes = tuple(
+        Option(name, ("scene=a", *more))
+        for name, more in (
+            ("all", ()),
+            ("future", ("scene.holdout_frames=5",)),
+            ("two", ("scene.also_train=[b]",)),
+            ("other", ("scene.material=c",)),
+        )
+    )
+    made = experiment(
+        axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,)
+    )
     jobs = jobs_of(made, tmp_path)
     assert [job.film for job in jobs] == ["scene=a"] * 3 + ["scene=a scene.material=c"]
     assert len({job.first for job in jobs}) == 4
@@ -283,10 +334,15 @@ def test_what_is_held_out_or_learned_from_changes_no_film(tmp_path):
 
 def test_what_shares_films_begins_when_these_are_made_and_reconstructs_for_itself(tmp_path, fake):
     """Two seeds of a scene have the same films; each would make all of them."""
-    fake(FAKE.replace("time.sleep(0.3)", """time.sleep(0.6)
+    fake(
+        FAKE.replace(
+            "time.sleep(0.3)",
+            """time.sleep(0.6)
     open(log, "a").write("filmed it\\n")
     print("data took 1 s", flush=True)
-    time.sleep(1.5)"""))
+    time.sleep(1.5)""",
+        )
+    )
     jobs = jobs_of(narrowed(experiment(), {"scene": ["a"], "method": ["ours"]}, (0, 1)), tmp_path)
     assert jobs[0].film == jobs[1].film and jobs[0].first != jobs[1].first
     running.run_jobs(jobs, [None], 2)
@@ -298,10 +354,15 @@ def test_what_is_said_at_the_end_is_of_the_goes_of_this_command_alone(tmp_path, 
     """A quick variant has the same folder by default; its jobs and its estimate are others."""
     fake()
     options = arguments(["made", "--runs", str(tmp_path)])
-    Clock(tmp_path, Go("2026-01-01 00:00:00", "mosa-experiment made --quick", "abc", 1, 1, 7, 0.6)).ended(failed=False)
+    Clock(
+        tmp_path, Go("2026-01-01 00:00:00", "mosa-experiment made --quick", "abc", 1, 1, 7, 0.6)
+    ).ended(failed=False)
     jobs = jobs_of(narrowed(experiment(), {"scene": ["a"], "method": ["ours"]}, (0,)), tmp_path)
     assert run_counted(options, jobs, [None], 30.0, lambda job: None) == {}
-    assert "1 jobs in one go: 0.00 hours of a device; the first go began with 1 to run and expected 0.50" in capsys.readouterr().out
+    assert (
+        "1 jobs in one go: 0.00 hours of a device; the first go began with 1 to run and expected 0.50"
+        in capsys.readouterr().out
+    )
 
 
 def test_every_gpu_has_its_own_jobs(tmp_path, fake, monkeypatch):
@@ -309,14 +370,22 @@ def test_every_gpu_has_its_own_jobs(tmp_path, fake, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
     jobs = [job for job in jobs_of(experiment(), tmp_path) if "operator" in job.folder.name]
     assert running.run_jobs(jobs, [0, 1], 1) == {}
-    assert {json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs} == {"4", "7"}
+    assert {json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs} == {
+        "4",
+        "7",
+    }
 
 
 def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path, fake, monkeypatch):
     fake()
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     scenes = tuple(Option(name, (f"scene={name}",)) for name in "abcd")
-    jobs = jobs_of(experiment(axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,)), tmp_path)
+    jobs = jobs_of(
+        experiment(
+            axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,)
+        ),
+        tmp_path,
+    )
     assert running.run_jobs(jobs, [0, 1], 4) == {}
     taken = [json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs]
     assert sorted(taken) == ["0", "0", "1", "1"]
@@ -324,15 +393,23 @@ def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path,
 
 def test_a_job_that_runs_alone_has_its_device_to_itself(tmp_path, fake):
     fake()
-    scenes = {"scene": tuple(Option(name, (f"scene={name}",)) for name in "abcd"), "method": (Option("ours", ()),)}
-    company, timed = (jobs_of(experiment(axes=scenes, seeds=(0,), alone=alone), tmp_path) for alone in (False, True))
+    scenes = {
+        "scene": tuple(Option(name, (f"scene={name}",)) for name in "abcd"),
+        "method": (Option("ours", ()),),
+    }
+    company, timed = (
+        jobs_of(experiment(axes=scenes, seeds=(0,), alone=alone), tmp_path)
+        for alone in (False, True)
+    )
     assert running.run_jobs([*timed, *company], [None], 3) == {}
     now, most = [], {"alone": 0, "in company": 0}
     for line in (tmp_path / "log.txt").read_text().splitlines():
         word, name = line.split()
         now.append(name) if word == "begin" else now.remove(name)
         alone = any(each.startswith("alone") for each in now)
-        most["alone" if alone else "in company"] = max(most["alone" if alone else "in company"], len(now))
+        most["alone" if alone else "in company"] = max(
+            most["alone" if alone else "in company"], len(now)
+        )
     assert most == {"alone": 1, "in company": 3}
 
 
@@ -345,7 +422,10 @@ def test_a_table_has_means_and_spreads_over_seeds_and_the_mean_over_columns_that
     assert rows["ours"]["a"] == Cell(pytest.approx(11.0), pytest.approx(math.sqrt(2)), 2)
     assert rows["prior"]["a"] == Cell(pytest.approx(20.0), pytest.approx(0.0), 2)
     assert rows["box"]["b"] is None
-    assert rows["ours"]["mean"] == Cell(pytest.approx(21.0), pytest.approx(math.sqrt(2)), 2) and rows["box"]["mean"] is None
+    assert (
+        rows["ours"]["mean"] == Cell(pytest.approx(21.0), pytest.approx(math.sqrt(2)), 2)
+        and rows["box"]["mean"] is None
+    )
     assert best_of(rows, "a", "least") in ("ours", "box") and best_of(rows, "b", "least") == "prior"
     assert best_of(rows, "a", None) is None
 
@@ -361,37 +441,60 @@ def test_what_failed_or_diverged_is_not_what_was_not_run(tmp_path):
                  if place["scene"].name == "a" and place["method"].name == "ours")  # fmt: skip
     write_metrics(ended, rms=math.inf, prior=0.020)
     rows = table(found, records_of(jobs), found.figures[1])
-    assert rows["box"]["b"].text(1) == "failed" and rows["ours"]["a"].text(1) == "diverged" and rows["ours"]["a"].sd is None
-    assert rows["ours"]["mean"] is None and best_of(rows, "a", "least") != "ours" and best_of(rows, "b", "least") == "prior"
+    assert (
+        rows["box"]["b"].text(1) == "failed"
+        and rows["ours"]["a"].text(1) == "diverged"
+        and rows["ours"]["a"].sd is None
+    )
+    assert (
+        rows["ours"]["mean"] is None
+        and best_of(rows, "a", "least") != "ours"
+        and best_of(rows, "b", "least") == "prior"
+    )
     page = write_results(found, jobs, tmp_path / "results", "the command").read_text()
-    assert f"failed: {missing[0].folder.name} (" in page and "): SimulationDiverged: the step is too large" in page
+    assert (
+        f"failed: {missing[0].folder.name} (" in page
+        and "): SimulationDiverged: the step is too large" in page
+    )
     assert "not run: " in page  # the other seed of it
     again = read_tables(tmp_path / "results" / f"{found.name}.json")[0][found.figures[1].label]
     assert again["box"]["b"].text(1) == "failed" and again["ours"]["a"].text(1) == "diverged"
 
 
-def test_what_was_identified_before_the_adapter_has_its_own_name_and_infinite_figures_are_read(tmp_path):
-    found = experiment(figures=(Figure("E", "id/E", 1e-5), Figure("growth", "id/growth_per_period")), seeds=(0,))
+def test_what_was_identified_before_the_adapter_has_its_own_name_and_infinite_figures_are_read(
+    tmp_path,
+):
+    found = experiment(
+        figures=(Figure("E", "id/E", 1e-5), Figure("growth", "id/growth_per_period")), seeds=(0,)
+    )
     jobs = jobs_of(found, tmp_path)
     for job in jobs:
         write_metrics(job, **{"id/E": 3e5, "id_prior/E": 2e5, "id/growth_per_period": "Infinity"})
     rows = table(found, records_of(jobs), found.figures[0])
-    assert rows["prior"]["a"].mean == pytest.approx(2.0) and rows["ours"]["a"].mean == pytest.approx(3.0)
+    assert rows["prior"]["a"].mean == pytest.approx(2.0) and rows["ours"][
+        "a"
+    ].mean == pytest.approx(3.0)
     assert rows["ours"]["a"].sd is None and rows["ours"]["a"].text(2) == "3.00"
     assert table(found, records_of(jobs), found.figures[1])["ours"]["a"].text(2) == "diverged"
 
 
 def test_the_page_says_where_its_figures_come_from_and_what_is_missing(tmp_path):
     found, jobs = made_up(tmp_path / "runs")
-    page = write_results(replace(found, printed="generalisation"), jobs, tmp_path / "results", "the command")
+    page = write_results(
+        replace(found, printed="generalisation"), jobs, tmp_path / "results", "the command"
+    )
     text = page.read_text()
     for part in ("| ours ", "11.0 ± 1.4", "`the command`", "seeds: 0, 1", "a machine", "6 of 8 jobs complete",
                  "12.0 minutes", "The paper prints", "31.35 / 92.3", "made.png"):  # fmt: skip
         assert part in text, part
     assert text.count("- not run: ") == 2
-    assert (tmp_path / "results" / "made.png").stat().st_size > 1000 and (tmp_path / "results" / "made.pdf").is_file()
+    assert (tmp_path / "results" / "made.png").stat().st_size > 1000 and (
+        tmp_path / "results" / "made.pdf"
+    ).is_file()
     lines = (tmp_path / "results" / "made.csv").read_text().splitlines()
-    assert lines[0] == "method,scene,seed,label,figure,value,run" and len(lines) == 1 + 3 * 2 * 2 * 2
+    assert (
+        lines[0] == "method,scene,seed,label,figure,value,run" and len(lines) == 1 + 3 * 2 * 2 * 2
+    )
     tex = (tmp_path / "results" / "made.tex").read_text()
     assert tex.count(r"\begin{tabular}{lccc}") == 2 and r"$\pm$" in tex and r"\textbf{" in tex
 
@@ -422,13 +525,18 @@ def test_results_that_cannot_be_written_leave_the_ones_before(tmp_path, monkeypa
 def test_nothing_complete_is_a_page_without_figures(tmp_path):
     found = experiment()
     page = write_results(found, jobs_of(found, tmp_path), tmp_path / "results", "")
-    assert "0 of 8 jobs complete" in page.read_text() and not (tmp_path / "results" / "made.png").exists()
+    assert (
+        "0 of 8 jobs complete" in page.read_text()
+        and not (tmp_path / "results" / "made.png").exists()
+    )
 
 
 def test_a_damaged_metrics_file_is_named(tmp_path):
     _, jobs = made_up(tmp_path)
     (jobs[0].folder / "metrics.json").write_text("{")
-    with pytest.raises(DataError, match=r"metrics\.json.*belongs to the job adapter=operator scene=a seed=0"):
+    with pytest.raises(
+        DataError, match=r"metrics\.json.*belongs to the job adapter=operator scene=a seed=0"
+    ):
         records_of(jobs)
 
 
@@ -442,9 +550,22 @@ def test_a_time_that_a_kill_left_half_written_is_taken_from_the_figures(tmp_path
 
 
 def test_the_command_is_written_without_folders_of_this_machine():
-    words = ["table_time", "--quick", "--runs", "/a/b", "--results", "/c", "--only", "method=prior only", "--set", "x=1"]
+    words = [
+        "table_time",
+        "--quick",
+        "--runs",
+        "/a/b",
+        "--results",
+        "/c",
+        "--only",
+        "method=prior only",
+        "--set",
+        "x=1",
+    ]
     options = arguments(words)
-    assert shown(options) == "mosa-experiment table_time --quick --only 'method=prior only' --set x=1"
+    assert (
+        shown(options) == "mosa-experiment table_time --quick --only 'method=prior only' --set x=1"
+    )
 
 
 def test_errors_frame_by_frame_are_those_of_the_motions(tmp_path):
@@ -467,7 +588,9 @@ def test_errors_frame_by_frame_are_those_of_the_motions(tmp_path):
 
 # ------------------------------------------------------------------------------------------------ one for real
 @pytest.mark.slow
-def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path, capsys, monkeypatch):
+def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(
+    cache, tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr(specimens, "ANGLES", 4)
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
              "--only", "method=ours"]  # fmt: skip
@@ -482,28 +605,53 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path,
     assert (results / "figure_heterogeneity_quick_factor.png").is_file()
     assert run(arguments(words)) == 0
     assert "0 to run" in capsys.readouterr().out
-    one = narrowed(load_experiment(PAPER, "table_generalisation", quick=True), {"method": ["ours"]}, (0,))
-    text, pictures = ANALYSES["directions"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
+    one = narrowed(
+        load_experiment(PAPER, "table_generalisation", quick=True), {"method": ["ours"]}, (0,)
+    )
+    text, pictures = ANALYSES["directions"](
+        one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law"
+    )
     assert "| tiny  | ours" in text and len(pictures) == 1
-    rows = [line.split(",") for line in (tmp_path / "law_directions.csv").read_text().splitlines()[1:]]
+    rows = [
+        line.split(",") for line in (tmp_path / "law_directions.csv").read_text().splitlines()[1:]
+    ]
     (tiny,) = one.axes["scene"]
-    two = replace(one, axes=one.axes | {"scene": (tiny, replace(tiny, name="again"))})  # the same run in two columns
-    text, _ = ANALYSES["compression"](two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law")
-    assert "| tiny  | ours" in text and "| again | ours" in text and (tmp_path / "law_plates.png").is_file()
-    plates = [line.split(",") for line in (tmp_path / "law_plates.csv").read_text().splitlines()[1:]]
-    assert [row[:2] for row in plates[::5]] == [["tiny", "ours"], ["again", "ours"]]  # four directions and the fibres'
-    assert len(plates) == 2 * 5 and [row[2:] for row in plates[:5]] == [row[2:] for row in plates[5:]]
+    two = replace(
+        one, axes=one.axes | {"scene": (tiny, replace(tiny, name="again"))}
+    )  # the same run in two columns
+    text, _ = ANALYSES["compression"](
+        two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law"
+    )
+    assert (
+        "| tiny  | ours" in text
+        and "| again | ours" in text
+        and (tmp_path / "law_plates.png").is_file()
+    )
+    plates = [
+        line.split(",") for line in (tmp_path / "law_plates.csv").read_text().splitlines()[1:]
+    ]
+    assert [row[:2] for row in plates[::5]] == [
+        ["tiny", "ours"],
+        ["again", "ours"],
+    ]  # four directions and the fibres'
+    assert len(plates) == 2 * 5 and [row[2:] for row in plates[:5]] == [
+        row[2:] for row in plates[5:]
+    ]
     pressed = [float(row[4]) for row in plates[:5]]
-    assert max(pressed) / min(pressed) == pytest.approx(1.6, rel=0.1)  # of the truth, between plates
+    assert max(pressed) / min(pressed) == pytest.approx(
+        1.6, rel=0.1
+    )  # of the truth, between plates
     for job in jobs_of(two, tmp_path / "runs", more):
         (job.folder / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
-    kept, _ = ANALYSES["compression"](two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law")
+    kept, _ = ANALYSES["compression"](
+        two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law"
+    )
     assert kept == text  # what was measured is in the run's folder
     true = [float(row[5]) for row in rows]
-    assert true[0] / true[18] == pytest.approx(1.6, rel=0.01)  # along the rabbit's fibres and across
+    assert true[0] / true[18] == pytest.approx(
+        1.6, rel=0.01
+    )  # along the rabbit's fibres and across
     assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
-
-
 
 
 def test_a_claim_of_a_figure_or_row_that_is_not_there_is_a_mistake_of_the_file():
@@ -516,4 +664,6 @@ def test_a_claim_of_a_figure_or_row_that_is_not_there_is_a_mistake_of_the_file()
     for name in NAMES:  # rows that the claims name are rows
         made = load_experiment(PAPER, name)
         rows = {option.name for option in made.axes[made.rows]}
-        assert {row for claim in made.claims if claim.row for row in (claim.row, *claim.against)} <= rows, name
+        assert {
+            row for claim in made.claims if claim.row for row in (claim.row, *claim.against)
+        } <= rows, name

@@ -22,14 +22,18 @@ def test_what_every_go_took_is_kept_beside_that_of_the_ones_before(tmp_path, mon
     before, now = replace(FIRST, minutes=30.0, complete=1, failed=1), replace(later, minutes=1.0)
     assert again.write() == [before, now] == read_goes(tmp_path)
     assert said_of(read_goes(tmp_path)) == (
-        "1 jobs in 2 goes: 1.03 hours of a device; the first go began with 10 to run and expected 2.00 for them")
+        "1 jobs in 2 goes: 1.03 hours of a device; the first go began with 10 to run and expected 2.00 for them"
+    )
 
 
 def test_two_commands_in_the_same_folder_have_a_row_each(tmp_path):
     one, other = (Clock(tmp_path, replace(FIRST, command=command)) for command in ("one", "other"))
     for clock in (one, other, one):
         clock.ended(failed=False)
-    assert sorted((go.command, go.complete) for go in read_goes(tmp_path)) == [("one", 2), ("other", 1)]
+    assert sorted((go.command, go.complete) for go in read_goes(tmp_path)) == [
+        ("one", 2),
+        ("other", 1),
+    ]
 
 
 def test_a_file_that_is_damaged_is_named(tmp_path):

@@ -33,14 +33,18 @@ def program(tmp_path, monkeypatch):
 
 def test_a_job_has_its_words_its_environment_and_its_screen(tmp_path, program):
     for words, code in (["a=1"], 0), (["fail"], 7):
-        process = processes.begun(program, words, tmp_path / "screen.log", os.environ | {"COLOUR": "green"})
+        process = processes.begun(
+            program, words, tmp_path / "screen.log", os.environ | {"COLOUR": "green"}
+        )
         process.join(60)
         assert process.exitcode == code
         said = (tmp_path / "screen.log").read_text()  # that of the last one alone
         assert said.startswith(f"words {words} colour green") and said.endswith("below python\n")
 
 
-def test_what_its_parent_no_longer_has_set_a_job_does_not_have_either(tmp_path, program, monkeypatch):
+def test_what_its_parent_no_longer_has_set_a_job_does_not_have_either(
+    tmp_path, program, monkeypatch
+):
     monkeypatch.delenv("COLOUR", raising=False)
     process = processes.begun(program, [], tmp_path / "screen.log", os.environ)
     process.join(60)
@@ -49,7 +53,9 @@ def test_what_its_parent_no_longer_has_set_a_job_does_not_have_either(tmp_path, 
 
 def test_a_job_that_is_stopped_ends_at_once(tmp_path, program):
     process = processes.begun(program, ["wait"], tmp_path / "screen.log", os.environ)
-    while "below" not in ((tmp_path / "screen.log").read_text() if (tmp_path / "screen.log").is_file() else ""):
+    while "below" not in (
+        (tmp_path / "screen.log").read_text() if (tmp_path / "screen.log").is_file() else ""
+    ):
         time.sleep(0.05)
     began = time.perf_counter()
     process.terminate()
@@ -66,7 +72,12 @@ def test_what_the_server_imports_begins_neither_threads_nor_warp_nor_cuda():
         "tasks = [line for line in open('/proc/self/status') if line.startswith('Threads')]\n"
         "print(context.runtime is None, torch.cuda.is_initialized(), threading.active_count(), tasks[0].split()[1])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
     assert found.stdout.split() == ["True", "False", "1", "1"], found.stderr[-500:]
 
 
@@ -105,7 +116,9 @@ def test_a_stop_that_a_job_is_sent_before_it_answers_any_is_not_lost(tmp_path):
     """Its server answers none, and a fork begins as its server is."""
     (tmp_path / "looking_job.py").write_text(LOOK)
     (tmp_path / "parent.py").write_text(AT_ONCE_STOPPED)
-    found = subprocess.run([sys.executable, "parent.py"], cwd=tmp_path, capture_output=True, text=True, timeout=500)
+    found = subprocess.run(
+        [sys.executable, "parent.py"], cwd=tmp_path, capture_output=True, text=True, timeout=500
+    )
     assert found.stdout.split() == ["-15"] * 5, found.stderr[-500:]
 
 
@@ -154,7 +167,10 @@ def test_a_stop_of_the_whole_group_of_processes_waits_for_what_jobs_save(tmp_pat
                           env=os.environ | {"PYTHONPATH": str(tmp_path)}) as parent:  # fmt: skip
         log = tmp_path / "screen.log"
         began = time.perf_counter()
-        while "ready" not in (log.read_text() if log.is_file() else "") and time.perf_counter() - began < 60:
+        while (
+            "ready" not in (log.read_text() if log.is_file() else "")
+            and time.perf_counter() - began < 60
+        ):
             time.sleep(0.05)
         os.killpg(parent.pid, 15)
         parent.wait(30)

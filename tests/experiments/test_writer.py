@@ -20,7 +20,11 @@ def job(folder, complete=False) -> Job:
 def planned(tmp_path):
     shared = job(tmp_path / "shared")
     old = job(tmp_path / "old", complete=True)
-    return {"one": [job(tmp_path / "a"), shared], "two": [shared, old], "three": [job(tmp_path / "b")]}
+    return {
+        "one": [job(tmp_path / "a"), shared],
+        "two": [shared, old],
+        "three": [job(tmp_path / "b")],
+    }
 
 
 def test_an_experiment_is_written_when_its_last_job_has_ended_and_the_rest_at_the_end(planned):

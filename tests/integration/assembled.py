@@ -21,7 +21,14 @@ KNOWN: dict[tuple, Start] = {}
 
 def start_once(shape: RestShape, seen: Appearance, scene: Scene, **named: bool) -> Start:
     means, colors = (getattr(seen.splats, name).numpy().tobytes() for name in ("means", "colors"))
-    key = (scene.sequence, scene.fingerprint, shape.rest.numpy().tobytes(), means, colors, *named.items())
+    key = (
+        scene.sequence,
+        scene.fingerprint,
+        shape.rest.numpy().tobytes(),
+        means,
+        colors,
+        *named.items(),
+    )
     if key not in KNOWN:
         KNOWN[key] = sequence_start(shape, seen, scene, **named)
     return KNOWN[key]
@@ -30,7 +37,9 @@ def start_once(shape: RestShape, seen: Appearance, scene: Scene, **named: bool) 
 def made(cache: Path, *overrides: str, taught: Collection[str] = ()) -> Run:
     """cache: folder of the scene and its reconstruction; taught: further sequences."""
     names = f"scene.also_train=[{','.join(taught)}]"
-    run = assemble(compose("debug=default", f"scene.cache={cache}", names, *overrides), held_out=False)
+    run = assemble(
+        compose("debug=default", f"scene.cache={cache}", names, *overrides), held_out=False
+    )
     with patch.object(datamodule, "sequence_start", start_once):
         _ = run.data.starts
     return run

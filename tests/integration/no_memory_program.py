@@ -19,12 +19,18 @@ from mosa.system import refused
 from mosa.training import datamodule
 from mosa.types import Appearance, Scene
 
-TORCH = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 139.80 GiB")
+TORCH = torch.OutOfMemoryError(
+    "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 139.80 GiB"
+)
 WARP = RuntimeError("Failed to allocate 4000 bytes on device 'cuda:0'")
 MODULE = Exception("Failed to load CUDA module 'transfer' (out of resources)")
 """Of Warp, which raises no other type there."""
-HANDLE = RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED when calling `cublasCreate(handle)`")
-ALLOC = RuntimeError("cusolver error: CUSOLVER_STATUS_ALLOC_FAILED, when calling `cusolverDnCreate(handle)`")
+HANDLE = RuntimeError(
+    "CUDA error: CUBLAS_STATUS_NOT_INITIALIZED when calling `cublasCreate(handle)`"
+)
+ALLOC = RuntimeError(
+    "cusolver error: CUSOLVER_STATUS_ALLOC_FAILED, when calling `cusolverDnCreate(handle)`"
+)
 
 cache, folder = Path(sys.argv[1]), Path(sys.argv[2])
 SMALL = ["debug=default", f"scene.cache={cache}", "evaluation.video=false", "logger=none"]
@@ -76,7 +82,11 @@ def tried(command: str, words: list[str], place: str, error: Exception) -> None:
     *above, name = path.split(".")
     for part in above:
         target = getattr(target, part)
-    broken = Later(target.training_step, error) if name == "training_step" else (lambda *_, **__: raised(error))
+    broken = (
+        Later(target.training_step, error)
+        if name == "training_step"
+        else (lambda *_, **__: raised(error))
+    )
     sys.argv = [command, *words]
     screen, code = io.StringIO(), None
     with patch.object(target, name, broken), contextlib.redirect_stderr(screen):
@@ -106,6 +116,9 @@ def start_once(body: Body, seen: Appearance, scene: Scene, **named: bool) -> Sta
 
 
 if __name__ == "__main__":
-    with patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)), patch.object(datamodule, "sequence_start", start_once):
+    with (
+        patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)),
+        patch.object(datamodule, "sequence_start", start_once),
+    ):
         for one in PLACES:
             tried(*one)

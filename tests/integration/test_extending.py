@@ -37,7 +37,13 @@ def written(folder: Path) -> list[str]:
 def recorded(folder: Path, cache: Path) -> Path:
     """The tiny scene in the page's format."""
     scene = load_scene(format="builtin", name="tiny", cache=cache)
-    kept = {"images": scene.images, "mattes": scene.mattes, "K": scene.cameras.K, "w2c": scene.cameras.w2c, "times": scene.times}
+    kept = {
+        "images": scene.images,
+        "mattes": scene.mattes,
+        "K": scene.cameras.K,
+        "w2c": scene.cameras.w2c,
+        "times": scene.times,
+    }
     np.savez(folder / "fall.npz", **{name: value.numpy() for name, value in kept.items()})
     return folder / "fall.npz"
 
@@ -60,7 +66,10 @@ def test_the_law_is_learned_with_its_direction(run):
     start = np.array([1, 0.2, 0]) / np.hypot(1, 0.2)
     for prefix in ("id_prior", "id"):
         fibre = np.array([figures[f"{prefix}/fibre_{axis}"] for axis in "xyz"])
-        assert np.linalg.norm(fibre) == pytest.approx(1, abs=1e-6) and 1e-3 < np.linalg.norm(fibre - start) < 0.5
+        assert (
+            np.linalg.norm(fibre) == pytest.approx(1, abs=1e-6)
+            and 1e-3 < np.linalg.norm(fibre - start) < 0.5
+        )
         assert figures[f"{prefix}/fibre_stiffness"] > 0
         assert figures[f"{prefix}/fibre_stiffness"] != pytest.approx(2e3, rel=1e-3)
 
@@ -68,7 +77,12 @@ def test_the_law_is_learned_with_its_direction(run):
 def test_adapter_and_term_are_in_the_fit(run):
     lines = next((run / "run").rglob("metrics.csv")).read_text()
     header = lines.splitlines()[0].split(",")
-    assert {"loss_raw/volume", "loss_weighted/volume", "loss_raw/operator", "adapter/mean_abs_C"} <= set(header)
+    assert {
+        "loss_raw/volume",
+        "loss_weighted/volume",
+        "loss_raw/operator",
+        "adapter/mean_abs_C",
+    } <= set(header)
     figures = json.loads((run / "run" / "metrics.json").read_text())
     assert 0 < figures["train/mean_abs_C"] < 0.2
 
@@ -100,10 +114,16 @@ def test_a_checkpoint_needs_the_package_and_does_not_import_it(run):
                          environment=os.environ | {"PYTHONPATH": f"{run}{os.pathsep}{ROOT}"})  # fmt: skip
     assert result.returncode == 0, result.stderr[-2000:]
     refused, found = result.stdout.strip().splitlines()[-2:]
-    assert "adapter.name: expected" in refused and "found 'softer'" in refused and "extensions" in refused
+    assert (
+        "adapter.name: expected" in refused
+        and "found 'softer'" in refused
+        and "extensions" in refused
+    )
     flag, *numbers = found.split()
     figures = json.loads((run / "run" / "metrics.json").read_text())
-    assert flag == "True" and [float(n) for n in numbers] == pytest.approx([figures[f"id/fibre_{a}"] for a in "xyz"], abs=1e-6)
+    assert flag == "True" and [float(n) for n in numbers] == pytest.approx(
+        [figures[f"id/fibre_{a}"] for a in "xyz"], abs=1e-6
+    )
 
 
 def test_the_simulator_alone():
@@ -115,9 +135,15 @@ def test_the_simulator_alone():
     assert rollout.x.shape == (26, 13**3, 3) and len(block.strip().splitlines()) <= 12
     height = rollout.x[:, :, 1].mean(1)
     fall = 0.165 - 0.5 * 9.8 * rollout.times[:7].square()
-    torch.testing.assert_close(height[:7], fall, rtol=0, atol=1.5e-3)  # half a substep of gravity early, 0.3 mm in 0.12 s
+    torch.testing.assert_close(
+        height[:7], fall, rtol=0, atol=1.5e-3
+    )  # half a substep of gravity early, 0.3 mm in 0.12 s
     low = int(height.argmin())
-    assert 6 < low < 25 and rollout.x[:, :, 1].min() > -names["dx"] / 2 and height[low:].max() > 1.5 * height[low]
+    assert (
+        6 < low < 25
+        and rollout.x[:, :, 1].min() > -names["dx"] / 2
+        and height[low:].max() > 1.5 * height[low]
+    )
 
 
 BASELINE = """
@@ -141,7 +167,9 @@ def test_the_baseline_stands_in_for_the_law(tmp_path):
     written(tmp_path)
     path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "modules")))
     (tmp_path / "baseline.py").write_text(BASELINE)
-    result = forked.call(str(tmp_path / "baseline.py"), environment=os.environ | {"PYTHONPATH": path})
+    result = forked.call(
+        str(tmp_path / "baseline.py"), environment=os.environ | {"PYTHONPATH": path}
+    )
     assert result.returncode == 0, result.stderr[-2000:]
     other_prior, other_number, slope = map(float, result.stdout.split()[-3:])
     assert other_prior < 1e-9 < 1e-4 < other_number and abs(slope) > 1e-4

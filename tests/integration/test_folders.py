@@ -32,7 +32,9 @@ def call(script, folder, *overrides):
 def wider(scene, camera, margin):
     """The scene's images of one camera surrounded by white, as a camera with a larger sensor takes them; (images, mattes, K)."""
     pad = (margin, margin)
-    images = torch.nn.functional.pad(scene.images[camera].movedim(-1, 1), pad + pad, value=1.0).movedim(1, -1)
+    images = torch.nn.functional.pad(
+        scene.images[camera].movedim(-1, 1), pad + pad, value=1.0
+    ).movedim(1, -1)
     K = scene.cameras.K.clone()
     K[:, :2, 2] += margin
     return images, torch.nn.functional.pad(scene.mattes[camera], pad + pad), K
@@ -43,13 +45,23 @@ def capture(scene, folder, camera=0, margin=4):
     export_transforms(scene, folder)
     images, mattes, K = wider(scene, camera, margin)
     size = scene.cameras.width + 2 * margin
-    larger = replace(scene, images=images[None].expand(len(scene.cameras), -1, -1, -1, -1), cameras=replace(
-        scene.cameras, K=K, width=size, height=size), mattes=mattes[None].expand(len(scene.cameras), -1, -1, -1))
+    larger = replace(
+        scene,
+        images=images[None].expand(len(scene.cameras), -1, -1, -1, -1),
+        cameras=replace(scene.cameras, K=K, width=size, height=size),
+        mattes=mattes[None].expand(len(scene.cameras), -1, -1, -1),
+    )
     other = export_transforms(larger, folder.parent / f"{folder.name}_larger")
-    document, wide = (json.loads((place / "transforms.json").read_text()) for place in (folder, other))
+    document, wide = (
+        json.loads((place / "transforms.json").read_text()) for place in (folder, other)
+    )
     name = scene.cameras.names[camera]
     rest = [entry for entry in document["frames"] if entry["camera"] != name]
-    own = [entry | {"file_path": str(other / entry["file_path"])} for entry in wide["frames"] if entry["camera"] == name]
+    own = [
+        entry | {"file_path": str(other / entry["file_path"])}
+        for entry in wide["frames"]
+        if entry["camera"] == name
+    ]
     (folder / "transforms.json").write_text(json.dumps({"frames": own + rest}))
     return folder
 
@@ -64,8 +76,17 @@ def run(tmp_path_factory, cache):
             export_particles(scene.truth.positions, folder / "data" / "ply")
         if sequence == "test_40":
             export_particles(scene.truth.positions, folder / "data" / sequence / "ply")
-    result = call("train.py", folder / "run", *QUICK, f"scene.root={folder}/data", "scene.path=train", "scene.particles=ply",
-                  "scene.also_train=[test_60]", "scene.test=[{path: test_40, name: second}]", f"scene.cache={cache}")
+    result = call(
+        "train.py",
+        folder / "run",
+        *QUICK,
+        f"scene.root={folder}/data",
+        "scene.path=train",
+        "scene.particles=ply",
+        "scene.also_train=[test_60]",
+        "scene.test=[{path: test_40, name: second}]",
+        f"scene.cache={cache}",
+    )
     assert result.returncode == 0, result.stderr[-3000:]
     return folder / "run"
 
@@ -73,20 +94,32 @@ def run(tmp_path_factory, cache):
 def test_how_the_ground_is_touched_is_found_where_nobody_says_it(run):
     """And the twin of the run meets the same ground."""
     figures = json.loads((run / "metrics.json").read_text())
-    tried = {key.split("/")[-1].removesuffix("_m"): value for key, value in figures.items()
-             if key.startswith("id_prior/ground/") and key.endswith("_m")}
-    assert {"sticky", "separate_0.15", "separate_1.2"} <= set(tried) and all(0 < value < 0.1 for value in tried.values())
+    tried = {
+        key.split("/")[-1].removesuffix("_m"): value
+        for key, value in figures.items()
+        if key.startswith("id_prior/ground/") and key.endswith("_m")
+    }
+    assert {"sticky", "separate_0.15", "separate_1.2"} <= set(tried) and all(
+        0 < value < 0.1 for value in tried.values()
+    )
     ground = Twin.load(run / "checkpoints" / "last.ckpt").world.ground
-    assert taken_of(tried) == named(ground) and "Ground: the body" in (run / "results.md").read_text()
+    assert (
+        taken_of(tried) == named(ground) and "Ground: the body" in (run / "results.md").read_text()
+    )
 
 
 def test_a_folder_that_is_held_out_has_figures(run):
     figures = json.loads((run / "metrics.json").read_text())
     for part in ("train", "train/test_60", "test/second"):
         for model in ("", "prior/"):
-            assert 15 < figures[f"{model}{part}/psnr_crop"] < 50 and 0.5 < figures[f"{model}{part}/ssim_crop"] <= 1
+            assert (
+                15 < figures[f"{model}{part}/psnr_crop"] < 50
+                and 0.5 < figures[f"{model}{part}/ssim_crop"] <= 1
+            )
     assert figures["test/psnr_crop"] == figures["test/second/psnr_crop"]
-    assert figures["test/second/cd_m"] > 0 and "train/test_60/cd_m" not in figures  # known particles, beside those images alone
+    assert (
+        figures["test/second/cd_m"] > 0 and "train/test_60/cd_m" not in figures
+    )  # known particles, beside those images alone
     assert not [key for key in figures if key.endswith("rms_m")]
     assert set(np.load(run / "rollout.npz")) >= {"train/x", "train/test_60/x", "test/second/x"}
     assert set(np.load(run / "observed.npz")) >= {"train/x", "train/test_60/x"}

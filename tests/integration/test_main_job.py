@@ -33,7 +33,12 @@ from mosa.viewer.clips import read_run
 
 ROOT = Path(__file__).parents[2]
 FIGURES = (ROOT / "docs" / "figures.md").read_text()
-FEW_FIGURES = ["evaluation.video=false", "evaluation.floor=false", "evaluation.samples=256", "evaluation.assignment=64"]
+FEW_FIGURES = [
+    "evaluation.video=false",
+    "evaluation.floor=false",
+    "evaluation.samples=256",
+    "evaluation.assignment=64",
+]
 """Of runs whose fit is looked at, and not what comes after it."""
 
 
@@ -45,7 +50,9 @@ def cache(cache, tmp_path_factory):
 
 def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str]:
     common = [f"hydra.run.dir={folder}"]
-    common += ["debug=default", f"scene.cache={cache}"] if script == "train.py" else [f"cache={cache}"]
+    common += (
+        ["debug=default", f"scene.cache={cache}"] if script == "train.py" else [f"cache={cache}"]
+    )
     return [sys.executable, script, *common, *overrides]
 
 
@@ -56,7 +63,9 @@ def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("run")
-    given = command("train.py", folder, cache, "logger=[tensorboard,csv]", "callbacks.pictures.every=2")  # as a user begins it
+    given = command(
+        "train.py", folder, cache, "logger=[tensorboard,csv]", "callbacks.pictures.every=2"
+    )  # as a user begins it
     result = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, timeout=400)
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     (folder / "screen").write_text(result.stderr)
@@ -68,36 +77,66 @@ def stepped(tmp_path_factory, cache):
     """A run of Adam in all stages, with steps of two cells of the contact offset."""
     folder = tmp_path_factory.mktemp("stepped")
     adam = [f"+fit.{stage}.optimizer=adam" for stage in ("prior", "prior_eta", "joint")]
-    result = call("train.py", folder, cache, *adam, "fit.prior.lr_contact=2", "logger=[tensorboard,csv]", *FEW_FIGURES)
+    result = call(
+        "train.py",
+        folder,
+        cache,
+        *adam,
+        "fit.prior.lr_contact=2",
+        "logger=[tensorboard,csv]",
+        *FEW_FIGURES,
+    )
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     return folder
 
 
 def test_a_run_leaves_its_outputs(run):
-    figures = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)  # strict JSON
-    for key in ("train/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "test/rms_m", "floor/test/rms_m", "test/psnr_crop",
-                "id_prior/E", "id/E"):
+    figures = json.loads(
+        (run / "metrics.json").read_text(), parse_constant=pytest.fail
+    )  # strict JSON
+    for key in (
+        "train/rms_m",
+        "prior/test/rms_m",
+        "prior_eta/test/rms_m",
+        "test/rms_m",
+        "floor/test/rms_m",
+        "test/psnr_crop",
+        "id_prior/E",
+        "id/E",
+    ):
         assert np.isfinite(figures[key]), key
     rollout = np.load(run / "rollout.npz")
     assert rollout["train/x"].shape[2] == 3 and rollout["train/F"].shape[2:] == (3, 3)
     assert (run / "video.mp4").stat().st_size > 1000
     events = EventAccumulator(str(run / "tensorboard"))
     events.Reload()
-    assert events.Scalars("final/test/rms_m")[-1].value == pytest.approx(figures["test/rms_m"], rel=1e-6)
+    assert events.Scalars("final/test/rms_m")[-1].value == pytest.approx(
+        figures["test/rms_m"], rel=1e-6
+    )
     assert {"_hparams_/session_start_info", "_hparams_/experiment"} <= set(events.summary_metadata)
     assert "seed: 0" in (run / "tensorboard" / "hparams.yaml").read_text()
     # what two samplings of the body are apart: more than nothing, less than the body
     assert 0 < figures["floor/sampling/cd_m"] < 0.1 and 0 < figures["floor/sampling/emd_m"] < 0.1
     assert figures["id/E_ratio"] == pytest.approx(figures["id/E"] / 2e5)
-    assert 0 < figures["id/growth_per_period"] <= 1 and figures["id/stiffness_ratio"] > 1  # it has an energy, and learned something
+    assert (
+        0 < figures["id/growth_per_period"] <= 1 and figures["id/stiffness_ratio"] > 1
+    )  # it has an energy, and learned something
     assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
 
 
 def test_the_log_has_the_lines_that_matter(run):
     log = (run / "train.log").read_text()
-    for line in (f"] mosa {__version__}: debug=default", "scene tiny: synthetic", "] reconstruction took ",
-                 "] body: 200 particles, ", "] start of test/test_60: velocity (", "] stage prior: at most 2 steps",
-                 "] stage joint: ended after 2 steps, ", "| rms [mm]  | adapted ", f"run folder: {run}"):
+    for line in (
+        f"] mosa {__version__}: debug=default",
+        "scene tiny: synthetic",
+        "] reconstruction took ",
+        "] body: 200 particles, ",
+        "] start of test/test_60: velocity (",
+        "] stage prior: at most 2 steps",
+        "] stage joint: ended after 2 steps, ",
+        "| rms [mm]  | adapted ",
+        f"run folder: {run}",
+    ):
         assert line in log, line
     assert log.count("] stage ") == 6
 
@@ -120,7 +159,9 @@ def table_of(folder: Path) -> list[dict[str, str]]:
         rows = list(csv.DictReader(file))
     for tag in (t for t in rows[0] if t not in ("epoch", "step")):
         group = tag.rpartition("/")[0]
-        assert f"`{tag}`" in FIGURES or f"`{group}/<" in FIGURES, f"docs/figures.md does not describe {tag}"
+        assert f"`{tag}`" in FIGURES or f"`{group}/<" in FIGURES, (
+            f"docs/figures.md does not describe {tag}"
+        )
     return rows
 
 
@@ -131,10 +172,15 @@ def test_steps_times_and_pictures_are_logged(run):
     shares = [event.value for event in events.Scalars("newton/share")]
     assert len(shares) == 5 and all(0 <= s <= 1 for s in shares) and max(shares) > 0
     assert [float(row["newton/share"]) for row in rows] == pytest.approx(shares)
-    assert not any(tag.startswith("lr/") for tag in events.Tags()["scalars"])  # no optimiser of torch has stepped
+    assert not any(
+        tag.startswith("lr/") for tag in events.Tags()["scalars"]
+    )  # no optimiser of torch has stepped
     for tag in events.Tags()["scalars"]:  # also Lightning's own
         assert events.summary_metadata[tag].summary_description, tag
-    assert events.summary_metadata["id/E"].summary_description == "parameter E after the step, without eta [Pa]"
+    assert (
+        events.summary_metadata["id/E"].summary_description
+        == "parameter E after the step, without eta [Pa]"
+    )
     pictures = events.Images("real_above_rendered_below")
     assert [p.step for p in pictures] == [2, 4] and all(p.height >= 320 for p in pictures)
 
@@ -155,27 +201,42 @@ def test_a_module_comes_back_from_its_checkpoint_and_is_tested(run):
     saved = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
     for name, value in module.state_dict().items():
         assert torch.equal(value, saved[name]), name
-    (found,) = L.Trainer(logger=False, accelerator="cpu", enable_checkpointing=False, enable_progress_bar=False).test(
-        module, verbose=False)
+    (found,) = L.Trainer(
+        logger=False, accelerator="cpu", enable_checkpointing=False, enable_progress_bar=False
+    ).test(module, verbose=False)
     figures = json.loads((run / "metrics.json").read_text())
-    assert {"train/rms_m", "test/rms_m", "prior/test/test_40/psnr_crop", "test/mean_abs_C"} <= set(found)
+    assert {"train/rms_m", "test/rms_m", "prior/test/test_40/psnr_crop", "test/mean_abs_C"} <= set(
+        found
+    )
     for key, value in found.items():
         assert value == pytest.approx(figures[key], rel=1e-5), key
 
 
 def test_a_run_can_be_looked_at(run):
     train, *held_out = read_run(run)
-    assert train.name == "train" and {clip.name for clip in held_out} == {"test/test_60", "test/test_40"}
+    assert train.name == "train" and {clip.name for clip in held_out} == {
+        "test/test_60",
+        "test/test_40",
+    }
     observed, prior, learned = train.bodies.values()
-    assert observed.centers.shape == prior.centers.shape == learned.centers.shape  # all frames were learned from
+    assert (
+        observed.centers.shape == prior.centers.shape == learned.centers.shape
+    )  # all frames were learned from
     assert observed.covariances.shape == prior.covariances.shape == learned.covariances.shape
-    assert float(train.deviation(0).max()) < 0.02 * train.size  # one particle is the same one in both
+    assert (
+        float(train.deviation(0).max()) < 0.02 * train.size
+    )  # one particle is the same one in both
     figures = json.loads((run / "metrics.json").read_text())
     for clip in held_out:
         assert list(clip.bodies) == ["truth", "prior", "learned"]
-        for model, key in (("prior", f"prior/{clip.name}/rms_m"), ("learned", f"{clip.name}/rms_m")):
+        for model, key in (
+            ("prior", f"prior/{clip.name}/rms_m"),
+            ("learned", f"{clip.name}/rms_m"),
+        ):
             squares = [np.square(clip.deviation(t, model)).mean() for t in range(len(clip.times))]
-            after = [np.sqrt(np.mean(squares[contact:])) for contact in range(len(squares))]  # the figure's: from contact on
+            after = [
+                np.sqrt(np.mean(squares[contact:])) for contact in range(len(squares))
+            ]  # the figure's: from contact on
             assert any(value == pytest.approx(figures[key], rel=1e-5) for value in after), key
 
 
@@ -190,8 +251,15 @@ def test_eval_reproduces_the_figures_from_the_checkpoint_alone(run, cache, tmp_p
 
 
 def test_the_twin_simulates_from_a_new_start(run, cache, tmp_path):
-    result = call("eval.py", tmp_path, cache, f"ckpt_path={run}/checkpoints/last.ckpt", "simulate.velocity=[0.1,-1.5,0]",
-                  "simulate.rotation=[0,0,1,30]", "simulate.frames=4")
+    result = call(
+        "eval.py",
+        tmp_path,
+        cache,
+        f"ckpt_path={run}/checkpoints/last.ckpt",
+        "simulate.velocity=[0.1,-1.5,0]",
+        "simulate.rotation=[0,0,1,30]",
+        "simulate.frames=4",
+    )
     assert result.returncode == 0, result.stderr[-3000:]
     assert len(list((tmp_path / "ply").glob("*.ply"))) == 4
     assert (tmp_path / "simulation.mp4").stat().st_size > 1000
@@ -200,34 +268,59 @@ def test_the_twin_simulates_from_a_new_start(run, cache, tmp_path):
 def test_the_contact_offset_stays_where_a_grid_can_put_it(stepped):
     """Steps of two cells: without the limits it would end far outside."""
     figures = json.loads((stepped / "metrics.json").read_text())
-    assert min(abs(figures["id/contact_offset_m"] / figures["dx_m"] - limit) for limit in ContactOffset.LIMITS) < 1e-5
+    assert (
+        min(
+            abs(figures["id/contact_offset_m"] / figures["dx_m"] - limit)
+            for limit in ContactOffset.LIMITS
+        )
+        < 1e-5
+    )
 
 
 def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_path):
-    process = subprocess.Popen(command("train.py", tmp_path / "killed", cache), cwd=ROOT, stdout=subprocess.DEVNULL,
-                               stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command("train.py", tmp_path / "killed", cache),
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     checkpoint = tmp_path / "killed" / "checkpoints" / "last.ckpt"
     try:
         deadline = time.monotonic() + 300
         while time.monotonic() < deadline:
             time.sleep(0.02)
-            if checkpoint.exists() and torch.load(checkpoint, weights_only=True)["mosa"]["steps_done"] >= 2:
+            if (
+                checkpoint.exists()
+                and torch.load(checkpoint, weights_only=True)["mosa"]["steps_done"] >= 2
+            ):
                 break
-        assert process.poll() is None, "the run ended before it could be killed: make the scene's fit longer"
+        assert process.poll() is None, (
+            "the run ended before it could be killed: make the scene's fit longer"
+        )
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-    begun = [call("train.py", tmp_path / "killed", cache, "resume=auto", *FEW_FIGURES) for _ in range(2)]
+    begun = [
+        call("train.py", tmp_path / "killed", cache, "resume=auto", *FEW_FIGURES) for _ in range(2)
+    ]
     first, second = (result.stdout for result in begun)
-    assert f"going on from {checkpoint}" in first and "skipped" not in first, begun[0].stderr[-3000:]
-    assert f"skipped: {tmp_path}" in second and [result.returncode for result in begun] == [0, 0], begun[1].stderr[-3000:]
+    assert f"going on from {checkpoint}" in first and "skipped" not in first, begun[0].stderr[
+        -3000:
+    ]
+    assert f"skipped: {tmp_path}" in second and [result.returncode for result in begun] == [0, 0], (
+        begun[1].stderr[-3000:]
+    )
     whole = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     resumed = torch.load(checkpoint, weights_only=True)
     assert whole["mosa"]["steps_done"] == resumed["mosa"]["steps_done"]
     for key, value in whole["state_dict"].items():
         assert torch.equal(value, resumed["state_dict"][key]), key
-    figures, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path / "killed", run))
-    assert {k: v for k, v in figures.items() if k.startswith("id/")} == {k: v for k, v in expected.items() if k.startswith("id/")}
+    figures, expected = (
+        json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path / "killed", run)
+    )
+    assert {k: v for k, v in figures.items() if k.startswith("id/")} == {
+        k: v for k, v in expected.items() if k.startswith("id/")
+    }
 
 
 @pytest.mark.parametrize(
@@ -279,7 +372,9 @@ def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
 
 def test_eval_renders_as_the_run_did(run, tmp_path, monkeypatch):
     used = []
-    monkeypatch.setattr(pipeline, "use_backend", lambda name, required: used.append((name, required)))
+    monkeypatch.setattr(
+        pipeline, "use_backend", lambda name, required: used.append((name, required))
+    )
     evaluated(run, tmp_path, monkeypatch)
     assert used == [("warp", False)]
 
@@ -287,14 +382,22 @@ def test_eval_renders_as_the_run_did(run, tmp_path, monkeypatch):
 HELD_OUT = {"test/test_60", "test/test_40"}
 
 
-@pytest.mark.parametrize("where, variant", [("test", "prior"), ("test", "adapted"), ("train", "adapted")])
-def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(run, tmp_path, monkeypatch, where, variant):
+@pytest.mark.parametrize(
+    "where, variant", [("test", "prior"), ("test", "adapted"), ("train", "adapted")]
+)
+def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(
+    run, tmp_path, monkeypatch, where, variant
+):
     """The fit was lost with it, and all other figures. On the training drop too, which no stage has to simulate freely."""
     simulate, failing = Body.simulate, [False]
 
     def diverges(self, start, world, frames, frame_dt, **more):
         asked, wanted = more.get("model") or self.model(), self.model(variant)
-        if failing[0] and asked.material is wanted.material and asked.heterogeneity is wanted.heterogeneity:
+        if (
+            failing[0]
+            and asked.material is wanted.material
+            and asked.heterogeneity is wanted.heterogeneity
+        ):
             raise SimulationDiverged("substep 7, particle 3: gone")
         return simulate(self, start, world, frames, frame_dt, **more)
 
@@ -309,7 +412,10 @@ def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(run,
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", "evaluation.floor=false"])
     named = "test/test_60" if where == "test" else "train"
-    with pytest.warns(UserWarning, match=rf"{named}: the (prior|learned law) cannot be simulated .*particle 3: gone"):
+    with pytest.warns(
+        UserWarning,
+        match=rf"{named}: the (prior|learned law) cannot be simulated .*particle 3: gone",
+    ):
         pipeline.evaluate_checkpoint(cfg)
     figures, before = read_figures(tmp_path / "metrics.json"), read_figures(run / "metrics.json")
     model = evaluation.PREFIX[variant]
@@ -317,9 +423,13 @@ def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(run,
         assert figures[f"{model}{part}/rms_m"] == figures[f"{model}{part}/cd_m"] == float("inf")
         assert figures[f"{model}{part}/psnr_crop"] == -float("inf")
     other, spared = "prior_eta/test/rms_m", "train" if where == "test" else "test"
-    assert figures[other] == pytest.approx(before[other], rel=1e-5) and np.isfinite(figures[f"{model}{spared}/rms_m"])
+    assert figures[other] == pytest.approx(before[other], rel=1e-5) and np.isfinite(
+        figures[f"{model}{spared}/rms_m"]
+    )
     motion = np.load(tmp_path / {"prior": "prior.npz", "adapted": "rollout.npz"}[variant])
-    assert {key.split("/x")[0] for key in motion if key.endswith("/x")} == ({"train"} if where == "test" else HELD_OUT)
+    assert {key.split("/x")[0] for key in motion if key.endswith("/x")} == (
+        {"train"} if where == "test" else HELD_OUT
+    )
     assert "inf" in (tmp_path / "results.md").read_text() and (tmp_path / "video.mp4").is_file()
     shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
     assert read_run(tmp_path)
@@ -340,7 +450,11 @@ def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monke
 
     load = pipeline.scenes
     monkeypatch.setattr(pipeline, "scenes", scenes)
-    monkeypatch.setattr(pipeline, "sequence_start", lambda body, *_, **__: Start(torch.eye(3), body.center, *torch.zeros(2, 3)))
+    monkeypatch.setattr(
+        pipeline,
+        "sequence_start",
+        lambda body, *_, **__: Start(torch.eye(3), body.center, *torch.zeros(2, 3)),
+    )
     world = evaluated(run, tmp_path, monkeypatch, "scene=tiny", f"scene.cache={cache}")["world"]
     assert world.ground == raised and world.gravity.tolist() == pytest.approx([0.0, -3.7, 0.0])
     assert evaluated(run, tmp_path, monkeypatch)["world"].ground == Ground(0.0, "sticky", 0.0)
@@ -350,5 +464,8 @@ def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tm
     keys = ["debug=default", f"scene.cache={cache}", "trainer.accelerator=tpu,hpu"]
     result = forked.call("train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys)
     assert result.returncode == 1
-    assert result.stderr.count("ConfigError: trainer: expected what lightning.pytorch.Trainer takes") >= 2
+    assert (
+        result.stderr.count("ConfigError: trainer: expected what lightning.pytorch.Trainer takes")
+        >= 2
+    )
     assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer: expected" in result.stderr

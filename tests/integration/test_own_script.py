@@ -13,12 +13,24 @@ from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
 
 HELD = ["scene.holdout_cameras=[1]", "scene.holdout_frames=1", "heterogeneity.enabled=false"]
-QUIET = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+QUIET = {
+    "logger": False,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+    "accelerator": "cpu",
+}
 
 
 @pytest.fixture(scope="module")
 def cfg(cache):
-    return compose("debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.views=1", "fit.joint.iterations=5", *HELD)
+    return compose(
+        "debug=default",
+        f"scene.cache={cache}",
+        "adapter=mosa",
+        "fit.views=1",
+        "fit.joint.iterations=5",
+        *HELD,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +39,17 @@ def fitted(cfg, tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
     stopping = EarlyStopping("val/loss", patience=50)
     best = ModelCheckpoint(folder, filename="best", monitor="val/loss", save_last=True)
-    trainer = L.Trainer(max_epochs=-1, callbacks=[stopping, best, LearningRateMonitor()], profiler="simple", accelerator="cpu",
-                        logger=CSVLogger(folder, name="csv"), log_every_n_steps=1, enable_progress_bar=False,
-                        enable_model_summary=False, default_root_dir=folder)
+    trainer = L.Trainer(
+        max_epochs=-1,
+        callbacks=[stopping, best, LearningRateMonitor()],
+        profiler="simple",
+        accelerator="cpu",
+        logger=CSVLogger(folder, name="csv"),
+        log_every_n_steps=1,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+    )
     data, module = SceneDataModule(cfg), LitMosa(cfg)
     trainer.fit(module, datamodule=data)
     return folder, data, module, trainer
@@ -42,8 +62,18 @@ def test_the_data_stand_alone(cache):
     batch = next(iter(data.train_dataloader()))
     (own,) = batch.sequences
     V, T, h, w, _ = own.observations.images.shape
-    assert own.observations.mattes.shape == (V, T, h, w) and own.observations.flow.shape == (V, T - 1, h, w, 2)
-    assert own.cues.positions.shape == own.cues.stretch.shape == (T, own.cues.rotation.shape[1], 3) and T == len(own.frames)
+    assert own.observations.mattes.shape == (V, T, h, w) and own.observations.flow.shape == (
+        V,
+        T - 1,
+        h,
+        w,
+        2,
+    )
+    assert own.cues.positions.shape == own.cues.stretch.shape == (
+        T,
+        own.cues.rotation.shape[1],
+        3,
+    ) and T == len(own.frames)
     assert f"images ({V}, {T}, {h}, {w}, 3)" in repr(batch)
     cameras, frames = (each.sequences[0] for each in data.val_dataloader())
     assert cameras.views == [1] and len(cameras.frames) == T and frames.frames == [T]
@@ -61,23 +91,39 @@ def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
     theirs = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
     for name, value in module.state_dict().items():
         assert torch.equal(value, theirs["state_dict"][name]), name
-    assert module.stage is None and trainer.global_step == module.steps_done == theirs["global_step"]
+    assert (
+        module.stage is None and trainer.global_step == module.steps_done == theirs["global_step"]
+    )
     figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures["val/loss"] == pytest.approx(float(trainer.callback_metrics["val/loss"]), rel=1e-6)
-    assert not {"trainer", "callbacks", "logger"} & set(theirs["mosa"]["config"]["cfg"])  # what it holds is data
+    assert figures["val/loss"] == pytest.approx(
+        float(trainer.callback_metrics["val/loss"]), rel=1e-6
+    )
+    assert not {"trainer", "callbacks", "logger"} & set(
+        theirs["mosa"]["config"]["cfg"]
+    )  # what it holds is data
 
 
 def test_what_lightning_s_callbacks_left(fitted):
     folder, _, module, trainer = fitted
     rows = (folder / "csv" / "version_0" / "metrics.csv").read_text()
-    assert "lr/material" in rows and "val/loss" in rows and "val/cameras/psnr" in rows and "id/E" in rows
+    assert (
+        "lr/material" in rows
+        and "val/loss" in rows
+        and "val/cameras/psnr" in rows
+        and "id/E" in rows
+    )
     assert (folder / "best.ckpt").is_file() and (folder / "last.ckpt").is_file()
     assert trainer.current_epoch >= sum(stage.iterations for stage in module.stages if stage.newton)
 
 
 def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tmp_path):
     _, data, module, _ = fitted
-    begun = L.Trainer(**QUIET, max_epochs=2, default_root_dir=tmp_path, callbacks=[ModelCheckpoint(tmp_path, save_last=True)])
+    begun = L.Trainer(
+        **QUIET,
+        max_epochs=2,
+        default_root_dir=tmp_path,
+        callbacks=[ModelCheckpoint(tmp_path, save_last=True)],
+    )
     begun.fit(LitMosa(cfg), datamodule=data)
     loaded = LitMosa.load_from_checkpoint(tmp_path / "last.ckpt")
     assert 0 < loaded.steps_done < module.steps_done and loaded.stage is not None
@@ -98,10 +144,16 @@ def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tm
 def test_what_cannot_be_done_is_named(cfg):
     with pytest.raises(ConfigError, match="expected a SceneDataModule"):
         L.Trainer(**QUIET, enable_checkpointing=False).fit(LitMosa(cfg), train_dataloaders=[0])
-    with pytest.raises(ConfigError, match=r"trainer\.accumulate_grad_batches: expected 1, found 2: fit\.views"):
-        L.Trainer(**QUIET, enable_checkpointing=False, accumulate_grad_batches=2).fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
+    with pytest.raises(
+        ConfigError, match=r"trainer\.accumulate_grad_batches: expected 1, found 2: fit\.views"
+    ):
+        L.Trainer(**QUIET, enable_checkpointing=False, accumulate_grad_batches=2).fit(
+            LitMosa(cfg), datamodule=SceneDataModule(cfg)
+        )
     with pytest.raises(ConfigError, match=r"trainer\.precision: expected 32-true, found '64-true'"):
-        L.Trainer(**QUIET, enable_checkpointing=False, precision="64-true").fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
+        L.Trainer(**QUIET, enable_checkpointing=False, precision="64-true").fit(
+            LitMosa(cfg), datamodule=SceneDataModule(cfg)
+        )
 
 
 def test_a_stopper_ends_a_stage_and_not_the_fit(cache):
@@ -109,7 +161,10 @@ def test_a_stopper_ends_a_stage_and_not_the_fit(cache):
     cfg = compose("debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.joint.iterations=30", "fit.prior.iterations=5",
                   "fit.prior.newton_iterations=5", *HELD)  # fmt: skip
     stopper = EarlyStopping("val/loss", patience=1, min_delta=1e9)
-    module, trainer = LitMosa(cfg), L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False, callbacks=[stopper])
+    module, trainer = (
+        LitMosa(cfg),
+        L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False, callbacks=[stopper]),
+    )
     begun, begin = [], module.begin
     module.begin = lambda stage: (begun.append(stage.name), begin(stage))
     trainer.fit(module, datamodule=SceneDataModule(cfg, held_out=False))

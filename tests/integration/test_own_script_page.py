@@ -17,4 +17,6 @@ def test_the_page_runs(cache, tmp_path):
     script.write_text(f"import os\n\nos.chdir({str(tmp_path)!r})\n{code}")
     result = forked.call(str(script))
     assert result.returncode == 0, result.stderr[-3000:]
-    assert "MotionBatch(" in result.stdout and re.search(r"torch.Size\(\[3, \d+, 3\]\)", result.stdout)
+    assert "MotionBatch(" in result.stdout and re.search(
+        r"torch.Size\(\[3, \d+, 3\]\)", result.stdout
+    )

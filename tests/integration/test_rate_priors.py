@@ -12,7 +12,9 @@ def test_the_loss_reaches_every_parameter(prior, cache):
     stage = module.stages[0]
     module.begin(stage)
     named = {name: float(value) for name, value in cfg.prior.parameters.items()}
-    assert {n: pytest.approx(float(v.detach()), rel=1e-5) for n, v in body.material.physical().items()} == named
+    assert {
+        n: pytest.approx(float(v.detach()), rel=1e-5) for n, v in body.material.physical().items()
+    } == named
     terms, _ = module.terms(stage, module.takes[0].observations, scene.frames, module.takes[0])
     sum(terms.values()).backward()
     for name, raw in body.material.raw.items():

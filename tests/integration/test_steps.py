@@ -37,8 +37,13 @@ def test_a_step_that_cannot_be_simulated_is_taken_back_and_the_fit_goes_on(cache
     module.descend = failing
     tried, module.try_last_step = module.try_last_step, last_step
     trainer().fit(module, datamodule=run.data)
-    assert all(torch.equal(a, b) for a, b in zip(weights[0], weights[2]))  # where the first step began
-    moved = [max(float((a - b).abs().max()) for a, b in zip(one, weights[0])) for one in (weights[1], weights[3])]
+    assert all(
+        torch.equal(a, b) for a, b in zip(weights[0], weights[2])
+    )  # where the first step began
+    moved = [
+        max(float((a - b).abs().max()) for a, b in zip(one, weights[0]))
+        for one in (weights[1], weights[3])
+    ]
     assert 0 < moved[1] < 0.6 * moved[0]
     assert len(losses[-1]) == 4 and losses[-1][1] == losses[-1][0]
     assert module.stage is None  # the last step was taken back too
@@ -70,5 +75,7 @@ def test_a_calibration_alone_looks_again_and_goes_on_from_there(cache):
 
 
 def test_it_does_not_where_there_is_no_look(cache):
-    run = made(cache, "adapter=none", "heterogeneity.enabled=false", "reconstruction.informed.iterations=0")
+    run = made(
+        cache, "adapter=none", "heterogeneity.enabled=false", "reconstruction.informed.iterations=0"
+    )
     assert not any(stage.looks_again for stage in run.module.stages)

@@ -18,7 +18,9 @@ def test_a_step_descends_the_mean_over_the_sequences(cache):
 
     def gradient(own):
         take = module.takes[own.index]
-        frames = stage.active_frames(0, min(take.first_contact + 3, len(take.cues.positions)), len(take.cues.positions))
+        frames = stage.active_frames(
+            0, min(take.first_contact + 3, len(take.cues.positions)), len(take.cues.positions)
+        )
         terms, _ = module.terms(stage, own.observations, frames, take)
         loss = sum(module.weights[k] * v for k, v in terms.items())
         slope = torch.stack(torch.autograd.grad(loss, parameters))
@@ -38,8 +40,20 @@ def test_a_take_is_simulated_at_its_own_frame_rate(cache):
     longer = replace(take, frame_dt=2 * take.frame_dt)
     with torch.no_grad():
         _, found = module.terms(stage, take.observations.select([0]), 3, longer)
-        expected = module.body.simulate(take.start, module.world, 3, longer.frame_dt, model=module.body.model().only(adapter=False))
-        usual = module.body.simulate(take.start, module.world, 3, take.frame_dt, model=module.body.model().only(adapter=False))
+        expected = module.body.simulate(
+            take.start,
+            module.world,
+            3,
+            longer.frame_dt,
+            model=module.body.model().only(adapter=False),
+        )
+        usual = module.body.simulate(
+            take.start,
+            module.world,
+            3,
+            take.frame_dt,
+            model=module.body.model().only(adapter=False),
+        )
     assert (found.x - expected.x).abs().max() < 1e-6
     assert (expected.x - usual.x).abs().max() > 1e-2
 
@@ -49,13 +63,28 @@ def run(cache, folder, script, *overrides):
 
 
 def test_what_is_learned_from_is_not_held_out(cache, tmp_path):
-    result = run(cache, tmp_path / "run", "train.py", "debug=default", f"scene.cache={cache}", "scene.also_train=[test_60]",
-                 "evaluation.video=false", "evaluation.floor=false", "reconstruction.informed.iterations=0")
+    result = run(
+        cache,
+        tmp_path / "run",
+        "train.py",
+        "debug=default",
+        f"scene.cache={cache}",
+        "scene.also_train=[test_60]",
+        "evaluation.video=false",
+        "evaluation.floor=false",
+        "reconstruction.informed.iterations=0",
+    )
     assert result.returncode == 0, result.stderr[-3000:]
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert "train/test_60/rms_m" in figures and "test/test_60/rms_m" not in figures
     assert figures["test/rms_m"] == figures["test/test_40/rms_m"]
-    again = run(cache, tmp_path / "eval", "eval.py", f"ckpt_path={tmp_path}/run/checkpoints/last.ckpt", f"cache={cache}")
+    again = run(
+        cache,
+        tmp_path / "eval",
+        "eval.py",
+        f"ckpt_path={tmp_path}/run/checkpoints/last.ckpt",
+        f"cache={cache}",
+    )
     assert again.returncode == 0, again.stderr[-3000:]
     second = json.loads((tmp_path / "eval" / "metrics.json").read_text())
     for key in ("train/test_60/rms_m", "test/test_40/rms_m", "prior/train/rms_m"):
@@ -63,6 +92,17 @@ def test_what_is_learned_from_is_not_held_out(cache, tmp_path):
 
 
 def test_a_sequence_that_is_not_there(cache, tmp_path):
-    result = run(cache, tmp_path, "train.py", "debug=default", f"scene.cache={cache}", "scene.also_train=[test_90]")
-    assert result.returncode == 2 and "scene.also_train" in result.stderr and "test_60, test_40" in result.stderr, result.stderr
+    result = run(
+        cache,
+        tmp_path,
+        "train.py",
+        "debug=default",
+        f"scene.cache={cache}",
+        "scene.also_train=[test_90]",
+    )
+    assert (
+        result.returncode == 2
+        and "scene.also_train" in result.stderr
+        and "test_60, test_40" in result.stderr
+    ), result.stderr
     assert "Traceback" not in result.stderr

@@ -37,18 +37,28 @@ def compiled(module: str, name: str, options: dict) -> dict:
     launch = {key: options[key] for key in ("num_warps", "num_stages", "maxnreg") if key in options}
     source = ASTSource(fn=function, signature=signature, constexprs=constants, attrs=divisible)
     kernel = compile(source, target=GPUTarget("cuda", 90, 32), options=launch)
-    return {"shared": kernel.metadata.shared, "tensor_cores": "wgmma" in kernel.asm["ptx"] or "mma.sync" in kernel.asm["ptx"]}
+    return {
+        "shared": kernel.metadata.shared,
+        "tensor_cores": "wgmma" in kernel.asm["ptx"] or "mma.sync" in kernel.asm["ptx"],
+    }
 
 
 def main(precision: str, hidden: int) -> None:
     launch = _Launch(Settings(0.1, 0.1, 10.0, True, precision), 1000, hidden, torch.device("cpu"))
     found = {name: compiled("network_kernels", name, launch.forward()[1]) for name in FORWARD}
-    found |= {name: compiled("adjoint_kernels", name, launch.backward(True)[1]) for name in BACKWARD}
-    found |= {name: compiled("assembly_kernels", name, {"BLOCK": LANES, "num_warps": 4}) for name in BETWEEN}
+    found |= {
+        name: compiled("adjoint_kernels", name, launch.backward(True)[1]) for name in BACKWARD
+    }
+    found |= {
+        name: compiled("assembly_kernels", name, {"BLOCK": LANES, "num_warps": 4})
+        for name in BETWEEN
+    }
     if launch.half:
         for stored, operator in ((False, True), (True, True), (True, False)):
             options = launch.forward_half()[1] | {"STORE": stored, "OPERATOR": operator}
-            found[f"half {stored} {operator} forward"] = compiled("half_kernel", "operator_half", options)
+            found[f"half {stored} {operator} forward"] = compiled(
+                "half_kernel", "operator_half", options
+            )
     print(json.dumps(found))
 
 

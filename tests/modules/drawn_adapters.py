@@ -16,17 +16,24 @@ def randomise(module: torch.nn.Module, size: float = 0.3, seed: int = 0) -> None
             p.copy_(size * torch.randn(p.shape, generator=generator, dtype=torch.float64))
 
 
-def drawn_adapter(seed: int = 0, size: float = 0.3, dtype: torch.dtype = torch.float64, **options) -> StressAdapter:
+def drawn_adapter(
+    seed: int = 0, size: float = 0.3, dtype: torch.dtype = torch.float64, **options
+) -> StressAdapter:
     adapter = StressAdapter(**options).to(dtype)
     randomise(adapter, size, seed)
     adapter.switch_on(E_REF, 0.3)
     return adapter
 
 
-def drawn_states(count: int, seed: int = 0, size: float = 0.1, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+def drawn_states(
+    count: int, seed: int = 0, size: float = 0.1, dtype: torch.dtype = torch.float64
+) -> tuple[torch.Tensor, ...]:
     """(w, s), each (count, 6), dimensionless."""
     generator = torch.Generator().manual_seed(1000 + seed)
-    return tuple(size * torch.randn(count, 6, generator=generator, dtype=torch.float64).to(dtype) for _ in range(2))
+    return tuple(
+        size * torch.randn(count, 6, generator=generator, dtype=torch.float64).to(dtype)
+        for _ in range(2)
+    )
 
 
 def material_state(w: torch.Tensor, s: torch.Tensor) -> MaterialState:

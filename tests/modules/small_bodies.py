@@ -31,7 +31,13 @@ def small_body(*, numbers=None, strain="green", adapter=True, modes=False, law="
     rest = lattice(counts)
     n = len(rest)
     module = HyperelasticAdapter(strain=strain) if adapter else None
-    field = StiffnessModes(rest.amin(0) - DX / 4, rest.amax(0) + DX / 4, HeterogeneitySettings(wavelength=1.0)) if modes else None
+    field = (
+        StiffnessModes(
+            rest.amin(0) - DX / 4, rest.amax(0) + DX / 4, HeterogeneitySettings(wavelength=1.0)
+        )
+        if modes
+        else None
+    )
     body = Body(
         rest=rest, volume=torch.full((n,), (DX / 2) ** 3).double(), colors=torch.ones(n, 3), opacities=torch.ones(n),
         covariances=1e-4 * torch.eye(3).expand(n, 3, 3), density=1000.0, material=Material(law, {"E": E, "nu": nu}),
@@ -49,12 +55,24 @@ def small_body(*, numbers=None, strain="green", adapter=True, modes=False, law="
     return body
 
 
-def start(height=0.09, speed=-1.5, turn=0.0, axis=(0.3, 0.5, 0.8), spin=(0.0, 0.0, 0.0), dtype=torch.float64) -> Start:
+def start(
+    height=0.09,
+    speed=-1.5,
+    turn=0.0,
+    axis=(0.3, 0.5, 0.8),
+    spin=(0.0, 0.0, 0.0),
+    dtype=torch.float64,
+) -> Start:
     """A body turned by `turn` [rad] about `axis` whose centre is at `height` [m]."""
     k = torch.tensor(axis).double()
     k = turn * k / k.norm()
     K = torch.tensor([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]]).double()
-    vectors = (torch.linalg.matrix_exp(K), torch.tensor([0.0, height, 0.0]), torch.tensor([0.1, speed, 0.0]), torch.tensor(spin))
+    vectors = (
+        torch.linalg.matrix_exp(K),
+        torch.tensor([0.0, height, 0.0]),
+        torch.tensor([0.1, speed, 0.0]),
+        torch.tensor(spin),
+    )
     return Start(*(v.to(dtype) for v in vectors))
 
 
@@ -63,14 +81,27 @@ def cues_of(rollout, rotation) -> MotionCues:
     """What a perfect reconstruction would have seen of a rollout that began at `rotation` (3, 3)."""
     U, S, V = singular_value_decomposition(rollout.F_tot)
     T, n = rollout.x.shape[:2]
-    return MotionCues(rollout.x.detach(), U @ V.mT @ rotation.T.to(U), S, torch.ones(T, n).to(S), torch.zeros(T, n, 3, 3).to(S))
+    return MotionCues(
+        rollout.x.detach(),
+        U @ V.mT @ rotation.T.to(U),
+        S,
+        torch.ones(T, n).to(S),
+        torch.zeros(T, n, 3, 3).to(S),
+    )
 
 
 @torch.no_grad()
 def take_of(body: Body, begins: Start, frames: int, world: World = WORLD):
     """A sequence of the body as it is, with all that it has."""
     rollout = body.simulate(begins, world, frames, FRAME_DT)
-    touched = (rollout.x[:, :, 1].amin(1) < 0.7 * DX).nonzero()  # a grid stops a body a fraction of a cell before it touches
+    touched = (
+        rollout.x[:, :, 1].amin(1) < 0.7 * DX
+    ).nonzero()  # a grid stops a body a fraction of a cell before it touches
     first = int(touched[0]) if len(touched) else frames - 1
-    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT, first_contact=first,
-                           response=None)
+    return SimpleNamespace(
+        start=begins,
+        cues=cues_of(rollout, begins.rotation),
+        frame_dt=FRAME_DT,
+        first_contact=first,
+        response=None,
+    )

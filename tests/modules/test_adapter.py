@@ -52,7 +52,11 @@ def test_without_any_part_it_is_the_prior_whatever_the_weights():
         assert torch.equal(value, torch.zeros_like(value))
 
 
-@pytest.mark.parametrize("options", [*OPTIONS.values(), {"no_prior_stress": True}], ids=[*OPTIONS.keys(), "no prior stress"])
+@pytest.mark.parametrize(
+    "options",
+    [*OPTIONS.values(), {"no_prior_stress": True}],
+    ids=[*OPTIONS.keys(), "no prior stress"],
+)
 def test_the_operator_is_the_steps_of_the_paper(options):
     """Check 10 of docs/verification.md: d = (A - I) s + b, and what the simulator gets, in Pa."""
     adapter = drawn_adapter(**options)
@@ -63,12 +67,16 @@ def test_the_operator_is_the_steps_of_the_paper(options):
     torch.testing.assert_close((A @ s[..., None])[..., 0] - s + b, d, rtol=0, atol=1e-12)
     answer = adapter(material_state(w, s))
     stress = E_REF * s
-    torch.testing.assert_close((answer.G @ stress[..., None])[..., 0] + answer.h, E_REF * d, rtol=0, atol=1e-12 * E_REF)
+    torch.testing.assert_close(
+        (answer.G @ stress[..., None])[..., 0] + answer.h, E_REF * d, rtol=0, atol=1e-12 * E_REF
+    )
 
 
 def test_major_symmetry_is_a_property_of_the_operator_the_simulator_gets():
     w, s = drawn_states(10)
-    plain, symmetric = (drawn_adapter(major_symmetry=on)(material_state(w, s)).G for on in (False, True))
+    plain, symmetric = (
+        drawn_adapter(major_symmetry=on)(material_state(w, s)).G for on in (False, True)
+    )
     scale = torch.tensor([1, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64)
     one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
     C0 = torch.eye(6).double() + 0.3 / 0.4 * torch.outer(one, one)
@@ -124,13 +132,20 @@ def test_gradients_against_differences(at_rest, options):
     directions = [direction[:, :6], direction[:, 6:], *weights]
     slope = sum((g * d).sum() for g, d in zip(grads, directions) if g is not None)
     h = 1e-4
-    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)  # fourth order
+    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (
+        12 * h
+    )  # fourth order
     assert abs(slope) > 1e-3
     torch.testing.assert_close(slope, difference, rtol=1e-6, atol=0)
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10**6), st.floats(-6, 6), st.floats(-3, 3), st.sampled_from([torch.float32, torch.float64]))
+@given(
+    st.integers(0, 10**6),
+    st.floats(-6, 6),
+    st.floats(-3, 3),
+    st.sampled_from([torch.float32, torch.float64]),
+)
 def test_bounds_hold_for_any_input_and_any_weights(seed, input_power, weight_power, dtype):
     """Check 9 of docs/verification.md: inputs to 1e6, weights to 1e3."""
     alpha, l_max = 0.1, 0.1
@@ -142,7 +157,9 @@ def test_bounds_hold_for_any_input_and_any_weights(seed, input_power, weight_pow
     assert max(pre.abs().max(), post.abs().max()) <= l_max * (1 + 1e-6)
     det = torch.linalg.det(torch.eye(3).double() + C.double())
     assert (det >= (1 - alpha) ** 6 * (1 - 1e-4)).all()
-    assert C.abs().max() <= 2 * alpha + 3 * alpha**2 + 1e-6  # of (I + L)(I + U) - I with entries within alpha
+    assert (
+        C.abs().max() <= 2 * alpha + 3 * alpha**2 + 1e-6
+    )  # of (I + L)(I + U) - I with entries within alpha
 
 
 @pytest.mark.parametrize(("switch", "part"), [("no_C", 0), ("no_pre", 1), ("no_post", 2)])
@@ -155,13 +172,20 @@ def test_a_switch_removes_its_part_and_no_other(switch, part):
         assert torch.equal(ablated, torch.zeros_like(ablated)) == (index == part), name
 
 
-@pytest.mark.parametrize("switches", [{}, {"no_C": True}, {"no_pre": True}, {"no_post": True}, {"no_C": True, "no_post": True}])
+@pytest.mark.parametrize(
+    "switches",
+    [{}, {"no_C": True}, {"no_pre": True}, {"no_post": True}, {"no_C": True, "no_post": True}],
+)
 def test_every_weight_that_is_learned_has_an_effect(switches):
     adapter = drawn_adapter(**switches)
     adapter(material_state(*drawn_states(10)))
     G, b, _ = adapter.affine(adapter.operator, *drawn_states(10))
     (G.square().sum() + b.square().sum()).backward()
-    dead = [n for n, p in adapter.named_parameters() if p.requires_grad and (p.grad is None or not p.grad.abs().sum() > 0)]
+    dead = [
+        n
+        for n, p in adapter.named_parameters()
+        if p.requires_grad and (p.grad is None or not p.grad.abs().sum() > 0)
+    ]
     assert dead == []
 
 
@@ -185,7 +209,9 @@ def test_plastic_part_corrects_the_strain_and_is_bounded_too():
     w, s = drawn_states(20)
     answer = adapter(material_state(w, s))
     e = 0.5 * w
-    expected = adapter.plastic_operator.stepwise(w, e) - adapter.plastic_operator.stepwise(*[torch.zeros(1, 6).double()] * 2)
+    expected = adapter.plastic_operator.stepwise(w, e) - adapter.plastic_operator.stepwise(
+        *[torch.zeros(1, 6).double()] * 2
+    )
     corrected = e + (answer.plastic_G @ e[..., None])[..., 0] + answer.plastic_h
     torch.testing.assert_close(corrected, expected, rtol=0, atol=1e-12)
     assert adapter(material_state(w, s)._replace(plastic_strain=None)).plastic_G is None
@@ -198,7 +224,10 @@ def test_recomputing_changes_nothing_but_memory(plastic):
         adapter = drawn_adapter(dtype=torch.float32, recompute=recompute, plastic=plastic)
         w, s = (a.requires_grad_() for a in drawn_states(30, dtype=torch.float32))
         answer = adapter(material_state(w, s))
-        loss = sum(a.square().sum() for a in answer if a is not None) + adapter.statistics().mean_square
+        loss = (
+            sum(a.square().sum() for a in answer if a is not None)
+            + adapter.statistics().mean_square
+        )
         loss.backward()
         values = [a.detach() for a in answer if a is not None]
         results.append([*values, w.grad, s.grad, *(p.grad for p in adapter.parameters())])
@@ -214,8 +243,12 @@ def test_statistics_are_those_of_the_outputs_and_pool_over_evaluations():
         part = adapter.operator(w, s)
     assert float(whole.mean_abs_C.detach()) == pytest.approx(float(part.C.abs().mean()), rel=1e-12)
     entries = torch.cat([part.C.flatten(1), part.pre, part.post], 1)
-    assert float(whole.mean_square.detach()) == pytest.approx(float(entries.square().mean()), rel=1e-12)
-    assert float(whole.variance.detach()) == pytest.approx(float(entries.var(0, unbiased=False).mean()), rel=1e-12)
+    assert float(whole.mean_square.detach()) == pytest.approx(
+        float(entries.square().mean()), rel=1e-12
+    )
+    assert float(whole.variance.detach()) == pytest.approx(
+        float(entries.var(0, unbiased=False).mean()), rel=1e-12
+    )
     halves = []
     for chosen in (slice(0, 20), slice(20, 40)):
         adapter(material_state(w[chosen], s[chosen]))
@@ -224,13 +257,18 @@ def test_statistics_are_those_of_the_outputs_and_pool_over_evaluations():
     for name in ("mean_abs_C", "mean_square", "variance"):
         mine, theirs = (float(getattr(a, name).detach()) for a in (pooled, whole))
         assert mine == pytest.approx(theirs, rel=1e-12), name
-    assert torch.stack([h.variance for h in halves]).mean() < 0.999 * pooled.variance  # time counts as well
+    assert (
+        torch.stack([h.variance for h in halves]).mean() < 0.999 * pooled.variance
+    )  # time counts as well
     pooled.variance.backward()
     assert all(p.grad.abs().sum() > 0 for p in adapter.operator.planes.parameters())
 
 
 def test_a_constant_correction_has_no_variance():
-    C, L = torch.randn(1, 4, 3, 3).double().expand(9, 4, 3, 3), torch.randn(1, 6).double().expand(9, 6)
+    C, L = (
+        torch.randn(1, 4, 3, 3).double().expand(9, 4, 3, 3),
+        torch.randn(1, 6).double().expand(9, 6),
+    )
     assert statistics(C, L, L).variance < 1e-30
 
 
@@ -247,7 +285,9 @@ def test_the_unit_of_stress_is_fixed_once_and_travels_with_the_weights():
     other = StressAdapter()
     other.load_state_dict(adapter.state_dict())
     w, s = drawn_states(5, dtype=torch.float32)
-    assert other.is_on and torch.equal(other(material_state(w, s)).G, adapter(material_state(w, s)).G)
+    assert other.is_on and torch.equal(
+        other(material_state(w, s)).G, adapter(material_state(w, s)).G
+    )
 
 
 @pytest.mark.parametrize("kind", [StressAdapter, DirectAdapter])
@@ -278,13 +318,23 @@ def test_a_value_out_of_range_is_named(options, message):
 
 def test_all_combinations_of_switches_evaluate():
     w, s = drawn_states(3)
-    names = ("no_C", "no_pre", "no_post", "no_prior_stress", "rest_free", "major_symmetry", "plastic")
+    names = (
+        "no_C",
+        "no_pre",
+        "no_post",
+        "no_prior_stress",
+        "rest_free",
+        "major_symmetry",
+        "plastic",
+    )
     for values in itertools.product((False, True), repeat=len(names)):
         options = dict(zip(names, values))
         if options["no_pre"] and options["no_prior_stress"]:
             continue
         for dependence in ("full", "constant"):
-            answer = drawn_adapter(hidden=4, state_dependence=dependence, **options)(material_state(w, s))
+            answer = drawn_adapter(hidden=4, state_dependence=dependence, **options)(
+                material_state(w, s)
+            )
             assert torch.isfinite(answer.G).all() and torch.isfinite(answer.h).all(), options
 
 
@@ -294,7 +344,9 @@ def test_the_matrix_between_the_planes_has_a_bound_of_its_own(dependence):
     w, s = drawn_states(40)
     largest = []
     for bound in (None, 0.01, 0.2):
-        adapter = drawn_adapter(size=30.0, alpha=0.1, alpha_normal=bound, state_dependence=dependence)  # every tanh at its end
+        adapter = drawn_adapter(
+            size=30.0, alpha=0.1, alpha_normal=bound, state_dependence=dependence
+        )  # every tanh at its end
         C = adapter.affine(adapter.operator, w, s)[2].C.detach()
         largest.append((float(C[:, :3].abs().max()), float(C[:, 3].abs().max())))
     assert largest[0][0] == largest[1][0] == largest[2][0]

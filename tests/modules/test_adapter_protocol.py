@@ -47,7 +47,9 @@ def on(name: str, size: float = 0.0, prepared: bool = False):
 
 
 def prior_states():
-    return material_states("corotated", Material("corotated", {"E": E_REF, "nu": NU}).per_particle())
+    return material_states(
+        "corotated", Material("corotated", {"E": E_REF, "nu": NU}).per_particle()
+    )
 
 
 def state():
@@ -57,9 +59,14 @@ def state():
 @pytest.mark.parametrize("name", NAMES)
 def test_it_has_all_that_is_asked(name):
     adapter = made(name)
-    asked = [*AdapterProtocol.__annotations__, *(key for key in vars(AdapterProtocol) if not key.startswith("_"))]
+    asked = [
+        *AdapterProtocol.__annotations__,
+        *(key for key in vars(AdapterProtocol) if not key.startswith("_")),
+    ]
     assert len(asked) > 20 and not [key for key in asked if not hasattr(adapter, key)]
-    assert all(callable(penalty) for penalty in adapter.penalties.values()) and set(PENALTIES) <= set(adapter.penalties)
+    assert all(callable(penalty) for penalty in adapter.penalties.values()) and set(
+        PENALTIES
+    ) <= set(adapter.penalties)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -81,8 +88,14 @@ def test_it_is_switched_on_once(name):
 def test_it_begins_as_the_prior_and_notes_no_departure(name):
     adapter = on(name, prepared=True)
     answer = adapter(state())
-    assert answer.G.shape == (5, 6, 6) and answer.h.shape == (5, 6) and answer.G.dtype == answer.h.dtype == torch.float64
-    if adapter.replaces_law:  # networks that were fitted to the prior's stress, so that the difference is theirs
+    assert (
+        answer.G.shape == (5, 6, 6)
+        and answer.h.shape == (5, 6)
+        and answer.G.dtype == answer.h.dtype == torch.float64
+    )
+    if (
+        adapter.replaces_law
+    ):  # networks that were fitted to the prior's stress, so that the difference is theirs
         here = prior_states()(drawn_stretches(50, 0.1, torch.Generator().manual_seed(0)))
         assert 0 < adapter(here).h.norm() < 0.06 * here.stress.norm()
         return
@@ -127,7 +140,12 @@ def test_what_it_adds_is_its_answer_at_that_state(name):
     assert added.shape == (5, 6) and torch.autograd.grad(added.sum(), s)[0].shape == (5, 6)
     if adapter.strain is None:
         answer = adapter(material_state(w, s))
-        torch.testing.assert_close(E_REF * added, (answer.G @ (E_REF * s)[..., None])[..., 0] + answer.h, rtol=1e-9, atol=1e-6)
+        torch.testing.assert_close(
+            E_REF * added,
+            (answer.G @ (E_REF * s)[..., None])[..., 0] + answer.h,
+            rtol=1e-9,
+            atol=1e-6,
+        )
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -136,7 +154,11 @@ def test_a_stiffness_is_one_and_says_of_which_strain(name):
     found = adapter.stiffness()
     assert (found is None) == (adapter.strain is None)
     if found is not None:
-        assert found.shape == (6, 6) and found.dtype == torch.float64 and torch.allclose(found, found.T)
+        assert (
+            found.shape == (6, 6)
+            and found.dtype == torch.float64
+            and torch.allclose(found, found.T)
+        )
         assert torch.linalg.eigvalsh(found).min() > 0
 
 
@@ -158,8 +180,12 @@ def test_a_plastic_flow_takes_no_effect_in_no_time(name):
 def test_its_copy_in_double_precision_is_a_copy(name):
     adapter = on(name, 0.3).float()
     held = adapter.in_double()
-    assert held.is_on and held is not adapter and not any(p.requires_grad for p in held.parameters())
-    assert {p.dtype for p in held.parameters()} == {torch.float64} and {p.dtype for p in adapter.parameters()} == {torch.float32}
+    assert (
+        held.is_on and held is not adapter and not any(p.requires_grad for p in held.parameters())
+    )
+    assert {p.dtype for p in held.parameters()} == {torch.float64} and {
+        p.dtype for p in adapter.parameters()
+    } == {torch.float32}
     assert any(p.requires_grad for p in adapter.parameters())
     with pytest.raises(ConfigError, match="switch_on"):
         made(name).in_double()
@@ -171,7 +197,9 @@ def test_it_can_be_copied_and_pickled_after_an_evaluation_with_a_graph(name):
     adapter.follow(torch.tensor(NU).double().requires_grad_(True) * 1.0)
     expected = adapter(state())
     for other in (copy.deepcopy(adapter), pickle.loads(pickle.dumps(adapter))):
-        assert torch.equal(other(state()).G, expected.G) and torch.equal(other(state()).h, expected.h)
+        assert torch.equal(other(state()).G, expected.G) and torch.equal(
+            other(state()).h, expected.h
+        )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -192,7 +220,9 @@ def test_only_what_has_nothing_to_correct_is_left_out():
     for name in NAMES:
         adapter = made(name)
         assert adapter.unsuited(law_named("corotated")) is None
-        assert (adapter.unsuited(law_named("newtonian")) is not None) == (adapter.strain is not None)
+        assert (adapter.unsuited(law_named("newtonian")) is not None) == (
+            adapter.strain is not None
+        )
     with pytest.warns(UserWarning, match="newtonian has no shear stiffness"):
         assert fitting(made("hyperelastic"), "newtonian") is None
     assert fitting(None, "newtonian") is None
@@ -201,10 +231,17 @@ def test_only_what_has_nothing_to_correct_is_left_out():
 def test_nobody_asks_which_adapter_it_is():
     """Beside the adapters themselves; the engine takes any function that answers an operator, and may look what else it has."""
     root = Path(mosa.__file__).parent
-    own = {"registry.py", *(place.partition(":")[0].rpartition(".")[2] + ".py" for place in ADAPTERS.values())}
+    own = {
+        "registry.py",
+        *(place.partition(":")[0].rpartition(".")[2] + ".py" for place in ADAPTERS.values()),
+    }
     classes = "|".join(place.partition(":")[2] for place in ADAPTERS.values())
-    asks = re.compile(rf"(has|get)attr\([\w.]*adapter\b|isinstance\([\w.]*adapter\b|\b({classes})\b")
+    asks = re.compile(
+        rf"(has|get)attr\([\w.]*adapter\b|isinstance\([\w.]*adapter\b|\b({classes})\b"
+    )
     found = [str(path.relative_to(root)) for path in root.rglob("*.py")
              if not (path.parent.name in ("adapters", "baselines") and path.name in own) and "physics" not in path.parts
              and asks.search("\n".join(line for line in path.read_text().splitlines() if "`" not in line))]  # fmt: skip
-    assert not [name for name in found if not name.endswith("warm_start.py")]  # which is a part of one
+    assert not [
+        name for name in found if not name.endswith("warm_start.py")
+    ]  # which is a part of one

@@ -33,8 +33,17 @@ def tensors():
 
 def twin(material=("neo_hookean", {"E": 5e4, "nu": 0.3}), adapter=None, **settings):
     settings = SimulationSettings(dx=0.06, **{"adaptive": True, **settings})
-    body = Body(**tensors(), density=1000.0, material=Material(*material), heterogeneity=None, adapter=adapter, settings=settings)
-    start = Start(torch.eye(3), torch.tensor([0.0, 0.15, 0.0]), torch.tensor([0.0, -2.0, 0.0]), torch.zeros(3))
+    body = Body(
+        **tensors(),
+        density=1000.0,
+        material=Material(*material),
+        heterogeneity=None,
+        adapter=adapter,
+        settings=settings,
+    )
+    start = Start(
+        torch.eye(3), torch.tensor([0.0, 0.15, 0.0]), torch.tensor([0.0, -2.0, 0.0]), torch.zeros(3)
+    )
     return Twin(body, build_world(WORLD), 0.02, {}, start)
 
 
@@ -49,7 +58,9 @@ def test_the_twin_records_and_replays_its_counts():
     alone = one.simulate(frames=8)
     assert one.body.last_substeps == math.ceil(sum(alone.counts) / 7)
     start, world = one.training_start, one.world
-    replayed = twin(SOFT["material"], adaptive=False).body.simulate(start, world, 8, 0.02, counts=alone.counts)
+    replayed = twin(SOFT["material"], adaptive=False).body.simulate(
+        start, world, 8, 0.02, counts=alone.counts
+    )
     assert torch.equal(replayed.x, alone.x)
     fixed = twin(**SOFT, adaptive=False).simulate(frames=8, colliders=[PLATE])
     assert set(fixed.counts) == {fixed.reactions.shape[1]}
@@ -58,8 +69,13 @@ def test_the_twin_records_and_replays_its_counts():
 
 
 def test_an_adapter_keeps_its_margin_and_its_stride():
-    plain, adapted = (twin(adapter=adapter, stride=5).body for adapter in (None, StressAdapter(hidden=4)))
-    assert plain.step_control(False).factor == 1.0 and adapted.step_control(True).factor == ADAPTER_MARGIN
+    plain, adapted = (
+        twin(adapter=adapter, stride=5).body for adapter in (None, StressAdapter(hidden=4))
+    )
+    assert (
+        plain.step_control(False).factor == 1.0
+        and adapted.step_control(True).factor == ADAPTER_MARGIN
+    )
     assert plain.step_control(False).multiple == 10
     one = twin(adapter=StressAdapter(hidden=4), stride=6, courant=0.2)
     one.body.adapter.switch_on(5e4, 0.3)
@@ -72,8 +88,15 @@ def test_gradient_through_the_body_is_that_of_the_replay():
     """Adaptive and replayed: one graph; against differences of the replay in Young's modulus."""
     one = twin(precision=64, courant=0.15, stride=4, min_substeps=8)
     body, raw = one.body.double(), one.body.material.raw["E"]
-    start = Start(*(getattr(one.training_start, k).double() for k in ("rotation", "center", "velocity", "angular_velocity")))
-    probe = torch.randn(len(body.rest), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    start = Start(
+        *(
+            getattr(one.training_start, k).double()
+            for k in ("rotation", "center", "velocity", "angular_velocity")
+        )
+    )
+    probe = torch.randn(
+        len(body.rest), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
 
     def value(counts=None):
         rollout = body.simulate(start, one.world, 5, 0.02, counts=counts)
@@ -105,7 +128,10 @@ def test_the_configuration_reaches_the_body():
     body = build_body(config, tensors())
     assert body.settings.adaptive and body.settings.min_substeps == 3
     start = twin().training_start
-    with pytest.raises(ConfigError, match=r"simulation\.max_substeps: expected at least 2\d for frame 1, found 20.*simulation\.dx"):
+    with pytest.raises(
+        ConfigError,
+        match=r"simulation\.max_substeps: expected at least 2\d for frame 1, found 20.*simulation\.dx",
+    ):
         body.simulate(start, build_world(WORLD), 3, 0.03)
     old = copy.deepcopy(config)  # of a checkpoint from before
     del old["cfg"]["simulation"]["adaptive"], old["cfg"]["simulation"]["min_substeps"]

@@ -68,7 +68,9 @@ def test_invariants_have_gradients_also_where_singular_values_are_equal():
     W = torch.eye(3).double().expand(2, 3, 3) * torch.tensor([1.0, 1.3]).double()[:, None, None]
 
     def sums(A):
-        x = invariants(0.5 * (A + A.mT))  # a sum of equal singular values is smooth, each alone is not
+        x = invariants(
+            0.5 * (A + A.mT)
+        )  # a sum of equal singular values is smooth, each alone is not
         return torch.cat([x[:, :3].sum(1, keepdim=True), x[:, 3:]], 1)
 
     assert torch.autograd.gradcheck(sums, W.clone().requires_grad_(True))
@@ -78,7 +80,9 @@ def test_invariants_have_gradients_also_where_singular_values_are_equal():
 def test_stress_and_flow_are_objective_whatever_the_weights(adapter):
     adapter = drawn(adapter)
     F, Q = gradients(20), rotations(20, seed=5)
-    torch.testing.assert_close(kirchhoff(adapter, Q @ F), Q @ kirchhoff(adapter, F) @ Q.mT, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        kirchhoff(adapter, Q @ F), Q @ kirchhoff(adapter, F) @ Q.mT, rtol=1e-9, atol=1e-12
+    )
     flowed = adapter.flow(F, 1e-3)
     assert (flowed - F).abs().max() > 1e-6
     torch.testing.assert_close(adapter.flow(Q @ F, 1e-3), Q @ flowed, rtol=1e-9, atol=1e-12)
@@ -89,7 +93,9 @@ def test_it_is_stress_free_at_rest_and_may_be_anisotropic():
     assert torch.equal(adapter.stress(torch.zeros(3, 6).double()), torch.zeros(3, 6).double())
     F, Q = gradients(20), rotations(20, seed=5)
     turned, fixed = kirchhoff(adapter, F @ Q.mT), kirchhoff(adapter, F)
-    assert (turned - fixed).norm() > 0.05 * fixed.norm()  # an isotropic law knows no rotation of the rest shape
+    assert (
+        turned - fixed
+    ).norm() > 0.05 * fixed.norm()  # an isotropic law knows no rotation of the rest shape
 
 
 def test_they_have_as_many_weights_as_the_papers():
@@ -115,7 +121,9 @@ def test_low_rank_starts_as_the_pretrained_network_and_learns_no_weight_of_it():
     with torch.no_grad():
         for layer in adapter.elastic[::2]:
             layer.weight.zero_()
-    assert torch.equal(adapter.stress(state.w), torch.zeros_like(before))  # the change is nothing yet
+    assert torch.equal(
+        adapter.stress(state.w), torch.zeros_like(before)
+    )  # the change is nothing yet
     adapter.stress(state.w).sum().backward()
     assert all(p.grad is None for n, p in adapter.named_parameters() if n.endswith("weight"))
 
@@ -152,7 +160,9 @@ def test_a_plastic_network_takes_the_place_of_the_return_mapping():
             moved[name] = (rollout.F - rollout.F_tot).abs().max()
             randomise(adapter.plastic, 0.3)
         alone = body.simulate(start(), WORLD, 8, FRAME_DT, model=body.model().only(adapter=False))
-    assert moved["none"] < 1e-12 and moved["some"] > 1e-4  # without flow it is elastic, however low the prior's yield stress is
+    assert (
+        moved["none"] < 1e-12 and moved["some"] > 1e-4
+    )  # without flow it is elastic, however low the prior's yield stress is
     assert (alone.F - alone.F_tot).abs().max() > 1e-3
 
 
@@ -181,7 +191,12 @@ def test_pair_forces_keep_momentum_and_angular_momentum_and_turn_with_the_frame(
     assert size > 0 and f.sum(0).abs().max() < 1e-12 * size
     assert torch.linalg.cross(x, f).sum(0).abs().max() < 1e-12 * size
     Q = rotations(1)[0]
-    torch.testing.assert_close(adapter.forces(x @ Q.T + 0.3, v @ Q.T, 1000.0), f @ Q.T, rtol=1e-9, atol=1e-9 * float(size.detach()))
+    torch.testing.assert_close(
+        adapter.forces(x @ Q.T + 0.3, v @ Q.T, 1000.0),
+        f @ Q.T,
+        rtol=1e-9,
+        atol=1e-9 * float(size.detach()),
+    )
 
 
 def test_the_bonds_have_the_bulk_modulus_of_a_quarter_before_anything_is_learned():
@@ -193,7 +208,9 @@ def test_the_bonds_have_the_bulk_modulus_of_a_quarter_before_anything_is_learned
     x = rest[adapter.nodes] * (1 + strain)
     virial = -(adapter.forces(x, torch.zeros_like(x), 1000.0) * rest[adapter.nodes]).sum()
     pressure = float(virial.detach()) / (3 * float(adapter.node_volume.sum()))
-    assert pressure == pytest.approx(3 * strain * E / (3 * (1 - 2 * 0.25)), rel=1e-3)  # strains are logarithms
+    assert pressure == pytest.approx(
+        3 * strain * E / (3 * (1 - 2 * 0.25)), rel=1e-3
+    )  # strains are logarithms
 
 
 def test_a_falling_body_is_rigid_until_it_lands_and_then_bounces():
@@ -226,13 +243,20 @@ def test_its_rollout_has_gradients():
 
 def rolled(body: Body, device: str, rollouts: int) -> list[torch.Tensor]:
     """Positions and gradients of the last of several rollouts, the weights stepped after each: on CUDA the last are graphs."""
-    body, world = body.to(device), replace(WORLD, **{name: getattr(WORLD, name).to(device) for name in ("gravity", "up", "box")})
+    body, world = (
+        body.to(device),
+        replace(
+            WORLD, **{name: getattr(WORLD, name).to(device) for name in ("gravity", "up", "box")}
+        ),
+    )
     for _ in range(rollouts):
         first = start()
         first = type(first)(*(t.to(device).requires_grad_() for t in vars(first).values()))
         weights = list(body.adapter.net.parameters())
         rollout = body.simulate(first, world, 6, FRAME_DT)
-        found = torch.autograd.grad(rollout.x.square().sum() + rollout.F.square().sum(), [first.velocity, *weights])
+        found = torch.autograd.grad(
+            rollout.x.square().sum() + rollout.F.square().sum(), [first.velocity, *weights]
+        )
         with torch.no_grad():
             for weight, gradient in zip(weights, found[1:]):
                 weight -= 0.01 * gradient / (gradient.norm() + 1e-12)
@@ -241,7 +265,10 @@ def rolled(body: Body, device: str, rollouts: int) -> list[torch.Tensor]:
 
 def test_the_adjoint_of_its_frames_is_that_of_their_substeps():
     body = adapted(InteractionNetwork(nodes=40, neighbours=8))
-    x, v = torch.nn.Parameter(lattice()[body.adapter.nodes]), torch.full((40, 3), 0.1).double().requires_grad_()
+    x, v = (
+        torch.nn.Parameter(lattice()[body.adapter.nodes]),
+        torch.full((40, 3), 0.1).double().requires_grad_(),
+    )
     dynamics = body.adapter.simulator(1000.0, WORLD, FRAME_DT)
     dynamics.substeps = 5
     weights = tuple(body.adapter.net.parameters())
@@ -250,7 +277,10 @@ def test_the_adjoint_of_its_frames_is_that_of_their_substeps():
     around = passes.gravity, passes.up, body.adapter.net
     there = dynamics.frame(*dynamics.frame(x, v, *around), *around)
     torch.testing.assert_close(moved, there, rtol=0, atol=0)
-    found, expected = (torch.autograd.grad(each[0].square().sum() + each[1].sum(), [x, v, *weights]) for each in (moved, there))
+    found, expected = (
+        torch.autograd.grad(each[0].square().sum() + each[1].sum(), [x, v, *weights])
+        for each in (moved, there)
+    )
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
 
 
@@ -306,13 +336,20 @@ def test_a_body_that_is_built_again_and_loaded_moves_alike(name):
     config = {"cfg": OmegaConf.to_container(cfg, resolve=True), "density": 1000.0, "dx": DX}
     rest = lattice().float()
     n = len(rest)
-    tensors = {"rest": rest, "volume": torch.full((n,), (DX / 2) ** 3), "colors": torch.ones(n, 3), "opacities": torch.ones(n),
-               "covariances": 1e-4 * torch.eye(3).expand(n, 3, 3)}
+    tensors = {
+        "rest": rest,
+        "volume": torch.full((n,), (DX / 2) ** 3),
+        "colors": torch.ones(n, 3),
+        "opacities": torch.ones(n),
+        "covariances": 1e-4 * torch.eye(3).expand(n, 3, 3),
+    }
     first = build_body(config, tensors)
     first.adapter.switch_on(E, NU)
     randomise(first.adapter, 0.1)
     again = build_body(config | {"cfg": config["cfg"] | {"seed": 7}}, tensors)
     again.load_state_dict(first.state_dict())
     with torch.no_grad():
-        here, there = (body.simulate(start(dtype=torch.float32), WORLD, 4, FRAME_DT) for body in (first, again))
+        here, there = (
+            body.simulate(start(dtype=torch.float32), WORLD, 4, FRAME_DT) for body in (first, again)
+        )
     assert torch.equal(here.x, there.x)

@@ -28,9 +28,19 @@ def appearance(count: int = 40, degree: int = 1, light: bool = True, seed: int =
     means = CENTER + 0.14 * (torch.rand(count, 3, generator=g) - 0.5)
     harmonics = 0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=g)
     colors = (0.5 + 0.28209479 * harmonics[:, 0]).clamp(0, 1)
-    splats = Splats(means, 0.005 + 0.01 * torch.rand(count, 3, generator=g), rotations, torch.rand(count, generator=g), colors)
+    splats = Splats(
+        means,
+        0.005 + 0.01 * torch.rand(count, 3, generator=g),
+        rotations,
+        torch.rand(count, generator=g),
+        colors,
+    )
     normals = torch.nn.functional.normalize(means - CENTER, dim=1)
-    return Appearance(splats, harmonics, normals, 0.3 * torch.randn(LIGHT, generator=g)) if light else Appearance(splats, harmonics)
+    return (
+        Appearance(splats, harmonics, normals, 0.3 * torch.randn(LIGHT, generator=g))
+        if light
+        else Appearance(splats, harmonics)
+    )
 
 
 def body_with(found: Appearance | None):
@@ -50,8 +60,17 @@ def test_without_splats_the_particles_are_seen():
     body = body_with(None)
     F = torch.eye(3).expand(2, N, 3, 3)
     x = torch.stack([body.rest, body.rest + 0.01])
-    wanted = observe(x, deformed_covariances(F, body.covariances), body.opacities, body.colors, views(), BACKGROUND).images
-    torch.testing.assert_close(seen(body, x, F).images(views(), BACKGROUND), wanted, rtol=0, atol=1e-6)
+    wanted = observe(
+        x,
+        deformed_covariances(F, body.covariances),
+        body.opacities,
+        body.colors,
+        views(),
+        BACKGROUND,
+    ).images
+    torch.testing.assert_close(
+        seen(body, x, F).images(views(), BACKGROUND), wanted, rtol=0, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -76,14 +95,18 @@ def test_the_light_is_that_of_the_place_where_a_normal_points_to():
     R = torch.as_tensor(Rotation.from_rotvec([0.5, 0, 0]).as_matrix()).expand(9, 3, 3)
     wanted = (0.5 * 0.4886025119029199 * ((R[0] @ normals.T).T - normals)[:, 2]).exp()
     torch.testing.assert_close(shading(light, normals, R), wanted)
-    assert torch.equal(shading(light, normals, torch.eye(3).double().expand(9, 3, 3)), torch.ones(9).double())
+    assert torch.equal(
+        shading(light, normals, torch.eye(3).double().expand(9, 3, 3)), torch.ones(9).double()
+    )
 
 
 def test_normals_of_a_ball_point_outwards():
     axis = torch.linspace(-1, 1, 13)
     grid = torch.cartesian_prod(axis, axis, axis)
     ball = grid[grid.norm(dim=1) < 0.95]
-    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(3)), dim=1)
+    directions = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(3)), dim=1
+    )
     cosine = (surface_normals(directions, ball) * directions).sum(1)
     assert float(cosine.min()) > 0.9
     assert torch.isfinite(surface_normals(grid[:1], grid[:1].expand(9, 3))).all()
@@ -93,7 +116,9 @@ def test_splats_are_no_part_of_the_state_and_follow_a_copy():
     body = body_with(appearance())
     assert not [name for name in body.state_dict() if "splats" in name]
     again = copy.deepcopy(body)
-    torch.testing.assert_close(again.splats.carry(body.rest[None]).means[0], body.splats.means, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        again.splats.carry(body.rest[None]).means[0], body.splats.means, rtol=0, atol=1e-6
+    )
 
 
 def with_splats(change=lambda stored: None):
@@ -118,9 +143,18 @@ def test_a_checkpoint_gives_them_back(tmp_path):
     ("change", "message"),
     [
         (lambda s: s.pop("light"), r"mosa\.splats: expected the parts .* found none called light"),
-        (lambda s: s.update(means=s["means"][:0]), r"mosa\.splats\.means: expected 1 to \d+ splats"),
-        (lambda s: s.update(scales=s["scales"][:, :2].clone()), r"splats\.scales: expected finite numbers of shape \(40, 3\)"),
-        (lambda s: s.update(harmonics=s["harmonics"][:, :3].clone()), r"harmonics: expected .* \(40, 1, 3\) or \(40, 4, 3\)"),
+        (
+            lambda s: s.update(means=s["means"][:0]),
+            r"mosa\.splats\.means: expected 1 to \d+ splats",
+        ),
+        (
+            lambda s: s.update(scales=s["scales"][:, :2].clone()),
+            r"splats\.scales: expected finite numbers of shape \(40, 3\)",
+        ),
+        (
+            lambda s: s.update(harmonics=s["harmonics"][:, :3].clone()),
+            r"harmonics: expected .* \(40, 1, 3\) or \(40, 4, 3\)",
+        ),
         (lambda s: s["opacities"].fill_(2.0), r"splats\.opacities: expected numbers from 0 to 1"),
         (lambda s: s["rotations"].zero_(), r"quaternions and normals that are not zero"),
         (lambda s: s["colors"].fill_(float("nan")), r"splats\.colors: expected finite numbers"),

@@ -22,9 +22,13 @@ def test_a_motion_that_is_seen_as_it_is_predicted_is_not_corrected(gain, contact
     body, begins = small_body(contact=contact), start(turn=0.6)
     free = simulated(body, begins)
     corrected = simulated(body, begins, observed=free.x, gain=gain)
-    assert free.x[:, :, 1].min() < 0.7 * DX  # it has touched the ground, whose friction is felt a cell above it
+    assert (
+        free.x[:, :, 1].min() < 0.7 * DX
+    )  # it has touched the ground, whose friction is felt a cell above it
     for name in ("x", "v", "F", "F_tot", "times"):
-        assert torch.allclose(getattr(free, name), getattr(corrected, name), rtol=0, atol=1e-11), name
+        assert torch.allclose(getattr(free, name), getattr(corrected, name), rtol=0, atol=1e-11), (
+            name
+        )
     assert corrected.inverted == free.inverted == 0 and corrected.counts == free.counts
 
 
@@ -32,7 +36,11 @@ def test_no_gain_is_the_free_rollout_bit_for_bit():
     body, begins = small_body(), start(turn=0.6)
     free = simulated(body, begins)
     other = simulated(body, begins, observed=torch.randn(free.x.shape).double(), gain=0.0)
-    assert torch.equal(free.x, other.x) and torch.equal(free.F, other.F) and torch.equal(free.v, other.v)
+    assert (
+        torch.equal(free.x, other.x)
+        and torch.equal(free.F, other.F)
+        and torch.equal(free.v, other.v)
+    )
 
 
 @pytest.mark.parametrize("gain", [0.1, 0.5, 1.0])
@@ -51,7 +59,9 @@ def test_in_free_flight_an_error_follows_its_closed_form(gain):
         d = d - gain * e / FRAME_DT
     error = corrected.x - truth.x
     expected = torch.tensor(expected, dtype=torch.float64)
-    assert torch.allclose(error[:, :, 1], expected[:, None].expand(error.shape[:2]), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        error[:, :, 1], expected[:, None].expand(error.shape[:2]), rtol=0, atol=1e-12
+    )
     assert error[:, :, [0, 2]].abs().max() < 1e-12
     # the form's invariant gain e^2 + gain e D + D^2 with D = T d bounds it, where the free rollout's grows without end
     bound = FRAME_DT * 0.25 / (gain * (1 - gain / 4)) ** 0.5
@@ -65,8 +75,12 @@ def test_a_start_that_is_off_stays_nearer_through_the_bounce():
     seen = simulated(truth, start(turn=0.6), 24)
     body, wrong = small_body(E=2e4), start(turn=0.6, speed=-1.2)
     free = (simulated(body, wrong, 24).x - seen.x).norm(dim=-1).mean(1)
-    corrected = (simulated(body, wrong, 24, observed=seen.x, gain=0.5).x - seen.x).norm(dim=-1).mean(1)
-    assert torch.allclose(free[:2], corrected[:2], rtol=1e-12)  # frame 1 is predicted before anything is corrected
+    corrected = (
+        (simulated(body, wrong, 24, observed=seen.x, gain=0.5).x - seen.x).norm(dim=-1).mean(1)
+    )
+    assert torch.allclose(
+        free[:2], corrected[:2], rtol=1e-12
+    )  # frame 1 is predicted before anything is corrected
     assert corrected[12:].mean() < 0.5 * free[12:].mean()
 
 
@@ -103,7 +117,9 @@ def test_one_frame_is_the_start():
 def test_what_a_criterion_compares_and_refuses():
     assert Criterion("free", 0.5).gains == (0.0,) and Criterion("corrected", 0.3).gains == (0.3,)
     assert Criterion("both", 0.3).gains == (0.0, 0.3)
-    with pytest.raises(ConfigError, match=r"criterion\.name: expected free or corrected or both, found 'open'"):
+    with pytest.raises(
+        ConfigError, match=r"criterion\.name: expected free or corrected or both, found 'open'"
+    ):
         Criterion("open")
     for gain in (0.0, -0.1, 1.1, float("nan")):
         with pytest.raises(ConfigError, match=r"criterion\.gain: expected"):
@@ -112,16 +128,33 @@ def test_what_a_criterion_compares_and_refuses():
 
 def test_laws_side_by_side_are_so_many_simulations():
     """What differences of a residual need: a law in each world, free and corrected, to the last bit."""
-    body, begins = small_body(numbers=0.1 * torch.linspace(-1, 1, 19).double(), contact=True), start(speed=-2.0)
-    laws = read_numbers(body) + 0.02 * torch.randn(3, len(read_numbers(body)), generator=torch.Generator().manual_seed(2)).double()
+    body, begins = (
+        small_body(numbers=0.1 * torch.linspace(-1, 1, 19).double(), contact=True),
+        start(speed=-2.0),
+    )
+    laws = (
+        read_numbers(body)
+        + 0.02
+        * torch.randn(
+            3, len(read_numbers(body)), generator=torch.Generator().manual_seed(2)
+        ).double()
+    )
     with torch.no_grad():
         seen = body.simulate(begins, WORLD, 6, FRAME_DT).x + 1e-3
         for more in ({}, {"observed": seen, "gain": 0.5}):
-            expected = [body.simulate(begins, WORLD, 6, FRAME_DT, substeps=12, **more) for _ in each_law(body, laws)]
-            parts = [body.ready(begins, WORLD, 6, FRAME_DT, substeps=12).answered() for _ in each_law(body, laws)]
+            expected = [
+                body.simulate(begins, WORLD, 6, FRAME_DT, substeps=12, **more)
+                for _ in each_law(body, laws)
+            ]
+            parts = [
+                body.ready(begins, WORLD, 6, FRAME_DT, substeps=12).answered()
+                for _ in each_law(body, laws)
+            ]
             found = Ready.stack(parts).simulate(6, **more).worlds()
             for own, other in zip(expected, found, strict=True):
                 assert torch.equal(own.x, other.x) and torch.equal(own.F, other.F)
             assert (expected[0].x - expected[1].x).abs().max() > 1e-5
-    with pytest.raises(ConfigError, match=r"worlds: expected the same fixed substeps in all, found \[12, 16\]"):
+    with pytest.raises(
+        ConfigError, match=r"worlds: expected the same fixed substeps in all, found \[12, 16\]"
+    ):
         Ready.stack([parts[0], body.ready(begins, WORLD, 6, FRAME_DT, substeps=16)])

@@ -24,7 +24,9 @@ def test_it_starts_as_the_prior_and_is_bounded_and_stress_free_at_rest():
     randomise(adapter, 10.0)
     answer = adapter(material_state(w, s))
     assert torch.equal(answer.G, torch.zeros(30, 6, 6))
-    assert 0 < answer.h.abs().max() <= 2 * 0.1 * E_REF  # within l_max, and the same of what it subtracts at rest
+    assert (
+        0 < answer.h.abs().max() <= 2 * 0.1 * E_REF
+    )  # within l_max, and the same of what it subtracts at rest
     zero = torch.zeros(30, 6)
     assert torch.equal(adapter(material_state(zero, zero)).h, zero)
 
@@ -35,8 +37,12 @@ def test_increment_and_redistribution_say_the_same():
     adapter.switch_on(E_REF)
     w, s = drawn_states(10)
     A, b = adapter.redistribution(w, s)
-    torch.testing.assert_close((A @ s[..., None])[..., 0] - s + b, adapter.increment(w, s), rtol=0, atol=1e-14)
-    torch.testing.assert_close(adapter(material_state(w, s)).h, E_REF * b, rtol=1e-13, atol=0)  # sums of six in other orders
+    torch.testing.assert_close(
+        (A @ s[..., None])[..., 0] - s + b, adapter.increment(w, s), rtol=0, atol=1e-14
+    )
+    torch.testing.assert_close(
+        adapter(material_state(w, s)).h, E_REF * b, rtol=1e-13, atol=0
+    )  # sums of six in other orders
 
 
 @pytest.mark.parametrize("switch", ["no_C", "no_pre", "no_post", "no_prior_stress"])

@@ -17,9 +17,25 @@ from mosa.data.synthetic.drop import simulate
 from mosa.data.synthetic.films import built
 from mosa.environments import arena as arenas
 from mosa.environments import command, pictures, study
-from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
+from mosa.environments.arena import (
+    LOST,
+    Arena,
+    Simulator,
+    play,
+    play_all,
+    simulator_named,
+    world_of,
+)
 from mosa.environments.pictures import film
-from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_evolution, by_gradient, by_model, by_reinforcement
+from mosa.environments.policies import (
+    LinearPolicy,
+    Search,
+    _side_by_side,
+    by_evolution,
+    by_gradient,
+    by_model,
+    by_reinforcement,
+)
 from mosa.environments.study import Bench, Setting
 from mosa.environments.task import View
 from mosa.environments.tasks import CLEARANCE, TASKS, task_named
@@ -42,7 +58,9 @@ def simulator(name="learned", E=6e4, precision=32):
 
 def arena(task="pushing", worlds=3, steps=None, precision=32, **options):
     made = simulator(precision=precision)
-    return Arena(made, task_named(task, made.twin.body.rest, steps=steps or SHORT[task], **options), worlds)
+    return Arena(
+        made, task_named(task, made.twin.body.rest, steps=steps or SHORT[task], **options), worlds
+    )
 
 
 def drawn(made, count, seed=0):
@@ -54,7 +72,9 @@ def test_the_truth_is_what_the_films_show():
     film_of, sequence = object_named("tiny"), "test_60"
     surface, particles, _ = built(film_of.shape, film_of.pitch, film_of.spacing, 0)
     drops = film_of.drops
-    fall = simulate(film_of, film_of.material, particles, surface.vertices, drops[sequence], drops["train"])
+    fall = simulate(
+        film_of, film_of.material, particles, surface.vertices, drops[sequence], drops["train"]
+    )
     twin = true_twin("tiny", sequence)
     np.testing.assert_allclose(twin.body.rest.numpy(), fall.rest, atol=1e-6)
     worlds = twin.worlds(2)
@@ -67,7 +87,10 @@ def test_the_truth_is_what_the_films_show():
     again = twin.simulate(variant="prior", frames=film_of.footage.frames)
     np.testing.assert_allclose(again.x[-1].numpy(), fall.positions[-1], atol=2e-3)  # other substeps
     other = true_twin("tiny", material="isotropic", spacing=0.02)
-    assert len(other.body.rest) < 0.5 * len(twin.body.rest) and float(other.body.material.true_kf.abs().max()) == 0
+    assert (
+        len(other.body.rest) < 0.5 * len(twin.body.rest)
+        and float(other.body.material.true_kf.abs().max()) == 0
+    )
     with pytest.raises(ConfigError, match=r"scene\.name: expected one of the built-in"):
         true_twin("unicorn")
 
@@ -79,7 +102,10 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     assert [s["name"] for s in task.solids()] == [s["name"] for s in double.solids()] != []
     for quantity in (*task.actions, *task.observations, *task.drawn[0], *task.drawn[1]):
         assert quantity.unit in ("m", "rad", "m/s", "rad/s", "1") and quantity.low < quantity.high
-    low, high = task.physical(-torch.ones(1, len(task.actions))), task.physical(torch.ones(1, len(task.actions)))
+    low, high = (
+        task.physical(-torch.ones(1, len(task.actions))),
+        task.physical(torch.ones(1, len(task.actions))),
+    )
     assert low[0].tolist() == pytest.approx([q.low for q in task.actions])
     assert high[0].tolist() == pytest.approx([q.high for q in task.actions])
     a, b = (task.draw(5, torch.Generator().manual_seed(s)) for s in (1, 2))
@@ -87,20 +113,27 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     assert torch.equal(a.observed, task.draw(5, torch.Generator().manual_seed(1)).observed)
     with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
         task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
-    with pytest.raises(ConfigError, match="task: expected one of placement, hanging, striking, pushing"):
+    with pytest.raises(
+        ConfigError, match="task: expected one of placement, hanging, striking, pushing"
+    ):
         task_named("juggling", torch.zeros(2, 3))
 
 
 def view(task, center=(0.0, 0.0, 0.0), lean=0.0, lowest=0.0, speed=0.0):
     up = torch.tensor([[np.sin(lean), np.cos(lean), 0.0]]).float()
     moved = torch.tensor([[speed, 0.0, 0.0]])
-    return View(torch.tensor([center]), moved, up, torch.tensor([lowest]), torch.zeros(1, 3), torch.zeros(1))
+    return View(
+        torch.tensor([center]), moved, up, torch.tensor([lowest]), torch.zeros(1, 3), torch.zeros(1)
+    )
 
 
 def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
     rest = torch.tensor([[0.0, 0, 0], [0.2, 0.24, 0.16]])
     placement, hanging, striking, pushing = (task_named(name, rest) for name in TASKS)
-    nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, striking, pushing)}
+    nothing = {
+        task.name: task.draw(1, torch.Generator())
+        for task in (placement, hanging, striking, pushing)
+    }
     top, grip = placement.top, hanging.grip
     tx, tz = nothing["pushing"].observed[0].tolist()
     sx, sz = nothing["striking"].observed[0].tolist()
@@ -117,7 +150,13 @@ def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
         for worse in bad[task]:
             wrong = view(task, **{**values, **worse})
             assert not bool(task.succeeded(trials, wrong)), (task.name, worse)
-        farther = view(task, **{**values, "center": tuple(c + d for c, d in zip(values["center"], (0.3, -0.1, 0.1)))})
+        farther = view(
+            task,
+            **{
+                **values,
+                "center": tuple(c + d for c, d in zip(values["center"], (0.3, -0.1, 0.1))),
+            },
+        )
         assert float(task.loss(trials, farther)) > float(task.loss(trials, fine)) + 1
 
 
@@ -139,7 +178,12 @@ def test_a_hand_reaches_its_aim_in_free_fall():
         turned = made.rest @ begun["rotation"].T
         assert float((turned - upright).norm(dim=1).max()) > 0.01
     first = made.worlds.reset(starts, colliders=made.task.solids(), control_dt=made.task.control_dt)
-    torch.testing.assert_close(first.positions[..., 1].amin(1), torch.full((4,), made.task.top + CLEARANCE), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        first.positions[..., 1].amin(1),
+        torch.full((4,), made.task.top + CLEARANCE),
+        atol=1e-6,
+        rtol=0,
+    )
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -147,9 +191,17 @@ def test_every_trial_is_its_own_world(name):
     """The same trials in three worlds and in one at a time; the recorded motion ends where the view is."""
     many, alone = arena(name, 3), arena(name, 1)
     trials, policy = drawn(many, 3), LinearPolicy(many.task)
-    together, apart = play(many, trials, policy, record=True), [play(alone, trials.select([b]), policy) for b in range(3)]
-    torch.testing.assert_close(together.loss, torch.cat([p.loss for p in apart]), rtol=1e-4, atol=1e-5)
-    assert together.success.tolist() == [bool(p.success) for p in apart] and not together.diverged.any()
+    together, apart = (
+        play(many, trials, policy, record=True),
+        [play(alone, trials.select([b]), policy) for b in range(3)],
+    )
+    torch.testing.assert_close(
+        together.loss, torch.cat([p.loss for p in apart]), rtol=1e-4, atol=1e-5
+    )
+    assert (
+        together.success.tolist() == [bool(p.success) for p in apart]
+        and not together.diverged.any()
+    )
     x, F, places = together.states
     assert x.shape[:2] == (many.task.steps + 1, 3) and F.shape == (*x.shape, 3)
     assert places.shape == (*x.shape[:2], len(many.task.solids()), 3, 4)
@@ -178,12 +230,16 @@ def test_gradients_of_the_loss_reach_the_policy(name):
                 parameter.copy_(value + side * d)
         sides.append(float(play(made, trials, policy).loss.sum()))
     slope = (sides[0] - sides[1]) / (2 * step)
-    assert sum(float((g * d).sum()) for g, d in zip(found, direction)) == pytest.approx(slope, rel=1e-3)
+    assert sum(float((g * d).sum()) for g, d in zip(found, direction)) == pytest.approx(
+        slope, rel=1e-3
+    )
 
 
 def test_descent_through_the_simulator_lowers_the_loss():
     train, check = arena("pushing", 2), arena("pushing", 2)
-    found = by_gradient(train, check, Search(iterations=4, batch=2, rate=0.05, every=4, validation=2), seed=0)
+    found = by_gradient(
+        train, check, Search(iterations=4, batch=2, rate=0.05, every=4, validation=2), seed=0
+    )
     losses = [entry["loss"] for entry in found.history]
     assert len(losses) == 2 and losses[1] < losses[0] - 0.1 and found.trials == 4 * 2 + 2 * 2
     validation = check.task.draw(2, torch.Generator().manual_seed(10**6))
@@ -211,17 +267,41 @@ def test_a_paddle_turns_as_it_is_told_and_a_picture_shows_it_and_the_target():
 
 def test_the_jaws_of_the_tower_close_about_what_is_between_them():
     """A body that is there when they close is held, and one that is not goes on."""
-    made = arena("hanging", worlds=2, steps=20, shut=0, closing=3, close=0.0, far=0.0, aside=0.0, grip=0.1, free=0.01, squeeze=0.4)
+    made = arena(
+        "hanging",
+        worlds=2,
+        steps=20,
+        shut=0,
+        closing=3,
+        close=0.0,
+        far=0.0,
+        aside=0.0,
+        grip=0.1,
+        free=0.01,
+        squeeze=0.4,
+    )
     played = []
     for before in (0.0, 0.3):
         object.__setattr__(made.task, "before", before)
         trials = drawn(made, 2)
-        played.append(play(made, trials, lambda _: torch.tensor([[0.0, 0, 0, 0, -1.0]]).repeat(2, 1), record=True))
-    apart = [shown.states[2][:, 0, 1, 2, 3] - shown.states[2][:, 0, 0, 2, 3] - made.task.JAW[2] for shown in played]
+        played.append(
+            play(
+                made,
+                trials,
+                lambda _: torch.tensor([[0.0, 0, 0, 0, -1.0]]).repeat(2, 1),
+                record=True,
+            )
+        )
+    apart = [
+        shown.states[2][:, 0, 1, 2, 3] - shown.states[2][:, 0, 0, 2, 3] - made.task.JAW[2]
+        for shown in played
+    ]
     wide = made.task.extents[2]
     for faces in apart:
         assert float(faces[0]) == pytest.approx(wide + 2 * made.task.OPEN, abs=1e-6)
-        torch.testing.assert_close(faces[3:].float(), torch.full((18,), 0.6 * wide), atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            faces[3:].float(), torch.full((18,), 0.6 * wide), atol=1e-6, rtol=0
+        )
     moved = [(shown.states[0][-1] - shown.states[0][-2]).mean(1).norm(dim=1) for shown in played]
     assert float(moved[0].max()) < 1e-3 and float(moved[1].min()) > 1e-2, moved
     shots = [film(made, (x[-1:], F[-1:], places[[k]]), 0, 1, size=96)[0].astype(float) for x, F, places in [played[1].states]
@@ -237,7 +317,10 @@ def test_a_model_of_what_was_tried_leads():
     assert losses[-1] < losses[0] - 0.2 and found.trials == 2 * 24 + 2 * 4
     again = by_model(train, check, search, seed=0)
     assert again.history == found.history
-    with pytest.raises(ConfigError, match="policy: expected a task of one decision with policy=model, found task=pushing"):
+    with pytest.raises(
+        ConfigError,
+        match="policy: expected a task of one decision with policy=model, found task=pushing",
+    ):
         by_model(arena("pushing", 2), arena("pushing", 2), search, seed=0)
 
 
@@ -253,7 +336,9 @@ def test_a_stroke_is_one_decision_after_which_the_paddle_stands():
     v = made.task.physical(action).double()
     went = 3 * made.task.control_dt * torch.stack([v[:, 0], 0 * v[:, 0], v[:, 1]], 1)
     torch.testing.assert_close(made.view.tool - before, went, atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(made.view.tool_turn, 3 * made.task.control_dt * v[:, 2], atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(
+        made.view.tool_turn, 3 * made.task.control_dt * v[:, 2], atol=1e-6, rtol=1e-5
+    )
     fast, slow = made.view.center[:, 0] - trials.hidden[:, 0]
     assert fast > slow + 0.02
 
@@ -266,13 +351,19 @@ def test_the_best_of_drawn_policies_lead():
     losses = [entry["loss"] for entry in found.history]
     assert losses[-1] < losses[0] - 0.1 and found.trials == 8 * 8 + 2 * 4
     policy = LinearPolicy(check.task)
-    numbers = torch.randn(3, sum(p.numel() for p in policy.parameters()), generator=torch.Generator().manual_seed(0))
+    numbers = torch.randn(
+        3, sum(p.numel() for p in policy.parameters()), generator=torch.Generator().manual_seed(0)
+    )
     seen = torch.randn(6, len(check.task.observations), generator=torch.Generator().manual_seed(1))
     together = _side_by_side(policy, numbers, 2)(seen)
     for k, own in enumerate(numbers):
         torch.nn.utils.vector_to_parameters(own, policy.parameters())
-        torch.testing.assert_close(together[2 * k : 2 * k + 2], policy(seen[2 * k : 2 * k + 2]).detach())
-    with pytest.raises(ConfigError, match="search: expected 8 candidates times 1 trials as worlds, found 4"):
+        torch.testing.assert_close(
+            together[2 * k : 2 * k + 2], policy(seen[2 * k : 2 * k + 2]).detach()
+        )
+    with pytest.raises(
+        ConfigError, match="search: expected 8 candidates times 1 trials as worlds, found 4"
+    ):
         by_evolution(check, check, search, seed=1)
 
 
@@ -290,7 +381,11 @@ def test_a_trial_that_diverges_is_lost_and_the_others_go_on(monkeypatch):
 
     monkeypatch.setattr(made.worlds, "step", failing)
     lost = play(made, trials, policy)
-    assert lost.diverged.tolist() == [False, True, False] and float(lost.loss[1]) == LOST and not bool(lost.success[1])
+    assert (
+        lost.diverged.tolist() == [False, True, False]
+        and float(lost.loss[1]) == LOST
+        and not bool(lost.success[1])
+    )
     torch.testing.assert_close(lost.loss[[0, 2]], whole.loss[[0, 2]], rtol=1e-5, atol=1e-6)
     assert world_of(SimulationDiverged("substep 3")) is None
     calls.clear()
@@ -319,7 +414,11 @@ def small_bench(tmp_path, monkeypatch, **changes):
     values = {"task": "pushing", "checkpoint": None, "scene": "tiny", "device": "cpu", "policy": "gradient", "search": search,
               "decisions": 8, "trials": 3, "worlds": 2, "spacing": None, "train_spacing": None,
               "options": {"steps": 4}}  # fmt: skip
-    made = {"learned": simulator(), "isotropic": simulator("isotropic", E=1.2e5), "truth": simulator("truth", E=3e4)}
+    made = {
+        "learned": simulator(),
+        "isotropic": simulator("isotropic", E=1.2e5),
+        "truth": simulator("truth", E=3e4),
+    }
     monkeypatch.setattr(study, "simulator_named", lambda name, *a, **k: made[name])
     return Bench(Setting(**{**values, **changes}))
 
@@ -331,7 +430,9 @@ def test_the_table_is_made_once_and_resumed(tmp_path, monkeypatch):
     assert jobs == [f"pushing_{name}_0.json" for name in ("isotropic", "learned", "none", "truth")]
     assert all(f"\n| {name} " in text for name in ("none", "learned", "isotropic", "truth"))
     rows = (tmp_path / "pushing.csv").read_text().splitlines()
-    assert rows[0] == "task,trained_in,seed,tested_in,trial,success,loss" and len(rows) == 1 + 3 * (1 + 2 + 2 + 1)
+    assert rows[0] == "task,trained_in,seed,tested_in,trial,success,loss" and len(rows) == 1 + 3 * (
+        1 + 2 + 2 + 1
+    )
     assert (tmp_path / "pushing_trial_0.png").stat().st_size > 5000
     kept = json.loads((tmp_path / "jobs" / "pushing_learned_0.json").read_text())
     tested = study.test(bench, "truth", LinearPolicy.read(bench.task("truth"), kept["policy"]))
@@ -341,15 +442,22 @@ def test_the_table_is_made_once_and_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "films", lambda *a: [])
     assert study.table(bench, ["learned", "isotropic", "truth"], [0], tmp_path).read_text() == text
     other = small_bench(tmp_path, monkeypatch, trials=2)
-    with pytest.raises(DataError, match=r"pushing_none_0.json: expected a job of the same setting, found trials=3 instead of 2"):
+    with pytest.raises(
+        DataError,
+        match=r"pushing_none_0.json: expected a job of the same setting, found trials=3 instead of 2",
+    ):
         study.table(other, ["learned"], [0], tmp_path)
 
 
 def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
-    values = OmegaConf.to_container(OmegaConf.load(study.Path(command.__file__).parents[2] / "conf" / "environments.yaml"))
+    values = OmegaConf.to_container(
+        OmegaConf.load(study.Path(command.__file__).parents[2] / "conf" / "environments.yaml")
+    )
     values.pop("defaults")
     setting = command.setting_of(values)
-    assert setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100
+    assert (
+        setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100
+    )
     for change, message in (({"task": "juggling"}, "task: expected one of placement"), ({"trials": 0}, "trials: expected a whole"),
                             ({"policy": "magic"}, "policy: expected one of gradient, cma, model, sac, ppo"),
                             ({"options": {"nearr": 1.0}}, "options.nearr: expected one of steps"),
@@ -365,7 +473,9 @@ def test_a_picture_shows_the_body_on_its_box():
     assert len(pictures) == 2 and pictures[0].shape == (48, 48, 3) and pictures[0].dtype == np.uint8
     x, F, tool = played.states
     gone = film(made, (x + torch.tensor([0.0, 5.0, 0.0]), F, tool), 0, 1, size=48)[0]
-    assert np.abs(pictures[0].astype(int) - gone).max() > 60  # the white body hides what is behind it
+    assert (
+        np.abs(pictures[0].astype(int) - gone).max() > 60
+    )  # the white body hides what is behind it
 
 
 def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
@@ -381,7 +491,9 @@ def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
 
     monkeypatch.delitem(sys.modules, "mosa.environments.gymnasium_api", raising=False)
     monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(ConfigError, match=r"expected Gymnasium, found none; pip install 'mosa\[environments\]'"):
+    with pytest.raises(
+        ConfigError, match=r"expected Gymnasium, found none; pip install 'mosa\[environments\]'"
+    ):
         by_reinforcement("sac", arena(), 8, 0)
     with pytest.raises(ConfigError, match="policy: expected one of sac, ppo"):
         by_reinforcement("magic", arena(), 8, 0)
@@ -391,15 +503,22 @@ def test_a_checkpoint_that_does_not_say_its_scene_is_named(monkeypatch):
     """One line that names file and field; with a scene that is named it is not asked."""
     learned = SimpleNamespace(config={"cfg": {}})
     monkeypatch.setattr(arenas.Twin, "load", lambda *a: learned)
-    with pytest.raises(DataError, match=r"old\.ckpt: cfg\.scene: expected the scene that the twin was learned from, found none"):
+    with pytest.raises(
+        DataError,
+        match=r"old\.ckpt: cfg\.scene: expected the scene that the twin was learned from, found none",
+    ):
         simulator_named("truth", "old.ckpt")
-    for scene, error, message in (({"format": "builtin"}, DataError, r"old\.ckpt: cfg\.scene\.name: expected the name"),
-                                  ({"format": "transforms", "name": "x"}, ConfigError, "truth is known for built-in")):
+    for scene, error, message in (
+        ({"format": "builtin"}, DataError, r"old\.ckpt: cfg\.scene\.name: expected the name"),
+        ({"format": "transforms", "name": "x"}, ConfigError, "truth is known for built-in"),
+    ):
         learned.config["cfg"]["scene"] = scene
         with pytest.raises(error, match=message):
             simulator_named("truth", "old.ckpt")
     learned.config.clear()
-    assert len(simulator_named("truth", "old.ckpt", scene="tiny", spacing=0.03).twin.body.rest) < 300
+    assert (
+        len(simulator_named("truth", "old.ckpt", scene="tiny", spacing=0.03).twin.body.rest) < 300
+    )
 
 
 def test_several_processes_share_a_table(tmp_path, monkeypatch):
@@ -409,7 +528,9 @@ def test_several_processes_share_a_table(tmp_path, monkeypatch):
     assert not (tmp_path / "pushing.md").exists()
     made = []
     record = study._record
-    monkeypatch.setattr(study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed))
+    monkeypatch.setattr(
+        study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed)
+    )
     page = study.table(bench, ["learned", "isotropic"], [0], tmp_path, filmed=0)
     assert made == ["isotropic"] and not list(tmp_path.glob("*.png"))
     document = tmp_path / "doc.md"
@@ -417,7 +538,9 @@ def test_several_processes_share_a_table(tmp_path, monkeypatch):
     for _ in range(2):
         study.put_into(document, page, "pushing")
     text = document.read_text()
-    assert text.startswith("before\n<!-- table: pushing -->\nOf 3 drawn trials") and text.endswith("<!-- end -->\nafter\n")
+    assert text.startswith("before\n<!-- table: pushing -->\nOf 3 drawn trials") and text.endswith(
+        "<!-- end -->\nafter\n"
+    )
     assert "old" not in text and text.count("\n| isotropic ") == 1
     with pytest.raises(DataError, match=r"doc\.md: expected a line '<!-- table: hanging -->'"):
         study.put_into(document, page, "hanging")
@@ -432,11 +555,16 @@ def test_the_truths_jobs_do_not_wait_for_a_twin(tmp_path, monkeypatch):
     bench = small_bench(tmp_path, monkeypatch, checkpoint=str(checkpoint), scene=None)
     bench.simulator("learned").twin.config["cfg"] = {"scene": {"format": "builtin", "name": "tiny"}}
     made, record = [], study._record
-    monkeypatch.setattr(study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed))
+    monkeypatch.setattr(
+        study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed)
+    )
     study.table(bench, ["learned", "truth"], [0], tmp_path, filmed=0)
     assert made == ["learned"]
     bench.simulator("learned").twin.config["cfg"]["scene"]["seed"] = 3
-    with pytest.raises(DataError, match=r"pushing_truth_0.json: expected a job of the same setting, .*'seed': 0.*'seed': 3"):
+    with pytest.raises(
+        DataError,
+        match=r"pushing_truth_0.json: expected a job of the same setting, .*'seed': 0.*'seed': 3",
+    ):
         study.make_jobs(bench, [("truth", 0)], tmp_path)
 
 

@@ -29,7 +29,9 @@ BALL.pop("position")
 
 def twin(precision=64, world=WORLD, **options):
     body = small_body(precision=precision, contact=True, numbers=NUMBERS, **options)
-    return Twin(body, world, FRAME_DT, {}, start(dtype=torch.float64 if precision == 64 else torch.float32))
+    return Twin(
+        body, world, FRAME_DT, {}, start(dtype=torch.float64 if precision == 64 else torch.float32)
+    )
 
 
 @pytest.mark.parametrize("adaptive", [False, True])
@@ -47,7 +49,10 @@ def test_a_state_of_any_speed_is_refused_by_what_it_takes(added, adaptive):
 def test_a_step_that_is_too_long_for_its_speed_is_refused():
     made = twin()
     made.reset(velocity=(2e5, 0, 0), control_dt=1, substeps=1)
-    with pytest.raises(SimulationDiverged, match=r"particles spread over 1e\+07 x .* \(speeds to 2e\+05 m/s\): use more substeps"):
+    with pytest.raises(
+        SimulationDiverged,
+        match=r"particles spread over 1e\+07 x .* \(speeds to 2e\+05 m/s\): use more substeps",
+    ):
         made.step()
 
 
@@ -57,19 +62,32 @@ def test_steps_are_one_long_simulation_to_the_last_bit(precision, adaptive):
     """Also from a state that was saved and read, and with colliders on motions of their own."""
     made = twin(precision)
     made.body.settings = replace(made.body.settings, adaptive=adaptive)
-    given = {"colliders": [PUSHER, BALL], "position": (0.01, None, -0.02), "velocity": (0.1, -1.0, 0.0), "frames": STEPS + 1}
+    given = {
+        "colliders": [PUSHER, BALL],
+        "position": (0.01, None, -0.02),
+        "velocity": (0.1, -1.0, 0.0),
+        "frames": STEPS + 1,
+    }
     long = made.simulate(**given)
     state = made.reset(**given)
-    assert torch.equal(state.positions, long.x[0]) and long.reactions.abs().max() > 1 and float(state.time) == 0
+    assert (
+        torch.equal(state.positions, long.x[0])
+        and long.reactions.abs().max() > 1
+        and float(state.time) == 0
+    )
     assert torch.allclose(long.x[0].mean(0)[::2], torch.tensor([0.01, -0.02]).to(long.x))
     for k in range(STEPS):
         state, reactions = made.step()
-        assert torch.equal(state.positions, long.x[k + 1]) and torch.equal(reactions, long.reactions[k])
+        assert torch.equal(state.positions, long.x[k + 1]) and torch.equal(
+            reactions, long.reactions[k]
+        )
         if k == 3:
             file, branch = BytesIO(), state
             torch.save(state.tensors(), file)
     assert (made.episode.substeps is None) == adaptive and int(state.substeps) == sum(long.counts)
-    assert float(state.time) == pytest.approx(STEPS * FRAME_DT) and float(state.position[0, 0]) == pytest.approx(-0.12 + 0.6 / 7.5)
+    assert float(state.time) == pytest.approx(STEPS * FRAME_DT) and float(
+        state.position[0, 0]
+    ) == pytest.approx(-0.12 + 0.6 / 7.5)
     assert float(state.position[1, 1]) == pytest.approx(0.15) and not state.driven.any()
     file.seek(0)
     for saved in (TwinState.read(torch.load(file, weights_only=True)), branch):
@@ -92,7 +110,10 @@ def test_driven_colliders_are_the_trajectory_of_their_commands():
         v, w = (0.3 * torch.randn(3, generator=generator).double() for _ in range(2))
         command = {"velocity": v, "angular_velocity": w}
         if kind == 1:
-            target = {"position": before.position[0] + FRAME_DT * v, "rotation": exponential(FRAME_DT * w) @ before.rotation[0]}
+            target = {
+                "position": before.position[0] + FRAME_DT * v,
+                "rotation": exponential(FRAME_DT * w) @ before.rotation[0],
+            }
             command = target
         elif kind == 2:
             command, w = tuple(v.tolist()), torch.zeros(3).double()
@@ -100,11 +121,17 @@ def test_driven_colliders_are_the_trajectory_of_their_commands():
         v, w = (0 * v, 0 * w) if kind == 3 else (v, w)
         state, reactions = made.step(action)
         if kind == 1:
-            assert torch.equal(state.position[0], target["position"]) and torch.equal(state.rotation[0], target["rotation"])
-        torch.testing.assert_close(state.position[0], before.position[0] + FRAME_DT * v, rtol=0, atol=1e-15)
+            assert torch.equal(state.position[0], target["position"]) and torch.equal(
+                state.rotation[0], target["rotation"]
+            )
+        torch.testing.assert_close(
+            state.position[0], before.position[0] + FRAME_DT * v, rtol=0, atol=1e-15
+        )
         times = dt * torch.arange(count).double()[:, None]
         turned = exponential(times * w) @ before.rotation[0]
-        parts.append((before.position[0] + times * v, turned, v.expand(count, 3), w.expand(count, 3)))
+        parts.append(
+            (before.position[0] + times * v, turned, v.expand(count, 3), w.expand(count, 3))
+        )
         states.append(state)
     assert reactions.abs().max() > 1e-3 and states[-1].driven.tolist() == [True, False]
     moving = Trajectory(*(torch.cat(values) for values in zip(*parts)))
@@ -119,7 +146,13 @@ def test_gradients_of_a_control_sequence_are_central_differences():
     a spring begins at no force, and nodes stick to the ground or do not touch it."""
     steps, generator = 50, torch.Generator().manual_seed(0)
     made = twin(world=STICKY, counts=(4, 4, 3))
-    pusher = {**PUSHER, "position": [-0.115, 0.08, 0], "mode": "sticky", "friction": 0, "motion": None}
+    pusher = {
+        **PUSHER,
+        "position": [-0.115, 0.08, 0],
+        "mode": "sticky",
+        "friction": 0,
+        "motion": None,
+    }
     values = {
         "velocity": torch.tensor([0.1, -0.5, 0.1]).double(), "position": torch.tensor([0.0, 0.08, -0.01]).double(),
         "spin": torch.tensor([0.5, 1.0, -2.0]).double(),
@@ -127,7 +160,11 @@ def test_gradients_of_a_control_sequence_are_central_differences():
         "turns": 0.5 * torch.randn(steps, 3, generator=generator).double(),
     }  # fmt: skip
     body = made.body
-    law = {"E": body.material.raw["E"], "numbers": body.adapter.numbers, "contact": body.contact.cells}
+    law = {
+        "E": body.material.raw["E"],
+        "numbers": body.adapter.numbers,
+        "contact": body.contact.cells,
+    }
     felt = []
 
     def loss(given):
@@ -138,7 +175,11 @@ def test_gradients_of_a_control_sequence_are_central_differences():
             state, reactions = made.step({"pusher": {"velocity": v, "angular_velocity": w}})
             total = total + 1e-3 * reactions.mean(0).square().sum()
             felt.append(bool(reactions.detach().abs().max() > 1e-3))
-        return total + (state.positions - torch.tensor([0.1, 0.1, 0.0])).square().sum() + 0.01 * state.v.square().sum()
+        return (
+            total
+            + (state.positions - torch.tensor([0.1, 0.1, 0.0])).square().sum()
+            + 0.01 * state.v.square().sum()
+        )
 
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     found = torch.autograd.grad(loss(leaves), [*leaves.values(), *law.values()])
@@ -157,18 +198,36 @@ def test_gradients_of_a_control_sequence_are_central_differences():
                     sides.append(loss(values))
                     value.copy_(kept)
         slope = (sides[0] - sides[1]) / 2e-5
-        torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-5, atol=0, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(
+            (gradient * direction).sum(),
+            slope,
+            rtol=1e-5,
+            atol=0,
+            msg=lambda m, name=name: f"{name}: {m}",
+        )
 
 
-PLATE = {"type": "box", "name": "plate", "size": [0.05, 0.4, 0.4], "mode": "separate", "friction": 0.3}
+PLATE = {
+    "type": "box",
+    "name": "plate",
+    "size": [0.05, 0.4, 0.4],
+    "mode": "separate",
+    "friction": 0.3,
+}
 """1.25 cells, and its edges far from the body."""
 
 
 def pushed(made, plate, speed, steps=12):
     """How far a body is pushed by a plate of that speed (3,) which begins a cell before it."""
     low = float(made.body.rest[:, 0].min() - made.body.center[0])
-    made.reset(position=(0.0, None, 0.0), height=0.01, velocity=(0, 0, 0), control_dt=0.02, differentiable=True,
-               colliders=[{**plate, "position": [low - 0.0513 - 0.5 * plate["size"][0], 0.12, 0.0]}])
+    made.reset(
+        position=(0.0, None, 0.0),
+        height=0.01,
+        velocity=(0, 0, 0),
+        control_dt=0.02,
+        differentiable=True,
+        colliders=[{**plate, "position": [low - 0.0513 - 0.5 * plate["size"][0], 0.12, 0.0]}],
+    )
     for _ in range(steps):
         state, _ = made.step({"plate": {"velocity": speed}})
     return state.positions[:, 0].mean()
@@ -176,10 +235,15 @@ def pushed(made, plate, speed, steps=12):
 
 def mismatch(made, plate, speed, h=1e-2):
     """Of the gradient in a plate's speed, as a share of the central difference."""
-    pushing, side = torch.tensor([speed, 0, 0]).double().requires_grad_(), torch.tensor([h, 0, 0]).double()
+    pushing, side = (
+        torch.tensor([speed, 0, 0]).double().requires_grad_(),
+        torch.tensor([h, 0, 0]).double(),
+    )
     (found,) = torch.autograd.grad(pushed(made, plate, pushing), pushing)
     with torch.no_grad():
-        slope = (pushed(made, plate, pushing + side) - pushed(made, plate, pushing - side)) / (2 * h)
+        slope = (pushed(made, plate, pushing + side) - pushed(made, plate, pushing - side)) / (
+            2 * h
+        )
     return abs(float(found[0] / slope) - 1)
 
 
@@ -187,13 +251,24 @@ def mismatch(made, plate, speed, h=1e-2):
 def test_gradients_of_a_plates_motion_are_differences_of_a_per_cent(mode, friction):
     """Of a plate of 1.25 cells, through the moments at which particles come to touch it: contact has no jumps."""
     made = twin(world=STICKY, counts=(4, 4, 3))
-    assert max(mismatch(made, {**PLATE, "mode": mode, "friction": friction}, speed) for speed in (0.45, 0.55, 0.65)) < 0.05
+    assert (
+        max(
+            mismatch(made, {**PLATE, "mode": mode, "friction": friction}, speed)
+            for speed in (0.45, 0.55, 0.65)
+        )
+        < 0.05
+    )
 
 
 def test_a_box_in_place_of_the_scenes():
-    made = twin(world=replace(WORLD, box=torch.tensor([[-0.2, -0.05, -0.2], [0.2, 0.3, 0.2]]).double()), counts=(4, 4, 3))
+    made = twin(
+        world=replace(WORLD, box=torch.tensor([[-0.2, -0.05, -0.2], [0.2, 0.3, 0.2]]).double()),
+        counts=(4, 4, 3),
+    )
     away = {"velocity": (3.0, 0.0, 0.0), "frames": 10}
-    with pytest.raises(SimulationDiverged, match=r"outside the box .*box= of a twin.* velocity that is not given"):
+    with pytest.raises(
+        SimulationDiverged, match=r"outside the box .*box= of a twin.* velocity that is not given"
+    ):
         made.simulate(**away)
     wide = [[-1, -0.05, -1], [1, 1, 1]]
     far = made.simulate(**away, box=wide)
@@ -207,9 +282,18 @@ def test_a_box_in_place_of_the_scenes():
         state, _ = worlds.step()
     assert torch.equal(state.positions[1], far.x[-1])
     worlds.restart([0], [{"position": (0.5, None, 0.0)}])  # within the box that it was reset with
-    with pytest.raises(ConfigError, match=r"starts\[1\]: box: expected one that the body starts in, found 100% of it outside"):
+    with pytest.raises(
+        ConfigError,
+        match=r"starts\[1\]: box: expected one that the body starts in, found 100% of it outside",
+    ):
         worlds.restart([1], [{"position": (1.5, None, 0.0)}])
-    for wrong in ([[0, 0, 0], [1, 1]], [[0, 0, 0], [1, 0, 1]], [[-1, -1, -1]], "large", [[0, 0, 0], [1, float("inf"), 1]]):
+    for wrong in (
+        [[0, 0, 0], [1, 1]],
+        [[0, 0, 0], [1, 0, 1]],
+        [[-1, -1, -1]],
+        "large",
+        [[0, 0, 0], [1, float("inf"), 1]],
+    ):
         with pytest.raises(ConfigError, match=r"box: expected \[low, high\] corners"):
             made.reset(box=wrong)
     with pytest.raises(ConfigError, match=r"box: expected one that the body starts in"):
@@ -219,7 +303,9 @@ def test_a_box_in_place_of_the_scenes():
 def test_without_differentiable_no_graph_is_kept():
     made = twin()
     made.reset(colliders=[PUSHER])
-    with pytest.raises(ConfigError, match=r"action: .*differentiable=True"):  # it would get no gradient
+    with pytest.raises(
+        ConfigError, match=r"action: .*differentiable=True"
+    ):  # it would get no gradient
         made.step({"pusher": torch.zeros(3, requires_grad=True)})
     state, reactions = made.step({"pusher": torch.zeros(3)})
     assert not state.x.requires_grad and not reactions.requires_grad
@@ -232,7 +318,9 @@ def test_without_differentiable_no_graph_is_kept():
 def test_worlds_are_so_many_twins():
     """Starts, commands for all or for each, gravity; then a law for each. Every world has the bits of its twin."""
     made, count = twin(), 3
-    starts = [{"velocity": (0.1 * b, -1.0, 0.0), "position": (0.01 * b, None, 0.0)} for b in range(count)]
+    starts = [
+        {"velocity": (0.1 * b, -1.0, 0.0), "position": (0.01 * b, None, 0.0)} for b in range(count)
+    ]
     pushes = torch.tensor([[0.4, 0.0, 0.0], [0.5, 0.1, 0.0], [0.3, 0.0, 0.2]]).double()
     laws = read_numbers(made.body) + 0.05 * torch.randn(count, len(read_numbers(made.body)),
                                                         generator=torch.Generator().manual_seed(1)).double()  # fmt: skip
@@ -241,7 +329,9 @@ def test_worlds_are_so_many_twins():
         first = worlds.reset(starts, colliders=[PUSHER, BALL], substeps=12, frames=5)
         assert first.x.shape == (count, 120, 3)
         for k in range(4):
-            state, reactions = worlds.step({"pusher": {"velocity": pushes}, "1": (0.0, -0.1 * k, 0.0)})
+            state, reactions = worlds.step(
+                {"pusher": {"velocity": pushes}, "1": (0.0, -0.1 * k, 0.0)}
+            )
         assert reactions.shape == (12, count, 2, 6) and state.position.shape == (count, 2, 3)
         for b in range(count):
             single = twin()
@@ -250,7 +340,9 @@ def test_worlds_are_so_many_twins():
             single.reset(**starts[b], colliders=[PUSHER, BALL], substeps=12, frames=5)
             for k in range(4):
                 own, forces = single.step({"pusher": pushes[b], "1": (0.0, -0.1 * k, 0.0)})
-            assert torch.equal(own.positions, state.positions[b]) and torch.equal(forces, reactions[:, b])
+            assert torch.equal(own.positions, state.positions[b]) and torch.equal(
+                forces, reactions[:, b]
+            )
             assert torch.equal(own.position, state.position[b])
     assert (state.positions[0] - state.positions[1]).abs().max() > 1e-3
     heavy = torch.tensor([[0.0, -9.8, 0.0], [0.0, -20.0, 0.0], [1.0, -9.8, 0.0]])
@@ -267,7 +359,10 @@ def test_some_worlds_begin_again():
     """Those are at their start, or at a new one, with the bits of a twin that begins there; the others go on."""
     made, still = twin(), PUSHER | {"motion": None}
     begins = [{"velocity": (0.1 * b, -1.0, 0.0), "position": (0.0, 0.1, 0.0)} for b in range(3)]
-    push, new = {"pusher": (0.5, 0.1, 0.0)}, {"velocity": (0.0, -0.5, 0.0), "position": (0.01, 0.11, 0.0)}
+    push, new = (
+        {"pusher": (0.5, 0.1, 0.0)},
+        {"velocity": (0.0, -0.5, 0.0), "position": (0.01, 0.11, 0.0)},
+    )
     worlds = made.worlds(3)
     worlds.reset(begins, colliders=[still], substeps=12)
     kept = worlds.reset(begins, colliders=[still], substeps=12)
@@ -277,7 +372,9 @@ def test_some_worlds_begin_again():
     assert torch.equal(worlds.restart([2]).positions[2], kept.positions[2])
     state = worlds.restart([0], [new])
     assert torch.equal(state.x[1], before.x[1]) and not torch.equal(state.x[0], before.x[0])
-    assert torch.equal(state.position[[0, 2]], kept.position[[0, 2]]) and torch.equal(state.position[1], before.position[1])
+    assert torch.equal(state.position[[0, 2]], kept.position[[0, 2]]) and torch.equal(
+        state.position[1], before.position[1]
+    )
     for _ in range(4):
         state, reactions = worlds.step(push)
     for b, begin, steps in ((0, new, 4), (1, begins[1], 7), (2, begins[2], 4)):
@@ -286,7 +383,9 @@ def test_some_worlds_begin_again():
             own, forces = made.step(push)
         torch.testing.assert_close(state.positions[b], own.positions, rtol=0, atol=0)
         assert torch.equal(reactions[:, b], forces)
-    with pytest.raises(ConfigError, match=r"restart: expected numbers of worlds below 3, found \[3\]"):
+    with pytest.raises(
+        ConfigError, match=r"restart: expected numbers of worlds below 3, found \[3\]"
+    ):
         worlds.restart([3])
     with pytest.raises(ConfigError, match=r"starts\[1\]: velocity: expected three"):
         worlds.restart([1], [{"velocity": 1}])
@@ -295,17 +394,29 @@ def test_some_worlds_begin_again():
 def test_gradients_of_worlds_are_those_of_their_twins():
     """Commands of each, to the last bit; the law's numbers, which they share, as a sum."""
     made, pushes = twin(), torch.tensor([[0.9, 0.0, 0.0], [0.8, 0.1, 0.1]]).double()
-    numbers, given = made.body.adapter.numbers, {"colliders": [PUSHER], "substeps": 12, "differentiable": True}
+    numbers, given = (
+        made.body.adapter.numbers,
+        {"colliders": [PUSHER], "substeps": 12, "differentiable": True},
+    )
 
     def pushed(stepped, push, begins):
-        stepped.reset(begins, **given) if begins is not None else stepped.reset(position=(-0.01, 0.09, 0), **given)
+        stepped.reset(begins, **given) if begins is not None else stepped.reset(
+            position=(-0.01, 0.09, 0), **given
+        )
         for _ in range(6):
             state, reactions = stepped.step({"pusher": push})
-        return torch.autograd.grad(state.positions.square().sum() + reactions.square().sum(), [push, numbers])
+        return torch.autograd.grad(
+            state.positions.square().sum() + reactions.square().sum(), [push, numbers]
+        )
 
-    of_each, of_all = pushed(made.worlds(2), pushes.clone().requires_grad_(), {"position": (-0.01, 0.09, 0)})
+    of_each, of_all = pushed(
+        made.worlds(2), pushes.clone().requires_grad_(), {"position": (-0.01, 0.09, 0)}
+    )
     alone = [pushed(made, push.clone().requires_grad_(), None) for push in pushes]
-    assert torch.equal(of_each, torch.stack([own for own, _ in alone])) and (of_each.abs().amax(1) > 1e-3).all()
+    assert (
+        torch.equal(of_each, torch.stack([own for own, _ in alone]))
+        and (of_each.abs().amax(1) > 1e-3).all()
+    )
     expected = sum(law for _, law in alone)
     # sums in another order: 1.2e-11 of the largest on a processor with AVX-512, less without
     torch.testing.assert_close(of_all, expected, rtol=0, atol=3e-11 * float(expected.abs().max()))
@@ -348,33 +459,57 @@ def test_errors_of_starts_and_states():
         made.reset(position=(0.0, "up", 0.0))
     with pytest.raises(ConfigError, match=r"control_dt: .*found -1"):
         made.reset(control_dt=-1)
-    with pytest.raises(ConfigError, match=r"colliders: expected names of their own, found 0 more than once"):
+    with pytest.raises(
+        ConfigError, match=r"colliders: expected names of their own, found 0 more than once"
+    ):
         made.reset(colliders=[PUSHER | {"name": ""}, BALL | {"name": "0"}])
     with pytest.raises(ConfigError, match=r"starts\[1\]: height: expected metres"):
         made.worlds(2).reset([{}, {"height": -1}])
-    with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor .*found \(3, 5\)"):
+    with pytest.raises(
+        ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor .*found \(3, 5\)"
+    ):
         made.worlds(2, torch.zeros(3, 5))
     for laws in (torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool()):
-        with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor \(2, 22\) of finite numbers"):
+        with pytest.raises(
+            ConfigError,
+            match=r"laws: expected one for each of 2 worlds, a tensor \(2, 22\) of finite numbers",
+        ):
             made.worlds(2, laws)
-    with pytest.raises(ConfigError, match="gravity: expected numbers without gradients"):  # found a small part of them
+    with pytest.raises(
+        ConfigError, match="gravity: expected numbers without gradients"
+    ):  # found a small part of them
         made.worlds(2).reset(gravity=torch.zeros(2, 3, requires_grad=True), differentiable=True)
     worlds = made.worlds(2)
     worlds.reset()
-    with pytest.raises(ConfigError, match=r"restart: expected numbers of worlds below 2, found \[True\]"):
+    with pytest.raises(
+        ConfigError, match=r"restart: expected numbers of worlds below 2, found \[True\]"
+    ):
         worlds.restart([True])
     with pytest.raises(ConfigError, match=r"worlds: expected at most .*, found 1e\+09 x 120"):
         made.worlds(10**9)
     made.reset()
-    with pytest.raises(ConfigError, match=r"state\.substeps: expected a whole number of at least 0 and at most 2\^53, found 4611"):
+    with pytest.raises(
+        ConfigError,
+        match=r"state\.substeps: expected a whole number of at least 0 and at most 2\^53, found 4611",
+    ):
         made.state = replace(made.state, substeps=torch.tensor(2**62))
-    with pytest.raises(ConfigError, match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)"):
+    with pytest.raises(
+        ConfigError,
+        match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)",
+    ):
         made.state = replace(made.state, x=torch.zeros(7, 3).double())
     made.reset(colliders=[PUSHER])
-    for name, value, message in (("position", math.nan, "finite numbers, found nan"), ("F", math.inf, "finite"),
-                                 ("lag", math.nan, "finite"), ("rotation", 0.0, "rotation"), ("rotation", 1e38, "rotation")):
+    for name, value, message in (
+        ("position", math.nan, "finite numbers, found nan"),
+        ("F", math.inf, "finite"),
+        ("lag", math.nan, "finite"),
+        ("rotation", 0.0, "rotation"),
+        ("rotation", 1e38, "rotation"),
+    ):
         with pytest.raises(ConfigError, match=f"expected {message}"):
-            made.state = replace(made.state, **{name: torch.full_like(getattr(made.state, name), value)})
+            made.state = replace(
+                made.state, **{name: torch.full_like(getattr(made.state, name), value)}
+            )
     with pytest.raises(DataError, match=r"state: expected .* found x"):
         TwinState.read({"x": torch.zeros(3)})
 
@@ -393,7 +528,11 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
             exec(block, names)
     assert names["outcomes"][0].shape == (120, 3) and not torch.equal(*names["outcomes"])
     assert names["by_push"].abs().max() > 0 and names["by_modulus"].abs() > 0
-    assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (4, 1, 6)
+    assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (
+        4,
+        1,
+        6,
+    )
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
 
 
@@ -407,11 +546,18 @@ def test_worlds_begin_again_outside_of_where_solids_are_by_then():
     for _ in range(20):
         before = made.step({"driven": (0, 0, -0.9)}).state
     for starts in ([place], place):
-        with pytest.raises(ConfigError, match=r"colliders\[0\] \(own\): .* of world 1 inside of it now, where its .* \[-0.0, 0"):
+        with pytest.raises(
+            ConfigError,
+            match=r"colliders\[0\] \(own\): .* of world 1 inside of it now, where its .* \[-0.0, 0",
+        ):
             made.restart([1], starts)
     assert torch.equal(made.state.x, before.x) and torch.equal(made.state.position, before.position)
-    free = made.restart([1], [{"position": (-0.2, None, 0), "height": 0.01}])  # where it was at t = 0
-    assert free.position[1, :, 2].tolist() == [0, 0.3] and free.position[0, 1, 2] == pytest.approx(0, abs=1e-9)
+    free = made.restart(
+        [1], [{"position": (-0.2, None, 0), "height": 0.01}]
+    )  # where it was at t = 0
+    assert free.position[1, :, 2].tolist() == [0, 0.3] and free.position[0, 1, 2] == pytest.approx(
+        0, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("ground", ["sticky", "separate", "slip", "touch"])
@@ -431,7 +577,9 @@ def test_nothing_is_put_where_the_axes_of_a_motion_have_no_digits():
     made, box = twin(32), [[-1e4] * 3, [1e4] * 3]
     state = made.reset(box=box)
     made.state = replace(state, x=state.x + torch.tensor([300.0, 0, 0]))
-    message = r"x: expected particles within 369 m of the place of the reset, found .* m: reset there"
+    message = (
+        r"x: expected particles within 369 m of the place of the reset, found .* m: reset there"
+    )
     with pytest.raises(ConfigError, match=message):
         made.state = replace(state, x=state.x + torch.tensor([400.0, 0, 0]))
     worlds = made.worlds(2)
@@ -439,7 +587,9 @@ def test_nothing_is_put_where_the_axes_of_a_motion_have_no_digits():
     before = worlds.restart([1], [{"position": (300, None, 0)}])
     with pytest.raises(ConfigError, match=message):
         worlds.restart([0], [{"position": (400, None, 0)}])
-    assert torch.equal(worlds.state.x, before.x) and float(before.x[1].mean(0)[0]) == pytest.approx(300, abs=1e-3)
+    assert torch.equal(worlds.state.x, before.x) and float(before.x[1].mean(0)[0]) == pytest.approx(
+        300, abs=1e-3
+    )
     made.reset(box=box, position=(400, None, 0))
     made.state = made.reset(box=box, position=(700, None, 0))
 
@@ -449,10 +599,15 @@ def test_a_twin_that_is_turned_and_far_away_moves_as_at_home(precision):
     """Ten kilometres away on a sloping ground: simulated, stepped, driven, saved and branched."""
     away = torch.tensor([9e3, 0.0, -4e3]).double()
     home = {"frames": STEPS + 1, "box": [[-9, -9, -9], [9, 9, 9]]}
-    there = home | {"position": (away + torch.tensor([0.0, 0.09, 0.0]).double()).tolist(), "box": [[-1e4] * 3, [1e4] * 3]}
+    there = home | {
+        "position": (away + torch.tensor([0.0, 0.09, 0.0]).double()).tolist(),
+        "box": [[-1e4] * 3, [1e4] * 3],
+    }
     made = twin(precision)
     near, far = made.simulate(**home), made.simulate(**there)
-    assert (far.x.double() - away - near.x.double()).abs().max() < (1.5e-3 if precision == 32 else 1e-6)  # float32 resolves 1 mm
+    assert (far.x.double() - away - near.x.double()).abs().max() < (
+        1.5e-3 if precision == 32 else 1e-6
+    )  # float32 resolves 1 mm
     assert (far.F - near.F).abs().max() < 0.02 and near.x[-1, :, 1].amin() > 0
     paddle = PUSHER | {"position": [-0.12, 0.08, 0]}
     moved = paddle | {"position": (away + torch.tensor([-0.12, 0.08, 0.0]).double()).tolist()}
@@ -475,9 +630,21 @@ def test_a_twin_that_is_turned_and_far_away_moves_as_at_home(precision):
 @pytest.mark.parametrize("angle", [0.9, 1.0, 1.5, 2.0, -3.0])
 def test_any_turn_is_swept(angle):
     """A bar that is told to turn by half a turn and more hits the body on its way; so again from a saved state, and in worlds."""
-    bar = {"type": "box", "name": "bar", "size": [0.5, 0.06, 0.04], "position": [0, 0.1, 0.2], "mode": "separate"}
+    bar = {
+        "type": "box",
+        "name": "bar",
+        "size": [0.5, 0.06, 0.04],
+        "position": [0, 0.1, 0.2],
+        "mode": "separate",
+    }
     made, target = twin(), torch.tensor([0.0, angle * torch.pi, 0.0]).double()
-    options = {"colliders": [bar], "control_dt": 0.4, "substeps": 600, "velocity": (0, 0, 0), "frames": 3}
+    options = {
+        "colliders": [bar],
+        "control_dt": 0.4,
+        "substeps": 600,
+        "velocity": (0, 0, 0),
+        "frames": 3,
+    }
     begun = made.reset(**options)
     state, reactions = made.step({"bar": {"rotation": target.tolist()}})
     assert float(reactions.abs().max()) > 0.1
@@ -498,17 +665,34 @@ def test_turns_go_on_beyond_half_a_turn():
     for n in (1, 2, 3, 4, 5, 6, 7, 8, 7, 6, 5):
         before = made.state.rotation[0]
         state, _ = made.step({"pusher": {"rotation": (0, 0.3 * torch.pi * n, 0)}})
-        torch.testing.assert_close(state.rotation[0], exponential(torch.tensor([0, 0.3 * math.pi * n, 0], dtype=torch.float64)))
+        torch.testing.assert_close(
+            state.rotation[0],
+            exponential(torch.tensor([0, 0.3 * math.pi * n, 0], dtype=torch.float64)),
+        )
         turned = state.rotation[0] @ before.mT
-        assert float(turned.diagonal().sum()) == pytest.approx(1 + 2 * math.cos(0.3 * math.pi), abs=1e-6)
+        assert float(turned.diagonal().sum()) == pytest.approx(
+            1 + 2 * math.cos(0.3 * math.pi), abs=1e-6
+        )
     held, _ = made.step({"pusher": {"rotation": (0, 1.5 * torch.pi, 0)}})
-    torch.testing.assert_close(held.rotation, state.rotation)  # at a speed of 0: a whole turn would be refused as too fast
+    torch.testing.assert_close(
+        held.rotation, state.rotation
+    )  # at a speed of 0: a whole turn would be refused as too fast
 
 
 FAST = {"type": "box", "name": "fast", "size": [0.1, 0.1, 0.1], "mode": "separate"}
 STILL = torch.zeros(200, 3).double()
-TURNS = Trajectory(torch.tensor([0, 0.0, 0.5]).expand(200, 3), 0.4 * torch.arange(200)[:, None] * torch.eye(3)[:1], STILL, STILL)
-JUMPS = Trajectory(torch.tensor([-1.0, 0.1, 0]) + torch.tensor([0.1, 0, 0]) * torch.arange(200)[:, None], STILL, STILL, STILL)
+TURNS = Trajectory(
+    torch.tensor([0, 0.0, 0.5]).expand(200, 3),
+    0.4 * torch.arange(200)[:, None] * torch.eye(3)[:1],
+    STILL,
+    STILL,
+)
+JUMPS = Trajectory(
+    torch.tensor([-1.0, 0.1, 0]) + torch.tensor([0.1, 0, 0]) * torch.arange(200)[:, None],
+    STILL,
+    STILL,
+    STILL,
+)
 
 
 @pytest.mark.parametrize("solid, action", [
@@ -524,9 +708,13 @@ JUMPS = Trajectory(torch.tensor([-1.0, 0.1, 0]) + torch.tensor([0.1, 0, 0]) * to
 ])  # fmt: skip
 def test_a_solid_that_no_body_would_feel_is_refused(solid, action):
     made = twin()
-    solids = colliders_from_config([FAST | (solid if isinstance(solid, dict) else {"position": [-1, 0.1, 0]})])
+    solids = colliders_from_config(
+        [FAST | (solid if isinstance(solid, dict) else {"position": [-1, 0.1, 0]})]
+    )
     solids = solids if isinstance(solid, dict) else (replace(solids[0], motion=solid),)
-    with pytest.raises(ConfigError, match=r"collider fast: expected a speed of at most .* half a cell per substep"):
+    with pytest.raises(
+        ConfigError, match=r"collider fast: expected a speed of at most .* half a cell per substep"
+    ):
         made.reset(colliders=solids, substeps=8)
         for _ in range(3):
             made.step(None if action is None else {"fast": action})

@@ -25,7 +25,9 @@ def body_with(monkeypatch):
 
     def made(fibre, kf, frozen=()):
         body = small_body(adapter=False)
-        body.material = Material(LAW, {"E": E, "nu": NU, "kf": kf, "fibre": fibre}, frozen=frozen).double()
+        body.material = Material(
+            LAW, {"E": E, "nu": NU, "kf": kf, "fibre": fibre}, frozen=frozen
+        ).double()
         return body
 
     return made
@@ -35,16 +37,32 @@ def test_the_direction_of_the_fibres_is_found_from_two_drops(body_with):
     """From 20 degrees beside it, with the right E and nu and half of the stiffness; what is found is exact to the last step.
     From 40 degrees the same drops lead to another minimum."""
     truth = body_with([1.0, 0.6, 0.3], 4e3)
-    takes = [take_of(truth, start(turn=0.5), FRAMES), take_of(truth, start(turn=1.6, axis=(1.0, 0.0, 0.2)), FRAMES)]
+    takes = [
+        take_of(truth, start(turn=0.5), FRAMES),
+        take_of(truth, start(turn=1.6, axis=(1.0, 0.0, 0.2)), FRAMES),
+    ]
     body = body_with([1.0, 0.2, 0.3], 2e3, frozen=["E", "nu"])
-    assert float((body.material.direction("fibre") @ truth.material.direction("fibre")).detach()) < 0.95
-    found = Identification(body, takes, WORLD, Stage("prior", 40, 0.1), Criterion("free"), IdentificationSettings(), seats=1)
+    assert (
+        float((body.material.direction("fibre") @ truth.material.direction("fibre")).detach())
+        < 0.95
+    )
+    found = Identification(
+        body,
+        takes,
+        WORLD,
+        Stage("prior", 40, 0.1),
+        Criterion("free"),
+        IdentificationSettings(),
+        seats=1,
+    )
     for _ in range(12):
         found.iterate()
         if found.converged:
             break
     cosine = float((body.material.direction("fibre") @ truth.material.direction("fibre")).detach())
-    assert cosine > 1 - 1e-5 and float(body.material.physical()["kf"].detach()) == pytest.approx(4e3, rel=0.02)
+    assert cosine > 1 - 1e-5 and float(body.material.physical()["kf"].detach()) == pytest.approx(
+        4e3, rel=0.02
+    )
     assert found.posterior().names == ["kf", "fibre_1", "fibre_2"]
 
 

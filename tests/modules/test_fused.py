@@ -17,7 +17,9 @@ from mosa.types import Ground, ParticleState
 triton = pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 if DEVICE == "cpu" and tuple(map(int, triton.__version__.split(".")[:2])) < (3, 7):
-    pytest.skip("the interpreter of Triton before 3.7 has no loops under NumPy 2.4", allow_module_level=True)
+    pytest.skip(
+        "the interpreter of Triton before 3.7 has no loops under NumPy 2.4", allow_module_level=True
+    )
 ACCURATE = 1e-5
 """Relative to the norm of the result: the modules in float64 are what is compared with."""
 TF32 = 2e-2
@@ -29,7 +31,9 @@ OPTIONS = {
 }
 
 
-def evaluate(adapter: StressAdapter, count: int, penalised: bool, device: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+def evaluate(
+    adapter: StressAdapter, count: int, penalised: bool, device: str, dtype: torch.dtype
+) -> dict[str, torch.Tensor]:
     """Outputs, and gradients of a drawn functional of them to the state and to every weight."""
     adapter = adapter.to(device=device, dtype=dtype)
     w, s = (t.to(device=device, dtype=dtype).requires_grad_() for t in drawn_states(count))
@@ -50,12 +54,19 @@ def evaluate(adapter: StressAdapter, count: int, penalised: bool, device: str, d
 
 def largest_error(found: dict, expected: dict) -> tuple[float, str]:
     assert found.keys() == expected.keys()
-    errors = {k: (found[k].detach().double().cpu() - v.detach()).norm() / v.detach().norm() for k, v in expected.items()}
+    errors = {
+        k: (found[k].detach().double().cpu() - v.detach()).norm() / v.detach().norm()
+        for k, v in expected.items()
+    }
     return max((float(error), k) for k, error in errors.items())
 
 
-def compared(options: dict, count: int, penalised: bool, device: str, precision: str = "accurate") -> tuple[float, str]:
-    expected = evaluate(drawn_adapter(size=0.2, fused=False, **options), count, penalised, "cpu", torch.float64)
+def compared(
+    options: dict, count: int, penalised: bool, device: str, precision: str = "accurate"
+) -> tuple[float, str]:
+    expected = evaluate(
+        drawn_adapter(size=0.2, fused=False, **options), count, penalised, "cpu", torch.float64
+    )
     fused = drawn_adapter(size=0.2, fused=True, precision=precision, **options)
     return largest_error(evaluate(fused, count, penalised, device, torch.float32), expected)
 
@@ -81,12 +92,20 @@ def test_evaluations_in_half_precision_without_a_backward_pass_and_before_one_ag
     """Before a backward pass the kernel leaves hidden layers behind; else the backward pass makes them again."""
     results = []
     for follows in (False, True):
-        adapter = drawn_adapter(dtype=torch.float32, size=0.2, fused=True, precision="half").to(DEVICE)
+        adapter = drawn_adapter(dtype=torch.float32, size=0.2, fused=True, precision="half").to(
+            DEVICE
+        )
         w, s = (t.float().to(DEVICE).requires_grad_() for t in drawn_states(70))
         with at_hand() if follows else nullcontext():
             answer = adapter(material_state(w, s))
         inputs = [w, s, *adapter.operator.parameters()]
-        results.append([answer.G, answer.h, *torch.autograd.grad(answer.G.square().sum() + answer.h.square().sum(), inputs)])
+        results.append(
+            [
+                answer.G,
+                answer.h,
+                *torch.autograd.grad(answer.G.square().sum() + answer.h.square().sum(), inputs),
+            ]
+        )
     for alone, at_once in zip(*results, strict=True):
         assert torch.equal(alone, at_once)
 
@@ -105,13 +124,17 @@ def test_next_to_no_strain_in_half_precision_there_is_next_to_no_stress(follows)
     w, s = (t.float().to(DEVICE) for t in drawn_states(70, size=1e-9))
     with at_hand() if follows else nullcontext():
         answer = adapter(material_state(w, s))
-    assert answer.h.abs().max() <= (1e-8 if DEVICE == "cuda" else 1e-6) * E_REF  # where NumPy multiplies, rows round differently
+    assert (
+        answer.h.abs().max() <= (1e-8 if DEVICE == "cuda" else 1e-6) * E_REF
+    )  # where NumPy multiplies, rows round differently
 
 
 def test_networks_too_wide_for_half_precision_are_evaluated_in_tf32():
     states = material_state(*(t.float().to(DEVICE) for t in drawn_states(5)))
     answers = [
-        drawn_adapter(dtype=torch.float32, size=0.1, hidden=128, fused=True, precision=precision).to(DEVICE)(states)
+        drawn_adapter(
+            dtype=torch.float32, size=0.1, hidden=128, fused=True, precision=precision
+        ).to(DEVICE)(states)
         for precision in ("tf32", "half")
     ]
     for tf32, half in zip(*(answer[:2] for answer in answers), strict=True):
@@ -121,7 +144,10 @@ def test_networks_too_wide_for_half_precision_are_evaluated_in_tf32():
 def test_half_weights_hold_every_weight_once_and_zeros():
     weights = [p.detach() for p in weights_of(drawn_adapter(dtype=torch.float32).operator)]
     count = sum(p.numel() for p in weights)
-    powers = [torch.arange(start, start + p.numel()).view_as(p) for start, p in zip(starts_of(weights), weights)]
+    powers = [
+        torch.arange(start, start + p.numel()).view_as(p)
+        for start, p in zip(starts_of(weights), weights)
+    ]
     seen = []
     for k in range(17):  # of the number of each weight, one binary digit after the other
         digits = packed([1.0 + (2.0 * (p >> k & 1)) for p in powers])
@@ -129,7 +155,9 @@ def test_half_weights_hold_every_weight_once_and_zeros():
     values = torch.stack(seen).float()
     filled = values.abs().amax(0) > 0
     factor = torch.where(values[:, filled].amin(0) < 1, 0.5, 1.0)
-    numbers = (((values[:, filled] / factor - 1.0) / 2.0).round().long() << torch.arange(17)[:, None]).sum(0)
+    numbers = (
+        ((values[:, filled] / factor - 1.0) / 2.0).round().long() << torch.arange(17)[:, None]
+    ).sum(0)
     assert torch.equal(numbers.sort().values, torch.arange(count))
 
 
@@ -146,8 +174,14 @@ def test_what_is_made_of_weights_serves_one_pass_and_no_other():
 
     assert [from_weights(make, weights, "key") for _ in range(2)] == [2.0, 2.0] and len(made) == 2
     with same_weights():
-        assert [from_weights(make, weights, "key") for _ in range(3)] == [2.0] * 3 and len(made) == 3
-        assert from_weights(make, weights, "another") == 2.0 and from_weights(make, weights[::-1], "key") == 2.0 and len(made) == 5
+        assert [from_weights(make, weights, "key") for _ in range(3)] == [2.0] * 3 and len(
+            made
+        ) == 3
+        assert (
+            from_weights(make, weights, "another") == 2.0
+            and from_weights(make, weights[::-1], "key") == 2.0
+            and len(made) == 5
+        )
     weights[0].mul_(3)
     with same_weights():
         assert from_weights(make, weights, "key") == 6.0
@@ -156,7 +190,9 @@ def test_what_is_made_of_weights_serves_one_pass_and_no_other():
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("penalised", [False, True])
-@pytest.mark.parametrize("precision, tolerance", [("accurate", ACCURATE), ("tf32", TF32), ("half", TF32)])
+@pytest.mark.parametrize(
+    "precision, tolerance", [("accurate", ACCURATE), ("tf32", TF32), ("half", TF32)]
+)
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_on_cuda_in_all_precisions(options, precision, tolerance, penalised):
     """20000 particles are more tiles than a card has multiprocessors. The accurate mode must not be the same numbers."""
@@ -206,14 +242,20 @@ def test_a_rollout_with_the_kernels_is_that_with_the_modules():
     index = torch.stack(torch.meshgrid(*(torch.arange(3),) * 3, indexing="ij"), -1).reshape(-1, 3)
     F = torch.eye(3) + 0.05 * torch.randn(27, 3, 3, generator=generator)
     zero = torch.zeros(27, 3)
-    state = ParticleState(*(t.to(DEVICE) for t in (0.1 + 0.02 * index, zero, torch.zeros_like(F), F, F)))
-    sim = Simulator("corotated", dx=0.04, substeps=4, frame_dt=1.6e-3, ground=Ground(0.05), device=DEVICE)
+    state = ParticleState(
+        *(t.to(DEVICE) for t in (0.1 + 0.02 * index, zero, torch.zeros_like(F), F, F))
+    )
+    sim = Simulator(
+        "corotated", dx=0.04, substeps=4, frame_dt=1.6e-3, ground=Ground(0.05), device=DEVICE
+    )
     results = []
     for fused in (True, False):
         adapter = drawn_adapter(dtype=torch.float32, size=0.2, fused=fused).to(DEVICE)
         mu = torch.tensor(4e4, device=DEVICE, requires_grad=True)
         volume = torch.full((27,), 8e-6, device=DEVICE)
-        rollout = sim.rollout(state, {"mu": mu, "lam": 5e4}, volume, 1000.0, 2, adapter=adapter, stride=2)
+        rollout = sim.rollout(
+            state, {"mu": mu, "lam": 5e4}, volume, 1000.0, 2, adapter=adapter, stride=2
+        )
         weights = list(adapter.operator.parameters())
         gradients = torch.autograd.grad(rollout.F[-1].square().sum(), [mu, *weights])
         results.append([rollout.x[-1], rollout.F[-1], *gradients])

@@ -19,8 +19,15 @@ SHARED = 227 * 1024
 def test_they_compile_for_hopper(precision, hidden):
     script = Path(__file__).with_name("compile_fused.py")
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
-    result = subprocess.run([sys.executable, str(script), precision, str(hidden)], capture_output=True, text=True, env=environment)
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    )
+    result = subprocess.run(
+        [sys.executable, str(script), precision, str(hidden)],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
     assert result.returncode == 0, result.stderr[-3000:]
     found = json.loads(result.stdout.splitlines()[-1])
     assert len(found) == (16 if precision == "half" else 13)

@@ -50,13 +50,22 @@ def test_one_iteration_solves_a_linear_problem_and_knows_its_covariance():
         P = torch.diag(1 / torch.cat([block.sd for block in blocks]).square())
         expected = torch.linalg.solve(A.T @ A + P, A.T @ b + P @ mean)
         posterior = newton.posterior()
-        assert report["share"] == pytest.approx(1.0, abs=1e-14) and report["after"] < report["before"]
+        assert (
+            report["share"] == pytest.approx(1.0, abs=1e-14) and report["after"] < report["before"]
+        )
         # one-sided differences of a linear function are wrong by its rounding over the step, 1e-15/0.02, times the condition
         assert torch.allclose(newton.seats[0].read(), expected, rtol=0, atol=1e-11)
-        assert torch.equal(posterior.mean, newton.seats[0].read()) and posterior.names == ["a[0]", "a[1]", "a[2]", "b"]
+        assert torch.equal(posterior.mean, newton.seats[0].read()) and posterior.names == [
+            "a[0]",
+            "a[1]",
+            "a[2]",
+            "b",
+        ]
         covariance = torch.linalg.inv(A.T @ A + P)
         assert torch.allclose(posterior.covariance, covariance, rtol=0, atol=1e-11)
-        assert torch.allclose(posterior.determined, 1 - covariance.diagonal() * P.diagonal(), rtol=0, atol=1e-11)
+        assert torch.allclose(
+            posterior.determined, 1 - covariance.diagonal() * P.diagonal(), rtol=0, atol=1e-11
+        )
         r = A @ expected - b
         cost = 0.5 * (r @ r + (expected - mean) @ P @ (expected - mean))
         assert report["after"] == pytest.approx(float(cost), rel=1e-12)
@@ -71,8 +80,13 @@ def test_what_the_data_do_not_see_stays_where_the_prior_has_it():
     newton.iterate(learn=False)
     posterior = newton.posterior()
     assert float(posterior.mean[2] - newton.mean()[2]) == pytest.approx(0, abs=1e-12)
-    assert float(posterior.determined[2]) == pytest.approx(0, abs=1e-12) and float(posterior.determined[0]) > 0.9
-    assert float(posterior.covariance[2, 2]) == pytest.approx(float(newton.blocks[0].sd[2]) ** 2, rel=1e-12)
+    assert (
+        float(posterior.determined[2]) == pytest.approx(0, abs=1e-12)
+        and float(posterior.determined[0]) > 0.9
+    )
+    assert float(posterior.covariance[2, 2]) == pytest.approx(
+        float(newton.blocks[0].sd[2]) ** 2, rel=1e-12
+    )
 
 
 def test_a_curved_problem_ends_at_its_minimum():
@@ -82,13 +96,19 @@ def test_a_curved_problem_ends_at_its_minimum():
     one = torch.ones(1)
     blocks = [Block("a", one, one, 1e-6), Block("k", 0.3 * one, 0.5 * one, 1e-6)]
     tensors = [torch.ones(1).double(), torch.tensor([0.3]).double()]
-    newton = GaussNewton(blocks, [Seat(tensors, lambda: (tensors[0] * torch.exp(-tensors[1] * t) - data) / 0.01)])
+    newton = GaussNewton(
+        blocks, [Seat(tensors, lambda: (tensors[0] * torch.exp(-tensors[1] * t) - data) / 0.01)]
+    )
     costs = [newton.iterate(learn=False) for _ in range(12)]
     assert all(c["after"] <= c["before"] for c in costs) and costs[-1]["length"] < 1e-3
 
     def cost(a, k):
         r = (a * torch.exp(-k * t) - data) / 0.01
-        return 0.5 * float(r @ r) + 0.5 * (a - 1) ** 2 + 0.5 * ((k - float(torch.tensor(0.3))) / 0.5) ** 2
+        return (
+            0.5 * float(r @ r)
+            + 0.5 * (a - 1) ** 2
+            + 0.5 * ((k - float(torch.tensor(0.3))) / 0.5) ** 2
+        )
 
     a, k = newton.seats[0].read().tolist()
     curvature, h = newton.matrix.diagonal().sqrt().tolist(), 1e-6
@@ -109,7 +129,10 @@ def decay(step):
         asked.append(torch.cat(tensors))
         return (tensors[0] * torch.exp(-tensors[1] * t) - data) / 0.05
 
-    return GaussNewton([Block("a", one, 3 * one, step), Block("k", 0.3 * one, 3 * one, step)], [Seat(tensors, residuals)]), asked
+    return GaussNewton(
+        [Block("a", one, 3 * one, step), Block("k", 0.3 * one, 3 * one, step)],
+        [Seat(tensors, residuals)],
+    ), asked
 
 
 def test_further_steps_with_one_jacobian_do_the_work_of_several():
@@ -119,7 +142,11 @@ def test_further_steps_with_one_jacobian_do_the_work_of_several():
     costs = [single.iterate(learn=False, settled=False)["after"] for _ in range(8)]
     newton, asked = decay(0.3)
     report = newton.iterate(learn=False)
-    assert len(asked) <= 3 + newton.steps and min(costs[:2]) > report["after"] + 1 and costs[-1] > report["after"]
+    assert (
+        len(asked) <= 3 + newton.steps
+        and min(costs[:2]) > report["after"] + 1
+        and costs[-1] > report["after"]
+    )
     steps = torch.stack(asked[2:])  # the last column's numbers, then those of the steps
     at = newton.seats[0].read()
     tried = steps[1:]
@@ -148,7 +175,9 @@ def test_bounds_hold_for_what_is_found_and_for_all_that_is_asked():
     asked = []
     blocks = [Block("a", torch.zeros(4), 10 * torch.ones(4), 0.05, bounds=(-1.0, 0.5))]
     b = torch.tensor([0.2, 3.0, -3.0, 0.49])
-    newton = linear(blocks, torch.eye(4).double(), b.double(), watch=lambda x: asked.append(x.clone()))
+    newton = linear(
+        blocks, torch.eye(4).double(), b.double(), watch=lambda x: asked.append(x.clone())
+    )
     for _ in range(3):
         newton.iterate(learn=False)
     free = b.double() / (1 + 0.01)
@@ -163,8 +192,14 @@ def test_evidence_finds_the_size_of_a_block_and_that_another_is_nothing():
     A = 20 * torch.linalg.qr(drawn(400, 130, seed=7)).Q
     truth = torch.cat([0.25 * drawn(60, seed=8), torch.zeros(60).double(), drawn(10, seed=9)])
     b = A @ truth + 0.5 * drawn(400, seed=10)
-    blocks = [Block(name, torch.zeros(n), sd * torch.ones(n), 0.02, learned=learned)
-              for name, n, sd, learned in (("sized", 60, 0.1, True), ("nothing", 60, 0.1, True), ("plain", 10, 0.1, False))]
+    blocks = [
+        Block(name, torch.zeros(n), sd * torch.ones(n), 0.02, learned=learned)
+        for name, n, sd, learned in (
+            ("sized", 60, 0.1, True),
+            ("nothing", 60, 0.1, True),
+            ("plain", 10, 0.1, False),
+        )
+    ]
     newton = linear(blocks, A, b)
     for _ in range(40):
         report = newton.iterate()
@@ -193,7 +228,9 @@ def test_several_seats_give_the_jacobian_of_one(seats):
     many.progress = lambda: counted.append(threading.get_ident())
     for newton in (one, many):
         newton.iterate(learn=False)
-    assert torch.equal(one.seats[0].read(), many.seats[0].read()) and torch.equal(one.data, many.data)
+    assert torch.equal(one.seats[0].read(), many.seats[0].read()) and torch.equal(
+        one.data, many.data
+    )
     assert len(counted) == 4
     assert all(torch.equal(seat.read(), many.seats[1].read()) for seat in many.seats[1:])
 
@@ -204,7 +241,10 @@ class Limited:
     def __init__(self, limit=math.inf, fails=(), error=SimulationDiverged):
         self.limit, self.fails, self.error, self.calls = limit, fails, error, 0
         self.x = torch.zeros(2, dtype=torch.float64)
-        self.newton = GaussNewton([Block("x", torch.zeros(2), 1e3 * torch.ones(2), 0.01)], [Seat([self.x], self.residuals)])
+        self.newton = GaussNewton(
+            [Block("x", torch.zeros(2), 1e3 * torch.ones(2), 0.01)],
+            [Seat([self.x], self.residuals)],
+        )
 
     def residuals(self):
         self.calls += 1
@@ -218,17 +258,29 @@ class Limited:
 def test_a_step_that_cannot_be_simulated_is_shortened():
     problem = Limited(limit=0.5)
     report = problem.newton.iterate(learn=False, settled=False)
-    assert report["share"] == pytest.approx(0.4, abs=1e-12) and torch.allclose(problem.x, torch.full((2,), 0.4).double(), atol=1e-5)
+    assert report["share"] == pytest.approx(0.4, abs=1e-12) and torch.allclose(
+        problem.x, torch.full((2,), 0.4).double(), atol=1e-5
+    )
     short = Limited(limit=0.0101)  # just above the step of the differences
     report = short.newton.iterate(learn=False)
     assert report["share"] == 0.0 and report["after"] == report["before"] and (short.x == 0).all()
     refused = Limited(fails=(4,), error=ConfigError)  # the time step is bounded
-    assert refused.newton.iterate(learn=False, settled=False)["share"] == pytest.approx(0.4, abs=1e-12)
+    assert refused.newton.iterate(learn=False, settled=False)["share"] == pytest.approx(
+        0.4, abs=1e-12
+    )
     nothing = Limited(limit=0.5, error=None)  # residuals that are not numbers, in place of an error
-    assert nothing.newton.iterate(learn=False, settled=False)["share"] == pytest.approx(0.4, abs=1e-12)
+    assert nothing.newton.iterate(learn=False, settled=False)["share"] == pytest.approx(
+        0.4, abs=1e-12
+    )
     assert torch.isfinite(nothing.newton.columns).all()
-    further = Limited(limit=0.5)  # once steps go on, they come nearer to the limit and stay below it
-    assert 0.4 < further.newton.iterate(learn=False)["share"] <= 0.5 and (further.x <= 0.5).all() and (further.x > 0.45).all()
+    further = Limited(
+        limit=0.5
+    )  # once steps go on, they come nearer to the limit and stay below it
+    assert (
+        0.4 < further.newton.iterate(learn=False)["share"] <= 0.5
+        and (further.x <= 0.5).all()
+        and (further.x > 0.45).all()
+    )
 
 
 def test_a_column_that_cannot_be_simulated_ends_the_fit_and_leaves_the_numbers():
@@ -237,7 +289,9 @@ def test_a_column_that_cannot_be_simulated_ends_the_fit_and_leaves_the_numbers()
         problem.newton.iterate(learn=False)
     assert (problem.x == 0).all()
     mistake = Limited(fails=(4,), error=ZeroDivisionError)
-    with pytest.raises(ZeroDivisionError):  # no simulation's failure: it is not hidden in a shorter step
+    with pytest.raises(
+        ZeroDivisionError
+    ):  # no simulation's failure: it is not hidden in a shorter step
         mistake.newton.iterate(learn=False)
     several = [Limited(), Limited(limit=0.0)]
     newton = GaussNewton(several[0].newton.blocks, [p.newton.seats[0] for p in several])
@@ -260,7 +314,10 @@ def test_a_column_that_cannot_be_simulated_ends_the_fit_and_leaves_the_numbers()
 
 def test_a_column_that_is_not_finite_is_named():
     x = torch.zeros(2, dtype=torch.float64)
-    newton = GaussNewton([Block("x", torch.zeros(2), torch.ones(2), 0.01)], [Seat([x], lambda: x / (x.abs() < 0.005))])
+    newton = GaussNewton(
+        [Block("x", torch.zeros(2), torch.ones(2), 0.01)],
+        [Seat([x], lambda: x / (x.abs() < 0.005))],
+    )
     with pytest.raises(SimulationDiverged, match="not finite"):
         newton.iterate()
     assert (x == 0).all()
@@ -276,7 +333,9 @@ def test_what_the_model_gets_wrong_is_a_standard_deviation_where_it_moves_the_nu
         each.iterate(learn=False)
     way = other.seats[0].read() - same.seats[0].read()
     alone, found = newton.posterior(share), newton.posterior(share, wrong)
-    assert torch.allclose(found.covariance, alone.covariance + torch.outer(way, way), rtol=0, atol=1e-11)
+    assert torch.allclose(
+        found.covariance, alone.covariance + torch.outer(way, way), rtol=0, atol=1e-11
+    )
     assert torch.equal(found.mean, alone.mean) and torch.equal(found.determined, alone.determined)
     assert torch.equal(newton.posterior(share, 0 * wrong).covariance, alone.covariance)
 
@@ -310,7 +369,9 @@ def test_draws_have_the_moments_of_the_posterior():
     assert ((torch.cov(found.T) - C).abs() < allowed).all()
     assert (C - torch.diag(C.diagonal())).abs().max() > 0.05 * C.diagonal().min()
     assert torch.equal(found, posterior.draws(n, torch.Generator().manual_seed(1)))
-    assert torch.equal(posterior.draws(3), posterior.draws(3, torch.Generator().manual_seed(0)))  # without a generator
+    assert torch.equal(
+        posterior.draws(3), posterior.draws(3, torch.Generator().manual_seed(0))
+    )  # without a generator
 
 
 def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
@@ -324,7 +385,9 @@ def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
     away = found - newton.mean()
     gradient = A.T @ (A @ found - other) + newton.precision() * away
     assert gradient.abs().max() < 1e-6 * (A.T @ other).abs().max()
-    assert cost == pytest.approx(0.5 * float((A @ found - other).square().sum() + (newton.precision() * away.square()).sum()))
+    assert cost == pytest.approx(
+        0.5 * float((A @ found - other).square().sum() + (newton.precision() * away.square()).sum())
+    )
     assert torch.equal(newton.seats[0].read(), here) and not torch.allclose(found, here, atol=1e-3)
 
 

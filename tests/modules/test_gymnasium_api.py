@@ -25,9 +25,15 @@ def options(name):
 
 
 @pytest.mark.parametrize("name", TASKS)
-@pytest.mark.filterwarnings("ignore:.*A Box observation space.*", "ignore:.*alternative render modes.*", "ignore:.*not within.*")
+@pytest.mark.filterwarnings(
+    "ignore:.*A Box observation space.*",
+    "ignore:.*alternative render modes.*",
+    "ignore:.*not within.*",
+)
 def test_the_checker_of_gymnasium_is_content(name):
-    env = gymnasium.make(f"mosa/{name.capitalize()}-v0", options=options(name), disable_env_checker=True)
+    env = gymnasium.make(
+        f"mosa/{name.capitalize()}-v0", options=options(name), disable_env_checker=True
+    )
     check_env(env.unwrapped, skip_render_check=True)
     decided = env.unwrapped.task.once
     env.reset(seed=1)
@@ -36,7 +42,9 @@ def test_the_checker_of_gymnasium_is_content(name):
         _, reward, terminated, truncated, info = env.step(env.action_space.sample())
         length, over = length + 1, terminated or truncated
         assert reward < 0 and set(info) == {"success", "diverged"}
-    assert (length, terminated, truncated) == ((1, True, False) if decided else (SHORT[name], False, True))
+    assert (length, terminated, truncated) == (
+        (1, True, False) if decided else (SHORT[name], False, True)
+    )
 
 
 @pytest.mark.parametrize("name", ["hanging", "pushing"])
@@ -57,7 +65,11 @@ def test_what_is_drawn_is_what_is_seen_or_held():
     env.reset(seed=0)
     before = env.render()
     env.step(np.zeros(4, np.float32))
-    assert before.shape == (40, 40, 3) and before.dtype == np.uint8 and not np.array_equal(before, env.render())
+    assert (
+        before.shape == (40, 40, 3)
+        and before.dtype == np.uint8
+        and not np.array_equal(before, env.render())
+    )
     env = TwinEnv("pushing", options={"steps": 2}, render_mode="rgb_array_list", size=40)
     env.reset(seed=0)
     env.step(np.ones(3, np.float32))
@@ -70,7 +82,10 @@ def test_what_is_drawn_is_what_is_seen_or_held():
 def test_a_vector_of_worlds_is_its_trials(name):
     """Episodes end together; what an ended one saw last is in info, and new trials have begun."""
     env = gymnasium.make_vec(f"mosa/{name.capitalize()}-v0", num_envs=3, options=options(name))
-    assert isinstance(env.unwrapped, TwinVectorEnv) and env.unwrapped.single_action_space.shape == env.action_space.shape[1:]
+    assert (
+        isinstance(env.unwrapped, TwinVectorEnv)
+        and env.unwrapped.single_action_space.shape == env.action_space.shape[1:]
+    )
     first, _ = env.reset(seed=3)
     assert first.shape == env.observation_space.shape and env.observation_space.contains(first)
     again, _ = env.reset(seed=3)
@@ -78,9 +93,15 @@ def test_a_vector_of_worlds_is_its_trials(name):
     action = np.full(env.action_space.shape, 0.2, np.float32)
     for _ in range(SHORT[name] if name == "pushing" else 1):
         seen, rewards, terminated, truncated, info = env.step(action)
-        assert rewards.shape == (3,) and (rewards < 0).all() and ("final_obs" in info) == bool((terminated | truncated).all())
+        assert (
+            rewards.shape == (3,)
+            and (rewards < 0).all()
+            and ("final_obs" in info) == bool((terminated | truncated).all())
+        )
     assert terminated.all() == (name == "placement") and truncated.all() == (name == "pushing")
-    assert info["final_info"]["success"].shape == (3,) and not np.array_equal(np.stack(info["final_obs"]), seen)
+    assert info["final_info"]["success"].shape == (3,) and not np.array_equal(
+        np.stack(info["final_obs"]), seen
+    )
     made = arena(name, 3)
     made.reset(env.unwrapped.arena.trials)
     assert np.allclose(seen, made.task.observe(made.trials, made.view).numpy(), atol=1e-6)
@@ -106,6 +127,8 @@ def test_a_library_learns_in_the_worlds(method):
 
     made = arena("placement", 4, steps=2)
     found = by_reinforcement(method, made, 24, 0, {"batch_size": 8})
-    assert found.trials >= 24 and len(found.history) == found.trials and found.history[-1]["loss"] > 0
+    assert (
+        found.trials >= 24 and len(found.history) == found.trials and found.history[-1]["loss"] > 0
+    )
     actions = found.policy(drawn(made, 4).observed)
     assert actions.shape == (4, 4) and float(actions.abs().max()) <= 1

@@ -52,7 +52,11 @@ def test_its_last_layer_learns_from_the_first_step():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"amplitude": 1.0}, "amplitude"), ({"frequencies": -1}, "frequencies"), ({"hidden": 0}, "hidden")],
+    [
+        ({"amplitude": 1.0}, "amplitude"),
+        ({"frequencies": -1}, "frequencies"),
+        ({"hidden": 0}, "hidden"),
+    ],
 )
 def test_a_value_out_of_range_is_named(options, message):
     with pytest.raises(ConfigError, match=message):

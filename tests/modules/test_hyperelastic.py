@@ -10,7 +10,12 @@ from small_bodies import FRAME_DT, FREE, STICKY, WORLD, small_body, start
 
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.stiffness import directional_moduli
-from mosa.modules.adapters.hyperelastic import NUMBERS, HyperelasticAdapter, anisotropic_basis, root_stiffness
+from mosa.modules.adapters.hyperelastic import (
+    NUMBERS,
+    HyperelasticAdapter,
+    anisotropic_basis,
+    root_stiffness,
+)
 from mosa.modules.adapters.microplane import isotropic_stiffness
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.physics import reference
@@ -40,7 +45,9 @@ def drawn(count, seed=0):
 def extreme():
     """+-15 of each number alone, and +-2 of all at once."""
     alone = 15 * torch.eye(NUMBERS).double()
-    together = 2 * torch.sign(torch.randn(30, NUMBERS, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    together = 2 * torch.sign(
+        torch.randn(30, NUMBERS, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    )
     return torch.cat([alone, -alone, together])
 
 
@@ -51,7 +58,9 @@ def mandel_rotation(Q):
 
 
 def rotation(seed):
-    Q = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)).Q
+    Q = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    ).Q
     return Q * torch.linalg.det(Q)
 
 
@@ -89,7 +98,12 @@ def test_stiffness_stays_positive_where_the_prior_moved_after_the_stage_began():
             C0 = isotropic_stiffness(live)
             values = torch.linalg.eigvalsh(adapter.stiffness())
             assert values[0] > 0
-            assert torch.allclose(adapter.stiffness(), C0 + adapter.correction(), rtol=1e-12, atol=1e-12 * float(values[-1]))
+            assert torch.allclose(
+                adapter.stiffness(),
+                C0 + adapter.correction(),
+                rtol=1e-12,
+                atol=1e-12 * float(values[-1]),
+            )
             stale += int(torch.linalg.eigvalsh(C0 + held)[0] < -1e-9)
     assert stale > 100
 
@@ -100,7 +114,9 @@ def test_the_numbers_leave_the_isotropic_part_to_the_prior():
     matrices of size 0.01, more than of any others, and not the same on all processors."""
     nu = torch.tensor(0.3, dtype=torch.float64)
     inner = torch.linalg.inv(root_stiffness(nu))
-    assert torch.allclose(root_stiffness(nu) @ root_stiffness(nu), isotropic_stiffness(nu), rtol=0, atol=1e-15)
+    assert torch.allclose(
+        root_stiffness(nu) @ root_stiffness(nu), isotropic_stiffness(nu), rtol=0, atol=1e-15
+    )
     one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
     for row in drawn(50, seed=2).clamp(-0.5, 0.5):
         M = inner @ adapter_of(row).stiffness() @ inner
@@ -119,7 +135,9 @@ def test_the_basis_is_the_same_on_every_processor():
     """A checkpoint holds coordinates in it. What a decomposition gives among matrices of one singular value is left to the
     processor's library; written out, squares of the entries are these fractions, and the order and the signs are kept."""
     basis = anisotropic_basis(torch.float64, torch.device("cpu"))
-    fractions = torch.tensor([0, 1, 1 / 2, 1 / 4, 1 / 6, 2 / 3, 1 / 12, 1 / 3, 2 / 15, 1 / 30], dtype=torch.float64)
+    fractions = torch.tensor(
+        [0, 1, 1 / 2, 1 / 4, 1 / 6, 2 / 3, 1 / 12, 1 / 3, 2 / 15, 1 / 30], dtype=torch.float64
+    )
     assert ((basis.square()[..., None] - fractions).abs().amin(-1) < 1e-15).all()
     kept = {0: {(0, 0): 0.5**0.5, (1, 1): -(0.5**0.5)}, 3: {(3, 3): (1 / 6) ** 0.5, (5, 5): -((2 / 3) ** 0.5)},
             4: {(1, 2): 0.5, (0, 2): -0.5}, 6: {(0, 0): (2 / 15) ** 0.5, (3, 3): -((2 / 15) ** 0.5), (0, 1): -((1 / 30) ** 0.5)},
@@ -137,7 +155,10 @@ def test_nothing_but_zero_is_isotropic():
     assert torch.allclose(basis, basis.mT, rtol=0, atol=1e-15)
 
     def change(matrices):
-        parts = [torch.stack([M @ B @ M.T - B for B in matrices]).flatten(1) for M in map(mandel_rotation, map(rotation, range(3)))]
+        parts = [
+            torch.stack([M @ B @ M.T - B for B in matrices]).flatten(1)
+            for M in map(mandel_rotation, map(rotation, range(3)))
+        ]
         return torch.linalg.svdvals(torch.cat(parts, 1))
 
     assert change(basis)[-1] > 0.1
@@ -153,8 +174,18 @@ def stress(F, mu, lam, S, strain):
     kernel = stress_kernel(law.stress, law.uses_rotation, wp.float64, True, strain, 0)
     parameters = F.new_zeros(n, SLOTS)
     parameters[:, 0], parameters[:, 1] = mu, lam
-    tensors = [F, torch.zeros_like(F), parameters, S.expand(n, 6, 6), F.new_zeros(n, 6), torch.empty_like(F)]
-    arrays = [wp.from_torch(t.contiguous(), dtype=k) for t, k in zip(tensors, (mat33, mat33, vecp, mat66, vec6, mat33))]
+    tensors = [
+        F,
+        torch.zeros_like(F),
+        parameters,
+        S.expand(n, 6, 6),
+        F.new_zeros(n, 6),
+        torch.empty_like(F),
+    ]
+    arrays = [
+        wp.from_torch(t.contiguous(), dtype=k)
+        for t, k in zip(tensors, (mat33, mat33, vecp, mat66, vec6, mat33))
+    ]
     wp.launch(kernel, n, inputs=arrays, device="cpu")
     return wp.to_torch(arrays[-1])
 
@@ -165,21 +196,32 @@ def test_moduli_of_the_stiffness_are_those_of_a_uniaxial_test(strain):
     """A bar along n is pulled by 1e-6: Newton's method on the strain until nothing but the axial stress is left."""
     young, nu = 2.0, 0.35
     mu, lam = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
-    adapter = adapter_of(0.4 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(3)), nu, strain)
+    adapter = adapter_of(
+        0.4 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(3)), nu, strain
+    )
     S = adapter.correction()
-    n = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64))
+    n = torch.nn.functional.normalize(
+        torch.randn(20, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    )
     N = n[:, :, None] * n[:, None, :]
     axis = reference.vech(N) * SCALE
 
     def response(e):
-        return reference.vech(stress(torch.eye(3).double() + reference.unvech(e / SCALE), mu, lam, S, strain)) * SCALE
+        return (
+            reference.vech(
+                stress(torch.eye(3).double() + reference.unvech(e / SCALE), mu, lam, S, strain)
+            )
+            * SCALE
+        )
 
     h = 1e-5
     units = h * torch.eye(6).double()
     tangent = ((response(units) - response(-units)) / (2 * h)).T
     pulled, e = 1e-6, 1e-6 * axis
     axial = torch.zeros(len(n), dtype=torch.float64)
-    for _ in range(8):  # unknown: strain and axial stress; wanted: stress = axial n n, n n : e = pulled
+    for _ in range(
+        8
+    ):  # unknown: strain and axial stress; wanted: stress = axial n n, n n : e = pulled
         compliance = torch.linalg.inv(tangent)
         left = response(e)
         free = e - left @ compliance.T
@@ -201,7 +243,10 @@ def test_moduli_of_the_stiffness_are_those_of_a_uniaxial_test(strain):
 def test_a_body_with_zero_numbers_moves_as_the_prior_does_bit_for_bit(precision, strain):
     body = small_body(strain=strain, precision=precision)
     begins = start(turn=0.4, dtype=torch.float64 if precision == 64 else torch.float32)
-    prior, adapted = (body.simulate(begins, WORLD, 8, FRAME_DT, model=body.model().only(adapter=on)) for on in (False, True))
+    prior, adapted = (
+        body.simulate(begins, WORLD, 8, FRAME_DT, model=body.model().only(adapter=on))
+        for on in (False, True)
+    )
     assert torch.equal(prior.x, adapted.x) and torch.equal(prior.F, adapted.F)
     body.adapter.numbers.fill_(0.1)
     moved = body.simulate(begins, WORLD, 8, FRAME_DT)
@@ -211,10 +256,14 @@ def test_a_body_with_zero_numbers_moves_as_the_prior_does_bit_for_bit(precision,
 @pytest.mark.parametrize("strain", ["green", "hencky"])
 def test_gradients_of_a_rollout_in_numbers_and_poisson_number(strain):
     """Through a bounce on sticky ground, at a held number of substeps, along one direction each."""
-    numbers = 0.2 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    numbers = 0.2 * torch.randn(
+        NUMBERS, generator=torch.Generator().manual_seed(8), dtype=torch.float64
+    )
     body = small_body(numbers=numbers, strain=strain)
     begins = start(height=0.05, speed=-1.0, turn=0.5, spin=(3.0, 0.0, 5.0))
-    probe = torch.randn(len(body.rest), 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    probe = torch.randn(
+        len(body.rest), 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64
+    )
     raw = body.material.raw["nu"]
 
     def value():
@@ -223,7 +272,11 @@ def test_gradients_of_a_rollout_in_numbers_and_poisson_number(strain):
 
     slopes = torch.autograd.grad(value(), [body.adapter.numbers, raw])
     along = torch.randn(NUMBERS, generator=torch.Generator().manual_seed(10), dtype=torch.float64)
-    for tensor, slope, direction in ((body.adapter.numbers, slopes[0], along), (raw, slopes[1], torch.ones(()).double())):
+    for tensor, slope, direction in (
+        (body.adapter.numbers, slopes[0], along),
+        (raw, slopes[1], torch.ones(()).double()),
+    ):
+
         def at(t, tensor=tensor, direction=direction):
             with torch.no_grad():
                 tensor.add_(t * direction)
@@ -247,25 +300,37 @@ def test_the_time_step_follows_the_poisson_number_that_is_asked_for():
     assert min(first) > ADAPTER_MARGIN and len(set(first)) == 3
     # exact along an axis: the acoustic modulus n m : (C0 + S) : n m is at least that of n = m = x, over lam + 2 mu
     adapter = adapter_of(0.6 * torch.ones(NUMBERS), 0.3)
-    ratio = adapter.stiffness()[:3, :3].diagonal() / isotropic_stiffness(torch.tensor(0.3).double())[0, 0]
+    ratio = (
+        adapter.stiffness()[:3, :3].diagonal()
+        / isotropic_stiffness(torch.tensor(0.3).double())[0, 0]
+    )
     assert adapter.stiffening(0.3) >= 0.995 * float(ratio.max())
     assert HyperelasticAdapter().stiffening(0.3) == ADAPTER_MARGIN
 
 
 def free_energy(body, rollout):
     """Kinetic and stored energy [J] (T,) of a rollout; the affine velocities' is not counted."""
-    law, p = law_named(body.material.law), {k: v.detach() for k, v in body.material.per_particle().items()}
+    law, p = (
+        law_named(body.material.law),
+        {k: v.detach() for k, v in body.material.per_particle().items()},
+    )
     F = rollout.F.reshape(-1, 3, 3)
     share = body.adapter.share().detach()
-    added = body.adapter.correction().detach() + (1 - share) * isotropic_stiffness(body.material.poisson().double())
+    added = body.adapter.correction().detach() + (1 - share) * isotropic_stiffness(
+        body.material.poisson().double()
+    )
     stored = share * law.energy(F, p["mu"], p["lam"])
-    stored = stored + reference.stiffness_energy(body.adapter.strain, F, p["mu"], added.expand(len(F), 6, 6))
+    stored = stored + reference.stiffness_energy(
+        body.adapter.strain, F, p["mu"], added.expand(len(F), 6, 6)
+    )
     kinetic = 0.5 * body.density * rollout.v.square().sum(-1)
     return ((kinetic + stored.reshape(kinetic.shape)) * body.volume).sum(1)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("strain, size", [("green", 0.3), ("green", 1.0), ("biot", 1.0), ("hencky", 1.0)])
+@pytest.mark.parametrize(
+    "strain, size", [("green", 0.3), ("green", 1.0), ("biot", 1.0), ("hencky", 1.0)]
+)
 def test_a_free_block_never_gains_energy(strain, size):
     """Spinning without gravity or contact: the sum of kinetic and stored energy. Numbers are up to ten times what a fit expects."""
     generator = torch.Generator().manual_seed(12)
@@ -286,18 +351,27 @@ def test_what_is_added_to_the_share_of_the_prior_is_positive(nu):
     generator = torch.Generator().manual_seed(5)
     C0 = isotropic_stiffness(torch.tensor(nu, dtype=torch.float64))
     inverse = torch.linalg.inv(torch.linalg.cholesky(C0))
-    state = MaterialState(torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64))
+    state = MaterialState(
+        torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64)
+    )
     lowest = []
     for size in torch.linspace(0, 1.5, 1000):
-        adapter = adapter_of(float(size) * torch.randn(NUMBERS, generator=generator) / NUMBERS**0.5, nu)
+        adapter = adapter_of(
+            float(size) * torch.randn(NUMBERS, generator=generator) / NUMBERS**0.5, nu
+        )
         answer = adapter(state)
         beta = 1 + float(answer.h[0, 0].detach())
         assert 0 < beta <= 1 and not bool(answer.h[0, 1:].any())
-        assert torch.allclose(answer.G[0] + beta * C0, adapter.stiffness(), rtol=0, atol=1e-6 * float(C0.abs().max()))
+        assert torch.allclose(
+            answer.G[0] + beta * C0, adapter.stiffness(), rtol=0, atol=1e-6 * float(C0.abs().max())
+        )
         lowest.append(float(torch.linalg.eigvalsh(inverse @ answer.G[0] @ inverse.T).min()) / beta)
     assert min(lowest) > -math.expm1(math.log(6) / 60) - 1e-6
     # the control: with the whole prior kept, the soft directions are taken from it
-    assert float(torch.linalg.eigvalsh(inverse @ adapter.correction().detach() @ inverse.T).min()) < -0.2
+    assert (
+        float(torch.linalg.eigvalsh(inverse @ adapter.correction().detach() @ inverse.T).min())
+        < -0.2
+    )
 
 
 def test_what_it_refuses_and_what_a_copy_holds():
@@ -307,5 +381,10 @@ def test_what_it_refuses_and_what_a_copy_holds():
     adapter.follow(torch.tensor(0.4, requires_grad=True) * 1.0)
     copied, same = copy.deepcopy(adapter), adapter_of(0.1 * torch.ones(NUMBERS), 0.3)
     same.follow(torch.tensor(0.4))
-    assert torch.equal(copied.stiffness(), same.stiffness())  # the same law; the graph of the prior's number is no part of it
-    assert not copied.requires_grad_(False).stiffness().requires_grad and adapter.stiffness().requires_grad
+    assert torch.equal(
+        copied.stiffness(), same.stiffness()
+    )  # the same law; the graph of the prior's number is no part of it
+    assert (
+        not copied.requires_grad_(False).stiffness().requires_grad
+        and adapter.stiffness().requires_grad
+    )

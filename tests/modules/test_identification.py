@@ -29,10 +29,14 @@ AXIS = torch.nn.functional.normalize(torch.tensor([1.0, 0.6, 0.3], dtype=torch.f
 def fibres(strength: float, axis: torch.Tensor = AXIS) -> torch.Tensor:
     """(19,) numbers of a body that is stiffer along `axis`: strength times the anisotropic part of nnnn."""
     N = dyads(axis[None])[0]
-    return strength * torch.einsum("kij,i,j->k", anisotropic_basis(torch.float64, torch.device("cpu")), N, N)
+    return strength * torch.einsum(
+        "kij,i,j->k", anisotropic_basis(torch.float64, torch.device("cpu")), N, N
+    )
 
 
-def identification(body, takes, stage="joint", criterion=None, seats=1, kinds=(True, True, True), **settings) -> Identification:
+def identification(
+    body, takes, stage="joint", criterion=None, seats=1, kinds=(True, True, True), **settings
+) -> Identification:
     return Identification(body, takes, WORLD, Stage(stage, 40, 0.1), criterion or Criterion("corrected"),
                           IdentificationSettings(**settings), kinds, seats=seats)  # fmt: skip
 
@@ -51,7 +55,11 @@ def test_an_iteration_that_hardly_lowers_the_cost_is_the_last(monkeypatch, lower
     """Though it goes far, along what the data do not tell; not while noise and sizes are still being found."""
     body = small_body()
     found = identification(body, [take_and_turn(small_body(), 0.5)])
-    monkeypatch.setattr(found.newton, "iterate", lambda **_: {"before": 10.0, "after": 10.0 - lowered, "share": 1.0, "length": 3.0})
+    monkeypatch.setattr(
+        found.newton,
+        "iterate",
+        lambda **_: {"before": 10.0, "after": 10.0 - lowered, "share": 1.0, "length": 3.0},
+    )
     assert next((i + 1 for i in range(8) if found.iterate() and found.converged), None) == stops
 
 
@@ -69,14 +77,27 @@ def test_the_first_iterations_on_several_drops_count_a_part_of_the_data():
     whole = counted(len(SOFTLY))
     assert whole > 0 and counted(40) == whole
     assert [counted(i) / whole for i in range(len(SOFTLY))] == pytest.approx(SOFTLY, rel=1e-5)
-    short = Identification(small_body(), several, WORLD, Stage("joint", 3, 0.1), Criterion("corrected"), IdentificationSettings())
+    short = Identification(
+        small_body(),
+        several,
+        WORLD,
+        Stage("joint", 3, 0.1),
+        Criterion("corrected"),
+        IdentificationSettings(),
+    )
     assert identification(small_body(), several[:1]).softly == short.softly == ()
     assert identification(small_body(adapter=False), several, "prior").softly == ()
 
 
 def test_a_fit_of_several_drops_is_not_over_before_all_data_count(monkeypatch):
-    found = identification(small_body(), [take_and_turn(small_body(), angle) for angle in (0.5, 1.6)])
-    monkeypatch.setattr(found.newton, "iterate", lambda **_: {"before": 10.0, "after": 10.0, "share": 0.0, "length": 0.0})
+    found = identification(
+        small_body(), [take_and_turn(small_body(), angle) for angle in (0.5, 1.6)]
+    )
+    monkeypatch.setattr(
+        found.newton,
+        "iterate",
+        lambda **_: {"before": 10.0, "after": 10.0, "share": 0.0, "length": 0.0},
+    )
     assert next(i + 1 for i in range(9) if found.iterate() and found.converged) == len(SOFTLY) + 2
 
 
@@ -101,10 +122,14 @@ def test_a_calibration_finds_modulus_and_poisson_number_from_the_coarse_grid(beg
     before = found.distance()
     distance = found.search()
     assert distance == found.distance() < before
-    assert body.material.begins["E"] == small_body(adapter=False, **begins).material.begins["E"]  # the prior's mean stays
+    assert (
+        body.material.begins["E"] == small_body(adapter=False, **begins).material.begins["E"]
+    )  # the prior's mean stays
     run(found)
     assert found.converged
-    assert values(body)["E"] == pytest.approx(E, rel=1e-3) and values(body)["nu"] == pytest.approx(NU, abs=1e-3)
+    assert values(body)["E"] == pytest.approx(E, rel=1e-3) and values(body)["nu"] == pytest.approx(
+        NU, abs=1e-3
+    )
     assert found.distance() < 1e-5
     posterior = found.posterior()
     assert posterior.names == ["E", "nu"] and posterior.determined.min() > 0.99
@@ -143,11 +168,15 @@ def test_a_contact_offset_is_found_with_them():
     with torch.no_grad():
         truth.contact.cells.fill_(0.42)
     body = small_body(adapter=False, contact=True, E=2e4, nu=0.3)
-    found = identification(body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.5, (1.0, 0.0, 0.2))], "prior")
+    found = identification(
+        body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.5, (1.0, 0.0, 0.2))], "prior"
+    )
     found.search()
     run(found)
     assert float(body.contact.cells.detach()) == pytest.approx(0.42, abs=0.01)
-    assert values(body)["E"] == pytest.approx(E, rel=0.02) and values(body)["nu"] == pytest.approx(NU, abs=0.01)
+    assert values(body)["E"] == pytest.approx(E, rel=0.02) and values(body)["nu"] == pytest.approx(
+        NU, abs=0.01
+    )
 
 
 def test_what_two_sequences_say_adds_up():
@@ -157,7 +186,9 @@ def test_what_two_sequences_say_adds_up():
     costs, precisions = [], []
     for some in (takes[:1], takes[1:], takes):
         found = identification(small_body(adapter=False, E=2e4, nu=0.3), some, "prior")
-        costs.append(found.iterate()["before"])  # the first iteration begins at the prior's mean, which costs nothing
+        costs.append(
+            found.iterate()["before"]
+        )  # the first iteration begins at the prior's mean, which costs nothing
         precisions.append(found.newton.data)
     assert costs[2] == pytest.approx(costs[0] + costs[1], rel=1e-9) and min(costs) > 0
     assert torch.allclose(precisions[2], precisions[0] + precisions[1], rtol=1e-9, atol=0)
@@ -189,7 +220,9 @@ def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
     drop than with the corotated law's numbers, and the body stays the corotated one."""
     truth = small_body(adapter=False, law="neo_hookean")
     body = small_body(law="corotated")
-    found = identification(body, [take_of(truth, start(turn=0.5, axis=(0.3, 0.5, 0.8), speed=-1.5), FRAMES)])
+    found = identification(
+        body, [take_of(truth, start(turn=0.5, axis=(0.3, 0.5, 0.8), speed=-1.5), FRAMES)]
+    )
     run(found)
     posterior, here = found.posterior(), read_numbers(body)
     assert set(posterior.rivals) == {"neo_hookean", "stvk"} and body.material.law == "corotated"
@@ -209,9 +242,13 @@ def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
 
 def test_the_sizes_of_the_numbers_are_settled_after_a_few_iterations(monkeypatch):
     """Found anew in each of the first ones but the very first, and kept from then on: costs can be compared."""
-    found = identification(small_body(), [take_and_turn(small_body(numbers=fibres(0.3)), 0.5, frames=SHORT)])
+    found = identification(
+        small_body(), [take_and_turn(small_body(numbers=fibres(0.3)), 0.5, frames=SHORT)]
+    )
     sizes, learn = [], found.newton._evidence
-    monkeypatch.setattr(found.newton, "_evidence", lambda *given: (learn(*given), sizes.append(found.iteration)))
+    monkeypatch.setattr(
+        found.newton, "_evidence", lambda *given: (learn(*given), sizes.append(found.iteration))
+    )
     for _ in range(EVIDENCE_ITERATIONS + 2):
         found.iterate()
     assert sizes == list(range(1, EVIDENCE_ITERATIONS))
@@ -235,7 +272,9 @@ def test_stiffness_modes_find_which_end_is_stiffer():
     with torch.no_grad():
         truth.heterogeneity.coefficients[0] = 0.6
     body = small_body(adapter=False, modes=True)
-    found = identification(body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.6, (1.0, 0.0, 0.2))], "prior_eta")
+    found = identification(
+        body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.6, (1.0, 0.0, 0.2))], "prior_eta"
+    )
     run(found)
     factors = [b.factor_of.detach() for b in map(Factors, (truth, body))]
     match = torch.corrcoef(torch.stack(factors))[0, 1]
@@ -288,8 +327,16 @@ def test_a_state_is_plain_and_survives_a_checkpoint(uninterrupted, tmp_path):
     state = uninterrupted[0].state()
     torch.save(state, tmp_path / "state.pt")
     read = torch.load(tmp_path / "state.pt", weights_only=True)
-    assert read.keys() == state.keys() and read["iteration"] == 5 and read["factors"] == state["factors"]
-    assert all(torch.equal(a, b) for x, y in zip(read["noise"], state["noise"], strict=True) for a, b in zip(x, y, strict=True))
+    assert (
+        read.keys() == state.keys()
+        and read["iteration"] == 5
+        and read["factors"] == state["factors"]
+    )
+    assert all(
+        torch.equal(a, b)
+        for x, y in zip(read["noise"], state["noise"], strict=True)
+        for a, b in zip(x, y, strict=True)
+    )
 
 
 def test_two_threads_find_what_one_does(uninterrupted):
@@ -310,7 +357,9 @@ def test_single_precision_finds_the_same_to_a_percent():
     found = identification(body, [take], "prior")
     found.search()
     run(found, 6)
-    assert values(body)["E"] == pytest.approx(E, rel=0.01) and values(body)["nu"] == pytest.approx(NU, abs=0.005)
+    assert values(body)["E"] == pytest.approx(E, rel=0.01) and values(body)["nu"] == pytest.approx(
+        NU, abs=0.005
+    )
 
 
 def test_write_numbers_sets_what_the_posterior_names():
@@ -318,9 +367,13 @@ def test_write_numbers_sets_what_the_posterior_names():
     found = identification(body, [take_and_turn(body, 0.5)])
     names = [b.name for b in found.newton.blocks]
     assert names == ["E", "nu", "contact", "operator", "stiffness", "grid"]
-    drawn = numbers_of(found)[:-1] + 0.01 * torch.arange(len(numbers_of(found)) - 1)  # the grid's multiple is no part of a law
+    drawn = numbers_of(found)[:-1] + 0.01 * torch.arange(
+        len(numbers_of(found)) - 1
+    )  # the grid's multiple is no part of a law
     write_numbers(body, drawn)
-    assert torch.allclose(Seat(found.newton.seats[0].tensors[:-1], torch.empty).read(), drawn, rtol=0, atol=1e-15)
+    assert torch.allclose(
+        Seat(found.newton.seats[0].tensors[:-1], torch.empty).read(), drawn, rtol=0, atol=1e-15
+    )
 
 
 def test_a_grid_without_a_start_that_can_be_simulated_is_an_error():
@@ -347,7 +400,9 @@ def test_a_body_whose_grid_is_changed_is_simulated_on_that_one():
     body.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40)
     for each in (body, fresh):
         each.settings = replace(each.settings, dx=COARSER * each.settings.dx)
-    moved = [each.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40).x for each in (body, fresh)]
+    moved = [
+        each.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40).x for each in (body, fresh)
+    ]
     assert torch.equal(*moved)
 
 
@@ -363,10 +418,14 @@ def test_what_a_grid_gets_wrong_is_not_taken_for_the_law():
     wrong = {}
     for known in (1.0, 0.0):
         body = small_body()
-        found = identification(body, [seen_on_a_coarser_grid(small_body(adapter=False))], grid_error=known)
+        found = identification(
+            body, [seen_on_a_coarser_grid(small_body(adapter=False))], grid_error=known
+        )
         run(found)
         wrong[known] = abs(values(body)["E"] / E - 1) + float(body.adapter.numbers.detach().norm())
-        assert found.multiple() == pytest.approx(-1.0, abs=0.1) if known else found.multiple() == 0.0
+        assert (
+            found.multiple() == pytest.approx(-1.0, abs=0.1) if known else found.multiple() == 0.0
+        )
         assert "grid" not in found.posterior().names
     assert wrong[1.0] < 0.02 and wrong[0.0] > 3 * wrong[1.0]
 
@@ -377,7 +436,9 @@ def test_a_calibration_knows_what_a_grid_may_have_done_to_it():
     body = small_body(adapter=False)
     found = identification(body, [seen_on_a_coarser_grid(small_body(adapter=False))], "prior")
     run(found)
-    found.independent = lambda _: 1.0  # all of what it counts, so that the grid alone is what widens
+    found.independent = lambda _: (
+        1.0
+    )  # all of what it counts, so that the grid alone is what widens
     aware = found.posterior()
     found.settings = replace(found.settings, grid_error=0.0)
     unaware = found.posterior()
@@ -401,8 +462,16 @@ def seen_about_a_prediction(truth, prior, angle, frames=FRAMES):
         (none, none, none), (one, none, none), (none, one, none), (none, none, one), (2 * x, none, none), (none, 2 * y, none),
         (none, none, 2 * z), (y, x, none), (none, z, y), (z, none, x))], -1) / (2 * DX)  # fmt: skip
     values, turn = torch.linalg.qr(values)
-    values, slopes = values * len(x) ** 0.5, torch.linalg.solve(turn.T, slopes.mT).mT * len(x) ** 0.5
-    share = torch.diag(torch.tensor([0.0] * 4 + [0.5] * 6).repeat_interleave(3)).double().expand(frames, -1, -1).clone()
+    values, slopes = (
+        values * len(x) ** 0.5,
+        torch.linalg.solve(turn.T, slopes.mT).mT * len(x) ** 0.5,
+    )
+    share = (
+        torch.diag(torch.tensor([0.0] * 4 + [0.5] * 6).repeat_interleave(3))
+        .double()
+        .expand(frames, -1, -1)
+        .clone()
+    )
     share[0] = 0
     take.response = Response(predicted, share, values, slopes)
     found = take.response.seen(seen.x.detach(), seen.F_tot.detach(), take.start.rotation)
@@ -414,8 +483,12 @@ def seen_about_a_prediction(truth, prior, angle, frames=FRAMES):
 def test_what_cues_keep_of_a_prediction_is_not_taken_for_the_law(criterion):
     wrong = {}
     for known in (True, False):
-        take = seen_about_a_prediction(small_body(adapter=False), small_body(adapter=False, E=1.5e4, nu=0.3), 0.5)
-        assert (take.cues.positions - take_and_turn(small_body(adapter=False), 0.5).cues.positions).abs().max() > 1e-3
+        take = seen_about_a_prediction(
+            small_body(adapter=False), small_body(adapter=False, E=1.5e4, nu=0.3), 0.5
+        )
+        assert (
+            take.cues.positions - take_and_turn(small_body(adapter=False), 0.5).cues.positions
+        ).abs().max() > 1e-3
         take.response = take.response if known else None
         body = small_body(adapter=False, E=2e4, nu=0.3)
         found = identification(body, [take], criterion=Criterion(criterion), grid_error=0.0)
@@ -430,7 +503,10 @@ def test_columns_as_worlds_are_those_one_by_one(criterion):
     ends of a longer tensor otherwise on some processors: last bits of residuals, over the columns' steps."""
     truth = small_body(numbers=fibres(0.3), contact=True)
     body = small_body(contact=True, modes=True)
-    takes = [seen_about_a_prediction(truth, small_body(contact=True), 0.5, SHORT), take_and_turn(truth, 1.5, frames=SHORT)]
+    takes = [
+        seen_about_a_prediction(truth, small_body(contact=True), 0.5, SHORT),
+        take_and_turn(truth, 1.5, frames=SHORT),
+    ]
     assert max(take.first_contact for take in takes) < SHORT - 2
     found = identification(body, takes, criterion=Criterion(criterion))
     found.iterate()
@@ -440,7 +516,10 @@ def test_columns_as_worlds_are_those_one_by_one(criterion):
     alone = newton.jacobian(numbers, r)
     newton.many = found._many
     for together in (10**6, 3 * len(body.rest)):
-        identification_module.PARTICLES_TOGETHER, kept = together, identification_module.PARTICLES_TOGETHER
+        identification_module.PARTICLES_TOGETHER, kept = (
+            together,
+            identification_module.PARTICLES_TOGETHER,
+        )
         try:
             rounded = 0.0 if criterion == "free" else 1e-12 * float(alone.abs().max())
             torch.testing.assert_close(newton.jacobian(numbers, r), alone, rtol=0, atol=rounded)
@@ -493,7 +572,13 @@ def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
         body = small_body(adapter=False)
         found = identification(body, [each], "prior", grid_error=0)
         found.iterate()
-        sure.append((found.independent(), found.posterior().covariance[0, 0], found.newton.posterior().covariance[0, 0]))
+        sure.append(
+            (
+                found.independent(),
+                found.posterior().covariance[0, 0],
+                found.newton.posterior().covariance[0, 0],
+            )
+        )
     assert sure[0][0] == 1.0 and sure[0][1] == sure[0][2]
     assert sure[1][0] < 0.1 and sure[1][1] > 5 * sure[1][2]
     # the bend is one pattern in all frames, and not one in each

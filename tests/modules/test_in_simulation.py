@@ -33,12 +33,21 @@ def body(dtype: torch.dtype) -> ParticleState:
 
 
 def simulator(dtype: torch.dtype, law: str = "neo_hookean", ground: bool = True) -> Simulator:
-    return Simulator(law, dx=DX, substeps=SUBSTEPS, frame_dt=FRAME_DT, dtype=dtype, ground=Ground(0.1) if ground else None)
+    return Simulator(
+        law,
+        dx=DX,
+        substeps=SUBSTEPS,
+        frame_dt=FRAME_DT,
+        dtype=dtype,
+        ground=Ground(0.1) if ground else None,
+    )
 
 
 def roll(adapter, dtype: torch.dtype, frames: int, ground: bool = True, stride: int = 5):
     volume, start = torch.full((64,), VOLUME, dtype=dtype), body(dtype)
-    return simulator(dtype, ground=ground).rollout(start, PARAMETERS, volume, 1000.0, frames, adapter=adapter, stride=stride)
+    return simulator(dtype, ground=ground).rollout(
+        start, PARAMETERS, volume, 1000.0, frames, adapter=adapter, stride=stride
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -96,7 +105,9 @@ CONSTANT = {"state_dependence": "constant", "no_pre": True, "no_post": True}
 def test_an_adapter_is_steady_where_its_operator_does_not_change_with_the_state(options, steady):
     adapter = drawn_adapter(**options)
     state, other = simulator(torch.float64), body(torch.float64)
-    near, far = (state.material_state(F, other.C_affine, PARAMETERS) for F in (other.F, other.F @ other.F))
+    near, far = (
+        state.material_state(F, other.C_affine, PARAMETERS) for F in (other.F, other.F @ other.F)
+    )
     first, second = adapter(near), adapter(far)
     same = torch.equal(first.G, second.G) and torch.equal(first.h, second.h)
     assert same == steady and adapter.steady == steady
@@ -116,4 +127,6 @@ def test_one_evaluation_of_a_steady_adapter_is_as_good_as_many(dtype):
     assert [r[0] for r in results] == [50, 10, 1]
     assert all(torch.equal(r[1], results[0][1]) for r in results)
     scale = results[0][2].abs().max()
-    assert scale > 0 and all((r[2] - results[0][2]).abs().max() <= 100 * torch.finfo(dtype).eps * scale for r in results)
+    assert scale > 0 and all(
+        (r[2] - results[0][2]).abs().max() <= 100 * torch.finfo(dtype).eps * scale for r in results
+    )

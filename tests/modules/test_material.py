@@ -11,7 +11,16 @@ from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
 from mosa.modules.body import material as material_module
-from mosa.modules.body.material import ANGLE_MAX, FORMS, LOG, NU_MAX, SOFTPLUS, Direction, Material, register_form
+from mosa.modules.body.material import (
+    ANGLE_MAX,
+    FORMS,
+    LOG,
+    NU_MAX,
+    SOFTPLUS,
+    Direction,
+    Material,
+    register_form,
+)
 from mosa.physics.constitutive import laws
 from mosa.physics.constitutive.laws import law_named
 
@@ -31,14 +40,21 @@ def test_every_prior_starts_at_the_values_of_its_file(file):
         assert float(value.detach()) == pytest.approx(keys["parameters"][name], rel=1e-5), name
     for law in map(law_named, laws):
         material.law = law.name
-        assert set(material.per_particle(torch.ones(4))) == {n for n in law.parameters if n != law.reference}
+        assert set(material.per_particle(torch.ones(4))) == {
+            n for n in law.parameters if n != law.reference
+        }
 
 
 def test_lame_parameters_and_friction_follow_from_the_physical_ones():
-    values = {name: value.detach() for name, value in Material("drucker_prager", SAND).per_particle().items()}
+    values = {
+        name: value.detach()
+        for name, value in Material("drucker_prager", SAND).per_particle().items()
+    }
     assert float(values["mu"]) == pytest.approx(1e5 / 2.8, rel=1e-5)
     assert float(values["lam"]) == pytest.approx(1e5 * 0.4 / (1.4 * 0.2), rel=1e-5)
-    assert float(values["friction_alpha"]) == pytest.approx((2 / 3) ** 0.5 * 2 * 0.5 / (3 - 0.5), rel=1e-5)
+    assert float(values["friction_alpha"]) == pytest.approx(
+        (2 / 3) ** 0.5 * 2 * 0.5 / (3 - 0.5), rel=1e-5
+    )
     assert float(values["cohesion"]) == 0.0
 
 
@@ -49,7 +65,9 @@ def test_heterogeneity_multiplies_the_stiffness_alone():
     torch.testing.assert_close(values["mu"], factor * material.per_particle()["mu"])
     torch.testing.assert_close(values["lam"], factor * material.per_particle()["lam"])
     assert values["yield_stress"].shape == ()
-    named = Material("von_mises", {**ELASTIC, "yield_stress": 5e3}, modulated=["yield_stress"]).per_particle(factor)
+    named = Material(
+        "von_mises", {**ELASTIC, "yield_stress": 5e3}, modulated=["yield_stress"]
+    ).per_particle(factor)
     torch.testing.assert_close(named["yield_stress"], factor * 5e3)
     assert named["mu"].shape == ()
 
@@ -86,7 +104,9 @@ def test_stiffness_is_learned_as_a_logarithm():
     material = Material("corotated", ELASTIC)
     with torch.no_grad():
         material.raw["E"].add_(0.1)
-    assert float(material.physical()["E"].detach()) == pytest.approx(1e5 * 2.718281828**0.1, rel=1e-5)
+    assert float(material.physical()["E"].detach()) == pytest.approx(
+        1e5 * 2.718281828**0.1, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,16 +145,31 @@ def test_unconstrained_form_and_back(name, place):
     [
         (("jelly", ELASTIC), "expected one of .*found 'jelly'"),
         (("corotated", {**ELASTIC, "stifness": 1.0}), "found stifness"),
-        (("corotated", {"E": -1.0, "nu": 0.4}), r"prior.parameters.E: expected a number between 0 and 1e\+20, found -1"),
-        (("corotated", {"E": 1e5, "nu": 0.5}), "prior.parameters.nu: expected a number between 0 and 0.49, found 0.5"),
-        (("drucker_prager", {**SAND, "friction_angle": 95.0}), "friction_angle: expected a number between 0 and 89"),
-        (("corotated", {"E": "soft", "nu": 0.4}), "prior.parameters.E: expected a number, found 'soft'"),
+        (
+            ("corotated", {"E": -1.0, "nu": 0.4}),
+            r"prior.parameters.E: expected a number between 0 and 1e\+20, found -1",
+        ),
+        (
+            ("corotated", {"E": 1e5, "nu": 0.5}),
+            "prior.parameters.nu: expected a number between 0 and 0.49, found 0.5",
+        ),
+        (
+            ("drucker_prager", {**SAND, "friction_angle": 95.0}),
+            "friction_angle: expected a number between 0 and 89",
+        ),
+        (
+            ("corotated", {"E": "soft", "nu": 0.4}),
+            "prior.parameters.E: expected a number, found 'soft'",
+        ),
         (("corotated", {"E": 1e5}), "E and nu go together"),
         (("corotated", {}), "expected E with nu, or kappa with mu"),
         (("von_mises", ELASTIC), "takes lam, mu, yield_stress"),
         (("corotated", {**ELASTIC, "yield_stress": 1e3}), "law corotated takes lam, mu"),
         (("corotated", ELASTIC, ["mu"]), "prior.frozen: expected names among E, nu, found mu"),
-        (("corotated", ELASTIC, [], ["kappa"]), "prior.modulated: expected names among E, nu, found kappa"),
+        (
+            ("corotated", ELASTIC, [], ["kappa"]),
+            "prior.modulated: expected names among E, nu, found kappa",
+        ),
     ],
 )
 def test_a_mistake_is_named(arguments, message):
@@ -145,7 +180,9 @@ def test_a_mistake_is_named(arguments, message):
 def test_a_parameter_without_a_range_says_how_it_gets_one(monkeypatch):
     monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
     laws.register_law("rangeless", law_named("stvk").stress, {"mu": 1, "lam": 1, "sponginess": 1})
-    with pytest.raises(ConfigError, match=r"found sponginess \(law rangeless takes sponginess: .*register_form"):
+    with pytest.raises(
+        ConfigError, match=r"found sponginess \(law rangeless takes sponginess: .*register_form"
+    ):
         Material("rangeless", {**ELASTIC, "sponginess": 2.0})
 
 
@@ -169,7 +206,9 @@ def test_a_direction_starts_at_its_value_and_stays_a_unit_vector(fibred, start):
     material = Material("fibred", {**fibred, "a": start})
     expected = torch.tensor(start).float() / torch.tensor(start).float().norm()
     torch.testing.assert_close(material.per_particle(torch.ones(4))["a"], expected)
-    assert [float(material.physical()[f"a_{axis}"].detach()) for axis in "xyz"] == pytest.approx(expected.tolist())
+    assert [float(material.physical()[f"a_{axis}"].detach()) for axis in "xyz"] == pytest.approx(
+        expected.tolist()
+    )
     assert "a" not in material.physical() and material.begins["a_1"] == material.begins["a_2"] == 0
     with torch.no_grad():
         material.raw["a_1"].fill_(0.6)
@@ -188,20 +227,29 @@ def test_the_angles_of_a_direction_have_a_slope_at_the_start_and_beyond(fibred):
     frame = Direction.frame([1, 2, -1])
     for angles in ([0.0, 0.0], [3e-5, -2e-5], [9e-5, 5e-5], [0.4, -1.1]):
         angles = torch.tensor(angles, dtype=torch.float64, requires_grad=True)
-        assert torch.autograd.gradcheck(lambda a: Direction.physical(frame, a), angles, eps=1e-6, atol=1e-8)
-    jacobian = torch.autograd.functional.jacobian(lambda a: Direction.physical(frame, a), torch.zeros(2, dtype=torch.float64))
+        assert torch.autograd.gradcheck(
+            lambda a: Direction.physical(frame, a), angles, eps=1e-6, atol=1e-8
+        )
+    jacobian = torch.autograd.functional.jacobian(
+        lambda a: Direction.physical(frame, a), torch.zeros(2, dtype=torch.float64)
+    )
     torch.testing.assert_close(jacobian, frame[1:].T)
 
 
 def test_a_frozen_direction_is_not_learned_and_another_start_is_no_part_of_what_is_saved(fibred):
     material = Material("fibred", {**fibred, "a": [0, 0, 1]}, frozen=["a"])
-    assert not any(material.raw[name].requires_grad for name in ("a_1", "a_2")) and material.raw["k"].requires_grad
+    assert (
+        not any(material.raw[name].requires_grad for name in ("a_1", "a_2"))
+        and material.raw["k"].requires_grad
+    )
     assert set(material.state_dict()) == {f"raw.{name}" for name in ("E", "nu", "k", "a_1", "a_2")}
 
 
 @pytest.mark.parametrize("value", [1.0, [0, 0, 0], [1, 2], [1, None, 0], "x", [math.inf, 0, 0]])
 def test_what_is_no_direction_is_refused(fibred, value):
-    with pytest.raises(ConfigError, match=r"prior.parameters.a: expected a direction \[x, y, z\], found"):
+    with pytest.raises(
+        ConfigError, match=r"prior.parameters.a: expected a direction \[x, y, z\], found"
+    ):
         Material("fibred", {**fibred, "a": value})
 
 

@@ -12,7 +12,9 @@ MANDEL = torch.tensor(microplane.MANDEL, dtype=torch.float64)
 
 
 def drawn(*shape: int, seed: int = 0, size: float = 0.1) -> torch.Tensor:
-    return size * torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return size * torch.randn(
+        *shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
 
 
 def by_hand(s: np.ndarray, planes: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -29,7 +31,9 @@ def test_twelve_numbers_fill_upper_then_lower_triangle_row_by_row():
     assert U.tolist() == [[1, 2, 3], [0, 4, 5], [0, 0, 6]]
     assert L.tolist() == [[7, 0, 0], [8, 9, 0], [10, 11, 12]]
     eye = torch.eye(3)
-    torch.testing.assert_close(microplane.correction(numbers), (eye + L) @ (eye + U) - eye, rtol=0, atol=0)
+    torch.testing.assert_close(
+        microplane.correction(numbers), (eye + L) @ (eye + U) - eye, rtol=0, atol=0
+    )
 
 
 def test_no_numbers_are_no_correction_bit_for_bit():
@@ -41,7 +45,12 @@ def test_no_numbers_are_no_correction_bit_for_bit():
 def test_assembled_operator_is_the_steps_written_out():
     C, s = drawn(7, 4, 3, 3, seed=1), drawn(7, 6, seed=2, size=1.0)
     A = torch.eye(6).double() + microplane.redistribution(C[:, :3], C[:, 3])
-    expected = np.stack([by_hand(s[i].numpy(), np.eye(3) + C[i, :3].numpy(), np.eye(3) + C[i, 3].numpy()) for i in range(7)])
+    expected = np.stack(
+        [
+            by_hand(s[i].numpy(), np.eye(3) + C[i, :3].numpy(), np.eye(3) + C[i, 3].numpy())
+            for i in range(7)
+        ]
+    )
     np.testing.assert_allclose((A @ s[..., None])[..., 0].numpy(), expected, rtol=0, atol=1e-14)
     n, shears = microplane.stepwise_planes(s, C[:, :3])
     n = n + (C[:, 3] @ n[..., None])[..., 0]
@@ -88,7 +97,9 @@ def test_major_symmetry_makes_the_stiffness_symmetric_and_is_a_projection(poisso
     projected = microplane.major_symmetric(G, nu)
     assert asymmetry(G) > 1e-2  # the paper's operator has no energy
     assert asymmetry(projected) < 1e-13 * float(C0.max())
-    torch.testing.assert_close(microplane.major_symmetric(projected, nu), projected, rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        microplane.major_symmetric(projected, nu), projected, rtol=0, atol=1e-13
+    )
     A = MANDEL[:, None] * G / MANDEL
     expected = 0.5 * (A + C0 @ A.mT @ torch.linalg.inv(C0)) / MANDEL[:, None] * MANDEL
     torch.testing.assert_close(projected, expected, rtol=0, atol=1e-13)

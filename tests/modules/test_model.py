@@ -12,8 +12,15 @@ from mosa.errors import ConfigError
 def test_a_model_is_a_view_of_what_is_learned():
     body = small_body(modes=True)
     model = body.model()
-    assert model == body.model("adapted") and model.material is body.material and model.adapter is body.adapter
-    assert model.only(adapter=False).adapter is None and model.only(adapter=False).heterogeneity is body.heterogeneity
+    assert (
+        model == body.model("adapted")
+        and model.material is body.material
+        and model.adapter is body.adapter
+    )
+    assert (
+        model.only(adapter=False).adapter is None
+        and model.only(adapter=False).heterogeneity is body.heterogeneity
+    )
     assert model.only(heterogeneity=False).heterogeneity is None and model.only() == model
     with pytest.raises(FrozenInstanceError):
         model.adapter = None
@@ -22,9 +29,14 @@ def test_a_model_is_a_view_of_what_is_learned():
 def test_backbones_have_no_adapter_and_the_calibrated_one_no_stiffness_field():
     body = small_body(modes=True)
     assert body.model("prior").adapter is body.model("prior_eta").adapter is None
-    assert body.model("prior").heterogeneity is None and body.model("prior_eta").heterogeneity is not None
+    assert (
+        body.model("prior").heterogeneity is None
+        and body.model("prior_eta").heterogeneity is not None
+    )
     assert body.model("prior").material is not body.material
-    with pytest.raises(ConfigError, match="variant: expected one of prior, prior_eta, adapted, found 'posterior'"):
+    with pytest.raises(
+        ConfigError, match="variant: expected one of prior, prior_eta, adapted, found 'posterior'"
+    ):
         body.model("posterior")
 
 
@@ -38,6 +50,9 @@ def test_an_adapter_before_its_stage_is_no_part_of_the_model():
 @torch.no_grad()
 def test_what_is_simulated_is_the_model_that_is_given():
     body = small_body(numbers=0.2 * torch.ones(19).double())
-    learned, prior = (body.simulate(start(), WORLD, 6, 1 / 60, model=model).x for model in (None, body.model().only(adapter=False)))
+    learned, prior = (
+        body.simulate(start(), WORLD, 6, 1 / 60, model=model).x
+        for model in (None, body.model().only(adapter=False))
+    )
     assert torch.equal(body.simulate(start(), WORLD, 6, 1 / 60, model=body.model("prior")).x, prior)
     assert float((learned - prior).abs().max()) > 1e-4

@@ -30,7 +30,9 @@ def test_gradient_against_differences():
     x = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
 
     def value(x, *weights):
-        return torch.func.functional_call(network, dict(zip(dict(network.named_parameters()), weights)), (x,))
+        return torch.func.functional_call(
+            network, dict(zip(dict(network.named_parameters()), weights)), (x,)
+        )
 
     assert gradcheck(value, (x, *parameters), rtol=1e-6, atol=1e-9)
 

@@ -78,9 +78,13 @@ def test_a_direction_of_the_material_stays_in_the_material():
     """Two stretches of equal size along different material axes give different stress: the correction is anisotropic."""
     adapter, Q = drawn_adapter(), rotations(1, 3)
     F = torch.diag_embed(torch.tensor([[1.2, 1.0, 1.0]], dtype=torch.float64))
-    turned_material = corrected_stress(adapter, "neo_hookean", F @ Q)  # the body was turned before it was stretched
+    turned_material = corrected_stress(
+        adapter, "neo_hookean", F @ Q
+    )  # the body was turned before it was stretched
     prior = reference.stress("neo_hookean", F, {"mu": torch.tensor(MU), "lam": torch.tensor(LAM)})
-    assert (turned_material - corrected_stress(adapter, "neo_hookean", F)).abs().max() > 1e-2 * prior.abs().max()
+    assert (
+        turned_material - corrected_stress(adapter, "neo_hookean", F)
+    ).abs().max() > 1e-2 * prior.abs().max()
 
 
 @pytest.mark.parametrize("law", LAWS)

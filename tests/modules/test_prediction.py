@@ -10,7 +10,16 @@ from small_bodies import WORLD, small_body, start
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import uncertainty as prediction
 from mosa.evaluation.evaluate import Sequence
-from mosa.evaluation.uncertainty import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, determined, physical_sd, total_spread
+from mosa.evaluation.uncertainty import (
+    DRAWN,
+    ELSEWHERE,
+    FORMS,
+    INFLATION,
+    among_forms,
+    determined,
+    physical_sd,
+    total_spread,
+)
 from mosa.modules.body.material import NU_MAX
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import as_rival, each_law, limits_of, read_numbers
@@ -34,7 +43,9 @@ def test_the_body_is_what_it_was_also_after_an_error():
     before = read_numbers(body)
     laws = before + torch.arange(1, 4).double()[:, None] * 1e-2
     seen = [read_numbers(body) for _ in each_law(body, laws)]
-    assert torch.allclose(torch.stack(seen), laws, atol=1e-6) and torch.equal(read_numbers(body), before)
+    assert torch.allclose(torch.stack(seen), laws, atol=1e-6) and torch.equal(
+        read_numbers(body), before
+    )
     with pytest.raises(RuntimeError, match="half way"):
         for i, _ in enumerate(each_law(body, laws)):
             if i == 1:
@@ -60,7 +71,9 @@ def test_spread_of_known_rivals():
     assert float(forms) == pytest.approx(5 * a**2 / 3, rel=1e-6) and among_forms(base, []) is None
     drawn = torch.stack([base - step, base + step])
     assert float(total_spread(drawn, wrong, forms)) == pytest.approx(
-        math.sqrt((DRAWN * 2**0.5 * a) ** 2 + FORMS**2 * 5 * a**2 / 3 + (ELSEWHERE * wrong) ** 2), rel=1e-6)
+        math.sqrt((DRAWN * 2**0.5 * a) ** 2 + FORMS**2 * 5 * a**2 / 3 + (ELSEWHERE * wrong) ** 2),
+        rel=1e-6,
+    )
 
 
 def test_a_law_with_a_rival_is_less_sure_where_the_two_part():
@@ -85,7 +98,9 @@ def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more()
     assert sd.shape == rollout.x.shape[:2] and float((sd - 0.004 * ELSEWHERE).abs().max()) < 1e-5
     before = read_numbers(unsure.body)
     _, wider = unsure.predict(draws=4, frames=9)
-    assert float(wider[-1].mean()) > 0.00405 * ELSEWHERE and torch.equal(read_numbers(unsure.body), before)
+    assert float(wider[-1].mean()) > 0.00405 * ELSEWHERE and torch.equal(
+        read_numbers(unsure.body), before
+    )
     with pytest.raises(ConfigError, match="no posterior"):
         Twin(sure.body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0)).predict(frames=3)
 
@@ -106,7 +121,9 @@ def test_a_law_that_can_be_simulated_nowhere_has_no_draws_that_can(monkeypatch):
 def said_of_nu(nu: float, sd: float) -> float:
     body = small_body(adapter=False, nu=nu)
     one = torch.ones(2).double()
-    posterior = Posterior(["E", "nu"], read_numbers(body), (sd / INFLATION) ** 2 * torch.diag(one), one)
+    posterior = Posterior(
+        ["E", "nu"], read_numbers(body), (sd / INFLATION) ** 2 * torch.diag(one), one
+    )
     return determined(body, posterior)["posterior/nu_sd"]
 
 
@@ -127,9 +144,13 @@ def test_a_bounded_number_beyond_its_limits_or_known_exactly_has_a_deviation_too
     """A number that is continued to another grid may lie beyond the limits of the fit; from there they are the nearest."""
     low, high = limits_of(name)
     for end, beyond in ((max(low, -8.0), -1e-3), (min(high, 8.0), 1e-3)):
-        at, past = (physical_sd(name, torch.tensor(end + step).double(), 0.03) for step in (0.0, beyond))
+        at, past = (
+            physical_sd(name, torch.tensor(end + step).double(), 0.03) for step in (0.0, beyond)
+        )
         assert past == pytest.approx(at, rel=0.1) and 0 < past < 0.1
-        exact, wide, widest = (physical_sd(name, torch.tensor(end).double(), sd) for sd in (0.0, 1e4, math.inf))
+        exact, wide, widest = (
+            physical_sd(name, torch.tensor(end).double(), sd) for sd in (0.0, 1e4, math.inf)
+        )
         assert exact < 1e-6 and wide == pytest.approx(widest, rel=0.01)
     assert math.isnan(physical_sd(name, torch.tensor(0.0), math.nan))
 
@@ -145,10 +166,15 @@ def test_two_deviations_of_a_bounded_number_hold_the_truth_as_often_as_they_say(
     raw = found.clamp(low, high)
     places = torch.linspace(low, high, 81).double()
     said = torch.tensor([physical_sd("nu", place, sd) for place in places])
-    held = (NU_MAX * raw.sigmoid() - truth).abs() <= 2 * said[((raw - low) / (high - low) * 80).round().long()]
+    held = (NU_MAX * raw.sigmoid() - truth).abs() <= 2 * said[
+        ((raw - low) / (high - low) * 80).round().long()
+    ]
     at_limit = (raw == low) | (raw == high)
     assert at_limit.sum() > 300
-    assert 0.92 <= float(held.double().mean()) <= 0.98 and 0.88 <= float(held[at_limit].double().mean()) <= 0.98
+    assert (
+        0.92 <= float(held.double().mean()) <= 0.98
+        and 0.88 <= float(held[at_limit].double().mean()) <= 0.98
+    )
 
 
 def test_information_of_known_draws():
@@ -165,5 +191,7 @@ def test_candidates_begin_with_the_rest_pose_and_the_most_telling_is_first():
     assert found[0] == (0.0, 1.0, 0.0, 0.0) and found == drawn_starts(6, seed=3)
     assert all(math.hypot(*each[:3]) == pytest.approx(1) and 0 <= each[3] <= 180 for each in found)
     ranked = plan(twin_of(0.05), count=3, draws=4, frames=5)
-    assert len(ranked) == 3 and [r.gain for r in ranked] == sorted((r.gain for r in ranked), reverse=True)
+    assert len(ranked) == 3 and [r.gain for r in ranked] == sorted(
+        (r.gain for r in ranked), reverse=True
+    )
     assert ranked[-1].gain > 0 and plan(twin_of(1e-7), count=2, draws=4, frames=5)[0].gain < 1e-3

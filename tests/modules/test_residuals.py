@@ -13,7 +13,9 @@ from mosa.types import MotionCues
 
 def turn(vector) -> torch.Tensor:
     k = torch.as_tensor(vector, dtype=torch.float64)
-    return torch.linalg.matrix_exp(torch.tensor([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]], dtype=torch.float64))
+    return torch.linalg.matrix_exp(
+        torch.tensor([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]], dtype=torch.float64)
+    )
 
 
 @torch.no_grad()
@@ -26,8 +28,12 @@ def test_a_rollout_has_no_distance_from_its_own_cues():
         assert field.shape == (7, len(chosen), 3) and field.abs().max() < 1e-14
     stretched = rollout.F_tot[1:].sub(begins.rotation).abs().max()
     assert stretched > 0.02  # it was deformed
-    other = residuals.fields(rollout, cues_of(rollout, torch.eye(3).double()), begins.rotation, chosen)
-    assert other.rotation.norm(dim=-1).min() == pytest.approx(math.sin(1.1), rel=1e-9)  # the pose at the start left out
+    other = residuals.fields(
+        rollout, cues_of(rollout, torch.eye(3).double()), begins.rotation, chosen
+    )
+    assert other.rotation.norm(dim=-1).min() == pytest.approx(
+        math.sin(1.1), rel=1e-9
+    )  # the pose at the start left out
 
 
 def test_known_turns_stretches_and_shifts_are_found():
@@ -38,7 +44,10 @@ def test_known_turns_stretches_and_shifts_are_found():
     S = torch.tensor([1.2, 1.0, 0.7], dtype=torch.float64)
     F = (R @ Q @ turn([0.3, 0.2, 0.1]) @ torch.diag(S) @ turn([0.3, 0.2, 0.1]).T).expand(2, n, 3, 3)
     x = torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
-    shift, stretch = torch.tensor([0.1, 0.2, 0.3]).double(), torch.tensor([0.02, 0.0, -0.01]).double()
+    shift, stretch = (
+        torch.tensor([0.1, 0.2, 0.3]).double(),
+        torch.tensor([0.02, 0.0, -0.01]).double(),
+    )
     weight = torch.tensor([1.0, 1.0, 0.5, 0.0, 1.0]).double().expand(2, n)
     # F = (R Q) (W in the rest frame): the pose Q is taken off on the right
     cues = MotionCues(x - shift, (R @ turn(vector).T).expand(2, n, 3, 3), (S - stretch).expand(2, n, 3), weight,
@@ -54,8 +63,15 @@ def test_known_turns_stretches_and_shifts_are_found():
 def test_a_frame_counts_as_many_data_as_it_is_given():
     """Scaled by its own root mean square a frame of vectors has the squared length `count`, however many particles it has."""
     generator = torch.Generator().manual_seed(2)
-    found = [residuals.Fields(*(size * torch.randn(6, n, 3, generator=generator, dtype=torch.float64) for size in (0.1, 1.0, 0.5)))
-             for n in (10, 300)]
+    found = [
+        residuals.Fields(
+            *(
+                size * torch.randn(6, n, 3, generator=generator, dtype=torch.float64)
+                for size in (0.1, 1.0, 0.5)
+            )
+        )
+        for n in (10, 300)
+    ]
     noise = residuals.spread(found, residuals.floors(0.01, 0.1))
     vector = residuals.whitened(found, noise, [(30.0, 20.0, 10.0), (1.0, 0.0, 0.0)])
     split = 6 * 10 * 9
@@ -68,14 +84,26 @@ def test_noise_is_not_below_that_of_the_cues_and_the_grid():
     """Of a field that is nothing, sqrt(3) times the floor of one component: cue and model errors add as squares."""
     none = residuals.Fields(*(torch.zeros(2, 4, 3).double() for _ in range(3)))
     for dx, cells in ((0.02, 0.0), (0.02, 0.1), (0.05, 0.5)):
-        expected = [math.hypot(0.5e-3, cells * dx), math.hypot(0.01, 0.3 * cells), math.hypot(0.015, 0.15 * cells)]
-        for scale, floor in zip(residuals.spread([none], residuals.floors(dx, cells))[0], expected, strict=True):
-            assert torch.allclose(scale, torch.full((2,), 3**0.5 * floor, dtype=torch.float64), rtol=1e-12)
+        expected = [
+            math.hypot(0.5e-3, cells * dx),
+            math.hypot(0.01, 0.3 * cells),
+            math.hypot(0.015, 0.15 * cells),
+        ]
+        for scale, floor in zip(
+            residuals.spread([none], residuals.floors(dx, cells))[0], expected, strict=True
+        ):
+            assert torch.allclose(
+                scale, torch.full((2,), 3**0.5 * floor, dtype=torch.float64), rtol=1e-12
+            )
 
 
 @pytest.mark.parametrize("particles", [1, 7, 2000, 2001, 12345])
 def test_the_sample_is_spread_evenly(particles):
     chosen = residuals.sampled(particles, torch.device("cpu"))
-    assert len(chosen) == min(particles, residuals.SAMPLES) and chosen[0] == 0 and chosen[-1] < particles
+    assert (
+        len(chosen) == min(particles, residuals.SAMPLES)
+        and chosen[0] == 0
+        and chosen[-1] < particles
+    )
     gaps = chosen.diff()
     assert len(chosen) == 1 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)

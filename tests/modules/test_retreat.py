@@ -23,13 +23,18 @@ def test_a_step_is_undone_with_its_momentum_and_halved(stepped):
     assert numbers.abs().min() > 0.09 and retreat.share == 1
     assert retreat.back(optimizer, [numbers])
     assert torch.equal(numbers, torch.zeros(3)) and retreat.share == 0.5
-    assert not optimizer.state[numbers]["exp_avg"].any() and optimizer.state[numbers]["exp_avg_sq"].all()
+    assert (
+        not optimizer.state[numbers]["exp_avg"].any()
+        and optimizer.state[numbers]["exp_avg_sq"].all()
+    )
 
 
 def test_nothing_is_undone_where_no_step_was_made_or_too_many_were_undone(stepped):
     numbers, optimizer, retreat = stepped
     assert not Retreat().back(optimizer, [numbers])
-    assert all(retreat.back(optimizer, [numbers]) for _ in range(MOST_HALVINGS)) and not retreat.back(optimizer, [numbers])
+    assert all(
+        retreat.back(optimizer, [numbers]) for _ in range(MOST_HALVINGS)
+    ) and not retreat.back(optimizer, [numbers])
 
 
 def test_it_is_written_and_read_for_the_same_numbers_alone(stepped):
@@ -40,5 +45,8 @@ def test_it_is_written_and_read_for_the_same_numbers_alone(stepped):
     assert again.halvings == 1 and torch.equal(again.before[0], torch.zeros(3))
     again.read(None, [numbers])  # of a checkpoint that knew none
     assert again.halvings == 0 and again.before is None
-    with pytest.raises(DataError, match=r"mosa\.retreat\.before: expected tensors of shapes \[\(4,\)\], found \[\(3,\)\]"):
+    with pytest.raises(
+        DataError,
+        match=r"mosa\.retreat\.before: expected tensors of shapes \[\(4,\)\], found \[\(3,\)\]",
+    ):
         again.read(retreat.written(), [torch.zeros(4)])

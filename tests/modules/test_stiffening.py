@@ -22,7 +22,9 @@ def operators(numbers: torch.Tensor) -> torch.Tensor:
 
 
 def corner(alpha: float, poisson: float) -> float:
-    return acoustic_stiffening(operators(torch.full((1, 4, 12), alpha, dtype=torch.float64)), poisson)
+    return acoustic_stiffening(
+        operators(torch.full((1, 4, 12), alpha, dtype=torch.float64)), poisson
+    )
 
 
 def modulus(G: torch.Tensor, poisson: float, n: torch.Tensor, m: torch.Tensor) -> torch.Tensor:
@@ -60,9 +62,13 @@ def test_the_figure_of_one_operator_is_the_largest_modulus():
 def test_the_prior_is_one_and_the_projection_changes_nothing():
     assert acoustic_stiffening(torch.zeros(6, 6), 0.4) == pytest.approx(1, abs=1e-12)
     assert acoustic_stiffening(0.5 * torch.eye(6), 0.4) == pytest.approx(1.5, abs=1e-12)
-    G = operators(0.1 * torch.randn(5, 4, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    G = operators(
+        0.1 * torch.randn(5, 4, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    )
     projected = microplane.major_symmetric(G, torch.tensor(0.35).double())
-    assert acoustic_stiffening(projected, 0.35) == pytest.approx(acoustic_stiffening(G, 0.35), rel=1e-12)
+    assert acoustic_stiffening(projected, 0.35) == pytest.approx(
+        acoustic_stiffening(G, 0.35), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.15, 0.2, 0.3])
@@ -79,7 +85,9 @@ def test_the_bound_holds_for_every_operator(alpha):
             for k in range(48):
                 flipped = x.clone()
                 flipped.view(-1)[k] *= -1
-                if acoustic_stiffening(operators(flipped), poisson) > acoustic_stiffening(operators(x), poisson):
+                if acoustic_stiffening(operators(flipped), poisson) > acoustic_stiffening(
+                    operators(x), poisson
+                ):
                     x = flipped
         assert acoustic_stiffening(operators(x), poisson) <= top * 1.001
         assert top <= worst_stiffening(alpha) * (1.001 if poisson <= 0.38 else 1.06)
@@ -105,8 +113,15 @@ def test_substeps_follow_the_operator_there_is():
     adapter = StressAdapter(alpha=0.2, **OPERATOR)
     one, count = body(adapter), 100_000.0
     before = one.substeps(count, 2.0, 1.0, True)
-    assert before % EVEN == 0 and before == -(-required_substeps(count, 1000.0, 2.0, 0.02, 1.0, ADAPTER_MARGIN) // EVEN) * EVEN
-    assert one.stiffening(True) == one.step_control(True).factor == ADAPTER_MARGIN and one.stiffening(False) == 1
+    assert (
+        before % EVEN == 0
+        and before
+        == -(-required_substeps(count, 1000.0, 2.0, 0.02, 1.0, ADAPTER_MARGIN) // EVEN) * EVEN
+    )
+    assert (
+        one.stiffening(True) == one.step_control(True).factor == ADAPTER_MARGIN
+        and one.stiffening(False) == 1
+    )
     with torch.no_grad():
         adapter.operator.free.fill_(0.03)  # tanh(0.3): C about 0.12
     assert one.stiffening(True) == ADAPTER_MARGIN and one.substeps(count, 2.0, 1.0, True) == before
@@ -115,7 +130,9 @@ def test_substeps_follow_the_operator_there_is():
     found = one.stiffening(True)
     assert found == pytest.approx(corner(0.2, 0.3), rel=1e-6) and found > 2.9
     assert one.step_control(True).factor == found
-    assert one.substeps(count, 2.0, 1.0, True) == pytest.approx(before * (found / ADAPTER_MARGIN) ** 0.5, abs=EVEN + 1)
+    assert one.substeps(count, 2.0, 1.0, True) == pytest.approx(
+        before * (found / ADAPTER_MARGIN) ** 0.5, abs=EVEN + 1
+    )
 
 
 def test_networks_of_the_state_are_given_their_bound():

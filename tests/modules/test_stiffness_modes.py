@@ -40,7 +40,9 @@ def test_no_wave_is_shorter_than_promised_and_none_that_fits_is_left_out(wavelen
     longest = float(sides.max())
     assert lengths.min() >= wavelength * longest * (1 - 1e-6) and (lengths.diff() <= 1e-6).all()
     counts = torch.cartesian_prod(*(torch.arange(20).double() for _ in range(3)))[1:]
-    assert len(lengths) == int((2 / (counts / sides).norm(dim=1) >= wavelength * longest * (1 - 1e-9)).sum())
+    assert len(lengths) == int(
+        (2 / (counts / sides).norm(dim=1) >= wavelength * longest * (1 - 1e-9)).sum()
+    )
     assert float(lengths[0]) == pytest.approx(2 * longest)  # half a wave along the longest side
     assert torch.allclose(field.size.double(), 2 * longest / lengths, rtol=1e-6)
 
@@ -50,7 +52,11 @@ def test_a_mode_is_the_product_of_its_cosines():
     x = (X - LOW) / (HIGH - LOW)
     for k in (0, 5, len(field.size) - 1):
         a, b, c = field.waves[k].tolist()
-        expected = torch.cos(torch.pi * a * x[:, 0]) * torch.cos(torch.pi * b * x[:, 1]) * torch.cos(torch.pi * c * x[:, 2])
+        expected = (
+            torch.cos(torch.pi * a * x[:, 0])
+            * torch.cos(torch.pi * b * x[:, 1])
+            * torch.cos(torch.pi * c * x[:, 2])
+        )
         assert torch.allclose(field.raw(X)[:, k], expected, rtol=0, atol=1e-12)
 
 
@@ -63,11 +69,15 @@ def test_the_factor_is_within_its_amplitude_and_1_without_coefficients():
     field = modes(amplitude=0.3)
     assert (field.factor(particles()) == 1).all()
     with torch.no_grad():
-        field.coefficients.copy_(torch.randn(len(field.size), generator=torch.Generator().manual_seed(1)))
+        field.coefficients.copy_(
+            torch.randn(len(field.size), generator=torch.Generator().manual_seed(1))
+        )
     factor = field.factor(particles())
     assert factor.max() <= 1.3 and factor.min() >= 0.7 and factor.max() - factor.min() > 0.4
     eta = field(particles())
-    assert torch.allclose(factor, 1 + 0.3 * torch.tanh(eta)) and torch.allclose(eta, field.basis(particles()) @ field.coefficients)
+    assert torch.allclose(factor, 1 + 0.3 * torch.tanh(eta)) and torch.allclose(
+        eta, field.basis(particles()) @ field.coefficients
+    )
 
 
 @pytest.mark.parametrize("options, key", [
@@ -84,4 +94,6 @@ def test_what_is_out_of_range_is_named(options, key):
 def test_a_flat_box_is_refused_and_the_longest_wavelength_is_one_mode():
     with pytest.raises(ConfigError, match="no volume"):
         StiffnessModes(LOW, torch.tensor([0.3, 0.0, 0.4]))
-    assert StiffnessModes(LOW, HIGH, HeterogeneitySettings(wavelength=2.0)).waves.tolist() == [[1.0, 0.0, 0.0]]
+    assert StiffnessModes(LOW, HIGH, HeterogeneitySettings(wavelength=2.0)).waves.tolist() == [
+        [1.0, 0.0, 0.0]
+    ]

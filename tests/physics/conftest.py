@@ -60,12 +60,20 @@ def block(n: int = 4, spacing: float = 0.02, height: float = 0.03, jitter: float
           dtype: torch.dtype = torch.float64, velocity=(0.2, -1.5, 0.1)) -> ParticleState:  # fmt: skip
     """A jittered cube of n^3 particles above the ground, slightly deformed so that nothing is special."""
     generator = torch.Generator().manual_seed(seed)
-    index = torch.stack(torch.meshgrid(*(torch.arange(n),) * 3, indexing="ij"), -1).reshape(-1, 3).double()
+    index = (
+        torch.stack(torch.meshgrid(*(torch.arange(n),) * 3, indexing="ij"), -1)
+        .reshape(-1, 3)
+        .double()
+    )
     x = (index + 0.5) * spacing + torch.tensor([0.11, height, 0.07], dtype=torch.float64)
     x = x + jitter * spacing * (torch.rand(x.shape, generator=generator, dtype=torch.float64) - 0.5)
     count = len(x)
-    F = torch.eye(3, dtype=torch.float64) + 0.03 * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
-    v = torch.tensor(velocity, dtype=torch.float64) + 0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3, dtype=torch.float64) + 0.03 * torch.randn(
+        count, 3, 3, generator=generator, dtype=torch.float64
+    )
+    v = torch.tensor(velocity, dtype=torch.float64) + 0.1 * torch.randn(
+        count, 3, generator=generator, dtype=torch.float64
+    )
     C = 2.0 * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
     return ParticleState(*(t.to(dtype).contiguous() for t in (x, v, C, F, F)))
 
@@ -92,14 +100,23 @@ def looks(monkeypatch):
 @pytest.fixture
 def oracle():
     """Loader of a file of the reference data's `oracle` folder: name -> (arrays as float64 tensors, meta)."""
-    folder = Path(os.environ.get("MOSA_DATA", Path(__file__).parents[2] / ".." / "shared" / "data")) / "oracle"
+    folder = (
+        Path(os.environ.get("MOSA_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+        / "oracle"
+    )
 
     def load(name: str):
         path = folder / f"{name}.npz"
         if not path.is_file():
-            pytest.skip(f"reference data absent: set MOSA_DATA to the folder that holds oracle/{name}.npz")
+            pytest.skip(
+                f"reference data absent: set MOSA_DATA to the folder that holds oracle/{name}.npz"
+            )
         with np.load(path, allow_pickle=False) as file:
-            arrays = {key: torch.from_numpy(np.asarray(file[key])) for key in file.files if file[key].dtype.kind in "fi"}
+            arrays = {
+                key: torch.from_numpy(np.asarray(file[key]))
+                for key in file.files
+                if file[key].dtype.kind in "fi"
+            }
             meta = json.loads(str(file["meta"])) if "meta" in file.files else {}
         return arrays, meta
 

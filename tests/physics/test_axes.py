@@ -37,12 +37,28 @@ def seen(state, Q, s, dtype):
 
 def moved(motion, Q, s):
     """A motion of the world that is turned by Q and moved by s."""
-    turned = {name: torch.as_tensor(getattr(motion, name)).double() @ Q.T for name in ("velocity", "angular_velocity")}
-    position, rotation = Q @ torch.as_tensor(motion.position).double() + s, Q @ rotation_matrices(motion.rotation)
+    turned = {
+        name: torch.as_tensor(getattr(motion, name)).double() @ Q.T
+        for name in ("velocity", "angular_velocity")
+    }
+    position, rotation = (
+        Q @ torch.as_tensor(motion.position).double() + s,
+        Q @ rotation_matrices(motion.rotation),
+    )
     return replace(motion, position=position, rotation=rotation, **turned)
 
 
-def fall(state, Q, s, mode="sticky", dtype=torch.float64, frames=9, law="neo_hookean", parameters=PARAMETERS, **options):
+def fall(
+    state,
+    Q,
+    s,
+    mode="sticky",
+    dtype=torch.float64,
+    frames=9,
+    law="neo_hookean",
+    parameters=PARAMETERS,
+    **options,
+):
     up = Q @ UP
     sim = Simulator(law, dx=DX, substeps=SUBSTEPS, frame_dt=FRAME_DT, gravity=Q @ GRAVITY, up=up, dtype=dtype,
                     ground=Ground(float(s @ up), mode, 0.3 if mode in ("separate", "touch") else 0.0), **options)  # fmt: skip
@@ -50,7 +66,10 @@ def fall(state, Q, s, mode="sticky", dtype=torch.float64, frames=9, law="neo_hoo
     return sim.rollout(seen(state, Q, s, dtype), parameters, volume, 1000.0, frames)
 
 
-NOWHERE, FAR = torch.zeros(3).double(), PERIOD * DX * torch.tensor([120.0, 1.0, -119.0]).double()  # 9.8 km
+NOWHERE, FAR = (
+    torch.zeros(3).double(),
+    PERIOD * DX * torch.tensor([120.0, 1.0, -119.0]).double(),
+)  # 9.8 km
 
 
 @pytest.mark.parametrize("mode", ["sticky", "slip", "separate"])
@@ -58,11 +77,16 @@ NOWHERE, FAR = torch.zeros(3).double(), PERIOD * DX * torch.tensor([120.0, 1.0, 
 def test_a_turned_world_has_the_motion_of_one_along_the_grid(mode, degrees, axis, make_block):
     Q, state = turn(degrees, axis), make_block()
     with torch.no_grad():
-        first, second = fall(state, torch.eye(3).double(), NOWHERE, mode), fall(state, Q, NOWHERE, mode)
+        first, second = (
+            fall(state, torch.eye(3).double(), NOWHERE, mode),
+            fall(state, Q, NOWHERE, mode),
+        )
     assert (second.x - first.x @ Q.T).abs().max() < 1e-9 * DX
     assert (second.F[-1] - Q @ first.F[-1]).abs().max() < 1e-9
     assert (second.v[-1] - first.v[-1] @ Q.T).abs().max() < 1e-8
-    assert float(first.v[-1][:, 1].mean()) > -1.0  # it has met the ground: free fall would have passed -3
+    assert (
+        float(first.v[-1][:, 1].mean()) > -1.0
+    )  # it has met the ground: free fall would have passed -3
 
 
 @pytest.mark.parametrize("place", [1.0, 0.1, 0.01])
@@ -71,15 +95,28 @@ def test_a_body_ten_kilometres_away_moves_as_one_at_the_origin(place, make_block
     state, s = make_block(), place * FAR
     s = DX * torch.round(s / DX)  # the grid lies in the body as before
     with torch.no_grad():
-        near, there = (fall(state, torch.eye(3).double(), at, "separate", torch.float32) for at in (NOWHERE, s))
+        near, there = (
+            fall(state, torch.eye(3).double(), at, "separate", torch.float32) for at in (NOWHERE, s)
+        )
     assert there.x.dtype == torch.float64 == there.final.x.dtype and near.x.dtype == torch.float32
     assert (there.x - s - near.x).abs().max() < 1e-4  # 0.0025 cells
     rounded = replace(seen(state, torch.eye(3).double(), s, torch.float32), x=(state.x + s).float())
     with torch.no_grad():
         ground = Ground(float(s[1]), "separate", 0.3)
-        sim = Simulator("neo_hookean", dx=DX, substeps=SUBSTEPS, frame_dt=FRAME_DT, gravity=GRAVITY, ground=ground)
-        found = sim.rollout(rounded, PARAMETERS, torch.full((len(state.x),), (DX / 2) ** 3), 1000.0, 9)
-    assert (found.x.mean(1) - found.x[0].mean(0) - (near.x.mean(1) - near.x[0].mean(0))).abs().max() < 2e-3
+        sim = Simulator(
+            "neo_hookean",
+            dx=DX,
+            substeps=SUBSTEPS,
+            frame_dt=FRAME_DT,
+            gravity=GRAVITY,
+            ground=ground,
+        )
+        found = sim.rollout(
+            rounded, PARAMETERS, torch.full((len(state.x),), (DX / 2) ** 3), 1000.0, 9
+        )
+    assert (
+        found.x.mean(1) - found.x[0].mean(0) - (near.x.mean(1) - near.x[0].mean(0))
+    ).abs().max() < 2e-3
 
 
 def test_all_that_is_spatial_is_turned(make_block):
@@ -95,11 +132,15 @@ def test_all_that_is_spatial_is_turned(make_block):
         motion = moved(motion, Q, s)
         paddle = Collider(Box((0.1, 0.1, 0.2)), "separate", 0.2, motion)
         out = fall(state, Q, s, "separate", colliders=(paddle,), frames=5, **law)
-        loss = ((out.x[-1] - s) @ Q).square().sum() + (out.reactions.sum((0, 1)).view(-1, 2, 3) @ Q)[0, 0] @ UP
+        loss = ((out.x[-1] - s) @ Q).square().sum() + (
+            out.reactions.sum((0, 1)).view(-1, 2, 3) @ Q
+        )[0, 0] @ UP
         return out, torch.autograd.grad(loss, (state.x, velocity))
 
     (first, gradients), (second, again) = run(torch.eye(3).double(), NOWHERE), run(Q, Q @ FAR)
-    assert (second.F_tot[-1] - Q @ first.F_tot[-1]).abs().max() < 1e-6 and not torch.allclose(first.F[-1], first.F_tot[-1])
+    assert (second.F_tot[-1] - Q @ first.F_tot[-1]).abs().max() < 1e-6 and not torch.allclose(
+        first.F[-1], first.F_tot[-1]
+    )
     forces = first.reactions.view(4, SUBSTEPS, -1, 2, 3)
     assert forces.abs().max() > 1
     torch.testing.assert_close(second.reactions.view_as(forces), forces @ Q.T, rtol=1e-5, atol=1e-6)
@@ -115,15 +156,26 @@ def test_steps_have_the_bits_of_a_rollout_in_axes_of_their_own(timing, make_bloc
     sim = Simulator("neo_hookean", dx=DX, substeps=2, frame_dt=FRAME_DT / SUBSTEPS * 2, gravity=Q @ GRAVITY, up=up,
                     ground=Ground(float(FAR @ up), "sticky"),
                     colliders=(Collider(Box((0.1, 0.1, 0.2)), motion=moved(PADDLE, Q, FAR)),))  # fmt: skip
-    given = seen(state, Q, FAR, torch.float32), PARAMETERS, torch.full((len(state.x),), (DX / 2) ** 3), 1000.0
+    given = (
+        seen(state, Q, FAR, torch.float32),
+        PARAMETERS,
+        torch.full((len(state.x),), (DX / 2) ** 3),
+        1000.0,
+    )
     with torch.no_grad():
         whole = sim.rollout(*given, 101, timing=timing)
         stepper, moment = sim.stepper(*given, timing=timing)
         for _ in range(100):
             # where the caller says where a solid is, he does so in the world
-            sample = None if timing else stepper.sample(moment, 2, sim.dt, [c.motion for c in sim.colliders])
+            sample = (
+                None
+                if timing
+                else stepper.sample(moment, 2, sim.dt, [c.motion for c in sim.colliders])
+            )
             moment, forces, _ = stepper.step(moment, sample)
-    torch.testing.assert_close(stepper.axes.world.state(moment.state).x, whole.final.x, rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        stepper.axes.world.state(moment.state).x, whole.final.x, rtol=0, atol=1e-9
+    )
     torch.testing.assert_close(forces, whole.reactions[-1], rtol=1e-4, atol=1e-4)
     assert float(whole.reactions.abs().max()) > 0.1
 
@@ -138,25 +190,46 @@ def test_worlds_have_gravities_of_their_own_in_axes_that_are_turned(make_block):
         sim = Simulator("neo_hookean", dx=DX, substeps=SUBSTEPS, frame_dt=FRAME_DT, up=turned @ UP, ground=Ground(0.0, "slip"),
                         dtype=torch.float64)  # fmt: skip
         with torch.no_grad():
-            return sim.rollout(seen(both, turned, NOWHERE, torch.float64), PARAMETERS, volume, 1000.0, 6, gravity=pulls @ turned.T)
+            return sim.rollout(
+                seen(both, turned, NOWHERE, torch.float64),
+                PARAMETERS,
+                volume,
+                1000.0,
+                6,
+                gravity=pulls @ turned.T,
+            )
 
     first, second = run(torch.eye(3).double()), run(Q)
-    assert (second.x - first.x @ Q.T).abs().max() < 1e-9 * DX and (first.x[-1, 0] - first.x[-1, 1]).abs().max() > 0.01
+    assert (second.x - first.x @ Q.T).abs().max() < 1e-9 * DX and (
+        first.x[-1, 0] - first.x[-1, 1]
+    ).abs().max() > 0.01
 
 
 def test_one_simulator_serves_places_that_are_far_from_each_other(make_block):
     """Its buffers know the plane where it was; a stepper that was made before goes on as it was."""
     state, up = make_block(), torch.eye(3).double()
-    sim = Simulator("neo_hookean", dx=DX, substeps=10, frame_dt=FRAME_DT / 4, ground=Ground(0.0), dtype=torch.float64)
+    sim = Simulator(
+        "neo_hookean",
+        dx=DX,
+        substeps=10,
+        frame_dt=FRAME_DT / 4,
+        ground=Ground(0.0),
+        dtype=torch.float64,
+    )
     volume = torch.full((len(state.x),), (DX / 2) ** 3).double()
     places = [torch.tensor([k * PERIOD * DX, 0.0, 0.0]).double() for k in (0, 3, 0, -5)]
     with torch.no_grad():
         stepper, moment = sim.stepper(state, PARAMETERS, volume, 1000.0)
-        moved = [sim.rollout(seen(state, up, s, torch.float64), PARAMETERS, volume, 1000.0, 12).x - s for s in places]
+        moved = [
+            sim.rollout(seen(state, up, s, torch.float64), PARAMETERS, volume, 1000.0, 12).x - s
+            for s in places
+        ]
         for _ in range(11):
             moment = stepper.step(moment).moment
     assert torch.equal(moved[0], moved[2]) and torch.equal(moment.state.x, moved[0][-1])
-    assert max(float((x - moved[0]).abs().max()) for x in moved) < 1e-6  # nodes with next to no mass are badly conditioned
+    assert (
+        max(float((x - moved[0]).abs().max()) for x in moved) < 1e-6
+    )  # nodes with next to no mass are badly conditioned
     assert float(moved[0][-1, :, 1].min()) > 0
 
 
@@ -172,14 +245,30 @@ def test_along_the_grid_and_near_the_origin_nothing_is_computed():
 
 def test_planes_at_right_angles_are_turned_together_and_others_refused():
     Q = turn(50, (1, 2, 0.5))
-    corner = [Plane((0, 0, 0), tuple((Q @ torch.tensor(n).double()).tolist())) for n in ((0, 1, 0), (-1, 0, 0), (0, 0, 1))]
-    turned = [turn_along(corner) @ torch.tensor(plane.normal, dtype=torch.float64) for plane in corner]
+    corner = [
+        Plane((0, 0, 0), tuple((Q @ torch.tensor(n).double()).tolist()))
+        for n in ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    ]
+    turned = [
+        turn_along(corner) @ torch.tensor(plane.normal, dtype=torch.float64) for plane in corner
+    ]
     assert all(sorted(n.abs().tolist())[1] < 1e-9 for n in turned)
     wall = Plane((0, 0, 0), (1, 0.5, 0), "separate")
     with pytest.raises(ConfigError, match=r"plane \d .*right angles.*touch"):
-        Simulator("neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, ground=Ground(0.0), planes=[wall])
-    Simulator("neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, ground=Ground(0.0, "touch"), planes=[wall])
-    Simulator("neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, ground=Ground(0.0), planes=[replace(wall, mode="touch")])
+        Simulator(
+            "neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, ground=Ground(0.0), planes=[wall]
+        )
+    Simulator(
+        "neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, ground=Ground(0.0, "touch"), planes=[wall]
+    )
+    Simulator(
+        "neo_hookean",
+        dx=DX,
+        substeps=1,
+        frame_dt=1e-3,
+        ground=Ground(0.0),
+        planes=[replace(wall, mode="touch")],
+    )
 
 
 def test_a_box_of_the_world_holds_in_turned_axes(make_block):
@@ -188,18 +277,24 @@ def test_a_box_of_the_world_holds_in_turned_axes(make_block):
     room = torch.stack([x.amin(0) - 1.0, x.amax(0) + 1.0])
     fall(state, Q, NOWHERE, frames=3, box=room)
     tight = torch.stack([x.amin(0) - 1.0, x.amax(0) + 0.001])
-    with pytest.raises(SimulationDiverged, match=r"particle \d+: position is outside the box \[-?\d.*larger box"):
+    with pytest.raises(
+        SimulationDiverged, match=r"particle \d+: position is outside the box \[-?\d.*larger box"
+    ):
         fall(state, Q, NOWHERE, box=tight)
     x = state.x + FAR
     with pytest.raises(SimulationDiverged, match=r"outside the box \[9829\.\d+, "):
-        fall(state, torch.eye(3).double(), FAR, box=torch.stack([x.amin(0) - 1.0, x.amax(0) + 0.001]))
+        fall(
+            state, torch.eye(3).double(), FAR, box=torch.stack([x.amin(0) - 1.0, x.amax(0) + 0.001])
+        )
 
 
 def test_worlds_that_are_far_from_each_other_are_refused(make_block):
     state = make_block()
     apart = torch.tensor([0.0, 1e4]).double()[:, None, None]
     both = ParticleState(*(torch.stack([getattr(state, n)] * 2) for n in NAMES))
-    with pytest.raises(ConfigError, match=r"x: expected worlds within 655 m of each other, found 1e\+04 m"):
+    with pytest.raises(
+        ConfigError, match=r"x: expected worlds within 655 m of each other, found 1e\+04 m"
+    ):
         Simulator("neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, dtype=torch.float64).rollout(
             replace(both, x=both.x + apart), PARAMETERS, torch.full((len(state.x),), 8e-6).double(), 1000.0, 2
         )  # fmt: skip

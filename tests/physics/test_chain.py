@@ -46,8 +46,23 @@ def simulator(chained: bool, law: str = "corotated", **options) -> Simulator:
     return sim
 
 
-def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, source="tape",
-           worlds=0, timing=None, **options):
+def rolled(
+    chained,
+    law,
+    device,
+    dtype,
+    state,
+    adapter,
+    *,
+    stride=2,
+    substeps=11,
+    frames=4,
+    penalised=True,
+    source="tape",
+    worlds=0,
+    timing=None,
+    **options,
+):
     """(frames x, F, F_tot, statistics of the evaluations, reactions) and gradients of a sum of them, all on the CPU in float64.
 
     source: of the states in the backward pass, tape | states | graphs; worlds: so many, which move at other speeds."""
@@ -56,26 +71,58 @@ def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11
     mu = torch.full((), E / (2 * (1 + NU)), device=device, dtype=dtype, requires_grad=True)
     v0 = torch.zeros(3, device=device, dtype=dtype, requires_grad=True)
     parameters = {"mu": mu, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
-    sim = simulator(chained, law, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
-                    **options)
+    sim = simulator(
+        chained,
+        law,
+        substeps=substeps,
+        frame_dt=4e-4 * substeps,
+        ground=Ground(0.0),
+        dtype=dtype,
+        device=device,
+        **options,
+    )
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
     weights = [p for p in adapter.parameters() if p.requires_grad]
 
     def rollout(collected):
         start, common = replace(state, v=state.v + v0), {"adapter": adapter, "stride": stride}
         if not worlds:
-            return sim.rollout(start, parameters, volume, 1000.0, frames, **common, collect=collected.append, timing=timing)
+            return sim.rollout(
+                start,
+                parameters,
+                volume,
+                1000.0,
+                frames,
+                **common,
+                collect=collected.append,
+                timing=timing,
+            )
         starts = [replace(start, v=(1 - 0.1 * world) * start.v) for world in range(worlds)]
-        return sim.rollout(ParticleState.stack(starts), parameters, volume, 1000.0, frames, **common, together=worlds)
+        return sim.rollout(
+            ParticleState.stack(starts),
+            parameters,
+            volume,
+            1000.0,
+            frames,
+            **common,
+            together=worlds,
+        )
 
     def once():
         collected = []
         with ExitStack() as stack:
             for name in ("KEPT_ON_CPU", "KEPT_SHARE"):
-                stack.enter_context(patch.object(budget, name, getattr(budget, name) if source == "tape" else 0))
-            stack.enter_context(patch.object(Chains, "plan", lambda *_: Plan(SEGMENT, graphs=source == "graphs")))
+                stack.enter_context(
+                    patch.object(budget, name, getattr(budget, name) if source == "tape" else 0)
+                )
+            stack.enter_context(
+                patch.object(Chains, "plan", lambda *_: Plan(SEGMENT, graphs=source == "graphs"))
+            )
             found = rollout(collected)
-            loss, values = (found.x**2).sum() + (found.F_tot**2).sum(), [found.x, found.F, found.F_tot]
+            loss, values = (
+                (found.x**2).sum() + (found.F_tot**2).sum(),
+                [found.x, found.F, found.F_tot],
+            )
             if collected:
                 over_all = pool(collected)
                 loss = loss + (10 * over_all.mean_square + over_all.variance) * penalised
@@ -96,7 +143,9 @@ def assert_same(found, expected, tolerance):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True), ("von_mises", False)])
+@pytest.mark.parametrize(
+    "law, plastic", [("corotated", False), ("von_mises", True), ("von_mises", False)]
+)
 @pytest.mark.parametrize("penalised", [True, False])
 @pytest.mark.parametrize("source", ["tape", "states", "graphs"])
 def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_block):
@@ -111,7 +160,9 @@ def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_b
         assert_same(found, expected, 1e-11 if device == "cpu" else 1e-9)
 
 
-BALL = Collider(Sphere(0.05), "separate", 0.3, Motion(position=(0.15, -0.015, 0.11), velocity=(0.0, 2.0, 0.0)))
+BALL = Collider(
+    Sphere(0.05), "separate", 0.3, Motion(position=(0.15, -0.015, 0.11), velocity=(0.0, 2.0, 0.0))
+)
 KINDS = {
     "colliders": {"colliders": [BALL]}, "worlds": {"worlds": 3}, "worlds, colliders": {"worlds": 2, "colliders": [BALL]},
     "replayed": {"timing": Replay([4, 11, 6])}, "replayed, colliders": {"timing": Replay([5, 9, 7], 0.0), "colliders": [BALL]},
@@ -133,14 +184,25 @@ def test_a_chain_knows_colliders_worlds_and_steps_that_vary(device, kind, source
         assert count == evaluations and once.chains
         assert_same(found, expected, 1e-11 if device == "cpu" else 1e-9)
     if "colliders" in kind:
-        assert float(expected[-len([*adapter.parameters()]) - 3].abs().max()) > 1e-3  # the ball is hit
+        assert (
+            float(expected[-len([*adapter.parameters()]) - 3].abs().max()) > 1e-3
+        )  # the ball is hit
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_steps_in_chains_are_the_frames_of_a_rollout(device, make_block):
-    adapter, state = adapter_of(device, torch.float64, False), make_block(n=4, velocity=(0.3, -1.0, 0.2))
-    state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
-    given = {"mu": 8e3, "lam": 1e4}, torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device), 1000.0
+    adapter, state = (
+        adapter_of(device, torch.float64, False),
+        make_block(n=4, velocity=(0.3, -1.0, 0.2)),
+    )
+    state = ParticleState(
+        *(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot"))
+    )
+    given = (
+        {"mu": 8e3, "lam": 1e4},
+        torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device),
+        1000.0,
+    )
     sim = simulator(True, substeps=11, frame_dt=4.4e-3, device=device)
     mu = given[0]["mu"] = torch.tensor(8e3, dtype=torch.float64, device=device, requires_grad=True)
     weights = [mu, *adapter.parameters()]
@@ -148,7 +210,10 @@ def test_steps_in_chains_are_the_frames_of_a_rollout(device, make_block):
     stepper, moment = sim.stepper(state, *given, adapter, 2)
     for _ in range(3):
         moment = stepper.step(moment).moment
-    found, expected = ([x.detach(), *torch.autograd.grad(x.square().sum(), weights)] for x in (moment.state.x, whole))
+    found, expected = (
+        [x.detach(), *torch.autograd.grad(x.square().sum(), weights)]
+        for x in (moment.state.x, whole)
+    )
     assert sim.buffers.chains
     assert_same(found, expected, 0.0 if device == "cpu" else 1e-9)
 
@@ -157,7 +222,9 @@ def test_steps_in_chains_are_the_frames_of_a_rollout(device, make_block):
 @pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True)])
 @pytest.mark.parametrize("source", ["tape", "graphs"])
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-9), (torch.float32, 2e-3)])
-def test_evaluations_after_an_odd_number_of_substeps(device, law, plastic, source, dtype, tolerance, make_block):
+def test_evaluations_after_an_odd_number_of_substeps(
+    device, law, plastic, source, dtype, tolerance, make_block
+):
     """Of 125 particles the second slot of the adjoints begins at no multiple of 16 bytes; gradients are added to it in place."""
     adapter = adapter_of(device, dtype, plastic)
     make = (law, device, dtype, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
@@ -171,7 +238,10 @@ def test_evaluations_after_an_odd_number_of_substeps(device, law, plastic, sourc
 def test_graphs_follow_new_weights_states_and_windows(device, make_block):
     """What a graph holds by value or address may not outlive it: weights change in place and by copy, the body moves."""
     adapter = adapter_of(device, torch.float64, False)
-    near, far = make_block(n=5, velocity=(0.3, -1.0, 0.2)), make_block(n=5, velocity=(30.0, 20.0, -10.0))
+    near, far = (
+        make_block(n=5, velocity=(0.3, -1.0, 0.2)),
+        make_block(n=5, velocity=(30.0, 20.0, -10.0)),
+    )
     for state in (near, near, near, far, far, far, near):
         make = ("corotated", device, torch.float64, state, adapter)
         expected, _ = rolled(False, *make)()
@@ -194,24 +264,43 @@ def test_graphs_follow_new_weights_states_and_windows(device, make_block):
 @pytest.mark.parametrize("collects", [True, False])
 def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_block):
     """They share a chain where their segments are alike. Neither replays what the other left: statistics, windows, mass cutoffs."""
-    adapter, near = adapter_of(device, torch.float64, False), make_block(n=5, velocity=(0.3, -1.0, 0.2))
-    near = replace(near, v=near.v + torch.tensor([4.0, 3.0, -2.0], dtype=torch.float64) * near.x[:, :1])
-    far = replace(near, v=near.v + torch.tensor([60.0, 40.0, -30.0], dtype=torch.float64) * near.x[:, :1])
+    adapter, near = (
+        adapter_of(device, torch.float64, False),
+        make_block(n=5, velocity=(0.3, -1.0, 0.2)),
+    )
+    near = replace(
+        near, v=near.v + torch.tensor([4.0, 3.0, -2.0], dtype=torch.float64) * near.x[:, :1]
+    )
+    far = replace(
+        near, v=near.v + torch.tensor([60.0, 40.0, -30.0], dtype=torch.float64) * near.x[:, :1]
+    )
     weights = list(adapter.parameters())
     sims = [
-        simulator(chained, substeps=8, frame_dt=3.2e-3, device=device)
-        for chained in (False, True)
+        simulator(chained, substeps=8, frame_dt=3.2e-3, device=device) for chained in (False, True)
     ]
     volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64, device=device)
 
     def result(sim, state, cutoff, differentiated):
         sim.options, collected = LawOptions(mass_cutoff=cutoff), []
-        state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+        state = ParticleState(
+            *(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot"))
+        )
         with torch.set_grad_enabled(differentiated):
-            x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2,
-                            collect=collected.append if collects else None).x
+            x = sim.rollout(
+                state,
+                {"mu": 8e3, "lam": 1e4},
+                volume,
+                1000.0,
+                3,
+                adapter=adapter,
+                stride=2,
+                collect=collected.append if collects else None,
+            ).x
         gradients = torch.autograd.grad(1e4 * x.square().sum(), weights) if differentiated else []
-        return [t.detach().cpu() for t in (x, *gradients, *(part for each in collected for part in each))]
+        return [
+            t.detach().cpu()
+            for t in (x, *gradients, *(part for each in collected for part in each))
+        ]
 
     for state, cutoff, differentiated in [
         (near, 0.0, True), (near, 0.0, False), (near, 0.0, True), (near, 0.0, False), (near, 0.0, True), (far, 0.0, True),
@@ -227,8 +316,13 @@ def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_b
 @pytest.mark.parametrize("device", DEVICES)
 def test_two_rollouts_before_their_backward_passes(device, make_block):
     """Of different mass cutoffs, which a graph holds by value."""
-    adapter, state = adapter_of(device, torch.float64, False), make_block(n=5, velocity=(0.3, -1.0, 0.2))
-    state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+    adapter, state = (
+        adapter_of(device, torch.float64, False),
+        make_block(n=5, velocity=(0.3, -1.0, 0.2)),
+    )
+    state = ParticleState(
+        *(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot"))
+    )
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device)
     weights, found = list(adapter.parameters()), []
     for chained in (False, True):
@@ -236,10 +330,14 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
         for _ in range(3):
             losses = []
             for sim.options in (LawOptions(mass_cutoff=1e-3), LawOptions(mass_cutoff=1e-2)):
-                x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=1).x
+                x = sim.rollout(
+                    state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=1
+                ).x
                 losses.append(1e4 * x.square().sum())
             found.append([g.cpu() for loss in losses for g in torch.autograd.grad(loss, weights)])
-    assert float((found[0][0] - found[0][len(weights)]).abs().max()) > 1e-3 * float(found[0][0].abs().max())
+    assert float((found[0][0] - found[0][len(weights)]).abs().max()) > 1e-3 * float(
+        found[0][0].abs().max()
+    )
     assert float(found[0][0].abs().max()) > 1e-3
     for gradients in found[3:]:
         assert_same(gradients, found[0], 1e-9)
@@ -248,32 +346,50 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True)])
 @pytest.mark.parametrize("pull, foreseen", [(9.8, True), (3000.0, False)])
-def test_frames_under_one_look_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, looks, monkeypatch):
+def test_frames_under_one_look_are_the_frames_one_by_one(
+    device, law, plastic, pull, foreseen, make_block, looks, monkeypatch
+):
     """A pull that is not foreseen takes the body out of their window."""
     monkeypatch.setattr(Chains, "plan", lambda *_: Plan(40))
     monkeypatch.setattr(stepping_module, "AHEAD", 40)
     if not foreseen:
         monkeypatch.setattr(solver_module, "fallen", lambda bounds, *_: bounds)
-    adapter, state = adapter_of(device, torch.float64, plastic), make_block(n=5, velocity=(0.3, -1.0, 0.2))
-    state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+    adapter, state = (
+        adapter_of(device, torch.float64, plastic),
+        make_block(n=5, velocity=(0.3, -1.0, 0.2)),
+    )
+    state = ParticleState(
+        *(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot"))
+    )
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device)
     parameters = {"mu": 8e3, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
     found = {}
     for chained in (False, True):
-        sim = simulator(chained, law, substeps=11, frame_dt=4.4e-3, gravity=(0.0, -pull, 0.0), device=device)
+        sim = simulator(
+            chained, law, substeps=11, frame_dt=4.4e-3, gravity=(0.0, -pull, 0.0), device=device
+        )
         for _ in range(3):  # on CUDA: eager, captured, replayed
             collected, frames = [], []
             with torch.no_grad():
                 rollout = sim.rollout(state, parameters, volume, 1000.0, 6, adapter=adapter, stride=2, collect=collected.append,
                                       progress=frames.append)  # fmt: skip
             assert frames == [1, 2, 3, 4, 5] and len(collected) == 30 + plastic
-            values = [rollout.x, rollout.v, rollout.F, rollout.F_tot, rollout.final.C_affine, rollout.final.F]
+            values = [
+                rollout.x,
+                rollout.v,
+                rollout.F,
+                rollout.F_tot,
+                rollout.final.C_affine,
+                rollout.final.F,
+            ]
             values += [part for each in collected for part in each]
             found.setdefault(chained, []).append([t.cpu() for t in values])
     for values in found[True]:
         assert_same(values, found[False][0], 1e-9 if device == "cuda" else 1e-11)
     # 3 and 2 of 5 frames; 3 that fail, then one by one
-    assert looks[: 2 if foreseen else 1] == ([3, 2] if foreseen else [3]) and len(looks) == 3 * (2 if foreseen else 1)
+    assert looks[: 2 if foreseen else 1] == ([3, 2] if foreseen else [3]) and len(looks) == 3 * (
+        2 if foreseen else 1
+    )
 
 
 def test_a_body_at_rest_falls_several_frames_under_one_look(make_block, looks, monkeypatch):
@@ -285,14 +401,19 @@ def test_a_body_at_rest_falls_several_frames_under_one_look(make_block, looks, m
     monkeypatch.setattr(stepping_module, "AHEAD", 160)
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     with torch.no_grad():
-        x = sim.rollout(state, {"mu": 8e2, "lam": 1e3}, volume, 1000.0, 5, adapter=adapter, stride=8).x
+        x = sim.rollout(
+            state, {"mu": 8e2, "lam": 1e3}, volume, 1000.0, 5, adapter=adapter, stride=8
+        ).x
     assert looks[0] > 1 and len(looks) < 4 and x[-1].mean(0)[1] < x[0].mean(0)[1] - 0.12
 
 
 def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block, looks, monkeypatch):
     monkeypatch.setattr(Chains, "plan", lambda *_: Plan(60))
     monkeypatch.setattr(stepping_module, "AHEAD", 60)
-    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -2.0, 0.0))
+    adapter, state = (
+        adapter_of("cpu", torch.float64, False),
+        make_block(n=4, velocity=(0.0, -2.0, 0.0)),
+    )
     low, volume = state.x.min(0).values, torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     box = torch.stack([low - torch.tensor([1.0, 0.03, 1.0], dtype=torch.float64), low + 2])
     seen = []
@@ -323,15 +444,24 @@ def test_gradients_are_of_the_weights_of_the_forward_pass(make_block):
     volume, found = torch.full((len(state.x),), 8e-6, dtype=torch.float64), []
     for chained in (False, True):
         sim = simulator(chained, substeps=6, frame_dt=2.4e-3)
-        adapter, mu = adapter_of("cpu", torch.float64, False), torch.tensor(8e3, dtype=torch.float64, requires_grad=True)
+        adapter, mu = (
+            adapter_of("cpu", torch.float64, False),
+            torch.tensor(8e3, dtype=torch.float64, requires_grad=True),
+        )
 
         def rolled_with(adapter, sim=sim, mu=mu):
-            x = sim.rollout(state, {"mu": mu, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x
+            x = sim.rollout(
+                state, {"mu": mu, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2
+            ).x
             return 1e4 * x.square().sum()
 
         replaced = {f"adapter.{name}": 0.8 * p.detach() for name, p in adapter.named_parameters()}
         leaves = [p.requires_grad_() for p in replaced.values()]
-        gradients = list(torch.autograd.grad(functional_call(_Holder(adapter, rolled_with), replaced, ()), leaves))
+        gradients = list(
+            torch.autograd.grad(
+                functional_call(_Holder(adapter, rolled_with), replaced, ()), leaves
+            )
+        )
         for learned_before, learned_after in ((True, False), (False, True)):
             loss = rolled_with(adapter.requires_grad_(learned_before))
             adapter.requires_grad_(learned_after)
@@ -377,7 +507,14 @@ def test_weights_that_are_freed_later_get_their_gradient(make_block):
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
 
     def end():
-        return sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x[-1].square().sum()
+        return (
+            sim.rollout(
+                state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2
+            )
+            .x[-1]
+            .square()
+            .sum()
+        )
 
     adapter.requires_grad_(False)
     end()
@@ -389,15 +526,21 @@ def test_weights_that_are_freed_later_get_their_gradient(make_block):
 def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(make_block):
     """A rollout of a faster body widens the grid of a chain whose backward pass is still to come."""
     adapter, near = adapter_of("cpu", torch.float64, False), make_block(n=5)
-    near = replace(near, v=near.v + torch.tensor([4.0, 3.0, -2.0], dtype=torch.float64) * near.x[:, :1])
-    far = replace(near, v=near.v + torch.tensor([40.0, 30.0, -20.0], dtype=torch.float64) * near.x[:, :1])
+    near = replace(
+        near, v=near.v + torch.tensor([4.0, 3.0, -2.0], dtype=torch.float64) * near.x[:, :1]
+    )
+    far = replace(
+        near, v=near.v + torch.tensor([40.0, 30.0, -20.0], dtype=torch.float64) * near.x[:, :1]
+    )
     volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64)
     gradients = []
     for disturbed in (False, True):
         sim = simulator(True, substeps=8, frame_dt=3.2e-3)
 
         def end(state, sim=sim):
-            x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x
+            x = sim.rollout(
+                state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2
+            ).x
             return 1e4 * x[-1].square().sum()
 
         loss = end(near)
@@ -419,7 +562,9 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     def run(stretch):
         volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
         start = replace(state, x=stretch * state.x)
-        return sim.rollout(start, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 2, adapter=adapter, stride=2).x
+        return sim.rollout(
+            start, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 2, adapter=adapter, stride=2
+        ).x
 
     expected, zeros = run(1), torch.zeros
     (chain,) = sim.buffers.chains.values()
@@ -437,17 +582,24 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     chain.full.set_window((0, 0, 0), (60, 60, 60))
     assert chain.full.fields.shape[2] >= 60**3
     chain.full.set_window((0, 0, 0), (6, 6, 6))  # not needed any more
-    assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not len(chain._graphs)
+    assert (
+        torch.equal(run(1), expected) and chain.full.capacity == capacity and not len(chain._graphs)
+    )
 
 
 def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block, monkeypatch):
     """A body that bounces back faster than its window foresees, as one segment after the other."""
     monkeypatch.setattr(Chains, "plan", lambda *_: Plan(192))
-    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -45.0, 0.0), jitter=0.0)
+    adapter, state = (
+        adapter_of("cpu", torch.float64, False),
+        make_block(n=4, velocity=(0.0, -45.0, 0.0), jitter=0.0),
+    )
     state = replace(state, x=0.5 * state.x)
     volume, found = torch.full((len(state.x),), 1e-6, dtype=torch.float64), []
     for chained in (False, True):
-        sim = simulator(chained, dx=0.02, substeps=192, frame_dt=192e-4, ground=Ground(0.0, "separate"))
+        sim = simulator(
+            chained, dx=0.02, substeps=192, frame_dt=192e-4, ground=Ground(0.0, "separate")
+        )
         collected = []
         with torch.no_grad():
             rollout = sim.rollout(state, {"mu": 6e6, "lam": 6e6}, volume, 1000.0, 2, adapter=adapter, stride=16,
@@ -460,7 +612,10 @@ def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block, monke
 
 
 def test_divergence_names_the_substep_and_the_particle(make_block):
-    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=5, velocity=(0.0, 1.5, 0.0))
+    adapter, state = (
+        adapter_of("cpu", torch.float64, False),
+        make_block(n=5, velocity=(0.0, 1.5, 0.0)),
+    )
     top = float(state.x[:, 1].max()) + 0.008  # reached in the second frame
     box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, top, 1.0]])
     messages = []
@@ -498,8 +653,17 @@ def test_replayed_kernels_find_the_weights_of_today(precision, make_block):
         for p in adapter.parameters():
             p.copy_(0.3 * torch.randn(p.shape, generator=generator))
     adapter.switch_on(E, NU)
-    make = ("corotated", "cuda", torch.float32, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter.cuda())
-    chained, alone = rolled(True, *make, stride=1, penalised=False), rolled(False, *make, stride=1, penalised=False)
+    make = (
+        "corotated",
+        "cuda",
+        torch.float32,
+        make_block(n=5, velocity=(0.3, -1.0, 0.2)),
+        adapter.cuda(),
+    )
+    chained, alone = (
+        rolled(True, *make, stride=1, penalised=False),
+        rolled(False, *make, stride=1, penalised=False),
+    )
     changes = []
     for _ in range(4):
         before = alone()[0]

@@ -5,7 +5,16 @@ import torch
 import warp as wp
 
 from mosa.physics.contact.collider_kernels import collider_kernels
-from mosa.physics.contact.colliders import HOLD, Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.colliders import (
+    HOLD,
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+    pack_colliders,
+)
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import exponential
 from mosa.physics.contact.reference import collide
@@ -31,9 +40,17 @@ def drawn(colliders, seed=0):
     """(velocities, places, springs; position, rotation vectors, linear, angular of the solids; seeds of velocity, force, torque)
     and (masses, volumes) of particles in a scene that is 0.5 m wide."""
     g, k = torch.Generator().manual_seed(seed), len(colliders)
-    v, x = torch.randn(COUNT, 3, generator=g).double(), 0.5 * torch.rand(COUNT, 3, generator=g).double()
-    mass, volume, spring = ((a + b * torch.rand(COUNT, generator=g).double()) for a, b in ((0.1, 1), (8e-6, 6e-5), (5e4, 5e4)))
-    centre = torch.tensor([0.27, 0.24, 0.22]).double() + 0.02 * torch.randn(k, 3, generator=g).double()
+    v, x = (
+        torch.randn(COUNT, 3, generator=g).double(),
+        0.5 * torch.rand(COUNT, 3, generator=g).double(),
+    )
+    mass, volume, spring = (
+        (a + b * torch.rand(COUNT, generator=g).double())
+        for a, b in ((0.1, 1), (8e-6, 6e-5), (5e4, 5e4))
+    )
+    centre = (
+        torch.tensor([0.27, 0.24, 0.22]).double() + 0.02 * torch.randn(k, 3, generator=g).double()
+    )
     others = [torch.randn(n, 3, generator=g).double() for n in (k, k, k, COUNT, k, k)]
     return [v, x, spring, centre, *others], (mass, volume)
 
@@ -41,7 +58,10 @@ def drawn(colliders, seed=0):
 def launch(kernel, colliders, v, x, spring, poses, bodies, arrays):
     """poses are those of substep 2 of 3; arrays: further (tensor, kind)."""
     packed = pack_colliders(colliders, torch.float64, torch.device("cpu"))
-    held = [torch.stack([torch.full_like(p, 7.0), torch.full_like(p, 7.0), p]).contiguous() for p in poses]
+    held = [
+        torch.stack([torch.full_like(p, 7.0), torch.full_like(p, 7.0), p]).contiguous()
+        for p in poses
+    ]
     mass, volume = bodies
     inputs = [
         *(wp.from_torch(t.contiguous(), dtype=kind) for t, kind in ((x, VEC3), (v, VEC3), (volume, NUMBER), (spring, NUMBER),
@@ -58,7 +78,16 @@ def forward(colliders, v, x, spring, poses, bodies):
     """(velocity, force, torque) of the kernel."""
     struck = torch.full_like(v, torch.nan)
     force, torque = (torch.zeros(3, len(colliders), 3).double() for _ in range(2))
-    launch(KERNELS.strike, colliders, v, x, spring, poses, bodies, [(t, VEC3) for t in (struck, force, torque)])
+    launch(
+        KERNELS.strike,
+        colliders,
+        v,
+        x,
+        spring,
+        poses,
+        bodies,
+        [(t, VEC3) for t in (struck, force, torque)],
+    )
     assert float(force[:2].abs().sum() + torque[:2].abs().sum()) == 0
     return struck, force[2], torque[2]
 
@@ -66,7 +95,9 @@ def forward(colliders, v, x, spring, poses, bodies):
 def backward(colliders, v, x, spring, poses, bodies, seeds):
     """Gradients in (v, x, spring, position, rotation, linear, angular) of the kernel."""
     a, of_x, of_spring = seeds[0].clone(), torch.zeros_like(x), torch.zeros_like(spring)
-    adj_force, adj_torque = (torch.stack([torch.full_like(s, 3.0)] * 2 + [s]).contiguous() for s in seeds[1:])
+    adj_force, adj_torque = (
+        torch.stack([torch.full_like(s, 3.0)] * 2 + [s]).contiguous() for s in seeds[1:]
+    )
     of_poses = [torch.zeros(3, *p.shape).double() for p in poses]
     kinds = (VEC3, VEC3, VEC3, VEC3, NUMBER, VEC3, MAT33, VEC3, VEC3)
     arrays = list(zip((adj_force, adj_torque, of_x, a, of_spring, *of_poses), kinds))
@@ -83,9 +114,14 @@ def test_kernel_and_adjoint_against_the_twin(name, mode, friction):
     """With a second collider after it, so that the order of contacts is differentiated through."""
     colliders = [Collider(SHAPES[name], mode, friction), Collider(Sphere(0.15), "separate", 0.2)]
     (v, x, spring, position, turns, linear, angular, *seeds), bodies = drawn(colliders)
-    leaves = [t.clone().requires_grad_() for t in (v, x, spring, position, exponential(turns), linear, angular)]
+    leaves = [
+        t.clone().requires_grad_()
+        for t in (v, x, spring, position, exponential(turns), linear, angular)
+    ]
     radius = 0.5 * bodies[1] ** (1 / 3)
-    expected = collide(leaves[0], leaves[1], bodies[0], radius, leaves[2], colliders, leaves[3:], DT)
+    expected = collide(
+        leaves[0], leaves[1], bodies[0], radius, leaves[2], colliders, leaves[3:], DT
+    )
     poses = [t.detach() for t in leaves[3:]]
     found = forward(colliders, v, x, spring, poses, bodies)
     torch.testing.assert_close(found[0], expected[0].detach(), rtol=1e-12, atol=1e-12)
@@ -93,7 +129,9 @@ def test_kernel_and_adjoint_against_the_twin(name, mode, friction):
         torch.testing.assert_close(a, b.detach(), rtol=1e-12, atol=1e-9)
     assert ((found[0] - v).abs() > 1e-6).any(1).sum() > 100
     loss = sum((value * seed).sum() for value, seed in zip(expected, seeds))
-    for a, b in zip(backward(colliders, v, x, spring, poses, bodies, seeds), torch.autograd.grad(loss, leaves)):
+    for a, b in zip(
+        backward(colliders, v, x, spring, poses, bodies, seeds), torch.autograd.grad(loss, leaves)
+    ):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10 * float(b.abs().max()))
 
 
@@ -106,12 +144,16 @@ def test_adjoint_against_differences(name, mode, friction):
     values, seeds = values[:7], values[7:]
 
     def loss(values):
-        found = forward(colliders, *values[:3], [values[3], exponential(values[4]), *values[5:]], bodies)
+        found = forward(
+            colliders, *values[:3], [values[3], exponential(values[4]), *values[5:]], bodies
+        )
         return sum((value * seed).sum() for value, seed in zip(found, seeds))
 
     leaf = values[4].clone().requires_grad_()
     R = exponential(leaf)
-    gradients = backward(colliders, *values[:3], [values[3], R.detach(), *values[5:]], bodies, seeds)
+    gradients = backward(
+        colliders, *values[:3], [values[3], R.detach(), *values[5:]], bodies, seeds
+    )
     (gradients[4],) = torch.autograd.grad(R, leaf, gradients[4])
     g = torch.Generator().manual_seed(5)
     rounding = 1e-15 * abs(float(loss(values))) + 1e-12 * sum(float(s.abs().sum()) for s in seeds)
@@ -123,22 +165,33 @@ def test_adjoint_against_differences(name, mode, friction):
             direction[20:] = 0
 
             def shifted(s, i=i, direction=direction):
-                return float(loss([v + s * direction if j == i else v for j, v in enumerate(values)]))
+                return float(
+                    loss([v + s * direction if j == i else v for j, v in enumerate(values)])
+                )
 
             fine, coarse = ((shifted(h) - shifted(-h)) / (2 * h) for h in (size, 2 * size))
             allowed = 1e-6 * abs(fine) + rounding / size
             if abs(fine - coarse) < allowed:
                 break
         else:
-            pytest.fail(f"{name_}: no direction in which differences of two steps agree: {fine}, {coarse}, {allowed}")
+            pytest.fail(
+                f"{name_}: no direction in which differences of two steps agree: {fine}, {coarse}, {allowed}"
+            )
         assert abs(float((gradients[i] * direction).sum()) - fine) < allowed, name_
 
 
 def test_what_a_solid_does_to_one_particle():
     """By hand: a ball of radius 5 mm that is 2 mm deep in a moving plane, in each mode."""
-    x, v = torch.tensor([[0.0, 0.0, 0.003]]).double().expand(COUNT, 3), torch.tensor([[3.0, 0.0, -1.0]]).double().expand(COUNT, 3)
+    x, v = (
+        torch.tensor([[0.0, 0.0, 0.003]]).double().expand(COUNT, 3),
+        torch.tensor([[3.0, 0.0, -1.0]]).double().expand(COUNT, 3),
+    )
     ones = torch.ones(COUNT).double()
-    eye, none, moves = torch.eye(3).double()[None], torch.zeros(1, 3).double(), torch.tensor([[1.0, 0.0, 0.5]]).double()
+    eye, none, moves = (
+        torch.eye(3).double()[None],
+        torch.zeros(1, 3).double(),
+        torch.tensor([[1.0, 0.0, 0.5]]).double(),
+    )
     stiff = DT * 1e4 * 0.002
     for mode, friction, expected in (("touch", 0.5, (3 - 0.5 * stiff, -1 + stiff)), ("slip", 0.0, (3.0, -1 + 2.4 * stiff)),
                                      ("separate", 0.5, (3 - 1.2 * stiff, -1 + 2.4 * stiff)),

@@ -7,7 +7,15 @@ import warp as wp
 from scipy.spatial import ConvexHull, cKDTree
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+    pack_colliders,
+)
 from mosa.physics.contact.mesh import field_of_mesh, field_of_triangles
 from mosa.physics.contact.reference import signed_distance as twin
 from mosa.physics.contact.shapes import shape_functions
@@ -31,11 +39,15 @@ def evaluate(
 
 def run(shape, q, b=None):
     """(phi (M,), gradient (M, 3), curvature along b (M, 3)); a mesh before it, so that offsets are not 0."""
-    packed = pack_colliders([Collider(CUBE_FIELD), Collider(shape)], torch.float64, torch.device("cpu"))
+    packed = pack_colliders(
+        [Collider(CUBE_FIELD), Collider(shape)], torch.float64, torch.device("cpu")
+    )
     b = torch.zeros_like(q) if b is None else b
     phi, g, h = torch.zeros(len(q)).double(), torch.zeros_like(q), torch.zeros_like(q)
     kinds = [wp.vec3d, wp.vec3d, wp.float64, wp.int32, wp.float64, wp.float64, wp.vec3d, wp.vec3d]
-    arrays = [wp.from_torch(t.contiguous(), dtype=k) for t, k in zip([q, b, *packed, phi, g, h], kinds)]
+    arrays = [
+        wp.from_torch(t.contiguous(), dtype=k) for t, k in zip([q, b, *packed, phi, g, h], kinds)
+    ]
     wp.launch(evaluate, len(q), inputs=arrays, device="cpu")
     return phi, g, h
 
@@ -86,9 +98,13 @@ def test_distance_gradient_and_curvature(name, points):
     torch.testing.assert_close(phi[inside], twin(shape, points)[inside], rtol=0, atol=1e-14)
     if name != "field":
         np.testing.assert_allclose(phi, projected(shape, points), rtol=0, atol=1e-14)
-        torch.testing.assert_close(g.norm(dim=1), torch.ones(len(points)).double(), rtol=0, atol=1e-14)
+        torch.testing.assert_close(
+            g.norm(dim=1), torch.ones(len(points)).double(), rtol=0, atol=1e-14
+        )
     step = 1e-6
-    (phi_plus, g_plus, _), (phi_minus, g_minus, _) = (run(shape, points + s * step * b) for s in (1, -1))
+    (phi_plus, g_plus, _), (phi_minus, g_minus, _) = (
+        run(shape, points + s * step * b) for s in (1, -1)
+    )
     along = (phi_plus - phi_minus)[inside] / (2 * step)
     slope = (g * b).sum(1)[inside]
     turned = ((g_plus - g_minus) / (2 * step))[inside]
@@ -102,7 +118,17 @@ def test_distance_gradient_and_curvature(name, points):
 @pytest.mark.parametrize("name", SHAPES)
 def test_special_points_are_finite(name):
     """Centre, axis, edges, corners: a unit gradient and a finite curvature, whichever side is taken."""
-    q = torch.tensor([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.25], [0.2, 0, 0.25], [0.3, 0.2, 0.1], [0.3, 0, 0], [0, 0, 0.2]]).double()
+    q = torch.tensor(
+        [
+            [0, 0, 0],
+            [0, 0, 0.1],
+            [0, 0, 0.25],
+            [0.2, 0, 0.25],
+            [0.3, 0.2, 0.1],
+            [0.3, 0, 0],
+            [0, 0, 0.2],
+        ]
+    ).double()
     phi, g, h = run(SHAPES[name], q, torch.ones_like(q))
     assert torch.isfinite(phi).all() and torch.isfinite(g).all() and torch.isfinite(h).all()
     if name != "field":
@@ -129,7 +155,10 @@ def test_field_of_a_polyhedron():
     flip = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
     faces[flip] = faces[flip][:, [0, 2, 1]]
     field = field_of_triangles(points, faces, spacing=0.15)
-    axes = [np.array(field.origin)[i] + field.spacing * np.arange(field.values.shape[i]) for i in range(3)]
+    axes = [
+        np.array(field.origin)[i] + field.spacing * np.arange(field.values.shape[i])
+        for i in range(3)
+    ]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     found = field.values.reshape(-1).numpy()
     level = (nodes @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1)
@@ -155,7 +184,9 @@ def test_mesh_files(tmp_path):
     (tmp_path / "box.obj").write_text("\n".join(lines))
     vertex = np.array([tuple(v) for v in CUBE], dtype=[("x", "f8"), ("y", "f8"), ("z", "f8")])
     face = np.array([(f,) for f in CUBE_FACES], dtype=[("vertex_indices", "i4", (3,))])
-    PlyData([PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]).write(str(tmp_path / "box.ply"))
+    PlyData([PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]).write(
+        str(tmp_path / "box.ply")
+    )
     for name, scale in (("box.obj", 1e-3), ("box.ply", 1.0)):
         field = field_of_mesh(tmp_path / name, spacing=0.025, margin=0.2, scale=scale)
         torch.testing.assert_close(field.values, CUBE_FIELD.values, rtol=0, atol=1e-7)

@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from mosa.physics.constitutive.elasticity import lame
-from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, domain_walls
+from mosa.physics.contact.colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+    domain_walls,
+)
 from mosa.physics.contact.motion import Motion, Trajectory, exponential
 from mosa.physics.contact.planes import Plane
 from mosa.physics.contact.reference import signed_distance
@@ -23,7 +31,16 @@ PARAMETERS = {"mu": 4e4, "lam": 5e4}
 DOWN = (0.0, 0.0, -9.8)
 
 
-def rollout(state, colliders=(), frames=3, substeps=25, law="corotated", parameters=PARAMETERS, gravity=DOWN, **options):
+def rollout(
+    state,
+    colliders=(),
+    frames=3,
+    substeps=25,
+    law="corotated",
+    parameters=PARAMETERS,
+    gravity=DOWN,
+    **options,
+):
     volume = torch.full((len(state.x),), SPACING**3, dtype=state.x.dtype)
     simulator = Simulator(law, dx=DX, substeps=substeps, frame_dt=4e-4 * substeps, gravity=gravity, colliders=colliders,
                           dtype=state.x.dtype, **options)  # fmt: skip
@@ -51,10 +68,15 @@ def acceleration(times, position):
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_a_resting_half_space_or_box_is_the_plane(friction, make_block):
     state = make_block()
-    plane = rollout(state, planes=[Plane((0, 0.01, 0), (0, 1, 0), "touch", friction)], gravity=(0.0, -9.8, 0.0))
+    plane = rollout(
+        state, planes=[Plane((0, 0.01, 0), (0, 1, 0), "touch", friction)], gravity=(0.0, -9.8, 0.0)
+    )
     turned = Motion((0.0, 0.01, 0.0), (-math.pi / 2, 0.0, 0.0))
     slab = Motion(position=(0.0, -0.99, 0.0))
-    for collider in (Collider(HalfSpace(), "touch", friction, turned), Collider(Box((9.0, 2.0, 9.0)), "touch", friction, slab)):
+    for collider in (
+        Collider(HalfSpace(), "touch", friction, turned),
+        Collider(Box((9.0, 2.0, 9.0)), "touch", friction, slab),
+    ):
         found = rollout(state, [collider], gravity=(0.0, -9.8, 0.0))
         torch.testing.assert_close(found.x, plane.x, rtol=0, atol=1e-14)
     free = rollout(state, gravity=(0.0, -9.8, 0.0))
@@ -75,7 +97,9 @@ def turned_drop(shape, top: float, mode: str, friction: float, degrees: float):
     v = torch.tensor([0.3, 0.0, -2.4]).double() @ R.T
     start = ParticleState((x @ R.T).contiguous(), v.expand_as(x).contiguous(), 0 * eye, eye, eye)
     pull = R @ torch.tensor(DOWN).double()
-    result = rollout(start, [Collider(shape, mode, friction, motion)], frames=10, law="neo_hookean", gravity=pull)
+    result = rollout(
+        start, [Collider(shape, mode, friction, motion)], frames=10, law="neo_hookean", gravity=pull
+    )
     return result.x @ R, result.reactions.unflatten(-1, (2, 3)) @ R
 
 
@@ -91,7 +115,9 @@ def test_a_world_that_is_turned_has_the_same_motion(shape, top, mode, friction):
     for degrees in (10.0, 30.0):
         found, felt = turned_drop(shape, top, mode, friction, degrees)
         assert float((found - flat).norm(dim=-1).square().mean(1).sqrt().max()) < 0.25 * DX
-        torch.testing.assert_close(felt[..., 0, :].sum((0, 1, 2)), impulse, rtol=0, atol=0.02 * float(impulse.norm()))
+        torch.testing.assert_close(
+            felt[..., 0, :].sum((0, 1, 2)), impulse, rtol=0, atol=0.02 * float(impulse.norm())
+        )
 
 
 def test_galilean_invariance(make_block):
@@ -100,7 +126,12 @@ def test_galilean_invariance(make_block):
     w = torch.tensor([4.0, 0.0, -4.0]).double()
     results = []
     for boost in (0 * w, w):
-        motion = Motion((0.15, -0.005, 0.11), (0.3, 0.0, 0.1), torch.tensor([0.1, 0.3, 0.0]).double() + boost, (2.0, -3.0, 1.0))
+        motion = Motion(
+            (0.15, -0.005, 0.11),
+            (0.3, 0.0, 0.1),
+            torch.tensor([0.1, 0.3, 0.0]).double() + boost,
+            (2.0, -3.0, 1.0),
+        )
         collider = Collider(Capsule(0.05, 0.1), "separate", 0.3, motion)
         shifted = replace(state, v=state.v + boost)
         results.append(rollout(shifted, [collider], frames=2, substeps=1))
@@ -117,19 +148,33 @@ def test_rotated_and_shifted_scene(make_block):
     eye = torch.eye(3).double().expand_as(state.F).contiguous()
     state = replace(state, F=eye, F_tot=eye)
     turned_F = Q.expand_as(eye).contiguous()
-    turned = ParticleState(state.x @ Q.T + shift, state.v @ Q.T, Q @ state.C_affine @ Q.T, turned_F, turned_F)
-    position, spin, velocity = (torch.tensor(a).double() for a in ((0.16, -0.05, 0.1), (0.0, 3.0, 5.0), (0.1, 0.2, 0.0)))
+    turned = ParticleState(
+        state.x @ Q.T + shift, state.v @ Q.T, Q @ state.C_affine @ Q.T, turned_F, turned_F
+    )
+    position, spin, velocity = (
+        torch.tensor(a).double() for a in ((0.16, -0.05, 0.1), (0.0, 3.0, 5.0), (0.1, 0.2, 0.0))
+    )
     attitude = exponential(torch.tensor([0.3, 0.1, 0.0]).double())
-    motions = Motion(position, attitude, velocity, spin), Motion(Q @ position + shift, Q @ attitude, Q @ velocity, Q @ spin)
+    motions = (
+        Motion(position, attitude, velocity, spin),
+        Motion(Q @ position + shift, Q @ attitude, Q @ velocity, Q @ spin),
+    )
     down = torch.tensor([0.0, -9.8, 0.0]).double()
     first, second = (
-        rollout(start, [Collider(Capsule(0.08, 0.1), "separate", 0.4, motion)], substeps=100, gravity=gravity)
+        rollout(
+            start,
+            [Collider(Capsule(0.08, 0.1), "separate", 0.4, motion)],
+            substeps=100,
+            gravity=gravity,
+        )
         for start, motion, gravity in zip((state, turned), motions, (down, Q @ down))
     )
     assert first.reactions[..., :3].norm(dim=-1).max() > 10
     assert (second.x[-1] - (first.x[-1] @ Q.T + shift)).abs().max() < 1e-10 * DX
     force = first.reactions.unflatten(-1, (2, 3)) @ Q.T
-    torch.testing.assert_close(second.reactions.unflatten(-1, (2, 3)), force, rtol=0, atol=1e-8 * float(force.abs().max()))
+    torch.testing.assert_close(
+        second.reactions.unflatten(-1, (2, 3)), force, rtol=0, atol=1e-8 * float(force.abs().max())
+    )
 
 
 @pytest.mark.parametrize("mode, friction", [("sticky", 0.0), ("slip", 0.0), ("separate", 0.3)])
@@ -147,7 +192,9 @@ def test_action_is_reaction(mode, friction, make_block):
 
     def momenta(s):
         C = s.C_affine * DX**2 / 4
-        spin = torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
+        spin = torch.stack(
+            [C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1
+        )
         return mass * s.v.sum(0), mass * (torch.linalg.cross(s.x, s.v) + spin).sum(0)
 
     (p0, l0), (p1, l1) = momenta(state), momenta(result.final)
@@ -162,23 +209,37 @@ def test_sticky_drags_a_body_along():
     """A cube glued between two plates is carried and turned with them, and takes no force at constant velocity."""
     x = lattice((0.2, 0.2, 0.2))
     velocity = torch.tensor([0.6, -0.3, 0.2]).double()
-    plates = [Collider(Box((0.4, 0.4, 0.1)), "sticky", motion=Motion((0.0, 0.0, z), velocity=velocity)) for z in (-0.13, 0.13)]
+    plates = [
+        Collider(Box((0.4, 0.4, 0.1)), "sticky", motion=Motion((0.0, 0.0, z), velocity=velocity))
+        for z in (-0.13, 0.13)
+    ]
     dragged = rollout(at_rest(x), plates, frames=41, gravity=(0, 0, 0))
     late = dragged.v[30:].mean((0, 1))
     assert (late - velocity).norm() < 0.02 * velocity.norm()
     impulse = dragged.reactions[..., :3].sum((0, 1, 2)) * 4e-4
-    torch.testing.assert_close(-impulse, DENSITY * SPACING**3 * dragged.v[-1].sum(0), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        -impulse, DENSITY * SPACING**3 * dragged.v[-1].sum(0), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_body_flows_around_and_does_not_enter():
     """A soft block falls on a sphere and a capsule: no particle deeper than a cell, the grid's own blur; without them
     it passes through."""
     x = lattice((0.24, 0.24, 0.24)) + torch.tensor([0.0, 0.0, 0.28]).double()
-    shapes = [(Sphere(0.12), Motion((0.02, 0.0, 0.0))), (Capsule(0.08, 0.3), Motion((-0.12, 0.0, 0.02), (math.pi / 2, 0.0, 0.0)))]
+    shapes = [
+        (Sphere(0.12), Motion((0.02, 0.0, 0.0))),
+        (Capsule(0.08, 0.3), Motion((-0.12, 0.0, 0.02), (math.pi / 2, 0.0, 0.0))),
+    ]
     colliders = [Collider(shape, "separate", 0.1, motion) for shape, motion in shapes]
     mu, lam = lame(torch.tensor(2e4).double(), torch.tensor(0.3).double())
-    soft = {"frames": 26, "law": "von_mises", "parameters": {"mu": mu, "lam": lam, "yield_stress": 500.0}}
-    result, passed = (rollout(at_rest(x, (0.0, 0.0, -1.5)), solid, **soft) for solid in (colliders, []))
+    soft = {
+        "frames": 26,
+        "law": "von_mises",
+        "parameters": {"mu": mu, "lam": lam, "yield_stress": 500.0},
+    }
+    result, passed = (
+        rollout(at_rest(x, (0.0, 0.0, -1.5)), solid, **soft) for solid in (colliders, [])
+    )
     for shape, motion in shapes:
         R = exponential(torch.tensor(motion.rotation).double())
         deepest, free = (min(float(signed_distance(shape, (x - torch.tensor(motion.position)) @ R).min()) for x in r.x)
@@ -209,7 +270,9 @@ def test_block_slips_at_the_friction_angle(turn):
     pull = 9.8 * math.sin(math.atan(friction) - math.radians(1.0))
     assert held == pytest.approx(pull * (0.024 / 45) * (0.12 / SPACING) / GRIP, rel=0.15)
     for found, expected, velocity in sliding:
-        assert found == pytest.approx(expected, abs=0.2 * 9.8 * math.radians(1.0)) and velocity > 0.1
+        assert (
+            found == pytest.approx(expected, abs=0.2 * 9.8 * math.radians(1.0)) and velocity > 0.1
+        )
 
 
 def test_sphere_rolls_down_an_incline():
@@ -224,8 +287,12 @@ def test_sphere_rolls_down_an_incline():
                           gravity=(9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle)),
                           colliders=[Collider(HalfSpace(), "touch", 0.6)])  # fmt: skip
     start = at_rest(x)
-    start = ParticleState(*(getattr(start, k).float() for k in ("x", "v", "C_affine", "F", "F_tot")))
-    result = simulator.rollout(start, {"mu": mu, "lam": lam}, torch.full((len(x),), (dx / 2) ** 3), DENSITY, 26)
+    start = ParticleState(
+        *(getattr(start, k).float() for k in ("x", "v", "C_affine", "F", "F_tot"))
+    )
+    result = simulator.rollout(
+        start, {"mu": mu, "lam": lam}, torch.full((len(x),), (dx / 2) ** 3), DENSITY, 26
+    )
     centre = result.x.double().mean(1)
     found = acceleration(result.times[8:].double(), centre[8:, 0]) / (9.8 * math.sin(angle))
     assert found == pytest.approx(5 / 7, rel=0.06)
@@ -245,12 +312,22 @@ def test_squeezed_block_answers_with_the_uniaxial_stress():
     x = lattice((edge,) * 3, dx / 2)
     start, rate = at_rest(x), stroke / duration
     shear = torch.diag(torch.tensor([0.3, 0.3, -1.0]).double()) * rate
-    start = replace(start, v=(x @ shear).contiguous(), C_affine=shear.expand(len(x), 3, 3).contiguous())
+    start = replace(
+        start, v=(x @ shear).contiguous(), C_affine=shear.expand(len(x), 3, 3).contiguous()
+    )
     motions = [Motion((0, 0, s * edge), velocity=(0, 0, -s * rate * edge / 2)) for s in (-1, 1)]
-    plates = [Collider(Box((4 * edge, 4 * edge, edge)), "slip", motion=motion) for motion in motions]
+    plates = [
+        Collider(Box((4 * edge, 4 * edge, edge)), "slip", motion=motion) for motion in motions
+    ]
     simulator = Simulator("neo_hookean", dx=dx, substeps=required_substeps(float(lam + 2 * mu), DENSITY, 0.02, dx, 1.0),
                           frame_dt=duration / frames, gravity=(0, 0, 0), colliders=plates, dtype=torch.float64)  # fmt: skip
-    result = simulator.rollout(start, {"mu": mu, "lam": lam}, torch.full((len(x),), (dx / 2) ** 3).double(), DENSITY, frames + 1)
+    result = simulator.rollout(
+        start,
+        {"mu": mu, "lam": lam},
+        torch.full((len(x),), (dx / 2) ** 3).double(),
+        DENSITY,
+        frames + 1,
+    )
     below, above = result.reactions[..., 0, 2].mean(1), -result.reactions[..., 1, 2].mean(1)
     torch.testing.assert_close(-below, -above, rtol=1e-6, atol=1e-6)
     stretch = result.F[:, x[:, 2].abs() < edge / 4, 2, 2].mean(1)
@@ -281,7 +358,9 @@ def test_gradient_of_a_rollout(name, make_block, monkeypatch):
     state = make_block(velocity=(0.0, -0.8, 0.0))
     leaves = {"position": [0.15, -0.05, 0.11], "rotation": [0.2, -0.1, 0.3], "velocity": [[0.2, 0.4, 0.0], [0.0, 0.6, -0.2]],
               "angular_velocity": [[1.0, 0.0, 2.0], [0.0, -3.0, 1.0]], "x0": [0.0] * 3, "v0": [0.0] * 3, "mu": 4e4}  # fmt: skip
-    leaves = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in leaves.items()}
+    leaves = {
+        k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in leaves.items()
+    }
     simulator = Simulator("corotated", dx=DX, substeps=15, frame_dt=6e-3, gravity=(0, 0, 0), dtype=torch.float64,
                           colliders=[Collider(Sphere(0.05), "slip", motion=Motion((0.15, 0.13, 0.1))),
                                      Collider(shape, mode, friction)])  # fmt: skip
@@ -291,7 +370,9 @@ def test_gradient_of_a_rollout(name, make_block, monkeypatch):
     weights["reactions"] *= 0.1
 
     def loss(leaves):
-        motion = Motion(*(leaves[k] for k in ("position", "rotation", "velocity", "angular_velocity")))
+        motion = Motion(
+            *(leaves[k] for k in ("position", "rotation", "velocity", "angular_velocity"))
+        )
         start = replace(state, x=state.x + leaves["x0"], v=state.v + leaves["v0"])
         result = simulator.rollout(start, {"mu": leaves["mu"], "lam": 5e4}, torch.full((64,), SPACING**3).double(), DENSITY, 3,
                                    motions=[simulator.colliders[0].motion, motion])  # fmt: skip
@@ -311,7 +392,10 @@ def test_gradient_of_a_rollout(name, make_block, monkeypatch):
                     return float(loss({**leaves, key: leaves[key] + s * direction}))
 
             h = steps.get(key, 1e-6)
-            estimates = [(8 * (shifted(s) - shifted(-s)) - (shifted(2 * s) - shifted(-2 * s))) / (12 * s) for s in (h, 2 * h)]
+            estimates = [
+                (8 * (shifted(s) - shifted(-s)) - (shifted(2 * s) - shifted(-2 * s))) / (12 * s)
+                for s in (h, 2 * h)
+            ]
             # a contact that opens or a node that changes sides between the steps is no derivative (docs/verification.md, check 18)
             apart = abs(estimates[0] - estimates[1]) / abs(estimates[0])
             if apart < 1e-6:
@@ -328,7 +412,11 @@ def test_a_flat_face_is_differentiable_in_its_height():
 
     def height_after(z):
         motion = Motion(torch.stack([0 * z, 0 * z, z]))
-        return rollout(at_rest(x, (0.0, 0.0, -1.0)), [Collider(HalfSpace(), "separate", 0.0, motion)]).x[-1][:, 2].mean()
+        return (
+            rollout(at_rest(x, (0.0, 0.0, -1.0)), [Collider(HalfSpace(), "separate", 0.0, motion)])
+            .x[-1][:, 2]
+            .mean()
+        )
 
     z = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(height_after(z), z)
@@ -339,13 +427,25 @@ def test_a_flat_face_is_differentiable_in_its_height():
 
 def test_continued_rollout_takes_the_motion_up(make_block):
     state = make_block()
-    motion = Motion.waypoints([0.0, 0.015, 0.05], [[0.15, -0.1, 0.1], [0.15, 0.0, 0.1], [0.0, 0.0, 0.0]])
+    motion = Motion.waypoints(
+        [0.0, 0.015, 0.05], [[0.15, -0.1, 0.1], [0.15, 0.0, 0.1], [0.0, 0.0, 0.0]]
+    )
     collider = Collider(Sphere(0.1), "separate", 0.2, motion)
-    simulator = Simulator("corotated", dx=DX, substeps=25, frame_dt=0.01, gravity=DOWN, colliders=[collider], dtype=torch.float64)
+    simulator = Simulator(
+        "corotated",
+        dx=DX,
+        substeps=25,
+        frame_dt=0.01,
+        gravity=DOWN,
+        colliders=[collider],
+        dtype=torch.float64,
+    )
     volume = torch.full((64,), SPACING**3).double()
     whole = simulator.rollout(state, PARAMETERS, volume, DENSITY, 5)
     first = simulator.rollout(state, PARAMETERS, volume, DENSITY, 3)
-    rest = simulator.rollout(first.final, PARAMETERS, volume, DENSITY, 3, started=True, start_time=0.02)
+    rest = simulator.rollout(
+        first.final, PARAMETERS, volume, DENSITY, 3, started=True, start_time=0.02
+    )
     torch.testing.assert_close(rest.x[-1], whole.x[-1], rtol=0, atol=1e-13)
     assert whole.reactions.shape == (4, 25, 1, 6)
     sampled = Trajectory(*collider.motion.sample(4, 25, simulator.dt))
@@ -363,6 +463,8 @@ def test_a_layer_of_particles_on_what_sticks_stays():
 @pytest.mark.parametrize("mode", ["separate", "touch"])
 def test_domain_walls_keep_a_body_in(mode):
     walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), mode)
-    result = rollout(at_rest(lattice((0.12, 0.12, 0.12)), (3.0, -2.0, -1.0)), planes=walls, frames=16)
+    result = rollout(
+        at_rest(lattice((0.12, 0.12, 0.12)), (3.0, -2.0, -1.0)), planes=walls, frames=16
+    )
     assert result.x.abs().max() < 0.2 + 0.5 * DX
     assert result.x[:, :, 0].max() > 0.15 and result.v[-1][:, 0].mean() < 2.0

@@ -25,7 +25,9 @@ from mosa.physics.engine.simulator import Simulator
 def test_every_type(tmp_path):
     corners = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    text = [f"v {x} {y} {z}" for x, y, z in corners] + ["f " + " ".join(str(i + 1) for i in f) for f in faces]
+    text = [f"v {x} {y} {z}" for x, y, z in corners] + [
+        "f " + " ".join(str(i + 1) for i in f) for f in faces
+    ]
     (tmp_path / "cube.obj").write_text("\n".join(text))
     made = colliders_from_config([
         {"type": "plane", "normal": [0, 2, 0], "position": [0, 1, 0], "mode": "separate", "friction": 0.3},
@@ -43,12 +45,22 @@ def test_every_type(tmp_path):
     torch.testing.assert_close(up, torch.tensor([0.0, 1.0, 0.0]).double(), rtol=0, atol=1e-15)
     assert sphere.shape == Sphere(0.1) and sphere.motion.max_speed(2.0) == pytest.approx(3.0)
     turned = capsule.motion.sample(1, 1, 0.1)[1][0]
-    torch.testing.assert_close(turned[:, 0], torch.tensor([0.0, 1.0, 0.0]).double(), rtol=0, atol=1e-15)
-    assert (roll.name, roll.mode) == ("roll", "touch") and reach(roll.shape) == pytest.approx(math.hypot(0.3, 0.2))
-    assert reach(box.shape) == pytest.approx(1.5) and reach(capsule.shape) == pytest.approx(0.3) and reach(plane.shape) == 0
+    torch.testing.assert_close(
+        turned[:, 0], torch.tensor([0.0, 1.0, 0.0]).double(), rtol=0, atol=1e-15
+    )
+    assert (roll.name, roll.mode) == ("roll", "touch") and reach(roll.shape) == pytest.approx(
+        math.hypot(0.3, 0.2)
+    )
+    assert (
+        reach(box.shape) == pytest.approx(1.5)
+        and reach(capsule.shape) == pytest.approx(0.3)
+        and reach(plane.shape) == 0
+    )
     x, R, *_ = box.motion.sample(3, 1, 0.5)
     torch.testing.assert_close(x[1], torch.tensor([0.0, 0.0, 0.5]).double())
-    torch.testing.assert_close(R[2] @ R[2], torch.diag(torch.tensor([1.0, -1.0, -1.0])).double(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        R[2] @ R[2], torch.diag(torch.tensor([1.0, -1.0, -1.0])).double(), rtol=0, atol=1e-12
+    )
     centre = torch.ones(1, 3).double()
     assert float(signed_distance(mesh.shape, centre)) == pytest.approx(-1.0, abs=0.06)
     assert mesh.shape.margin == 0.6
@@ -68,7 +80,9 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
             assert colliders_from_config([given])[0].mode == "sticky"  # needs no other key
     common = set(KEYS) - {key for keys in own.values() for key in keys}
     assert common == set(rows) - set(own) - {"type"}
-    turned, facing = colliders_from_config([{"type": "plane", "rotation": [1, 0, 0, -90]}, {"type": "plane", "normal": [0, 1, 0]}])
+    turned, facing = colliders_from_config(
+        [{"type": "plane", "rotation": [1, 0, 0, -90]}, {"type": "plane", "normal": [0, 1, 0]}]
+    )
     poses = [collider.motion.sample(1, 1, 0.1)[1][0] for collider in (turned, facing)]
     torch.testing.assert_close(*poses, rtol=0, atol=1e-15)
     assert turned.shape == HalfSpace()
@@ -133,6 +147,20 @@ def test_packing_errors(collider, match):
 
 
 def test_motions_of_another_number(make_block):
-    simulator = Simulator("corotated", dx=0.04, substeps=5, frame_dt=0.01, colliders=[Collider(Sphere(0.1))], dtype=torch.float64)
+    simulator = Simulator(
+        "corotated",
+        dx=0.04,
+        substeps=5,
+        frame_dt=0.01,
+        colliders=[Collider(Sphere(0.1))],
+        dtype=torch.float64,
+    )
     with pytest.raises(ConfigError, match="one for each of 1 colliders, found 2"):
-        simulator.rollout(make_block(), {"mu": 4e4, "lam": 5e4}, torch.full((64,), 8e-6).double(), 1e3, 2, motions=[Motion()] * 2)
+        simulator.rollout(
+            make_block(),
+            {"mu": 4e4, "lam": 5e4},
+            torch.full((64,), 8e-6).double(),
+            1e3,
+            2,
+            motions=[Motion()] * 2,
+        )

@@ -16,7 +16,10 @@ from mosa.types import ParticleState
 
 def falls(sim, state, *, mu=4e4, frames=9):
     """(positions, gradients) of a block that falls ever faster, so that its window grows."""
-    leaves = [state.v.clone().requires_grad_(), torch.tensor(mu, dtype=torch.float64, requires_grad=True)]
+    leaves = [
+        state.v.clone().requires_grad_(),
+        torch.tensor(mu, dtype=torch.float64, requires_grad=True),
+    ]
     start = ParticleState(state.x, leaves[0], state.C_affine, state.F, state.F_tot)
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     rollout = sim.rollout(start, {"mu": leaves[1], "lam": 5e4}, volume, 1000.0, frames)
@@ -25,7 +28,9 @@ def falls(sim, state, *, mu=4e4, frames=9):
 
 @pytest.mark.parametrize("kept", [True, False])
 @pytest.mark.parametrize("tight, collides", [(False, False), (True, False), (False, True)])
-def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, make_block, monkeypatch):
+def test_captured_segments_are_those_launched_one_by_one(
+    kept, tight, collides, make_block, monkeypatch
+):
     """tight: every window has buffers and graphs of its own size, else one size comes to serve all."""
     if tight:
         monkeypatch.setattr(workspace, "SPARE", 2**30)
@@ -33,7 +38,11 @@ def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, 
         monkeypatch.setattr(workspace, "SMALL", 0)
     monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", 2**29 if kept else 0)
     replays, launches, dims, sizes = [], [], set(), set()
-    replay, place, send = wp.capture_launch, workspace.Workspace.set_window, workspace.Workspace._launch
+    replay, place, send = (
+        wp.capture_launch,
+        workspace.Workspace.set_window,
+        workspace.Workspace._launch,
+    )
 
     def placed(work, origin, size):
         place(work, origin, size)
@@ -67,7 +76,9 @@ def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, 
     assert not replays
     for each in found:
         assert all(torch.equal(a, b) for a, b in zip(each, expected, strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(others, different, strict=True)) and not torch.equal(others[0], found[0][0])
+    assert all(
+        torch.equal(a, b) for a, b in zip(others, different, strict=True)
+    ) and not torch.equal(others[0], found[0][0])
     if collides:
         monkeypatch.setattr(workspace.Workspace, "_launch", send)
         assert not torch.equal(falls(Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0),

@@ -21,9 +21,21 @@ def run(state, law, device, dtype, substeps, frames, adapted):
               torch.zeros(3, device=device, dtype=dtype, requires_grad=True))  # fmt: skip
     parameters = {"mu": mu, "lam": 5e4, **({"yield_stress": 800.0} if law == "von_mises" else {})}
     g = torch.Generator().manual_seed(0)
-    G, h = (0.05 * torch.randn(n, 6, *s, generator=g, dtype=torch.float64).to(device=device, dtype=dtype) for s in ((6,), ()))
+    G, h = (
+        0.05
+        * torch.randn(n, 6, *s, generator=g, dtype=torch.float64).to(device=device, dtype=dtype)
+        for s in ((6,), ())
+    )
     operator = AdapterOperator(G, 1e3 * h, G, 0.01 * h)
-    sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device)
+    sim = Simulator(
+        law,
+        dx=0.04,
+        substeps=substeps,
+        frame_dt=4e-4 * substeps,
+        ground=Ground(0.0),
+        dtype=dtype,
+        device=device,
+    )
     volume = torch.full((n,), 8e-6, device=device, dtype=dtype)
     rollout = sim.rollout(replace(state, v=state.v + v0), parameters, volume, 1000.0, frames,
                           adapter=(lambda _: operator) if adapted else None, stride=5)  # fmt: skip
@@ -39,14 +51,24 @@ def run(state, law, device, dtype, substeps, frames, adapted):
 )
 def test_cuda_against_cpu(law, dtype, substeps, frames, tolerance, adapted, make_block):
     state = make_block(n=6)
-    results = [run(state, law, device, dtype, substeps, frames, adapted) for device in ("cuda", "cpu")]
+    results = [
+        run(state, law, device, dtype, substeps, frames, adapted) for device in ("cuda", "cpu")
+    ]
     for found, expected in zip(*results):
         assert (found - expected).abs().max() <= tolerance * max(1.0, float(expected.abs().max()))
 
 
 def simulator(device, dtype, substeps, **options):
     options = {"ground": Ground(0.0), **options}
-    return Simulator("corotated", dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, dtype=dtype, device=device, **options)
+    return Simulator(
+        "corotated",
+        dx=0.04,
+        substeps=substeps,
+        frame_dt=4e-4 * substeps,
+        dtype=dtype,
+        device=device,
+        **options,
+    )
 
 
 def on(device, dtype, state):
@@ -55,9 +77,13 @@ def on(device, dtype, state):
     return state, torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
 
 
-@pytest.mark.parametrize("dtype, substeps, tolerance", [(torch.float64, 40, 1e-9), (torch.float32, 40, 1e-4)])
+@pytest.mark.parametrize(
+    "dtype, substeps, tolerance", [(torch.float64, 40, 1e-9), (torch.float32, 40, 1e-4)]
+)
 @pytest.mark.parametrize("kept", [True, False])
-def test_gradients_with_states_kept_and_run_again(dtype, substeps, tolerance, kept, make_block, monkeypatch):
+def test_gradients_with_states_kept_and_run_again(
+    dtype, substeps, tolerance, kept, make_block, monkeypatch
+):
     """An operator that is asked for once, as the default adapter is; three times: passes run eagerly, captured, replayed."""
     monkeypatch.setattr("mosa.physics.engine.budget.KEPT_SHARE", 0.25 if kept else 0.0)
     monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", 0)
@@ -71,9 +97,13 @@ def test_gradients_with_states_kept_and_run_again(dtype, substeps, tolerance, ke
             def adapter(_, leaf=leaf, n=n):
                 return AdapterOperator(leaf.expand(n, 6, 6), leaf[0].expand(n, 6))
 
-            rollout = sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume, 1000.0, 4, adapter=adapter, stride=None)
+            rollout = sim.rollout(
+                state, {"mu": 4e4, "lam": 5e4}, volume, 1000.0, 4, adapter=adapter, stride=None
+            )
             (gradient,) = torch.autograd.grad((rollout.x**2).sum(), leaf)
-            results.setdefault(device, []).append([t.detach().cpu().double() for t in (rollout.x, rollout.F, gradient)])
+            results.setdefault(device, []).append(
+                [t.detach().cpu().double() for t in (rollout.x, rollout.F, gradient)]
+            )
     (expected,) = results["cpu"]
     for found in results["cuda"]:
         for a, b in zip(found, expected):
@@ -101,5 +131,8 @@ def test_long_segments_without_gradients(dtype, tolerance, make_block):
             looks = [str(w.message) for w in caught if "synchroniz" in str(w.message)]
             assert 0 < len(looks) <= 2 + (frames - 1) + 1, (len(looks), looks[:3])
     for name in ("x", "v", "F"):
-        found, expected = getattr(results["cuda"], name).cpu().double(), getattr(results["cpu"], name).double()
+        found, expected = (
+            getattr(results["cuda"], name).cpu().double(),
+            getattr(results["cpu"], name).double(),
+        )
         assert (found - expected).abs().max() <= tolerance * max(1.0, float(expected.abs().max()))

@@ -20,7 +20,10 @@ PARAMETERS = {
 LAWS = list(PARAMETERS)
 # (lam + 2 mu, lam, mu) at small strain
 MODULI = {
-    **dict.fromkeys(["herschel_bulkley", "herschel_bulkley_hencky"], (KAPPA + 4 * MU / 3, KAPPA - 2 * MU / 3, MU)),
+    **dict.fromkeys(
+        ["herschel_bulkley", "herschel_bulkley_hencky"],
+        (KAPPA + 4 * MU / 3, KAPPA - 2 * MU / 3, MU),
+    ),
     "newtonian": (7 * KAPPA, 7 * KAPPA, 0.0),
 }
 
@@ -43,7 +46,9 @@ def rotation(F):
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "stvk_paper"])
 def test_stress_is_the_gradient_of_the_energy(law):
     generator = torch.Generator().manual_seed(2)
-    F = torch.eye(3).double() + 0.25 * torch.randn(50, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3).double() + 0.25 * torch.randn(
+        50, 3, 3, generator=generator, dtype=torch.float64
+    )
     F = F[torch.linalg.det(F) > 0.2]
     F.requires_grad_()
     (P,) = torch.autograd.grad(law_named(law).energy(F, **PARAMETERS[law]).sum(), F)
@@ -62,7 +67,9 @@ def test_stress_is_the_gradient_of_the_energy(law):
 def test_the_printed_stvk_is_the_gradient_of_no_energy():
     """P = tau F^-T of an energy has a symmetric derivative: <dP(A), B> = <dP(B), A>."""
     generator = torch.Generator().manual_seed(9)
-    F = torch.eye(3).double() + 0.2 * torch.randn(20, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3).double() + 0.2 * torch.randn(
+        20, 3, 3, generator=generator, dtype=torch.float64
+    )
     A, B = torch.randn(2, 20, 3, 3, generator=generator, dtype=torch.float64)
 
     def asymmetry(law):
@@ -88,14 +95,18 @@ def test_the_printed_stvk_has_one_stretch_too_many(drawn):
 @pytest.mark.parametrize("law", LAWS)
 def test_frame_indifference(law, rotations):
     generator = torch.Generator().manual_seed(3)
-    F = torch.eye(3).double() + 0.3 * torch.randn(200, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3).double() + 0.3 * torch.randn(
+        200, 3, 3, generator=generator, dtype=torch.float64
+    )
     S = torch.linalg.svdvals(F)
     keep = (S[:, 1] - S[:, 2] > -1) & (S[:, 1] + S[:, 2] > 0.1) & (torch.linalg.det(F) > 0.05)
     F, Q = F[keep], rotations[keep]
     assert len(F) > 100
     C = torch.randn(F.shape, generator=generator, dtype=torch.float64)
     expected = Q @ stress(law, F, C=C) @ Q.mT
-    error = (stress(law, Q @ F, C=Q @ C @ Q.mT) - expected).abs().amax((1, 2)) / expected.abs().amax((1, 2))
+    error = (stress(law, Q @ F, C=Q @ C @ Q.mT) - expected).abs().amax(
+        (1, 2)
+    ) / expected.abs().amax((1, 2))
     if law == "linear":
         assert error.median() > 1e-2  # the control: this law is not objective
     else:
@@ -140,7 +151,10 @@ def test_gradient_of_the_material_state(law, drawn):
     names, F = [names[i] for i in keep], F[keep]
     sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=torch.float64)
     generator = torch.Generator().manual_seed(4)
-    a, b, C = (torch.randn(len(F), *shape, generator=generator, dtype=torch.float64) for shape in ((6,), (6,), (3, 3)))
+    a, b, C = (
+        torch.randn(len(F), *shape, generator=generator, dtype=torch.float64)
+        for shape in ((6,), (6,), (3, 3))
+    )
     mu = MU * (1 + 0.1 * torch.rand(len(F), generator=generator, dtype=torch.float64))
 
     def loss(F, mu, C=C):
@@ -158,7 +172,9 @@ def test_gradient_of_the_material_state(law, drawn):
     step = h[:, None, None]
     expected = (8 * (loss(F + step * dF, mu) - loss(F - step * dF, mu))
                 - (loss(F + 2 * step * dF, mu) - loss(F - 2 * step * dF, mu))) / (12 * h)  # fmt: skip
-    error = ((adj_F * dF).sum((1, 2)) - expected).abs() / torch.linalg.matrix_norm(adj_F).clamp_min(1.0)
+    error = ((adj_F * dF).sum((1, 2)) - expected).abs() / torch.linalg.matrix_norm(adj_F).clamp_min(
+        1.0
+    )
     assert error.max() < 1e-6, names[int(error.argmax())]
     expected = (loss(F, mu + 1) - loss(F, mu - 1)) / 2  # linear in mu
     torch.testing.assert_close(adj_mu, expected, rtol=1e-6, atol=1e-8)
@@ -173,10 +189,16 @@ def test_moduli():
     mu, lam = lame(E, nu)
     torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), E)
     torch.testing.assert_close(lam / (2 * (lam + mu)), nu)
-    assert float(wave_modulus("stvk", {"mu": mu, "lam": lam})) == pytest.approx(float((lam + 2 * mu).max()))
+    assert float(wave_modulus("stvk", {"mu": mu, "lam": lam})) == pytest.approx(
+        float((lam + 2 * mu).max())
+    )
     rate = {"mu": mu, "kappa": lam, "yield_stress": mu, "viscosity": mu}
-    assert float(wave_modulus("herschel_bulkley", rate)) == pytest.approx(float((lam + 4 * mu / 3).max()))
-    assert float(wave_modulus("newtonian", {"mu": mu, "kappa": lam})) == pytest.approx(float(7 * lam.max()))
+    assert float(wave_modulus("herschel_bulkley", rate)) == pytest.approx(
+        float((lam + 4 * mu / 3).max())
+    )
+    assert float(wave_modulus("newtonian", {"mu": mu, "kappa": lam})) == pytest.approx(
+        float(7 * lam.max())
+    )
     with pytest.raises(ConfigError, match="mu and lam, or mu and kappa"):
         wave_modulus("stvk", {"kappa": mu})
 

@@ -102,7 +102,11 @@ def test_memory_is_the_same_whoever_views_it():
     a = torch.arange(6.0)
     leaf = torch.nn.Parameter(a)
     assert same_memory([a, leaf], [leaf.detach(), a])
-    assert not same_memory([a], [a.clone()]) and not same_memory([a], [a[:3]]) and not same_memory([a], [a, a])
+    assert (
+        not same_memory([a], [a.clone()])
+        and not same_memory([a], [a[:3]])
+        and not same_memory([a], [a, a])
+    )
 
 
 def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay():
@@ -110,7 +114,9 @@ def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay()
     with same_weights():
         for value in range(50):
             weights = [torch.full((1000,), float(value))]
-            assert from_weights(lambda weights=weights: float(weights[0][0]), weights, "key") == value
+            assert (
+                from_weights(lambda weights=weights: float(weights[0][0]), weights, "key") == value
+            )
 
 
 def test_a_part_of_the_physics_knows_only_those_below_it():
@@ -123,12 +129,22 @@ def test_a_part_of_the_physics_knows_only_those_below_it():
         own = path.relative_to(root).with_suffix("").parts[0]
         own = whole.get(own, own)
         for node in ast.walk(ast.parse(path.read_text())):
-            if own in order and isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mosa.physics."):
+            if (
+                own in order
+                and isinstance(node, ast.ImportFrom)
+                and node.module
+                and node.module.startswith("mosa.physics.")
+            ):
                 other = node.module.split(".")[2]
                 other = whole.get(other, other)
                 seen.add((own, other))
-                upwards += [(path.name, other)] if own != other and order[other] >= order[own] else []
-    assert upwards == [] and {("engine", "grid"), ("contact", "grid"), ("constitutive", "launching")} <= seen
+                upwards += (
+                    [(path.name, other)] if own != other and order[other] >= order[own] else []
+                )
+    assert (
+        upwards == []
+        and {("engine", "grid"), ("contact", "grid"), ("constitutive", "launching")} <= seen
+    )
 
 
 def test_no_result_is_kept_under_an_id_or_an_address():
@@ -137,6 +153,10 @@ def test_no_result_is_kept_under_an_id_or_an_address():
     for path in sorted(Path(mosa.physics.__file__).parent.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call):
-                name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", None)
+                name = (
+                    node.func.id
+                    if isinstance(node.func, ast.Name)
+                    else getattr(node.func, "attr", None)
+                )
                 found += [(path.name, name)] if name in ("id", "data_ptr") else []
     assert found == [("launching.py", "data_ptr")]  # of alignment

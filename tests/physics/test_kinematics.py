@@ -6,7 +6,14 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.physics.constitutive.kinematics import contract, hencky_material, hencky_spatial, rotation, rotation_of, svd
+from mosa.physics.constitutive.kinematics import (
+    contract,
+    hencky_material,
+    hencky_spatial,
+    rotation,
+    rotation_of,
+    svd,
+)
 
 FUNCTIONS = ["rotation", "stretch", "hencky_spatial", "hencky_material", "contract"]
 
@@ -31,7 +38,9 @@ def kernel(name):
         return A
 
     @wp.kernel(module="unique")
-    def apply(F: wp.array(dtype=wp.mat33d), c: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.mat33d)):
+    def apply(
+        F: wp.array(dtype=wp.mat33d), c: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.mat33d)
+    ):
         i = wp.tid()
         out[i] = value(F[i], c[i])
 
@@ -74,9 +83,16 @@ def test_svd_has_proper_frames_and_signed_values(drawn):
         S[i] = s
         V[i] = v
 
-    F = torch.cat([F, torch.zeros(1, 3, 3).double(), torch.diag(torch.tensor([1.0, 0.0, 0.0])).double()[None]])
+    F = torch.cat(
+        [F, torch.zeros(1, 3, 3).double(), torch.diag(torch.tensor([1.0, 0.0, 0.0])).double()[None]]
+    )
     U, V, S = torch.zeros_like(F), torch.zeros_like(F), torch.zeros(len(F), 3).double()
-    wp.launch(factors, len(F), inputs=[to_warp(F), to_warp(U), wp.from_torch(S, dtype=wp.vec3d), to_warp(V)], device="cpu")
+    wp.launch(
+        factors,
+        len(F),
+        inputs=[to_warp(F), to_warp(U), wp.from_torch(S, dtype=wp.vec3d), to_warp(V)],
+        device="cpu",
+    )
     eye = torch.eye(3).double().expand_as(F)
     torch.testing.assert_close(U @ torch.diag_embed(S) @ V.mT, F, rtol=0, atol=4e-15)
     torch.testing.assert_close(U.mT @ U, eye, rtol=0, atol=2e-15)
@@ -107,10 +123,14 @@ def test_rotation_is_the_polar_one(drawn):
 def test_rotation_of_a_body_that_lies_flat(stretches, within):
     """Newton's iteration goes through a det F of zero; the SVD does what it cannot."""
     generator = torch.Generator().manual_seed(2)
-    U, V = (torch.linalg.qr(torch.randn(40, 3, 3, generator=generator).double())[0] for _ in range(2))
+    U, V = (
+        torch.linalg.qr(torch.randn(40, 3, 3, generator=generator).double())[0] for _ in range(2)
+    )
     U, V = (Q * torch.linalg.det(Q)[:, None, None] for Q in (U, V))
     F = U @ torch.diag(torch.tensor(stretches).double()) @ V.mT
-    torch.testing.assert_close(run("rotation", F, torch.ones(40).double()), U @ V.mT, rtol=0, atol=within)
+    torch.testing.assert_close(
+        run("rotation", F, torch.ones(40).double()), U @ V.mT, rtol=0, atol=within
+    )
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -135,12 +155,20 @@ def test_gradient_against_differences(name, drawn):
         assert error.max() < 1e-6, (name, int(error.argmax()), float(error.max()))
         if name == "contract":
             step = torch.full_like(c, 1e-3)[:, None, None]
-            expected = (seed * directional(lambda s: run(name, F, c + s[:, 0, 0]), step)).sum((1, 2))
+            expected = (seed * directional(lambda s: run(name, F, c + s[:, 0, 0]), step)).sum(
+                (1, 2)
+            )
             torch.testing.assert_close(adj_c, expected, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_gradient_is_finite_at_the_true_singularity(name):
-    F = torch.diag_embed(torch.tensor([[1.0, 0.5, -0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, -1.0]]).double())
-    adj_F, adj_c = run_adjoint(name, F, torch.full((4,), 0.5).double(), torch.ones(4, 3, 3).double())
+    F = torch.diag_embed(
+        torch.tensor(
+            [[1.0, 0.5, -0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, -1.0]]
+        ).double()
+    )
+    adj_F, adj_c = run_adjoint(
+        name, F, torch.full((4,), 0.5).double(), torch.ones(4, 3, 3).double()
+    )
     assert bool(torch.isfinite(adj_F).all()) and bool(torch.isfinite(adj_c).all())

@@ -30,7 +30,9 @@ def test_fibre_law_value_and_gradient(law, make_block):
     state = make_block()
     n = len(state.x)
     generator = torch.Generator().manual_seed(0)
-    a = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator, dtype=torch.float64), dim=1)
+    a = torch.nn.functional.normalize(
+        torch.randn(n, 3, generator=generator, dtype=torch.float64), dim=1
+    )
     values = {"mu": torch.tensor(3e4), "lam": torch.tensor(4e4), "kf": 2e4 * torch.ones(n), "a": a}
     values = {k: v.double().requires_grad_() for k, v in values.items()}
     volume = torch.full((n,), 8e-6, dtype=torch.float64)
@@ -46,7 +48,9 @@ def test_fibre_law_value_and_gradient(law, make_block):
     U, _, Vh = torch.linalg.svd(state.F)
     Wa = ((U @ Vh).mT @ state.F @ a[..., None])[..., 0]
     extra = 4e4 * ((Wa**2).sum(1) - 1)[:, None, None] * Wa[:, :, None] * Wa[:, None, :]
-    expected = torch.stack([extra[:, j, k] for j, k in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], 1)
+    expected = torch.stack(
+        [extra[:, j, k] for j, k in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], 1
+    )
     torch.testing.assert_close(seen - base, expected, rtol=1e-10, atol=1e-8)
 
     def loss(values):
@@ -66,7 +70,12 @@ def test_fibre_law_value_and_gradient(law, make_block):
 
 
 def test_registration(law):
-    assert register_law("test_fibre", fibre, PARAMETERS, needs_positive_J=True).offsets == {"mu": 0, "lam": 1, "kf": 2, "a": 3}
+    assert register_law("test_fibre", fibre, PARAMETERS, needs_positive_J=True).offsets == {
+        "mu": 0,
+        "lam": 1,
+        "kf": 2,
+        "a": 3,
+    }
     with pytest.raises(ConfigError, match="registered already"):
         register_law("test_fibre", fibre, ("mu", "lam"))
     with pytest.raises(ConfigError, match="at most 12"):

@@ -13,7 +13,11 @@ from mosa.types import ParticleState
 
 DENSITY, DX, DT = 1000.0, 0.04, 4e-4
 RATE = {"mu": 3e4, "kappa": 8e4, "yield_stress": 1.5e3, "viscosity": 8.0}
-PARAMETERS = {"herschel_bulkley": RATE, "herschel_bulkley_hencky": RATE, "newtonian": {"mu": 20.0, "kappa": 5e4}}
+PARAMETERS = {
+    "herschel_bulkley": RATE,
+    "herschel_bulkley_hencky": RATE,
+    "newtonian": {"mu": 20.0, "kappa": 5e4},
+}
 PLANES = [Plane((0, 0.02, 0), (0, 1, 0), "separate", 0.4)]
 
 
@@ -26,7 +30,10 @@ def start(state, law):
 
 
 def leaves_of(law):
-    return {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in PARAMETERS[law].items()}
+    return {
+        k: torch.tensor(v, dtype=torch.float64, requires_grad=True)
+        for k, v in PARAMETERS[law].items()
+    }
 
 
 @pytest.mark.parametrize("adapted", [False, True])
@@ -39,8 +46,14 @@ def test_twin(law, adapted, make_block):
     volume, parameters = torch.full((n,), 0.02**3, dtype=torch.float64), leaves_of(law)
     g = torch.Generator().manual_seed(3)
     draw = lambda *shape: 0.1 * torch.randn(*shape, generator=g, dtype=torch.float64)  # noqa: E731
-    operator = AdapterOperator(draw(n, 6, 6), 1e3 * draw(n, 6), draw(n, 6, 6), 0.01 * draw(n, 6)) if adapted else None
-    sim = Simulator(law, dx=DX, substeps=steps, frame_dt=steps * DT, planes=PLANES, dtype=torch.float64)
+    operator = (
+        AdapterOperator(draw(n, 6, 6), 1e3 * draw(n, 6), draw(n, 6, 6), 0.01 * draw(n, 6))
+        if adapted
+        else None
+    )
+    sim = Simulator(
+        law, dx=DX, substeps=steps, frame_dt=steps * DT, planes=PLANES, dtype=torch.float64
+    )
     rollout = sim.rollout(first, parameters, volume, DENSITY, 2, adapter=(lambda _: operator) if adapted else None,
                           stride=steps, started=True)  # fmt: skip
     twin = first
@@ -52,21 +65,29 @@ def test_twin(law, adapted, make_block):
     names = ("x", "v", "C_affine", "F", "F_tot")
     for name in names:
         value, expected = getattr(rollout.final, name).detach(), getattr(twin, name).detach()
-        assert (value - expected).abs().max() < 1e-12 * steps * max(1.0, float(expected.abs().max())), name
+        assert (value - expected).abs().max() < 1e-12 * steps * max(
+            1.0, float(expected.abs().max())
+        ), name
     weights = {name: torch.randn(getattr(twin, name).shape, generator=g).double() for name in names}
 
     def gradient(final):
         loss = sum((weights[name] * getattr(final, name)).sum() for name in names)
         return torch.autograd.grad(loss, [*leaves, *parameters.values()])
 
-    for name, found, expected in zip(("x", "v", "C_affine", "F", *parameters), gradient(rollout.final), gradient(twin)):
+    for name, found, expected in zip(
+        ("x", "v", "C_affine", "F", *parameters), gradient(rollout.final), gradient(twin)
+    ):
         assert (found - expected).abs().max() < 1e-9 * expected.abs().max(), name
         assert float(expected.abs().max()) > 0, name
 
 
 def rolled(law, state, parameters, dtype=torch.float64, substeps=50):
-    state = ParticleState(*(getattr(state, k).to(dtype) for k in ("x", "v", "C_affine", "F", "F_tot")))
-    sim = Simulator(law, dx=DX, substeps=substeps, frame_dt=substeps * DT, planes=PLANES, dtype=dtype)
+    state = ParticleState(
+        *(getattr(state, k).to(dtype) for k in ("x", "v", "C_affine", "F", "F_tot"))
+    )
+    sim = Simulator(
+        law, dx=DX, substeps=substeps, frame_dt=substeps * DT, planes=PLANES, dtype=dtype
+    )
     volume = torch.full((len(state.x),), 0.02**3, dtype=dtype)
     return sim.rollout(state, {k: p.to(dtype) for k, p in parameters.items()}, volume, DENSITY, 2)
 
@@ -76,7 +97,9 @@ def test_gradient_over_50_substeps_in_contact(law, make_block):
     """Against central differences, to max(1e-5, 10 x the disagreement of two steps) (verification 18); float32 to 1e-3 (19)."""
     state = start(make_block(), law)
     generator = torch.Generator().manual_seed(5)
-    wx, wv = (torch.randn(state.x.shape, generator=generator, dtype=torch.float64) for _ in range(2))
+    wx, wv = (
+        torch.randn(state.x.shape, generator=generator, dtype=torch.float64) for _ in range(2)
+    )
 
     def loss(parameters, shift, dtype=torch.float64):
         rollout = rolled(law, replace(state, v=state.v + shift), parameters, dtype)
@@ -102,7 +125,10 @@ def test_gradient_over_50_substeps_in_contact(law, make_block):
 
     for name, leaf in leaves.items():
         along = direction if name == "v" else leaf.detach()
-        value, other = float((found[name] * along).sum()), float((single[name].double() * along).sum())
+        value, other = (
+            float((found[name] * along).sum()),
+            float((single[name].double() * along).sum()),
+        )
         fine, coarse = difference(name, 1e-6), difference(name, 1e-5)
         tolerance = max(1e-5, 10 * abs(fine - coarse) / abs(fine))
         assert tolerance < 1e-2, (name, fine, coarse)

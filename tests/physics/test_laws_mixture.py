@@ -38,8 +38,12 @@ def packed(counts, values, order=LAWS):
     result = {}
     for name in names:
         columns = [values[law].get(name, torch.tensor(float("nan"))) for law in LAWS]
-        result[name] = torch.cat([torch.as_tensor(c).double().expand(n) for c, n in zip(columns, counts)])
-    result["law"] = torch.cat([torch.full((n,), float(order.index(law))).double() for law, n in zip(LAWS, counts)])
+        result[name] = torch.cat(
+            [torch.as_tensor(c).double().expand(n) for c, n in zip(columns, counts)]
+        )
+    result["law"] = torch.cat(
+        [torch.full((n,), float(order.index(law))).double() for law, n in zip(LAWS, counts)]
+    )
     return result
 
 
@@ -51,7 +55,10 @@ def bodies(make_block):
 
 def test_distant_bodies_move_as_alone_with_their_gradients(bodies):
     counts = [len(b.x) for b in bodies]
-    leaves = {law: {k: torch.tensor(v).double().requires_grad_() for k, v in OWN[law].items()} for law in LAWS}
+    leaves = {
+        law: {k: torch.tensor(v).double().requires_grad_() for k, v in OWN[law].items()}
+        for law in LAWS
+    }
     flat = [p for law in LAWS for p in leaves[law].values()]
     together = merged(bodies, gap=25 * 0.04)
     volume = torch.full((sum(counts),), 0.02**3, dtype=torch.float64)
@@ -61,7 +68,9 @@ def test_distant_bodies_move_as_alone_with_their_gradients(bodies):
     alone, expected = 0, []
     for i, law in enumerate(LAWS):
         part = merged([bodies[i]], 0.0)
-        part = ParticleState(together.x[alone : alone + counts[i]], part.v, part.C_affine, part.F, part.F_tot)
+        part = ParticleState(
+            together.x[alone : alone + counts[i]], part.v, part.C_affine, part.F, part.F_tot
+        )
         single = simulator(law).rollout(part, leaves[law], volume[: counts[i]], 1000.0, 2)
         for name in ("x", "v", "F", "F_tot"):
             found = getattr(rollout, name)[-1, alone : alone + counts[i]]
@@ -76,7 +85,10 @@ def test_distant_bodies_move_as_alone_with_their_gradients(bodies):
 
 def test_the_order_of_the_names_is_only_a_numbering(bodies):
     counts = [len(b.x) for b in bodies]
-    together, volume = merged(bodies, gap=0.08), torch.full((sum(counts),), 0.02**3, dtype=torch.float64)
+    together, volume = (
+        merged(bodies, gap=0.08),
+        torch.full((sum(counts),), 0.02**3, dtype=torch.float64),
+    )
     results = []
     for order in (LAWS, LAWS[::-1]):
         p = packed(counts, OWN, order)
@@ -85,23 +97,38 @@ def test_the_order_of_the_names_is_only_a_numbering(bodies):
 
 
 def test_touching_bodies_exchange_momentum_and_lose_none(make_block):
-    left, right = make_block(seed=0, velocity=(1.0, 0.0, 0.0)), make_block(seed=1, velocity=(-1.0, 0.0, 0.0))
+    left, right = (
+        make_block(seed=0, velocity=(1.0, 0.0, 0.0)),
+        make_block(seed=1, velocity=(-1.0, 0.0, 0.0)),
+    )
     law = "stvk+von_mises"
-    sim = Simulator(law, dx=0.04, substeps=200, frame_dt=0.04, dtype=torch.float64, gravity=(0, 0, 0))
+    sim = Simulator(
+        law, dx=0.04, substeps=200, frame_dt=0.04, dtype=torch.float64, gravity=(0, 0, 0)
+    )
     state = merged([left, right], gap=0.085)
     n = len(left.x)
-    p = {"mu": 3e4, "lam": 4e4, "yield_stress": 500.0, "law": torch.arange(2).repeat_interleave(n).double()}
+    p = {
+        "mu": 3e4,
+        "lam": 4e4,
+        "yield_stress": 500.0,
+        "law": torch.arange(2).repeat_interleave(n).double(),
+    }
     rollout = sim.rollout(state, p, torch.full((2 * n,), 0.02**3, dtype=torch.float64), 1000.0, 2)
     before, after = state.v.sum(0), rollout.v[-1].sum(0)
     assert (before - after).abs().max() < 1e-12 * state.v.norm(dim=1).sum()
     assert (rollout.v[-1, :n].sum(0) - state.v[:n].sum(0)).norm() > 0.1 * state.v[:n].sum(0).norm()
     plastic = (rollout.F[-1] - rollout.F_tot[-1]).abs().amax((1, 2))
-    assert plastic[:n].max() < 1e-13 and plastic[n:].max() > 1e-2  # the elastic one keeps no plastic strain
+    assert (
+        plastic[:n].max() < 1e-13 and plastic[n:].max() > 1e-2
+    )  # the elastic one keeps no plastic strain
 
 
 def test_registration():
     law = law_named("neo_hookean+linear")
-    assert law.parameters == {"mu": 1, "lam": 1, "reference": 9, "law": 1} and law.reference == "reference"
+    assert (
+        law.parameters == {"mu": 1, "lam": 1, "reference": 9, "law": 1}
+        and law.reference == "reference"
+    )
     assert law.needs_positive_J and not law.plastic and law_named("neo_hookean+linear") is law
     assert not any("+" in name for name in law_names())
     modulus = law_named(MIXTURE).wave_modulus(packed([1, 1, 1], OWN))

@@ -38,16 +38,22 @@ def test_it_keeps_volume_and_rotation_alone(fluid):
     assert (torch.linalg.det(A) - J).abs().max() < 1e-13
     assert (A.mT @ A - J[:, None, None] ** (2 / 3) * EYE).abs().max() < 1e-13
     spin = 0.5 * (C - C.mT)
-    assert (A / J[:, None, None] ** (1 / 3) - polar((EYE + DT * spin) @ polar(F))).abs().max() < 1e-13
+    assert (
+        A / J[:, None, None] ** (1 / 3) - polar((EYE + DT * spin) @ polar(F))
+    ).abs().max() < 1e-13
     # the rotation of a rigid spin, to second order in the angle per step
     turn = torch.linalg.matrix_exp(DT * spin) @ polar(F)
-    assert (A / J[:, None, None] ** (1 / 3) - turn).abs().max() < (DT * torch.linalg.matrix_norm(spin)).max() ** 3
+    assert (A / J[:, None, None] ** (1 / 3) - turn).abs().max() < (
+        DT * torch.linalg.matrix_norm(spin)
+    ).max() ** 3
 
 
 def test_volume_is_held_above_its_floor():
     A = advanced(0.3 * EYE[None], torch.zeros(1, 3, 3).double())
     assert float(torch.linalg.det(A)) == pytest.approx(0.05, rel=1e-14)
-    gone = advanced(torch.diag(torch.tensor([1.0, 1.0, -1.0])).double()[None], torch.zeros(1, 3, 3).double())
+    gone = advanced(
+        torch.diag(torch.tensor([1.0, 1.0, -1.0])).double()[None], torch.zeros(1, 3, 3).double()
+    )
     assert float(torch.linalg.det(gone)) == pytest.approx(0.05, rel=1e-14)
 
 
@@ -55,11 +61,15 @@ def test_pressure_and_half_of_the_usual_viscous_stress():
     """p = kappa (J^-7 - 1) with sigma = -p I at rest; at J = 1 a shear rate g gives tau_xy = mu g/2."""
     F = 0.9 * EYE[None]
     J = 0.9**3
-    tau = unvech(simulator().material_state(F, torch.zeros_like(F), {"mu": MU, "kappa": KAPPA}).stress)[0]
+    tau = unvech(
+        simulator().material_state(F, torch.zeros_like(F), {"mu": MU, "kappa": KAPPA}).stress
+    )[0]
     torch.testing.assert_close(tau / J, -KAPPA * (J**-7 - 1) * EYE, rtol=1e-13, atol=1e-13)
     C = torch.zeros(1, 3, 3).double()
     C[0, 0, 1] = 5.0
-    tau = unvech(simulator().material_state(EYE[None].clone(), C, {"mu": MU, "kappa": KAPPA}).stress)[0]
+    tau = unvech(
+        simulator().material_state(EYE[None].clone(), C, {"mu": MU, "kappa": KAPPA}).stress
+    )[0]
     expected = torch.zeros(3, 3).double()
     expected[0, 1] = expected[1, 0] = 0.5 * MU * 5.0
     torch.testing.assert_close(tau, expected, rtol=1e-14, atol=1e-14)
@@ -79,7 +89,13 @@ def test_gradient(states, fluid, drawn):
         F = EYE.expand(20, 3, 3).clone()
     if states == "drawn":  # a start may be any F: equal, close and sheared singular values
         names, F = drawn
-        F = F[[i for i, n in enumerate(names) if n in ("identity", "rest", "dilated", "nearly equal", "two equal", "generic")]]
+        F = F[
+            [
+                i
+                for i, n in enumerate(names)
+                if n in ("identity", "rest", "dilated", "nearly equal", "two equal", "generic")
+            ]
+        ]
     C = C[: len(F)]
     sim, weights, other = simulator(), draw(len(F), 3, 3, seed=4), draw(len(F), 6, seed=5)
 
@@ -89,13 +105,21 @@ def test_gradient(states, fluid, drawn):
         return (weights * A).sum((1, 2)) + (other * tau).sum(1)
 
     n = len(F)
-    leaves = [t.clone().requires_grad_() for t in (F, C, torch.full((n,), MU).double(), torch.full((n,), KAPPA).double())]
+    leaves = [
+        t.clone().requires_grad_()
+        for t in (F, C, torch.full((n,), MU).double(), torch.full((n,), KAPPA).double())
+    ]
     gradients = torch.autograd.grad(loss(*leaves).sum(), leaves)
     for i, (leaf, gradient) in enumerate(zip(leaves, gradients)):
         direction = draw(*leaf.shape, seed=6 + i)
 
         def shifted(s, i=i, direction=direction):
-            return loss(*(t.detach() + s * direction if k == i else t.detach() for k, t in enumerate(leaves)))
+            return loss(
+                *(
+                    t.detach() + s * direction if k == i else t.detach()
+                    for k, t in enumerate(leaves)
+                )
+            )
 
         h = 2e-2 if i == 1 else 1e-4
         expected = (8 * (shifted(h) - shifted(-h)) - (shifted(2 * h) - shifted(-2 * h))) / (12 * h)

@@ -19,7 +19,9 @@ def test_unused_outputs_count_as_zero_and_seeds_are_left_alone(law, drawn):
         seed = torch.randn(output.shape, generator=g, dtype=torch.float64)
         before = seed.clone()
         seeds = [seed if j == i else torch.zeros_like(seed) for j in range(len(outputs))]
-        alone = torch.autograd.grad(output, [F, parameters["mu"]], seed, retain_graph=True, allow_unused=True)
+        alone = torch.autograd.grad(
+            output, [F, parameters["mu"]], seed, retain_graph=True, allow_unused=True
+        )
         among = torch.autograd.grad(outputs, [F, parameters["mu"]], seeds, retain_graph=True)
         for a, b in zip(alone, among):
             assert torch.equal(a, b)

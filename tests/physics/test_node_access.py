@@ -49,7 +49,11 @@ def test_loads_stores_and_sums_are_those_of_plain_indexing(longest, dtype, devic
     index[torch.randint(0, n, (50,), generator=g).to(device)] = -1
     results = [torch.full((count, 4), 7.0, device=device, dtype=dtype) for count in (n, n, 62, 62)]
     vec4 = KINDS[dtype][1]
-    arrays = [wp.from_torch(source, dtype=vec4), wp.from_torch(index.int()), *(wp.from_torch(t, dtype=vec4) for t in results)]
+    arrays = [
+        wp.from_torch(source, dtype=vec4),
+        wp.from_torch(index.int()),
+        *(wp.from_torch(t, dtype=vec4) for t in results),
+    ]
     wp.launch(kernel_of(dtype), n, inputs=arrays, device=arrays[0].device)
     wp.synchronize_device(arrays[0].device)
     three = source.clone()
@@ -66,16 +70,25 @@ def test_loads_stores_and_sums_are_those_of_plain_indexing(longest, dtype, devic
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp has no compiler for GPUs")
 @pytest.mark.parametrize(
-    "dtype, add, load, per_node", [(torch.float32, "add.v4.f32", "v4.f32", 1), (torch.float64, "add.f64", "v2.f64", 4)]
+    "dtype, add, load, per_node",
+    [(torch.float32, "add.v4.f32", "v4.f32", 1), (torch.float64, "add.f64", "v2.f64", 4)],
 )
-def test_the_scatter_and_gather_of_a_node_are_vector_instructions(dtype, add, load, per_node, tmp_path):
+def test_the_scatter_and_gather_of_a_node_are_vector_instructions(
+    dtype, add, load, per_node, tmp_path
+):
     """The transfers, compiled for compute capability 9.0 without a GPU: 27 nodes, no atomic that returns a value."""
     kernels = transfer_kernels(KINDS[dtype][0])
     wp.compile_aot_module(kernels.p2g.module, arch=90, module_dir=tmp_path, use_ptx=True)
     (file,) = tmp_path.glob("*.ptx")
-    entries = {re.match(r"\w+__(\w+?)_[0-9a-f]+_", part)[1]: part for part in file.read_text().split(".visible .entry ")[1:]}
+    entries = {
+        re.match(r"\w+__(\w+?)_[0-9a-f]+_", part)[1]: part
+        for part in file.read_text().split(".visible .entry ")[1:]
+    }
     adds = {name: text.count(f"red.relaxed.gpu.global.{add}") for name, text in entries.items()}
-    loads = {name: len(re.findall(rf"ld\.global\.nc\.(?:L\w+::\w+\.)*{re.escape(load)}", text)) for name, text in entries.items()}
+    loads = {
+        name: len(re.findall(rf"ld\.global\.nc\.(?:L\w+::\w+\.)*{re.escape(load)}", text))
+        for name, text in entries.items()
+    }
     assert adds["p2g"] == 27 * per_node and adds["adj_g2p"] == 27 * min(per_node, 3)
     for name in ("g2p", "adj_g2p", "adj_p2g"):
         assert loads[name] >= 27, loads

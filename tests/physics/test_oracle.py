@@ -32,7 +32,9 @@ TAKEN = {
 def parameters_of(law, data):
     known = {name: value.double() for name, value in data.items() if value.ndim == 0}
     # the files give lam = kappa - 2 mu/3, to 1e-10 of kappa
-    known["kappa"] = known["lam"] + (0.6666666666 if law == "newtonian" else 2.0 / 3.0) * known["mu"]
+    known["kappa"] = (
+        known["lam"] + (0.6666666666 if law == "newtonian" else 2.0 / 3.0) * known["mu"]
+    )
     known["viscosity"] = known.get("plastic_viscosity", torch.tensor(0.0, dtype=torch.float64))
     return {name: known[name] for name in TAKEN[law]}
 
@@ -51,7 +53,9 @@ def simulator(law, data, frame_dt=1 / 24, substeps=100, dtype=torch.float64, **o
 def start(x, v):
     n = len(x)
     eye = torch.eye(3, dtype=torch.float64).expand(n, 3, 3).contiguous()
-    return ParticleState(x.double(), v.double(), torch.zeros(n, 3, 3, dtype=torch.float64), eye, eye)
+    return ParticleState(
+        x.double(), v.double(), torch.zeros(n, 3, 3, dtype=torch.float64), eye, eye
+    )
 
 
 @pytest.mark.parametrize("name", TRAJECTORIES)
@@ -78,7 +82,9 @@ def test_trajectory(name, oracle):
     if law == "newtonian":  # the file holds J in one entry
         F, expected = torch.linalg.det(F)[:, None, None], expected[:, :1, :1]
     assert (F - expected).abs().max() < tolerance_F
-    assert (torch.linalg.svdvals(F) - torch.linalg.svdvals(expected)).abs().max() < max(1e-7, tolerance_F * 1e-2)
+    assert (torch.linalg.svdvals(F) - torch.linalg.svdvals(expected)).abs().max() < max(
+        1e-7, tolerance_F * 1e-2
+    )
     # the README offers singular values or F^T F; in the viscoplastic file 2 of 2197 particles have F^T F off by 1.4e-7
     if law != "herschel_bulkley_hencky":
         assert (F.mT @ F - expected.mT @ expected).abs().max() < max(1e-7, tolerance_F * 1e-2)
@@ -91,13 +97,17 @@ def test_trajectory_in_single_precision(name, oracle):
     law, options, _, _ = TRAJECTORIES[name]
     data, _ = oracle(name)
     state = start(data["x0"], data["v0"])
-    state = ParticleState(*(getattr(state, key).float() for key in ("x", "v", "C_affine", "F", "F_tot")))
+    state = ParticleState(
+        *(getattr(state, key).float() for key in ("x", "v", "C_affine", "F", "F_tot"))
+    )
     volume = torch.full((len(state.x),), float(data["p_vol"]))
     with torch.no_grad():
         sim = simulator(law, data, dtype=torch.float32, **options)
         x = sim.rollout(state, parameters_of(law, data), volume, 1000.0, 9).x.double()
     error = (x - data["x"][:9]).abs().amax((1, 2))
-    assert bool((error <= 10 * data["x_f32_error"][:9]).all()), (error / data["x_f32_error"][:9]).tolist()
+    assert bool((error <= 10 * data["x_f32_error"][:9]).all()), (
+        error / data["x_f32_error"][:9]
+    ).tolist()
 
 
 # file -> law, options, tolerance on tau relative to its largest entry
@@ -152,9 +162,18 @@ def test_gradient(name, oracle):
     """Loss sum(wx x_N) + sum(wv v_N) after 48 substeps in contact, against central differences through the peer's code."""
     law, options = GRADIENTS[name]
     data, meta = oracle(name)
-    known = {k: torch.tensor(v, dtype=torch.float64) for k, v in meta.items() if isinstance(v, (int, float))}
-    parameters = {k: v.clone().requires_grad_() for k, v in parameters_of(law, {**known, **data}).items()}
-    x0, shift = data["x0"].clone().requires_grad_(), torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    known = {
+        k: torch.tensor(v, dtype=torch.float64)
+        for k, v in meta.items()
+        if isinstance(v, (int, float))
+    }
+    parameters = {
+        k: v.clone().requires_grad_() for k, v in parameters_of(law, {**known, **data}).items()
+    }
+    x0, shift = (
+        data["x0"].clone().requires_grad_(),
+        torch.zeros(3, dtype=torch.float64, requires_grad=True),
+    )
     n = len(x0)
     state = start(x0, data["v0"])
     state = ParticleState(x0, data["v0"] + shift, state.C_affine, state.F, state.F_tot)
@@ -171,6 +190,11 @@ def test_gradient(name, oracle):
     assert set(compared) >= {"fd_mu", "fd_lam", "fd_v_global", "fd_dirx"}
     for key in compared:
         value = found[key]
-        fd, coarse = data[key].double(), data[f"{key}_coarse"].double() if f"{key}_coarse" in data else data[key].double()
+        fd, coarse = (
+            data[key].double(),
+            data[f"{key}_coarse"].double() if f"{key}_coarse" in data else data[key].double(),
+        )
         tolerance = max(1e-5, 10 * float(((fd - coarse).abs() / fd.abs().clamp_min(1e-30)).max()))
-        torch.testing.assert_close(value, fd, rtol=tolerance, atol=0, msg=lambda m, key=key: f"{key}: {m}")
+        torch.testing.assert_close(
+            value, fd, rtol=tolerance, atol=0, msg=lambda m, key=key: f"{key}: {m}"
+        )

@@ -42,7 +42,10 @@ def kernel_of(name: str, scalar, own: bool):
 def test_values_and_gradients_are_those_of_plain_indexing(name, dtype, device):
     """The gradient is added to what is there: an adjoint's target is rarely empty."""
     generator = torch.Generator().manual_seed(0)
-    numbers, there = (torch.randn(77, *SHAPES[name], generator=generator, dtype=torch.float64).to(device, dtype) for _ in range(2))
+    numbers, there = (
+        torch.randn(77, *SHAPES[name], generator=generator, dtype=torch.float64).to(device, dtype)
+        for _ in range(2)
+    )
     seed = torch.randn(77, generator=generator, dtype=torch.float64).to(device)
     found = []
     for own in (False, True):
@@ -51,7 +54,9 @@ def test_values_and_gradients_are_those_of_plain_indexing(name, dtype, device):
         arrays = [wp.from_torch(numbers, dtype=field), wp.from_torch(out)]
         wp.launch(kernel, 77, inputs=arrays, device=arrays[0].device)
         adjoints = [wp.from_torch(gradient, dtype=field), wp.from_torch(seed.clone())]
-        wp.launch(kernel, 77, inputs=arrays, adj_inputs=adjoints, adjoint=True, device=arrays[0].device)
+        wp.launch(
+            kernel, 77, inputs=arrays, adj_inputs=adjoints, adjoint=True, device=arrays[0].device
+        )
         wp.synchronize_device(arrays[0].device)
         found.append((out, gradient))
     for a, b in zip(*found):
@@ -61,12 +66,17 @@ def test_values_and_gradients_are_those_of_plain_indexing(name, dtype, device):
 
 def product_of(scalar, own: bool):
     """out[i] = |G[place] x[i]|^2, place: i, or 0 where there is one matrix."""
-    field, wide = wp.types.matrix(shape=(6, 6), dtype=scalar), wp.types.matrix(shape=(6, 6), dtype=wp.float64)
+    field, wide = (
+        wp.types.matrix(shape=(6, 6), dtype=scalar),
+        wp.types.matrix(shape=(6, 6), dtype=wp.float64),
+    )
     vector = wp.types.vector(length=6, dtype=wp.float64)
     times66 = particle_access(scalar, SLOTS).times66
 
     @wp.kernel(module="unique")
-    def kernel(G: wp.array(dtype=field), x: wp.array(dtype=vector), out: wp.array(dtype=wp.float64)):
+    def kernel(
+        G: wp.array(dtype=field), x: wp.array(dtype=vector), out: wp.array(dtype=wp.float64)
+    ):
         i = wp.tid()
         if wp.static(own):
             value = times66(G, i, wp.min(i, G.shape[0] - 1), x[i])
@@ -88,14 +98,27 @@ def test_a_product_with_an_operator_is_that_of_matrices(shared, dtype, device):
     def drawn(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64).to(device)
 
-    G, x, there, there_x, seed = drawn(1 if shared else 77, 6, 6), drawn(77, 6), drawn(77, 6, 6), drawn(77, 6), drawn(77)
+    G, x, there, there_x, seed = (
+        drawn(1 if shared else 77, 6, 6),
+        drawn(77, 6),
+        drawn(77, 6, 6),
+        drawn(77, 6),
+        drawn(77),
+    )
     G, there = G.to(dtype), there.to(dtype)
     found = []
     for own in (False, True):
         kernel, field, vector = product_of(SCALARS[dtype], own)
         matrices = G if own else G.expand(77, 6, 6).contiguous()
-        out, gradients = torch.zeros(77, dtype=torch.float64, device=device), [there.clone(), there_x.clone()]
-        arrays = [wp.from_torch(matrices, dtype=field), wp.from_torch(x, dtype=vector), wp.from_torch(out)]
+        out, gradients = (
+            torch.zeros(77, dtype=torch.float64, device=device),
+            [there.clone(), there_x.clone()],
+        )
+        arrays = [
+            wp.from_torch(matrices, dtype=field),
+            wp.from_torch(x, dtype=vector),
+            wp.from_torch(out),
+        ]
         wp.launch(kernel, 77, inputs=arrays, device=arrays[0].device)
         adjoints = [wp.from_torch(t, dtype=kind) for t, kind in zip(gradients, (field, vector))]
         wp.launch(kernel, 77, inputs=arrays, adj_inputs=[*adjoints, wp.from_torch(seed.clone())], adjoint=True,

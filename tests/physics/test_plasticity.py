@@ -19,7 +19,12 @@ PARAMETERS = {
     "herschel_bulkley": RATE,
     "herschel_bulkley_hencky": RATE,
 }
-UNUSED = {"von_mises": ["lam"], "drucker_prager": [], "herschel_bulkley": ["kappa"], "herschel_bulkley_hencky": ["kappa"]}
+UNUSED = {
+    "von_mises": ["lam"],
+    "drucker_prager": [],
+    "herschel_bulkley": ["kappa"],
+    "herschel_bulkley_hencky": ["kappa"],
+}
 
 
 def simulator(law, **options):
@@ -40,7 +45,9 @@ def strains(F):
 
 def trial(count=120, scale=0.3, seed=6):
     generator = torch.Generator().manual_seed(seed)
-    F = torch.eye(3).double() + scale * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3).double() + scale * torch.randn(
+        count, 3, 3, generator=generator, dtype=torch.float64
+    )
     S = torch.linalg.svdvals(F)
     return F[(torch.linalg.det(F) > 0) & (S[:, 2] > 0.1)]
 
@@ -82,7 +89,9 @@ def test_drucker_prager_return():
     assert (eps_after.sum(1) - eps.sum(1))[flowing].abs().max() < 1e-12
     assert (mapped("drucker_prager", A[~tip]) - A[~tip]).abs().max() < 1e-12
     # continuity across the tip and across first yield
-    near = torch.diag(torch.exp(torch.tensor([c, c, c]).double() + torch.tensor([1e-9, -1e-9, -2e-12]).double()))[None]
+    near = torch.diag(
+        torch.exp(torch.tensor([c, c, c]).double() + torch.tensor([1e-9, -1e-9, -2e-12]).double())
+    )[None]
     assert (mapped("drucker_prager", near) - math.exp(c) * torch.eye(3).double()).abs().max() < 1e-8
 
 
@@ -96,7 +105,10 @@ def test_zero_operator_is_the_plain_map_and_gradients(law, adapted, drawn):
     keep = [i for i, name in enumerate(names) if name in kept]
     sheared = torch.eye(3).double().repeat(3, 1, 1)
     sheared[0, 0, 1], sheared[1, 1, 2], sheared[2, 2, 0] = 0.5, 0.5, 0.5
-    F, names = torch.cat([F[keep], sheared, 0.7 * trial(40)]), [names[i] for i in keep] + ["sheared"] * 3 + ["trial"] * 40
+    F, names = (
+        torch.cat([F[keep], sheared, 0.7 * trial(40)]),
+        [names[i] for i in keep] + ["sheared"] * 3 + ["trial"] * 40,
+    )
     n = len(F)
     generator = torch.Generator().manual_seed(7)
     G = 0.1 * torch.randn(n, 6, 6, generator=generator, dtype=torch.float64)
@@ -104,18 +116,22 @@ def test_zero_operator_is_the_plain_map_and_gradients(law, adapted, drawn):
     assert torch.equal(mapped(law, F, (0 * G, 0 * h)), mapped(law, F))
     values = PARAMETERS[law]
     values = {k: torch.full((n,), v, dtype=torch.float64) for k, v in values.items()}
-    leaves = [t.clone().requires_grad_() for t in (F, *values.values(), *([G, h] if adapted else []))]
+    leaves = [
+        t.clone().requires_grad_() for t in (F, *values.values(), *([G, h] if adapted else []))
+    ]
     seed = torch.randn(F.shape, generator=generator, dtype=torch.float64)
 
     def loss(F, *rest):
         parameters = dict(zip(values, rest))
-        return (seed * mapped(law, F, rest[len(values):] or (None, None), parameters)).sum((1, 2))
+        return (seed * mapped(law, F, rest[len(values) :] or (None, None), parameters)).sum((1, 2))
 
     gradients = torch.autograd.grad(loss(*leaves).sum(), leaves)
     names_of = ["F", *values, "G", "h"]
     for i, (name, leaf) in enumerate(zip(names_of, leaves)):
         direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
-        direction = direction * min(1.0, 10 * float(leaf.detach().abs().max()))  # a small parameter takes small steps
+        direction = direction * min(
+            1.0, 10 * float(leaf.detach().abs().max())
+        )  # a small parameter takes small steps
 
         def shifted(s, i=i, direction=direction):
             moved = [t.detach() for t in leaves]
@@ -124,7 +140,10 @@ def test_zero_operator_is_the_plain_map_and_gradients(law, adapted, drawn):
 
         found = (gradients[i] * direction).reshape(n, -1).sum(1)
         scale = gradients[i].reshape(n, -1).norm(dim=1).clamp_min(1.0)
-        coarse, fine = ((8 * (shifted(s) - shifted(-s)) - (shifted(2 * s) - shifted(-2 * s))) / (12 * s) for s in (4e-4, 1e-4))
+        coarse, fine = (
+            (8 * (shifted(s) - shifted(-s)) - (shifted(2 * s) - shifted(-2 * s))) / (12 * s)
+            for s in (4e-4, 1e-4)
+        )
         # a state within a step of a kink: its two differences disagree, and there is no derivative to compare with
         smooth = (coarse - fine).abs() < 1e-6 * scale
         assert smooth.double().mean() > 0.8
@@ -156,7 +175,9 @@ def test_gradient_is_finite_at_rest(law):
 
 def test_friction_alpha():
     s = math.sin(math.radians(40.0))
-    assert float(friction_alpha(torch.tensor(40.0).double())) == pytest.approx(math.sqrt(2 / 3) * 2 * s / (3 - s))
+    assert float(friction_alpha(torch.tensor(40.0).double())) == pytest.approx(
+        math.sqrt(2 / 3) * 2 * s / (3 - s)
+    )
 
 
 @pytest.mark.parametrize("angle", [20.0, 30.0])
@@ -164,11 +185,18 @@ def test_drucker_prager_is_steeper_in_plane_strain(angle):
     """A friction angle is that of triaxial compression: sheared in plane strain until it flows, the law's stresses reach
     sin = 2 sqrt(3) sin(angle)/(3 - sin(angle)), 43.9 degrees for 30, which is what a sand column in a channel feels."""
     s = math.sin(math.radians(angle))
-    numbers = {"mu": 2e5, "lam": 3e5, "friction_alpha": math.sqrt(2 / 3) * 2 * s / (3 - s), "cohesion": 0.0}
+    numbers = {
+        "mu": 2e5,
+        "lam": 3e5,
+        "friction_alpha": math.sqrt(2 / 3) * 2 * s / (3 - s),
+        "cohesion": 0.0,
+    }
     p = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
     F = math.exp(-0.01) * torch.eye(3, dtype=torch.float64)[None]
     shear = torch.diag(torch.tensor([math.exp(-1e-4), math.exp(1e-4), 1.0], dtype=torch.float64))
     for _ in range(1000):
         F = reference.return_map("drucker_prager", shear @ F, p)
     first, second, _ = reference.stress("drucker_prager", F, p)[0].diagonal().tolist()
-    assert (second - first) / -(first + second) == pytest.approx(2 * math.sqrt(3) * s / (3 - s), rel=2e-3)
+    assert (second - first) / -(first + second) == pytest.approx(
+        2 * math.sqrt(3) * s / (3 - s), rel=2e-3
+    )

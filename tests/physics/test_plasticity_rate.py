@@ -15,7 +15,9 @@ RADIUS = (2 / 3) ** 0.5 * YIELD
 
 
 def mapped(law, F, viscosity, **options):
-    sim = Simulator(law, dx=0.1, substeps=1, frame_dt=DT, dtype=torch.float64, options=LawOptions(**options))
+    sim = Simulator(
+        law, dx=0.1, substeps=1, frame_dt=DT, dtype=torch.float64, options=LawOptions(**options)
+    )
     parameters = {"mu": MU, "kappa": KAPPA, "yield_stress": YIELD, "viscosity": viscosity}
     return first_advance(sim.numerics, F, torch.zeros_like(F), sim.pack(parameters, len(F)))
 
@@ -33,9 +35,11 @@ def trials(drawn):
     """Trial gradients with J > 0 and S above the clamp: special singular values, generic ones, and barely deformed ones."""
     _, F = drawn
     generator = torch.Generator().manual_seed(6)
-    free = torch.eye(3).double() + torch.randn(80, 3, 3, generator=generator, dtype=torch.float64) * torch.tensor(
-        [0.3, 0.04]
-    ).double().repeat(40)[:, None, None]
+    free = (
+        torch.eye(3).double()
+        + torch.randn(80, 3, 3, generator=generator, dtype=torch.float64)
+        * torch.tensor([0.3, 0.04]).double().repeat(40)[:, None, None]
+    )
     F = torch.cat([F, free])
     return F[(torch.linalg.det(F) > 0) & (torch.linalg.svdvals(F)[:, 2] > 0.055)]
 
@@ -72,7 +76,9 @@ def test_stretches_are_those_of_the_papers_cubic(trials):
     """b_bar_i = d_i + beta, beta the largest real root of the cubic, S_i = J^(1/3) sqrt(b_bar_i)."""
     viscosity = 5e-3
     A = mapped("herschel_bulkley", trials, viscosity)
-    fraction = 1 - (1 - RADIUS / norm("herschel_bulkley", trials)).clamp_min(0) / (1 + viscosity / (2 * MU * DT))
+    fraction = 1 - (1 - RADIUS / norm("herschel_bulkley", trials)).clamp_min(0) / (
+        1 + viscosity / (2 * MU * DT)
+    )
     yielded = 0
     for F, found, c in zip(trials, A, fraction):
         J, S = float(torch.linalg.det(F)), torch.linalg.svdvals(F).numpy()
@@ -81,7 +87,9 @@ def test_stretches_are_those_of_the_papers_cubic(trials):
         roots = np.roots([1.0, 0.0, d[0] * d[1] + d[0] * d[2] + d[1] * d[2], d.prod() - 1.0])
         beta = max(root.real for root in roots if abs(root.imag) < 1e-9)
         expected = J ** (1 / 3) * np.sqrt(d + beta)
-        np.testing.assert_allclose(torch.linalg.svdvals(found).numpy(), expected, rtol=1e-9)  # np.roots near double roots
+        np.testing.assert_allclose(
+            torch.linalg.svdvals(found).numpy(), expected, rtol=1e-9
+        )  # np.roots near double roots
         yielded += float(c) < 1
     assert yielded > 20
 
@@ -92,7 +100,9 @@ def test_inverted_particles_are_survived_or_named(drawn):
     F = F[[i for i, name in enumerate(names) if name.startswith("inverted")]]
     assert torch.equal(mapped("herschel_bulkley", F, 0.0), F)
     A = mapped("herschel_bulkley_hencky", F, 0.0)
-    assert bool(torch.isfinite(A).all()) and bool((torch.linalg.det(A) > 0).all())  # the clamp at 0.05 turns them back
+    assert bool(torch.isfinite(A).all()) and bool(
+        (torch.linalg.det(A) > 0).all()
+    )  # the clamp at 0.05 turns them back
 
 
 @pytest.mark.parametrize("law", LAWS)

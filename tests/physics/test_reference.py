@@ -13,8 +13,15 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 MU, LAM, DENSITY, DX, DT = 4e4, 6e4, 1000.0, 0.04, 4e-4
-EXTRA = {"von_mises": {"yield_stress": 2e3}, "drucker_prager": {"friction_alpha": 0.3, "cohesion": 0.01}}
-PLANES = [Plane((0, 0.02, 0), (0, 1, 0), "separate", 0.4), Plane((0.08, 0, 0), (1, 0, 0), "slip"), Plane((0, 0, 0), (0, 1, 0))]
+EXTRA = {
+    "von_mises": {"yield_stress": 2e3},
+    "drucker_prager": {"friction_alpha": 0.3, "cohesion": 0.01},
+}
+PLANES = [
+    Plane((0, 0.02, 0), (0, 1, 0), "separate", 0.4),
+    Plane((0.08, 0, 0), (1, 0, 0), "slip"),
+    Plane((0, 0, 0), (0, 1, 0)),
+]
 
 
 def drawn_operator(n, seed=3, scale=0.1):
@@ -27,21 +34,34 @@ def drawn_operator(n, seed=3, scale=0.1):
 
 
 @pytest.mark.parametrize("adapted", [False, True])
-@pytest.mark.parametrize("law", ["linear", "neo_hookean", "corotated", "stvk", "stvk_paper", "von_mises", "drucker_prager"])
+@pytest.mark.parametrize(
+    "law",
+    ["linear", "neo_hookean", "corotated", "stvk", "stvk_paper", "von_mises", "drucker_prager"],
+)
 def test_twin(law, adapted, make_block):
     state = make_block(velocity=(0.5, -1.0, 0.2))
-    if law == "drucker_prager":  # compressed: the tip leaves equal singular values, where the twin has no gradient
+    if (
+        law == "drucker_prager"
+    ):  # compressed: the tip leaves equal singular values, where the twin has no gradient
         state = replace(state, F=0.94 * state.F)
     n = len(state.x)
     leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
     started = ParticleState(*leaves, leaves[3])
     volume = torch.full((n,), 0.02**3, dtype=torch.float64)
     parameters = {"mu": MU, "lam": LAM, **EXTRA.get(law, {})}
-    parameters = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in parameters.items()}
+    parameters = {
+        k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in parameters.items()
+    }
     operator = drawn_operator(n) if adapted else None
     steps = 4
     sim = Simulator(
-        law, dx=DX, substeps=steps, frame_dt=steps * DT, gravity=(0.3, -9.8, 0.0), planes=PLANES, dtype=torch.float64
+        law,
+        dx=DX,
+        substeps=steps,
+        frame_dt=steps * DT,
+        gravity=(0.3, -9.8, 0.0),
+        planes=PLANES,
+        dtype=torch.float64,
     )
     rollout = sim.rollout(started, parameters, volume, DENSITY, 2, adapter=(lambda _: operator) if adapted else None,
                           stride=steps, started=True)  # fmt: skip
@@ -58,16 +78,22 @@ def test_twin(law, adapted, make_block):
     names = ("x", "v", "C_affine", "F", "F_tot")
     for name in names:
         value, expected = getattr(rollout.final, name).detach(), getattr(twin, name).detach()
-        assert (value - expected).abs().max() < 1e-12 * steps * max(1.0, float(expected.abs().max())), name
+        assert (value - expected).abs().max() < 1e-12 * steps * max(
+            1.0, float(expected.abs().max())
+        ), name
 
     generator = torch.Generator().manual_seed(1)
-    weights = {name: torch.randn(getattr(twin, name).shape, generator=generator).double() for name in names}
+    weights = {
+        name: torch.randn(getattr(twin, name).shape, generator=generator).double() for name in names
+    }
 
     def gradient(final):
         loss = sum((weights[name] * getattr(final, name)).sum() for name in names)
         return torch.autograd.grad(loss, [*leaves, *parameters.values()])
 
-    for name, found, expected in zip(("x", "v", "C_affine", "F", *parameters), gradient(rollout.final), gradient(twin)):
+    for name, found, expected in zip(
+        ("x", "v", "C_affine", "F", *parameters), gradient(rollout.final), gradient(twin)
+    ):
         assert (found - expected).abs().max() < 1e-9 * expected.abs().max(), name
         # cohesion acts at the tip of the cone and through tr(eps) - 3c
         assert float(expected.abs().max()) > 0, name
@@ -78,9 +104,19 @@ def test_densities_per_particle(make_block):
     state = make_block(velocity=(0.5, -1.0, 0.2))
     n, steps = len(state.x), 4
     volume = torch.full((n,), 0.02**3, dtype=torch.float64)
-    parameters = {"mu": torch.tensor(MU, dtype=torch.float64), "lam": torch.tensor(LAM, dtype=torch.float64)}
+    parameters = {
+        "mu": torch.tensor(MU, dtype=torch.float64),
+        "lam": torch.tensor(LAM, dtype=torch.float64),
+    }
     halves = torch.where(state.x[:, 0] > state.x[:, 0].median(), 300.0, 3000.0).double()
-    sim = Simulator("neo_hookean", dx=DX, substeps=steps, frame_dt=steps * DT, planes=PLANES, dtype=torch.float64)
+    sim = Simulator(
+        "neo_hookean",
+        dx=DX,
+        substeps=steps,
+        frame_dt=steps * DT,
+        planes=PLANES,
+        dtype=torch.float64,
+    )
 
     def final(density):
         return sim.rollout(state, parameters, volume, density, 2, started=True).final
@@ -91,7 +127,9 @@ def test_densities_per_particle(make_block):
                                  planes=PLANES)  # fmt: skip
     for name in ("x", "v", "C_affine", "F"):
         value, expected = getattr(final(halves), name), getattr(twin, name)
-        assert (value - expected).abs().max() < 1e-12 * steps * max(1.0, float(expected.abs().max())), name
+        assert (value - expected).abs().max() < 1e-12 * steps * max(
+            1.0, float(expected.abs().max())
+        ), name
     assert torch.equal(final(torch.full((n,), DENSITY, dtype=torch.float64)).x, final(DENSITY).x)
     assert (final(halves).v - final(DENSITY).v).abs().max() > 1e-3
 
@@ -105,4 +143,6 @@ def test_a_density_that_cannot_be(density, message, make_block):
     volume = torch.full((len(state.x),), 0.02**3, dtype=torch.float64)
     sim = Simulator("neo_hookean", dx=DX, substeps=4, frame_dt=4 * DT, dtype=torch.float64)
     with pytest.raises(ConfigError, match=message):
-        sim.rollout(state, {"mu": MU, "lam": LAM}, volume, -volume if density is None else density, 2)
+        sim.rollout(
+            state, {"mu": MU, "lam": LAM}, volume, -volume if density is None else density, 2
+        )

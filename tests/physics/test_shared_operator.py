@@ -15,17 +15,31 @@ def results(state, rows: bool, device, dtype, *, strain, worlds, stride):
     n = len(state.x)
     g = torch.Generator().manual_seed(0)
     G, h = (torch.randn(6, *s, generator=g, dtype=torch.float64) for s in ((6,), ()))
-    G, h = ((scale * t).to(device=device, dtype=dtype).requires_grad_() for t, scale in ((G, 0.05), (h, 0.02 if strain else 1e3)))
+    G, h = (
+        (scale * t).to(device=device, dtype=dtype).requires_grad_()
+        for t, scale in ((G, 0.05), (h, 0.02 if strain else 1e3))
+    )
     mu = torch.full((), 4e4, device=device, dtype=dtype, requires_grad=True)
 
     def adapter(given):
         views = G.expand(len(given.w), 6, 6), h.expand(len(given.w), 6)
         return AdapterOperator(*(view.contiguous() if rows else view for view in views))
 
-    sim = Simulator("corotated", dx=0.04, substeps=10, frame_dt=4e-3, ground=Ground(0.0), dtype=dtype, device=device, strain=strain)
+    sim = Simulator(
+        "corotated",
+        dx=0.04,
+        substeps=10,
+        frame_dt=4e-3,
+        ground=Ground(0.0),
+        dtype=dtype,
+        device=device,
+        strain=strain,
+    )
     volume = torch.full((n,), 8e-6, device=device, dtype=dtype)
     start = ParticleState.stack([state] * worlds) if worlds else state
-    rollout = sim.rollout(start, {"mu": mu, "lam": 5e4}, volume, 1000.0, 3, adapter=adapter, stride=stride)
+    rollout = sim.rollout(
+        start, {"mu": mu, "lam": 5e4}, volume, 1000.0, 3, adapter=adapter, stride=stride
+    )
     gradients = torch.autograd.grad((rollout.x**2).sum() + (rollout.F**2).sum(), [G, h, mu])
     return sim, [rollout.x.detach(), *gradients]
 
@@ -34,7 +48,9 @@ def results(state, rows: bool, device, dtype, *, strain, worlds, stride):
 @pytest.mark.parametrize("worlds", [None, 2])
 @pytest.mark.parametrize("strain", [None, "green", "hencky"])
 @pytest.mark.parametrize("stride", [None, 4])
-def test_one_row_gives_the_bits_of_a_row_for_each_particle(dtype, worlds, strain, stride, make_block):
+def test_one_row_gives_the_bits_of_a_row_for_each_particle(
+    dtype, worlds, strain, stride, make_block
+):
     """Positions, and gradients: each particle adds to its own row of them, whatever it read."""
     options = {"strain": strain, "worlds": worlds, "stride": stride}
     found = [results(make_block(n=3), rows, "cpu", dtype, **options) for rows in (True, False)]
@@ -51,7 +67,9 @@ def test_one_row_gives_the_bits_of_a_row_for_each_particle(dtype, worlds, strain
 def test_one_row_on_a_gpu(dtype, tolerance, worlds, strain, make_block):
     """Within the order of the grid's sums, as `test_cuda`."""
     options = {"strain": strain, "worlds": worlds, "stride": None}
-    each, shared = (results(make_block(n=6), rows, "cuda", dtype, **options)[1] for rows in (True, False))
+    each, shared = (
+        results(make_block(n=6), rows, "cuda", dtype, **options)[1] for rows in (True, False)
+    )
     for a, b in zip(each, shared):
         assert (a - b).abs().max() <= tolerance * max(1.0, float(a.abs().max()))
 
@@ -60,7 +78,9 @@ def test_large_states_are_copied_one_tensor_at_a_time(make_block, monkeypatch):
     found = []
     for large in (2**40, 0):
         monkeypatch.setattr("mosa.physics.engine.workspace.LARGE", large)
-        sim, values = results(make_block(n=3), False, "cpu", torch.float64, strain="green", worlds=None, stride=None)
+        sim, values = results(
+            make_block(n=3), False, "cpu", torch.float64, strain="green", worlds=None, stride=None
+        )
         kinds = {work._large for work in sim.buffers}
         assert kinds == {large == 0}
         found.append(values)

@@ -27,7 +27,9 @@ KINDS = (0, 0, 3, 2, 1, 0)
 def launch(F, parameters, G, strain, seed=None):
     """tau (N, 3, 3) of the stress kernel, or gradients of sum(seed tau) in F, parameters and G. strain: None for an operator."""
     law, kinds = law_named(LAW), field_types(wp.float64)
-    kernel = stress_kernel(law.stress, law.uses_rotation, wp.float64, True, strain, law.offsets["mu"])
+    kernel = stress_kernel(
+        law.stress, law.uses_rotation, wp.float64, True, strain, law.offsets["mu"]
+    )
     tensors = [F, torch.zeros_like(F), parameters, G, F.new_zeros(len(F), 6), torch.empty_like(F)]
     arrays = [wp.from_torch(t.contiguous(), dtype=kinds[k]) for t, k in zip(tensors, KINDS)]
     if seed is None:
@@ -43,7 +45,9 @@ def inputs(F, seed=1):
     """(parameters (N, SLOTS), S (N, 6, 6)) of as many particles, drawn: another mu, lam and S for each."""
     generator = torch.Generator().manual_seed(seed)
     parameters = torch.zeros(len(F), SLOTS, dtype=torch.float64)
-    parameters[:, :2] = torch.tensor([MU, LAM]) * (0.5 + torch.rand(len(F), 2, generator=generator, dtype=torch.float64))
+    parameters[:, :2] = torch.tensor([MU, LAM]) * (
+        0.5 + torch.rand(len(F), 2, generator=generator, dtype=torch.float64)
+    )
     A = 0.3 * torch.randn(len(F), 6, 6, generator=generator, dtype=torch.float64)
     return parameters, A + A.mT
 
@@ -51,7 +55,9 @@ def inputs(F, seed=1):
 def drawn_gradients(count=200, size=0.3, seed=0):
     """F (N, 3, 3) with det F > 0.15 whose squared stretches are at least 1e-3 apart: the twin's eigenvectors need it."""
     generator = torch.Generator().manual_seed(seed)
-    F = torch.eye(3).double() + size * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3).double() + size * torch.randn(
+        count, 3, 3, generator=generator, dtype=torch.float64
+    )
     gaps = torch.linalg.svdvals(F).square().diff(dim=1).abs().amin(1)
     return F[(torch.linalg.det(F) > 0.15) & (gaps > 1e-3)]
 
@@ -59,7 +65,10 @@ def drawn_gradients(count=200, size=0.3, seed=0):
 def turned(stretches, seed=3):
     """U diag(stretches) V^T with drawn rotations."""
     generator = torch.Generator().manual_seed(seed)
-    U, V = (torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q for _ in range(2))
+    U, V = (
+        torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+        for _ in range(2)
+    )
     F = U @ torch.diag(torch.tensor(stretches, dtype=torch.float64)) @ V.T
     return F * torch.sign(torch.linalg.det(F))
 
@@ -92,9 +101,13 @@ def exact_added_stress(measure, F, mu, S):
                 E = (C - mpmath.eye(3)) / 2
             else:
                 values, V = mpmath.eigsy(C)
-                e = [mpmath.log(v) / 2 if measure == "hencky" else mpmath.sqrt(v) - 1 for v in values]
+                e = [
+                    mpmath.log(v) / 2 if measure == "hencky" else mpmath.sqrt(v) - 1 for v in values
+                ]
                 E = V * mpmath.diag(e) * V.T
-            vector = mpmath.matrix([E[0, 0], E[1, 1], E[2, 2], root * E[1, 2], root * E[2, 0], root * E[0, 1]])
+            vector = mpmath.matrix(
+                [E[0, 0], E[1, 1], E[2, 2], root * E[1, 2], root * E[2, 0], root * E[0, 1]]
+            )
             return mpf(mu) * (vector.T * Sm * vector)[0]
 
         P, h = mpmath.matrix(3, 3), mpf(10) ** -20
@@ -104,7 +117,9 @@ def exact_added_stress(measure, F, mu, S):
                 step[i, j] = h
                 P[i, j] = (energy(F0 + step) - energy(F0 - step)) / (2 * h)
         tau = P * F0.T
-        return torch.tensor([[float(tau[i, j]) for j in range(3)] for i in range(3)], dtype=torch.float64)
+        return torch.tensor(
+            [[float(tau[i, j]) for j in range(3)] for i in range(3)], dtype=torch.float64
+        )
 
 
 @pytest.mark.parametrize("measure", STRAINS)
@@ -130,7 +145,10 @@ def test_equal_and_nearly_equal_stretches_are_exact(measure, name):
     expected = exact_added_stress(measure, F[0], float(parameters[0, 0]), S[0])
     # rounding of stretches and of products of six matrices, of numbers of size one
     assert (found[0] - expected).abs().max() < 2e-14
-    assert name in ("identity", "1e-12 apart", "1e-6 apart", "1e-3 apart") or expected.abs().max() > 1e-3
+    assert (
+        name in ("identity", "1e-12 apart", "1e-6 apart", "1e-3 apart")
+        or expected.abs().max() > 1e-3
+    )
 
 
 def test_an_isotropic_dilation_in_closed_form():
@@ -154,18 +172,27 @@ def test_the_adjoint_is_that_of_differences(measure):
     F = torch.cat([drawn_gradients(), torch.stack(list(SPECIAL.values()))])
     parameters, S = inputs(F)
     generator = torch.Generator().manual_seed(7)
-    seed, dF, dS = (torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in (F, F, S))
+    seed, dF, dS = (
+        torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in (F, F, S)
+    )
     dp = torch.zeros_like(parameters)
     dp[:, :2] = torch.randn(len(F), 2, generator=generator, dtype=torch.float64)
 
     for direction in ((dF, 0, 0), (0, dp, 0), (0, 0, dS)):
+
         def at(t, d=direction):
-            return (launch(F + t * d[0], parameters + t * d[1], S + t * d[2], measure) * seed).sum((1, 2))
+            return (launch(F + t * d[0], parameters + t * d[1], S + t * d[2], measure) * seed).sum(
+                (1, 2)
+            )
 
         h = 2e-4
         difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
         gradients = launch(F, parameters, S, measure, seed)
-        slope = sum((g * d).flatten(1).sum(1) for g, d in zip(gradients, direction) if isinstance(d, torch.Tensor))
+        slope = sum(
+            (g * d).flatten(1).sum(1)
+            for g, d in zip(gradients, direction)
+            if isinstance(d, torch.Tensor)
+        )
         # fourth order: h^4 times a fifth derivative that the smallest stretch s makes of size s^-6; rounding 1e-16/h
         smallest = torch.linalg.svdvals(F)[:, -1].clamp(max=1.0)
         allowed = 1e-10 + 50 * h**4 * smallest**-6
@@ -180,7 +207,9 @@ def test_objectivity(measure, rotations):
     Q = rotations[: len(F)]
     parameters, S = inputs(F)
     tau = launch(F, parameters, S, measure)
-    assert (launch(Q @ F, parameters, S, measure) - Q @ tau @ Q.mT).abs().max() < 1e-12 * tau.abs().max()
+    assert (
+        launch(Q @ F, parameters, S, measure) - Q @ tau @ Q.mT
+    ).abs().max() < 1e-12 * tau.abs().max()
     frame = mandel_rotation(Q)
     inward = launch(F @ Q.mT, parameters, frame @ S @ frame.mT, measure)
     assert (inward - tau).abs().max() < 1e-12 * tau.abs().max()
@@ -232,14 +261,20 @@ def test_a_closed_loop_of_strain_does_no_work(size):
 def test_a_linear_operator_on_the_prior_s_stress_gains_work():
     """The control: entries of 0.1 with major symmetry, at the same loops. It has an energy to first order in the strain only."""
     torch.manual_seed(0)
-    adapter = StressAdapter(alpha=0.2, state_dependence="constant", major_symmetry=True, no_pre=True, no_post=True).double()
+    adapter = StressAdapter(
+        alpha=0.2, state_dependence="constant", major_symmetry=True, no_pre=True, no_post=True
+    ).double()
     adapter.switch_on(1.0, NU)
     with torch.no_grad():
-        adapter.operator.free.copy_(torch.where(torch.rand(4, 12) < 0.5, -1.0, 1.0) * torch.atanh(torch.tensor(0.5)) / 10)
+        adapter.operator.free.copy_(
+            torch.where(torch.rand(4, 12) < 0.5, -1.0, 1.0) * torch.atanh(torch.tensor(0.5)) / 10
+        )
         w = torch.zeros(1, 6).double()
         G = adapter(MaterialState(w, w)).G[0]
     works = [loop_work(None, G, size) for size in (0.02, 0.1, 0.3)]
-    assert works[0] > 1e-4 and works[1] > 1e-3 and works[2] > 0.02, works  # 1e-6 is what a law with an energy is allowed
+    assert works[0] > 1e-4 and works[1] > 1e-3 and works[2] > 0.02, (
+        works
+    )  # 1e-6 is what a law with an energy is allowed
 
 
 def simulator(law, **options):
@@ -247,11 +282,17 @@ def simulator(law, **options):
 
 
 def test_unknown_measures_and_laws_without_a_shear_modulus_are_refused():
-    with pytest.raises(ConfigError, match="strain: expected one of hencky, biot, green or None, found 'almansi'"):
+    with pytest.raises(
+        ConfigError, match="strain: expected one of hencky, biot, green or None, found 'almansi'"
+    ):
         simulator(LAW, strain="almansi")
-    with pytest.raises(ConfigError, match=r"adapter\.strain: expected hencky or biot or green, found 'almansi'"):
+    with pytest.raises(
+        ConfigError, match=r"adapter\.strain: expected hencky or biot or green, found 'almansi'"
+    ):
         HyperelasticAdapter(strain="almansi")
-    with pytest.raises(ConfigError, match="shear modulus mu, found 'newtonian'"):  # whose mu is a viscosity
+    with pytest.raises(
+        ConfigError, match="shear modulus mu, found 'newtonian'"
+    ):  # whose mu is a viscosity
         simulator("newtonian", strain="green")
     with pytest.raises(ConfigError, match=r"shear modulus mu, found .corotated\+newtonian."):
         simulator("corotated+newtonian", strain="green")

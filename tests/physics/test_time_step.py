@@ -15,7 +15,9 @@ def test_bounds():
     arguments = {"modulus_max": 4e5, "density": 1000.0, "frame_dt": 0.02, "dx": 0.03}
     assert wave_speed(4e5, 1000.0) == 20.0
     count = required_substeps(**arguments, v_max=1.0)
-    assert 20.0 * 0.02 / count / 0.03 <= 0.6 < 20.0 * 0.02 / (count - 1) / 0.03  # the Courant number c dt/dx
+    assert (
+        20.0 * 0.02 / count / 0.03 <= 0.6 < 20.0 * 0.02 / (count - 1) / 0.03
+    )  # the Courant number c dt/dx
     assert required_substeps(**arguments, v_max=1.0, factor=4.0) in (2 * count - 1, 2 * count)
     fast = required_substeps(**arguments, v_max=1e3)
     assert 1e3 * 0.02 / fast <= 0.5 * 0.03 < 1e3 * 0.02 / (fast - 1)
@@ -43,13 +45,28 @@ def test_a_viscous_fluid_needs_the_viscous_bound(make_block):
     """Noise on a fluid of 1 kPa s: it decays at the bound's step, and grows without limit at that of the sound speed alone."""
     state = make_block(velocity=(0.0, 0.0, 0.0))
     dx, frame_dt, mu, kappa, density = 0.04, 0.05, 1e3, 1e2, 1000.0
-    bound = {"modulus_max": 7 * kappa, "density": density, "frame_dt": frame_dt, "dx": dx, "v_max": 1.0}
+    bound = {
+        "modulus_max": 7 * kappa,
+        "density": density,
+        "frame_dt": frame_dt,
+        "dx": dx,
+        "v_max": 1.0,
+    }
     sound, both = required_substeps(**bound), required_substeps(**bound, viscosity=mu)
     waves = wave_speed(7 * kappa, density) / (0.6 * dx)
-    assert both == math.ceil(frame_dt * (waves + mu / (VISCOUS_NUMBER * density * dx**2))) > 5 * sound
+    assert (
+        both == math.ceil(frame_dt * (waves + mu / (VISCOUS_NUMBER * density * dx**2))) > 5 * sound
+    )
     speeds = {}
     for count in (sound, both):
-        sim = Simulator("newtonian", dx=dx, substeps=count, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64)
+        sim = Simulator(
+            "newtonian",
+            dx=dx,
+            substeps=count,
+            frame_dt=frame_dt,
+            gravity=(0, 0, 0),
+            dtype=torch.float64,
+        )
         F = torch.eye(3, dtype=torch.float64).expand_as(state.F).contiguous()
         start = type(state)(state.x, state.v, 0 * state.C_affine, F, F)
         volume = torch.full((len(state.x),), 0.02**3, dtype=torch.float64)
@@ -68,6 +85,8 @@ def test_materials_give_the_step_physical_values():
     fluid = Material("newtonian", {"mu": 100.0, "kappa": 1e5})
     assert float(fluid.max_viscosity()) == pytest.approx(100.0, rel=1e-6)
     assert float(fluid.max_viscosity(torch.tensor([0.8, 1.2]))) == pytest.approx(120.0, rel=1e-6)
-    paste = Material("herschel_bulkley", {"mu": 3e4, "kappa": 2e5, "yield_stress": 2e3, "viscosity": 10.0})
+    paste = Material(
+        "herschel_bulkley", {"mu": 3e4, "kappa": 2e5, "yield_stress": 2e3, "viscosity": 10.0}
+    )
     assert float(paste.max_viscosity()) == 0.0
     assert float(paste.max_modulus()) == pytest.approx(2.4e5, rel=1e-6)

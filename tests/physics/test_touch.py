@@ -19,7 +19,9 @@ GPU = pytest.param("cuda", marks=pytest.mark.gpu)
 def turned(axis, degrees: float) -> torch.Tensor:
     axis = torch.tensor(axis, dtype=torch.float64)
     x, y, z = (axis / axis.norm() * math.radians(degrees)).tolist()
-    return torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64))
+    return torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    )
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
@@ -33,26 +35,43 @@ def test_twin(friction, device, make_block):
     leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
     started, steps = ParticleState(*leaves, leaves[3]), 6
     volume = torch.full((len(state.x),), 0.02**3, dtype=torch.float64)
-    parameters = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in (("mu", MU), ("lam", LAM))}
+    parameters = {
+        k: torch.tensor(v, dtype=torch.float64, requires_grad=True)
+        for k, v in (("mu", MU), ("lam", LAM))
+    }
     sim = Simulator("neo_hookean", dx=DX, substeps=steps, frame_dt=steps * DT, gravity=(0.3, -9.8, 0.0), planes=planes,
                     dtype=torch.float64, device=device)  # fmt: skip
-    there = ParticleState(*(getattr(started, n).to(device) for n in ("x", "v", "C_affine", "F", "F_tot")))
+    there = ParticleState(
+        *(getattr(started, n).to(device) for n in ("x", "v", "C_affine", "F", "F_tot"))
+    )
     values = {k: p.to(device) for k, p in parameters.items()}
     found = sim.rollout(there, values, volume.to(device), DENSITY, 2, started=True).final
     twin = started
     for _ in range(steps):
         twin = reference.substep("neo_hookean", twin, parameters, volume, DENSITY, dx=DX, dt=DT, gravity=(0.3, -9.8, 0.0),
                                  planes=planes)  # fmt: skip
-    free = Simulator("neo_hookean", dx=DX, substeps=steps, frame_dt=steps * DT, gravity=(0.3, -9.8, 0.0), dtype=torch.float64)
+    free = Simulator(
+        "neo_hookean",
+        dx=DX,
+        substeps=steps,
+        frame_dt=steps * DT,
+        gravity=(0.3, -9.8, 0.0),
+        dtype=torch.float64,
+    )
     missed = free.rollout(state, {"mu": MU, "lam": LAM}, volume, DENSITY, 2, started=True).final
     assert (missed.v - twin.v.detach()).abs().max() > 0.1  # the planes act
     generator, losses = torch.Generator().manual_seed(1), []
-    weights = {name: torch.randn(getattr(twin, name).shape, generator=generator).double() for name in ("x", "v", "C_affine", "F")}
+    weights = {
+        name: torch.randn(getattr(twin, name).shape, generator=generator).double()
+        for name in ("x", "v", "C_affine", "F")
+    }
     for final in (found, twin):
         losses.append(sum((weights[name] * getattr(final, name).cpu()).sum() for name in weights))
     for name in weights:
         value, expected = getattr(found, name).detach().cpu(), getattr(twin, name).detach()
-        assert (value - expected).abs().max() < 1e-12 * steps * max(1.0, float(expected.abs().max())), name
+        assert (value - expected).abs().max() < 1e-12 * steps * max(
+            1.0, float(expected.abs().max())
+        ), name
     gradients = [torch.autograd.grad(loss, [*leaves, *parameters.values()]) for loss in losses]
     for name, ours, expected in zip(("x", "v", "C_affine", "F", *parameters), *gradients):
         assert (ours - expected).abs().max() < 1e-9 * expected.abs().max(), name
@@ -68,7 +87,9 @@ def test_what_slides_loses_friction_times_what_it_is_given_upwards(make_block):
     sim = Simulator("neo_hookean", dx=DX, substeps=substeps, frame_dt=substeps * DT, gravity=(0.0, -9.8, 0.0), planes=[plane],
                     dtype=torch.float64)  # fmt: skip
     volume = torch.full((len(state.x),), 0.02**3, dtype=torch.float64)
-    v = sim.rollout(state, {"mu": MU, "lam": LAM}, volume, DENSITY, frames + 1, started=True).v.mean(1)
+    v = sim.rollout(
+        state, {"mu": MU, "lam": LAM}, volume, DENSITY, frames + 1, started=True
+    ).v.mean(1)
     given = v[-1, 1] - v[0, 1] + 9.8 * frames * substeps * DT
     assert float(given) > 0.1
     assert float(v[0, 0] - v[-1, 0]) == pytest.approx(friction * float(given), rel=5e-4)
@@ -82,7 +103,9 @@ def test_worlds_are_single_rollouts(make_block):
     sim = Simulator("neo_hookean", dx=DX, substeps=10, frame_dt=10 * DT, planes=[Plane((0, low, 0), (0, 1, 0), "touch", 0.5)],
                     dtype=torch.float64)  # fmt: skip
     moduli = [MU, 2 * MU, 3 * MU]  # each world has springs of its own
-    alone = [sim.rollout(s, {"mu": mu, "lam": LAM}, volume, DENSITY, 4) for s, mu in zip(starts, moduli)]
+    alone = [
+        sim.rollout(s, {"mu": mu, "lam": LAM}, volume, DENSITY, 4) for s, mu in zip(starts, moduli)
+    ]
     names = ("x", "v", "C_affine", "F", "F_tot")
     together = sim.rollout(ParticleState(*(torch.stack([getattr(s, n) for s in starts]) for n in names)),
                            {"mu": torch.tensor(moduli, dtype=torch.float64)[:, None], "lam": LAM}, volume, DENSITY, 4)  # fmt: skip
@@ -96,8 +119,13 @@ def bottle(count: int) -> tuple[torch.Tensor, float]:
     radii = torch.tensor([0.0775, 0.085, 0.088, 0.07, 0.045, 0.0422], dtype=torch.float64)
     s = (0.00462 / count) ** (1 / 3)  # its volume
     axis = torch.arange(-0.1 + s / 2, 0.1, s, dtype=torch.float64)
-    x = torch.cartesian_prod(axis, axis, torch.arange(-0.145 + s / 2, 0.145, s, dtype=torch.float64))
-    x = x + s * (0.4 * torch.rand(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.2)
+    x = torch.cartesian_prod(
+        axis, axis, torch.arange(-0.145 + s / 2, 0.145, s, dtype=torch.float64)
+    )
+    x = x + s * (
+        0.4 * torch.rand(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        - 0.2
+    )
     above = torch.searchsorted(heights, x[:, 2].contiguous().clamp(-0.1449, 0.1449))
     share = (x[:, 2] - heights[above - 1]) / (heights[above] - heights[above - 1])
     inside = x[:, :2].norm(dim=1) < torch.lerp(radii[above - 1], radii[above], share)
@@ -132,5 +160,7 @@ def test_grip_holds_without_a_kick_back(make_block):
     """At any friction what is taken is at most GRIP of a particle's own sliding velocity."""
     x, v = torch.tensor([[0.0, 0.0, 0.0]]).double(), torch.tensor([[1.0, -1.0, 0.0]]).double()
     one = torch.ones(1).double()
-    after = reference.meet(x, v, [Plane((0, 0, 0), (0, 1, 0), "touch", 1e9)], 1e-6 * one, 1e6 * one, 1e-4)
+    after = reference.meet(
+        x, v, [Plane((0, 0, 0), (0, 1, 0), "touch", 1e9)], 1e-6 * one, 1e6 * one, 1e-4
+    )
     torch.testing.assert_close(after[0, 0], (1 - GRIP) * v[0, 0])

@@ -14,7 +14,11 @@ class Inside:
     """A thread that enters a turn, says so, and leaves when it is told."""
 
     def __init__(self, turn):
-        self.entered, self.leave, self.left = threading.Event(), threading.Event(), threading.Event()
+        self.entered, self.leave, self.left = (
+            threading.Event(),
+            threading.Event(),
+            threading.Event(),
+        )
         self.begun = threading.Event()
         self.thread = threading.Thread(target=self.run, args=(turn,), daemon=True)
         self.thread.start()
@@ -48,7 +52,9 @@ def test_a_capture_is_alone(waiting):
     capture = Inside(turns.capturing)
     assert capture.entered.wait(LONG)
     other = Inside(getattr(turns, waiting))
-    with turns._changed:  # nobody is counted as inside, and while the lock is held nobody can be about to be
+    with (
+        turns._changed
+    ):  # nobody is counted as inside, and while the lock is held nobody can be about to be
         assert turns._launching == 0 and turns._capturing == capture.thread.ident
     assert not other.entered.is_set()
     capture.end()

@@ -59,14 +59,21 @@ def bar(cells: int, *, across: int = 2, along: int = 8, embedded: float = EMBEDD
     tip = [0.0]
     with torch.no_grad():
         for frame in range(1, frames):  # one frame at a time: a rollout keeps all frames
-            state = sim.rollout(state, {"mu": MU, "lam": LAM}, volume, BAR_DENSITY, 2, started=frame > 1).final
-            tip.append(float(state.x[corner, 1].double() + state.F[corner, 1].double() @ to_corner) - lowest)
+            state = sim.rollout(
+                state, {"mu": MU, "lam": LAM}, volume, BAR_DENSITY, 2, started=frame > 1
+            ).final
+            tip.append(
+                float(state.x[corner, 1].double() + state.F[corner, 1].double() @ to_corner)
+                - lowest
+            )
     return frame_dt * np.arange(frames), np.array(tip)
 
 
 def finite_elements(reference_data: Path) -> tuple[np.ndarray, np.ndarray]:
     """(times [s], displacement [m]) of the reference solution."""
-    table = np.loadtxt(reference_data / "references" / "karamelo_vertical_bar" / "FEM.data", skiprows=1)
+    table = np.loadtxt(
+        reference_data / "references" / "karamelo_vertical_bar" / "FEM.data", skiprows=1
+    )
     return 1000 * table[:, 0], table[:, 1]
 
 

@@ -35,7 +35,9 @@ def is_fluid(law: str) -> bool:
 def known_laws() -> list[str]:
     """Prior laws of the registry; truth laws of the built-in scenes have directions and stiffnesses of their own."""
     laws = [law_named(name) for name in law_names()]
-    return [law.name for law in laws if {n for n in law.parameters if n != law.reference} <= set(VALUES)]
+    return [
+        law.name for law in laws if {n for n in law.parameters if n != law.reference} <= set(VALUES)
+    ]
 
 
 LAWS = known_laws()
@@ -50,10 +52,14 @@ def eyes(count: int, dtype: torch.dtype = torch.float64) -> Tensor:
 def lattice(cells: tuple[int, ...], spacing: float, origin=(0.0, 0.0, 0.0)) -> Tensor:
     """(N, 3) float64 centres of `cells` cubes of edge `spacing`, the block's corner at `origin`."""
     axes = torch.meshgrid(*(torch.arange(n) for n in cells), indexing="ij")
-    return (torch.stack(axes, -1).reshape(-1, 3).double() + 0.5) * spacing + torch.tensor(origin, dtype=torch.float64)
+    return (torch.stack(axes, -1).reshape(-1, 3).double() + 0.5) * spacing + torch.tensor(
+        origin, dtype=torch.float64
+    )
 
 
-def resting(x: Tensor, velocity=(0.0, 0.0, 0.0), dtype: torch.dtype = torch.float64) -> ParticleState:
+def resting(
+    x: Tensor, velocity=(0.0, 0.0, 0.0), dtype: torch.dtype = torch.float64
+) -> ParticleState:
     """Undeformed particles at x (N, 3) with one velocity, no affine part."""
     n = len(x)
     v = torch.tensor(velocity, dtype=dtype).expand(n, 3).contiguous()
@@ -88,7 +94,9 @@ def rotations(count: int, seed: int) -> Tensor:
     return Q * torch.linalg.det(Q)[:, None, None]
 
 
-def random_adapter(seed: int = 0, size: float = 0.3, dtype: torch.dtype = torch.float64, **options) -> StressAdapter:
+def random_adapter(
+    seed: int = 0, size: float = 0.3, dtype: torch.dtype = torch.float64, **options
+) -> StressAdapter:
     """The paper's adapter with Gaussian weights in place of all initial ones, the zeroed last layers included."""
     adapter = StressAdapter(**options).to(dtype)
     g = torch.Generator().manual_seed(seed)

@@ -4,7 +4,18 @@ import math
 
 import torch
 import warp as wp
-from bodies import DENSITY, LAM, MU, agitated, eyes, lattice, parameters_of, random_adapter, resting, uniform_volume
+from bodies import (
+    DENSITY,
+    LAM,
+    MU,
+    agitated,
+    eyes,
+    lattice,
+    parameters_of,
+    random_adapter,
+    resting,
+    uniform_volume,
+)
 from torch import Tensor
 
 from mosa.physics.constitutive.laws import LawParameters, register_law
@@ -21,7 +32,9 @@ def momenta(state: ParticleState, mass: Tensor, dx: float) -> tuple[Tensor, Tens
     p = sum m v; L = sum m (x x v + (dx^2/4) sum_j e_j x C e_j): dx^2/4 is the second moment of the quadratic spline.
     """
     x, v, C, m = state.x.double(), state.v.double(), state.C_affine.double(), mass.double()[:, None]
-    spin = torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
+    spin = torch.stack(
+        [C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1
+    )
     return (m * v).sum(0), (m * (torch.linalg.cross(x, v) + dx**2 / 4 * spin)).sum(0)
 
 
@@ -33,7 +46,15 @@ def conservation(law: str, dtype: torch.dtype, *, adapted: bool = True, interval
     longer elliptic, the body tears, and rounding is relative to stresses a hundred times larger.
     """
     n = 4
-    state = agitated(n, SPACING, (-0.5 * n * SPACING,) * 3, (0.3, -0.2, 0.1), dtype=dtype, strain=0.01, jitter=0.2)
+    state = agitated(
+        n,
+        SPACING,
+        (-0.5 * n * SPACING,) * 3,
+        (0.3, -0.2, 0.1),
+        dtype=dtype,
+        strain=0.01,
+        jitter=0.2,
+    )
     volume = uniform_volume(state, SPACING)
     mass = DENSITY * volume
     sim = Simulator(law, dx=DX, substeps=substeps, frame_dt=substeps * DT, gravity=(0, 0, 0), dtype=dtype,
@@ -51,7 +72,9 @@ def conservation(law: str, dtype: torch.dtype, *, adapted: bool = True, interval
             grids = [float(work.grid_slots()[0, -1, :, 3].double().sum()) for work in sim.buffers]
             total = float(mass.double().sum())
             worst["mass"] = max(worst["mass"], *(abs(g - total) / total for g in grids))
-            for name, before, now, scale in zip(("linear", "angular"), start, momenta(state, mass, DX), scales):
+            for name, before, now, scale in zip(
+                ("linear", "angular"), start, momenta(state, mass, DX), scales
+            ):
                 worst[name] = max(worst[name], float((now - before).abs().max()) / scale)
     return {**worst, "changed": float((state.v - first).abs().max())}
 
@@ -64,7 +87,9 @@ def asymmetric(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters
 def asymmetric_control() -> dict[str, float]:
     """`conservation` of tau = mu (F - I), whose skew part is a torque on every particle."""
     register_law("verification_asymmetric", asymmetric, ("mu", "lam"))
-    return conservation("verification_asymmetric", torch.float64, adapted=False, parameters={"mu": MU, "lam": LAM})
+    return conservation(
+        "verification_asymmetric", torch.float64, adapted=False, parameters={"mu": MU, "lam": LAM}
+    )
 
 
 def vibration(law: str = "corotated", *, periods: int = 20, size: int = 8, amplitude: float = 0.02, dtype=torch.float64,
@@ -86,12 +111,16 @@ def vibration(law: str = "corotated", *, periods: int = 20, size: int = 8, ampli
     volume = uniform_volume(state, SPACING)
     adapter = None
     if adapter_options:
-        adapter = random_adapter(state_dependence="constant", no_pre=True, no_post=True, dtype=dtype, **adapter_options)
+        adapter = random_adapter(
+            state_dependence="constant", no_pre=True, no_post=True, dtype=dtype, **adapter_options
+        )
     period = 2 * length / speed
     frames_per_period = 20
     frame_dt = period / frames_per_period
     substeps = math.ceil(frame_dt * math.sqrt(1.85 * (LAM + 2 * MU) / DENSITY) / (0.5 * dx))
-    sim = Simulator(law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=dtype)
+    sim = Simulator(
+        law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=dtype
+    )
     mass = DENSITY * volume[:, None].double()
     with torch.no_grad():
         rollout = sim.rollout(state, {"mu": MU, "lam": LAM}, volume, DENSITY, periods * frames_per_period + 1, adapter=adapter,

@@ -21,7 +21,13 @@ HELD = 0.178
 
 def thin(law: str, modulus: float) -> dict[str, float]:
     """Parameters of a rod that does not contract sideways: nu = 0, so E = M = 2 mu and one dimension is exact; no yielding."""
-    changes = {"mu": modulus / 2, "lam": 0.0, "kappa": modulus / 3, "yield_stress": 1e12, "cohesion": 1.0}
+    changes = {
+        "mu": modulus / 2,
+        "lam": 0.0,
+        "kappa": modulus / 3,
+        "yield_stress": 1e12,
+        "cohesion": 1.0,
+    }
     return {name: changes.get(name, value) for name, value in parameters_of(law).items()}
 
 
@@ -36,10 +42,16 @@ def affine_motion(law: str, dtype: torch.dtype) -> dict[str, float]:
     state = ParticleState(*(t.to(dtype) for t in (x, v, B.expand(300, 3, 3).contiguous(), F, F)))
     sim = Simulator(law, dx=dx, substeps=1, frame_dt=dt, gravity=(0, 0, 0), dtype=dtype)
     # stress-free whatever the law makes of C_affine: the stiffness is nearly zero
-    parameters = {k: 1e-30 if k in ("mu", "lam", "kappa") else v for k, v in parameters_of(law).items()}
-    out = sim.rollout(state, parameters, torch.full((300,), 8e-6, dtype=dtype), DENSITY, 2, started=True).final
+    parameters = {
+        k: 1e-30 if k in ("mu", "lam", "kappa") else v for k, v in parameters_of(law).items()
+    }
+    out = sim.rollout(
+        state, parameters, torch.full((300,), 8e-6, dtype=dtype), DENSITY, 2, started=True
+    ).final
     expected = {"v": v, "C_affine": B, "F_tot": torch.eye(3).double() + dt * B, "x": x + dt * v}
-    errors = {k: (getattr(out, k).double() - e).abs().max() / e.abs().max() for k, e in expected.items()}
+    errors = {
+        k: (getattr(out, k).double() - e).abs().max() / e.abs().max() for k, e in expected.items()
+    }
     return {k: float(e) for k, e in errors.items()}
 
 
@@ -47,7 +59,9 @@ def interior_force(law: str, dtype: torch.dtype) -> tuple[float, float]:
     """(largest |dv| in the interior, at the surface) after a substep of a regular lattice with one F, in units of a traction's
     impulse on a cell, dt |tau|/(density dx)."""
     dx, dt, n = 0.04, 2e-4, 16
-    F = torch.tensor([[0.97, 0.02, 0.0], [-0.01, 0.95, 0.03], [0.01, 0.0, 0.96]], dtype=torch.float64)
+    F = torch.tensor(
+        [[0.97, 0.02, 0.0], [-0.01, 0.95, 0.03], [0.01, 0.0, 0.96]], dtype=torch.float64
+    )
     x = lattice((n, n, n), dx / 2)
     state = resting(x, dtype=dtype)
     many = F.expand(len(x), 3, 3).contiguous().to(dtype)
@@ -55,7 +69,12 @@ def interior_force(law: str, dtype: torch.dtype) -> tuple[float, float]:
     sim = Simulator(law, dx=dx, substeps=1, frame_dt=dt, gravity=(0, 0, 0), dtype=dtype)
     parameters = parameters_of(law)
     tau = float(sim.material_state(many[:1], state.C_affine[:1], parameters).stress.abs().max())
-    v = sim.rollout(state, parameters, uniform_volume(state, dx / 2), DENSITY, 2, started=True).final.v.double().abs().amax(1)
+    v = (
+        sim.rollout(state, parameters, uniform_volume(state, dx / 2), DENSITY, 2, started=True)
+        .final.v.double()
+        .abs()
+        .amax(1)
+    )
     unit = dt * tau / (DENSITY * dx)
     depth = torch.minimum(x, n * dx / 2 - x).amin(1) / dx
     return float(v[depth > 3].max()) / unit, float(v[depth < 1].max()) / unit
@@ -72,10 +91,14 @@ def free_fall(law: str, dtype: torch.dtype) -> tuple[ParticleState, float]:
     sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=t, gravity=g, dtype=dtype)
     final = sim.rollout(state, parameters_of(law), uniform_volume(state, 0.02), DENSITY, 2).final
     expected = x + v0 * t + 0.5 * g * t**2 * (1 + sim.dt / t)
-    return final, float(torch.maximum((final.v - (v0 + g * t)).abs().max(), (final.x - expected).abs().max()))
+    return final, float(
+        torch.maximum((final.v - (v0 + g * t)).abs().max(), (final.x - expected).abs().max())
+    )
 
 
-def column(law: str, dtype: torch.dtype = torch.float64, cells: int = 16, modulus: float = 1e6) -> tuple[Tensor, Tensor, float]:
+def column(
+    law: str, dtype: torch.dtype = torch.float64, cells: int = 16, modulus: float = 1e6
+) -> tuple[Tensor, Tensor, float]:
     """(heights [m], vertical Kirchhoff stress [Pa], slope / (density g)) of a column on a slipping ground.
 
     Released without strain it oscillates about rest; every mode of a free-fixed rod has a whole number of periods in the first
@@ -92,9 +115,15 @@ def column(law: str, dtype: torch.dtype = torch.float64, cells: int = 16, modulu
                     planes=[Plane((0, 0, 0), (0, 1, 0), "slip")])  # fmt: skip
     parameters = thin(law, modulus)
     with torch.no_grad():
-        rollout = sim.rollout(state, parameters, uniform_volume(state, dx / 2), DENSITY, 2 * frames + 1)
+        rollout = sim.rollout(
+            state, parameters, uniform_volume(state, dx / 2), DENSITY, 2 * frames + 1
+        )
         C = torch.zeros_like(rollout.F[0])
-        tau = torch.stack([_spatial_stress(sim, F, C, parameters)[:, 1, 1] for F in rollout.F[1:]]).mean(0).double()
+        tau = (
+            torch.stack([_spatial_stress(sim, F, C, parameters)[:, 1, 1] for F in rollout.F[1:]])
+            .mean(0)
+            .double()
+        )
     y = x[:, 1]
     inside = (y > 2 * dx) & (y < height - 2 * dx)
     slope = np.polyfit(y[inside].numpy(), tau[inside].numpy(), 1)[0]
@@ -120,13 +149,18 @@ def wave(law: str, cells: int, dtype: torch.dtype = torch.float64) -> tuple[Tens
     k = math.pi / length
     v, C = torch.zeros(len(x), 3).double(), torch.zeros(len(x), 3, 3).double()
     amplitude = 1e-4 * speed
-    v[:, 0], C[:, 0, 0] = amplitude * torch.cos(k * x[:, 0]), -amplitude * k * torch.sin(k * x[:, 0])
+    v[:, 0], C[:, 0, 0] = (
+        amplitude * torch.cos(k * x[:, 0]),
+        -amplitude * k * torch.sin(k * x[:, 0]),
+    )
     state = ParticleState(state.x, v.to(dtype), C.to(dtype), state.F, state.F)
     frames, period = 80, 2 * length / speed
     sim = Simulator(law, dx=dx, substeps=math.ceil(period / 20 * speed / (0.4 * dx)), frame_dt=period / 20, gravity=(0, 0, 0),
                     dtype=dtype)  # fmt: skip
     with torch.no_grad():
-        out = sim.rollout(state, thin(law, modulus), uniform_volume(state, dx / 2), DENSITY, frames + 1)
+        out = sim.rollout(
+            state, thin(law, modulus), uniform_volume(state, dx / 2), DENSITY, frames + 1
+        )
     mode = (out.v[..., 0].double() * torch.cos(k * x[:, 0])).mean(1) / (amplitude / 2)
     zeros = _zeros(out.times.double().numpy(), mode.numpy())
     return out.times.double(), mode, period / 2 * (len(zeros) - 1) / (zeros[-1] - zeros[0])
@@ -150,7 +184,9 @@ def timoshenko(E: float, nu: float, length: float, depth: float) -> float:
     Shear coefficient of a rectangle k = 10 (1 + nu)/(12 + 11 nu) (Cowper 1966); breadth about the depth: E, not E/(1 - nu^2).
     """
     weight, shear, k = DENSITY * GRAVITY * depth, E / (2 * (1 + nu)), 10 * (1 + nu) / (12 + 11 * nu)
-    return weight * length**4 / (8 * E * depth**3 / 12) + weight * length**2 / (2 * k * shear * depth)
+    return weight * length**4 / (8 * E * depth**3 / 12) + weight * length**2 / (
+        2 * k * shear * depth
+    )
 
 
 def cantilever(law: str = "corotated", dtype: torch.dtype = torch.float64, depth: int = 6, length: int = 30, breadth: int = 2,
@@ -171,7 +207,9 @@ def cantilever(law: str = "corotated", dtype: torch.dtype = torch.float64, depth
     sim = Simulator(law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, -GRAVITY, 0), dtype=dtype,
                     planes=[Plane((0, 0, 0), (1, 0, 0), "sticky")])  # fmt: skip
     with torch.no_grad():
-        out = sim.rollout(state, {"mu": mu, "lam": lam}, uniform_volume(state, dx / 2), DENSITY, frames + 1)
+        out = sim.rollout(
+            state, {"mu": mu, "lam": lam}, uniform_volume(state, dx / 2), DENSITY, frames + 1
+        )
     end = x[:, 0] > x[:, 0].max() - 1e-9
     deflection = -(out.x[:, end, 1] - out.x[0, end, 1]).double().mean(1)
     return deflection, float(deflection[1:].mean()) / timoshenko(E, NU, L, h)

@@ -33,7 +33,9 @@ def released_elements(angle: float, friction: float, *, E: float = 1e6, nu: floa
     h, up = LENGTH / across, round(across * HEIGHT / LENGTH)
     lam, mu, t = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu)), math.radians(angle)
     K, nodes = stiffness(lam, mu, h), np.arange((across + 1) * (up + 1)).reshape(across + 1, up + 1)
-    corners = np.stack([nodes[:-1, :-1], nodes[1:, :-1], nodes[1:, 1:], nodes[:-1, 1:]], -1).reshape(-1, 4)
+    corners = np.stack(
+        [nodes[:-1, :-1], nodes[1:, :-1], nodes[1:, 1:], nodes[:-1, 1:]], -1
+    ).reshape(-1, 4)
     index = np.stack([2 * corners, 2 * corners + 1], -1).reshape(-1, 8)
     mass = np.repeat(np.bincount(corners.ravel()) * DENSITY * h * h / 4, 2)
     pull = np.tile([GRAVITY * math.sin(t), -GRAVITY * math.cos(t)], nodes.size)
@@ -43,11 +45,15 @@ def released_elements(angle: float, friction: float, *, E: float = 1e6, nu: floa
     for step in range(steps):
         force = -(u[index] + damping * v[index]) @ K
         v = v + dt * (np.bincount(index.ravel(), force.ravel(), minlength=len(u)) / mass + pull)
-        normal = -u[2 * low + 1] / dt - v[2 * low + 1]  # change of velocity that keeps a node above the incline
+        normal = (
+            -u[2 * low + 1] / dt - v[2 * low + 1]
+        )  # change of velocity that keeps a node above the incline
         change = np.maximum(normal, 0.0)
         along = v[2 * low]
         v[2 * low + 1] += change
-        v[2 * low] = np.where(change > 0, np.sign(along) * np.maximum(np.abs(along) - friction * change, 0.0), along)
+        v[2 * low] = np.where(
+            change > 0, np.sign(along) * np.maximum(np.abs(along) - friction * change, 0.0), along
+        )
         u = u + dt * v
         if step in (steps * 3 // 4, steps - 1):
             track.append(float((mass[0::2] * u[0::2]).sum() / mass[0::2].sum()))

@@ -6,7 +6,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from bodies import DENSITY, NU, VALUES, E, agitated, is_fluid, parameters_of, random_adapter, uniform_volume
+from bodies import (
+    DENSITY,
+    NU,
+    VALUES,
+    E,
+    agitated,
+    is_fluid,
+    parameters_of,
+    random_adapter,
+    uniform_volume,
+)
 from torch import Tensor
 
 from mosa.physics.constitutive.elasticity import lame
@@ -35,21 +45,41 @@ class Case:
     def __init__(self, law: str, substeps: int, *, contact: bool = False, stride: int = 5, dtype=torch.float64,
                  adapted: bool = True, friction: float = 0.3, recompute: bool = False) -> None:  # fmt: skip
         self.law, self.stride = law, stride
-        self.state = agitated(4, SPACING, (0.11, 0.012 if contact else 0.5, 0.07), dtype=dtype, strain=0.01, jitter=0.2)
+        self.state = agitated(
+            4,
+            SPACING,
+            (0.11, 0.012 if contact else 0.5, 0.07),
+            dtype=dtype,
+            strain=0.01,
+            jitter=0.2,
+        )
         self.volume = uniform_volume(self.state, SPACING)
         ground = Ground(0.0, "separate", friction) if contact else None
-        self.sim = Simulator(law, dx=DX, substeps=substeps, frame_dt=substeps * DT, ground=ground, dtype=dtype)
+        self.sim = Simulator(
+            law, dx=DX, substeps=substeps, frame_dt=substeps * DT, ground=ground, dtype=dtype
+        )
         self.adapter = None
         if adapted:
-            self.adapter = random_adapter(size=0.1, dtype=dtype, plastic=self.sim.law.plastic, recompute=recompute)
+            self.adapter = random_adapter(
+                size=0.1, dtype=dtype, plastic=self.sim.law.plastic, recompute=recompute
+            )
         names = [name for name in parameters_of(law) if name not in ("mu", "lam", "kappa")]
-        elastic = {"mu": parameters_of(law)["mu"], "kappa": VALUES["kappa"]} if is_fluid(law) else {"E": E, "nu": NU}
+        elastic = (
+            {"mu": parameters_of(law)["mu"], "kappa": VALUES["kappa"]}
+            if is_fluid(law)
+            else {"E": E, "nu": NU}
+        )
         values = {**elastic, **{name: VALUES[name] for name in names}, "v0": (0.0, 0.0, 0.0)}
-        self.leaves = {k: torch.tensor(v, dtype=dtype, requires_grad=True) for k, v in values.items()}
+        self.leaves = {
+            k: torch.tensor(v, dtype=dtype, requires_grad=True) for k, v in values.items()
+        }
         g = torch.Generator().manual_seed(9)
         n = len(self.state.x)
         shapes = {"x": (n, 3), "v": (n, 3), "F_tot": (n, 3, 3)}
-        self.probes = {k: torch.randn(*s, generator=g, dtype=torch.float64).to(dtype) for k, s in shapes.items()}
+        self.probes = {
+            k: torch.randn(*s, generator=g, dtype=torch.float64).to(dtype)
+            for k, s in shapes.items()
+        }
 
     def loss(self, leaves: dict[str, Tensor] | None = None) -> Tensor:
         leaves = leaves or self.leaves
@@ -60,11 +90,17 @@ class Case:
             moduli = {"mu": mu, "lam": lam, "kappa": lam + 2 * mu / 3}
             values |= {k: v for k, v in moduli.items() if k in wanted}
         start = replace(self.state, v=self.state.v + leaves["v0"])
-        final = self.sim.rollout(start, values, self.volume, DENSITY, 2, adapter=self.adapter, stride=self.stride).final
+        final = self.sim.rollout(
+            start, values, self.volume, DENSITY, 2, adapter=self.adapter, stride=self.stride
+        ).final
         return sum((probe * getattr(final, name)).sum() for name, probe in self.probes.items())
 
     def weights(self) -> list[Tensor]:
-        return [] if self.adapter is None else [p for p in self.adapter.parameters() if p.requires_grad]
+        return (
+            []
+            if self.adapter is None
+            else [p for p in self.adapter.parameters() if p.requires_grad]
+        )
 
     def gradient(self) -> dict[str, Tensor]:
         """By name; `weights`: all of the networks' in one vector."""
@@ -78,7 +114,9 @@ class Case:
         def at(s: float) -> float:
             with torch.no_grad():
                 if name != "weights":
-                    return float(self.loss({**self.leaves, name: self.leaves[name] + s * direction}))
+                    return float(
+                        self.loss({**self.leaves, name: self.leaves[name] + s * direction})
+                    )
                 parts = direction.split([w.numel() for w in self.weights()])
                 for w, d in zip(self.weights(), parts):
                     w.add_(s * d.view_as(w))
@@ -89,7 +127,9 @@ class Case:
 
         return (8 * (at(h) - at(-h)) - at(2 * h) + at(-2 * h)) / (12 * h)
 
-    def compare(self, *, both_steps: bool, names: tuple[str, ...] | None = None, scale: float = 1.0) -> dict[str, Comparison]:
+    def compare(
+        self, *, both_steps: bool, names: tuple[str, ...] | None = None, scale: float = 1.0
+    ) -> dict[str, Comparison]:
         """Per parameter, along one random direction. scale: factor on `STEPS`; both_steps: also the difference at 10 h."""
         g = torch.Generator().manual_seed(4)
         result = {}

@@ -29,7 +29,9 @@ def slide(angle: float, friction: float, dtype: torch.dtype = torch.float64, law
     sim = Simulator(law, dx=dx, substeps=20, frame_dt=frame_dt, gravity=(GRAVITY * math.sin(t), -GRAVITY * math.cos(t), 0.0),
                     up=(0.0, 1.0, 0.0), planes=[Plane((0, 0, 0), (0, 1, 0), "separate", friction)], dtype=dtype)  # fmt: skip
     with torch.no_grad():
-        out = sim.rollout(state, {"mu": MU, "lam": LAM}, uniform_volume(state, dx / 2), DENSITY, frames + 1)
+        out = sim.rollout(
+            state, {"mu": MU, "lam": LAM}, uniform_volume(state, dx / 2), DENSITY, frames + 1
+        )
     v = out.v.double().mean(1)
     half = frames // 2
     gain = (v[-1] - v[half]) / (frame_dt * (frames - half))
@@ -44,7 +46,9 @@ def bounced(thickness: float | None) -> float:
     R = torch.eye(3, dtype=torch.float64)
     R[:2, :2] = torch.tensor([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)]])
     x = lattice((12, 10, 8), dx / 2) @ R.T
-    state = resting(x - torch.tensor([0.0, float(x[:, 1].min()) - 0.02, 0.0]).double(), (0.3, -1.5, 0.0))
+    state = resting(
+        x - torch.tensor([0.0, float(x[:, 1].min()) - 0.02, 0.0]).double(), (0.3, -1.5, 0.0)
+    )
     plane = Plane((0, 0, 0), (0, 1, 0), "separate", 0.3, thickness)
     substeps = math.ceil(frame_dt * (math.sqrt((lam + 2 * mu) / DENSITY) + 3) / (0.4 * dx))
     sim = Simulator("corotated", dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, -GRAVITY, 0), up=(0, 1, 0),
@@ -67,8 +71,15 @@ def slip_angle(friction: float, dtype: torch.dtype = torch.float64) -> float:
     return steep + 3 - 3 * a / (b - a)
 
 
-def released(angle: float, friction: float, *, E: float = 1e6, turned: bool = False, gap: float = 0.0,
-             thickness: float | None = None) -> tuple[float, float]:
+def released(
+    angle: float,
+    friction: float,
+    *,
+    E: float = 1e6,
+    turned: bool = False,
+    gap: float = 0.0,
+    thickness: float | None = None,
+) -> tuple[float, float]:
     """(way [m], speed at the end [m/s]) down an incline, in 0.4 s, of a flat block of 10 x 3 x 5 cells that nothing strains when
     gravity begins. angle [degrees]; turned: the grid is horizontal and the incline crosses it; gap [cells] between block and
     incline; thickness [m]: of the contact."""
@@ -85,6 +96,8 @@ def released(angle: float, friction: float, *, E: float = 1e6, turned: bool = Fa
     sim = Simulator("corotated", dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY * down, up=(0.0, 1.0, 0.0),
                     planes=[plane], dtype=torch.float64)  # fmt: skip
     with torch.no_grad():
-        out = sim.rollout(state, {"mu": mu, "lam": lam}, uniform_volume(state, dx / 2), DENSITY, frames + 1)
+        out = sim.rollout(
+            state, {"mu": mu, "lam": lam}, uniform_volume(state, dx / 2), DENSITY, frames + 1
+        )
     along = (out.x.mean(1) @ R)[:, 0]
     return float(along[-1] - along[0]), float(along[-1] - along[-21]) / (20 * frame_dt)

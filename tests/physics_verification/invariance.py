@@ -23,7 +23,15 @@ def run(law: str, Q: torch.Tensor, shift: torch.Tensor) -> Rollout:
                     ground=Ground(float(shift @ up), "separate", 0.3))  # fmt: skip
     adapter = random_adapter(size=0.1, plastic=sim.law.plastic)
     with torch.no_grad():
-        return sim.rollout(start, parameters_of(law), uniform_volume(start, SPACING), DENSITY, 3, adapter=adapter, stride=5)
+        return sim.rollout(
+            start,
+            parameters_of(law),
+            uniform_volume(start, SPACING),
+            DENSITY,
+            3,
+            adapter=adapter,
+            stride=5,
+        )
 
 
 def differences(law: str) -> tuple[Rollout, dict[str, tuple[float, float]]]:

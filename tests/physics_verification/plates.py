@@ -20,7 +20,9 @@ def uniaxial(stretch: float) -> float:
     for _ in range(100):
         side = 0.5 * (low + high)
         J = stretch * side**2
-        low, high = (low, side) if 2 * MU * (side - 1) * side + LAM * (J - 1) * J > 0 else (side, high)
+        low, high = (
+            (low, side) if 2 * MU * (side - 1) * side + LAM * (J - 1) * J > 0 else (side, high)
+        )
     return (2 * MU * (stretch - 1) * stretch + LAM * (J - 1) * J) / stretch
 
 
@@ -32,7 +34,9 @@ def squeezed(cells: int, *, angle: float = 0.0, mode: str = "separate") -> float
     R = torch.eye(3, dtype=torch.float64)
     R[:2, :2] = torch.tensor([[math.cos(t), math.sin(t)], [-math.sin(t), math.cos(t)]])
     along = (torch.arange(n).double() + 0.5) * h
-    rest = torch.stack(torch.meshgrid(along - RADIUS, along, along - RADIUS, indexing="ij"), -1).reshape(-1, 3)
+    rest = torch.stack(
+        torch.meshgrid(along - RADIUS, along, along - RADIUS, indexing="ij"), -1
+    ).reshape(-1, 3)
     rest = rest[rest[:, 0] ** 2 + rest[:, 2] ** 2 < RADIUS**2]
     offset = R @ torch.tensor([0.0, 0.3 * dx if angle else 0.0, 0.0], dtype=torch.float64)
     axis, z = R[:, 1], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -40,7 +44,10 @@ def squeezed(cells: int, *, angle: float = 0.0, mode: str = "separate") -> float
     for side, height in ((1, 0.0), (-1, HEIGHT)):
         turn = torch.linalg.cross(z, side * axis)
         attitude = exponential(turn / turn.norm() * math.pi / 2)
-        first, last = offset + height * axis, offset + (height + side * 0.5 * STROKE * HEIGHT) * axis
+        first, last = (
+            offset + height * axis,
+            offset + (height + side * 0.5 * STROKE * HEIGHT) * axis,
+        )
         places = [p.tolist() for p in (first, last, last)]
         motion = Motion.waypoints([0, RAMP, RAMP + HOLD + 1], places, torch.stack([attitude] * 3))
         plates.append(Collider(HalfSpace(), mode, 0.0, motion))

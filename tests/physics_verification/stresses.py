@@ -13,14 +13,20 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.physics.launching import SCALARS
 
 
-def stress(law: str, F: Tensor, C: Tensor | None = None, operator=None, parameters: dict | None = None) -> Tensor:
+def stress(
+    law: str, F: Tensor, C: Tensor | None = None, operator=None, parameters: dict | None = None
+) -> Tensor:
     """tau (N, 3, 3) [Pa] in the precision of F (N, 3, 3). operator: what an adapter answered; `linear` is relative to I."""
     n, dtype = len(F), F.dtype
     C = torch.zeros_like(F) if C is None else C
     sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=dtype)
     packed = sim.pack(parameters or parameters_of(law), n, eyes(n, dtype))
     mat33, vec6, mat66, vecp = field_types(SCALARS[dtype])
-    G, h = (torch.zeros(1, 6, 6, dtype=dtype), torch.zeros(1, 6, dtype=dtype)) if operator is None else operator[:2]
+    G, h = (
+        (torch.zeros(1, 6, 6, dtype=dtype), torch.zeros(1, 6, dtype=dtype))
+        if operator is None
+        else operator[:2]
+    )
     tau = torch.zeros(n, 3, 3, dtype=dtype)
     kernel, _ = kernels_of(law_named(law), SCALARS[dtype], operator is not None, False)
     arrays = [wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in
@@ -34,7 +40,9 @@ def adapted_stress(law: str, F: Tensor, C: Tensor | None = None, seed: int = 0) 
     adapter = random_adapter(seed, dtype=F.dtype)
     sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=F.dtype)
     with torch.no_grad():
-        operator = adapter(sim.material_state(F, torch.zeros_like(F) if C is None else C, parameters_of(law)))
+        operator = adapter(
+            sim.material_state(F, torch.zeros_like(F) if C is None else C, parameters_of(law))
+        )
     return stress(law, F, C, operator)
 
 

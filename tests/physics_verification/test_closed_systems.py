@@ -53,8 +53,12 @@ def test_26_control_the_literal_operator_can_pump():
 @pytest.mark.parametrize("major_symmetry", [True, False])
 def test_26_a_run_reports_whether_its_law_makes_energy(major_symmetry):
     """The same operator as in the control, through what a run does with the law it has learned."""
-    material = Material("corotated", {"E": MU * (3 * LAM + 2 * MU) / (LAM + MU), "nu": LAM / (2 * (LAM + MU))})
-    adapter = random_adapter(7, state_dependence="constant", no_pre=True, no_post=True, major_symmetry=major_symmetry)
+    material = Material(
+        "corotated", {"E": MU * (3 * LAM + 2 * MU) / (LAM + MU), "nu": LAM / (2 * (LAM + MU))}
+    )
+    adapter = random_adapter(
+        7, state_dependence="constant", no_pre=True, no_post=True, major_symmetry=major_symmetry
+    )
     adapter.fused = True  # as in a run on a GPU: the report is made on the CPU
     growth = vibration_growth(material, adapter, density=DENSITY, stride=8)
     assert growth < 1 if major_symmetry else growth > GROWTH_LIMIT
@@ -62,6 +66,11 @@ def test_26_a_run_reports_whether_its_law_makes_energy(major_symmetry):
 
 def test_26_a_body_that_bursts_is_no_traceback_and_a_fluid_swings_too():
     adapter = random_adapter(0, size=3.0, rest_free=False, l_max=None)
-    assert vibration_growth(Material("corotated", {"E": 8e4, "nu": 0.3}), adapter, density=DENSITY, stride=8) == math.inf
+    assert (
+        vibration_growth(
+            Material("corotated", {"E": 8e4, "nu": 0.3}), adapter, density=DENSITY, stride=8
+        )
+        == math.inf
+    )
     water = Material("newtonian", {"mu": 100.0, "kappa": 1e5})
     assert 0.5 < vibration_growth(water, None, density=DENSITY, stride=8) <= GROWTH_LIMIT

@@ -43,7 +43,9 @@ def test_13_free_fall(law, dtype):
     final, error = free_fall(law, dtype)
     tolerance = 1e-12 if dtype == torch.float64 else 1e-5
     assert error < tolerance
-    assert (final.F.double() - torch.eye(3)).abs().max() < 1e2 * tolerance  # sums C_affine dt of 100 substeps
+    assert (
+        final.F.double() - torch.eye(3)
+    ).abs().max() < 1e2 * tolerance  # sums C_affine dt of 100 substeps
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)
@@ -88,7 +90,9 @@ def test_16_a_block_slips_at_the_friction_angle(friction, dtype):
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("angle, friction", [(35, 0.8), (25, 0.5)])
-def test_16_a_block_that_is_released_suddenly_below_the_friction_angle_stays(angle, friction, turned):
+def test_16_a_block_that_is_released_suddenly_below_the_friction_angle_stays(
+    angle, friction, turned
+):
     """It moves by what its own strain and the closing of the contact take, less than a fiftieth of a cell, and rests."""
     way, speed = released(angle, friction, turned=turned)
     assert abs(way) < 0.02 * 0.04 and abs(speed) < 1e-3

@@ -19,7 +19,11 @@ def assert_agreement(found: dict[str, Comparison], smooth: bool) -> None:
         if smooth:
             assert error < 1e-6, (name, error)
         else:
-            assert spread < 1e-2 and error < min(max(1e-5, 10 * spread), 1e-3), (name, error, spread)
+            assert spread < 1e-2 and error < min(max(1e-5, 10 * spread), 1e-3), (
+                name,
+                error,
+                spread,
+            )
 
 
 YIELDING = [law for law in LAWS if law not in ELASTIC]
@@ -39,33 +43,46 @@ def test_18_smooth_laws(law, substeps):
 @pytest.mark.parametrize("law, substeps", paths(YIELDING))
 def test_18_laws_that_yield_in_contact_with_friction(law, substeps):
     """Also in yield stress, friction_alpha, cohesion, viscosity; steps small enough that few particles cross a switch."""
-    assert_agreement(Case(law, substeps, contact=True).compare(both_steps=True, scale=0.003), smooth=False)
+    assert_agreement(
+        Case(law, substeps, contact=True).compare(both_steps=True, scale=0.003), smooth=False
+    )
 
 
 def test_18_contact_of_an_elastic_body():
-    assert_agreement(Case("corotated", 200, contact=True).compare(both_steps=True, scale=0.003), smooth=False)
+    assert_agreement(
+        Case("corotated", 200, contact=True).compare(both_steps=True, scale=0.003), smooth=False
+    )
 
 
 def test_18_training_horizon_on_a_smooth_path():
     """1500 substeps of the full adapter, the horizon of training: 1e-6."""
-    assert_agreement(Case("corotated", 1500, stride=10).compare(both_steps=False, scale=0.05), smooth=True)
+    assert_agreement(
+        Case("corotated", 1500, stride=10).compare(both_steps=False, scale=0.05), smooth=True
+    )
 
 
 def test_18_training_horizon_through_contact():
-    found = Case("corotated", 1500, stride=20, contact=True).compare(both_steps=True, scale=0.0003, names=("E", "weights"))
+    found = Case("corotated", 1500, stride=20, contact=True).compare(
+        both_steps=True, scale=0.0003, names=("E", "weights")
+    )
     assert_agreement(found, smooth=False)
 
 
 @pytest.mark.parametrize("law", ["corotated", "neo_hookean", "von_mises"])
 def test_19_single_precision_gradient_at_800_substeps(law):
     """Relative to the largest entry of each parameter's gradient, 1e-3: 800 substeps of eps 6e-8, growing with the path."""
-    single, double = (Case(law, 800, dtype=dtype, stride=20).gradient() for dtype in (torch.float32, torch.float64))
+    single, double = (
+        Case(law, 800, dtype=dtype, stride=20).gradient()
+        for dtype in (torch.float32, torch.float64)
+    )
     for name, expected in double.items():
         assert (single[name].double() - expected).abs().max() < 1e-3 * expected.abs().max(), name
 
 
 @pytest.mark.parametrize("law", ["corotated", "drucker_prager"])
 def test_19_recomputed_networks_give_the_gradient_bit_for_bit(law):
-    plain, recomputed = (Case(law, 60, recompute=recompute).gradient() for recompute in (False, True))
+    plain, recomputed = (
+        Case(law, 60, recompute=recompute).gradient() for recompute in (False, True)
+    )
     for name, expected in plain.items():
         assert torch.equal(recomputed[name], expected), name

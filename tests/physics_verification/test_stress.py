@@ -16,9 +16,13 @@ from mosa.physics.constitutive.laws import law_named
 def test_04_stress_is_symmetric(law, dtype):
     """tau = tau^T, of the law and with the adapter; 1e-6 in float32, 1e-13 in float64 of the largest entry."""
     F = deformations(200, 3).to(dtype)
-    C = torch.randn(200, 3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(dtype)
+    C = torch.randn(200, 3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(
+        dtype
+    )
     for tau in (stress(law, F, C), adapted_stress(law, F, C)):
-        assert (tau - tau.mT).abs().max() <= (1e-6 if dtype == torch.float32 else 1e-13) * tau.abs().max()
+        assert (tau - tau.mT).abs().max() <= (
+            1e-6 if dtype == torch.float32 else 1e-13
+        ) * tau.abs().max()
         assert tau.abs().max() > 1e-3 * E
 
 
@@ -47,4 +51,6 @@ def test_07_small_strain_and_rest(law):
     sheared[0, 1, 2] += e
     c11, c44 = moduli(law)
     assert float(stress(law, stretched)[0, 0, 0]) / e == pytest.approx(c11, rel=1e-4)
-    assert float(stress(law, sheared)[0, 1, 2]) / e == pytest.approx(c44, rel=1e-4, abs=1e-4 * c11 if is_fluid(law) else 0)
+    assert float(stress(law, sheared)[0, 1, 2]) / e == pytest.approx(
+        c44, rel=1e-4, abs=1e-4 * c11 if is_fluid(law) else 0
+    )

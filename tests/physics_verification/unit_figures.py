@@ -7,7 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from bodies import DENSITY, LAM, MU, agitated, eyes, parameters_of, random_adapter, rotations, uniform_volume
+from bodies import (
+    DENSITY,
+    LAM,
+    MU,
+    agitated,
+    eyes,
+    parameters_of,
+    random_adapter,
+    rotations,
+    uniform_volume,
+)
 from stresses import deformations, stress
 
 from mosa.errors import ConfigError
@@ -25,7 +35,9 @@ def initial_adapter(dtype: torch.dtype) -> float:
     state = agitated(dtype=dtype)
     adapter = StressAdapter()
     adapter.switch_on(8e4, 0.3)
-    sim = Simulator("corotated", dx=0.04, substeps=100, frame_dt=0.02, dtype=dtype, ground=Ground(0.0))
+    sim = Simulator(
+        "corotated", dx=0.04, substeps=100, frame_dt=0.02, dtype=dtype, ground=Ground(0.0)
+    )
     with torch.no_grad():
         runs = [sim.rollout(state, {"mu": MU, "lam": LAM}, uniform_volume(state, 0.02), DENSITY, 2, adapter=a, stride=5).x
                 for a in (None, adapter)]  # fmt: skip
@@ -37,8 +49,14 @@ def bounds(draws: int = 40, alpha: float = 0.1, l_max: float = 0.1) -> dict[str,
     det, largest = np.inf, 0.0
     g = torch.Generator().manual_seed(0)
     for seed in range(draws):
-        adapter = random_adapter(seed, 10.0 ** (6 * seed / (draws - 1) - 3), alpha=alpha, l_max=l_max)
-        w, s = (10.0 ** (12 * seed / (draws - 1) - 6) * (2 * torch.rand(20, 6, generator=g, dtype=torch.float64) - 1) for _ in "ws")
+        adapter = random_adapter(
+            seed, 10.0 ** (6 * seed / (draws - 1) - 3), alpha=alpha, l_max=l_max
+        )
+        w, s = (
+            10.0 ** (12 * seed / (draws - 1) - 6)
+            * (2 * torch.rand(20, 6, generator=g, dtype=torch.float64) - 1)
+            for _ in "ws"
+        )
         with torch.no_grad():
             _, pre, post, C = adapter.operator(w, s)
         det = min(det, float(torch.linalg.det(torch.eye(3).double() + C).min()))
@@ -70,7 +88,10 @@ def plastic_return(law: str) -> dict[str, float]:
     eps = torch.log(torch.linalg.svdvals(A))
     norm = (eps - eps.mean(1, keepdim=True)).norm(dim=1)
     if law == "von_mises":
-        excess, tip = norm - p["yield_stress"] / (2 * p["mu"]), torch.zeros(len(F), dtype=torch.bool)
+        excess, tip = (
+            norm - p["yield_stress"] / (2 * p["mu"]),
+            torch.zeros(len(F), dtype=torch.bool),
+        )
     else:
         t = eps.sum(1) - 3 * p["cohesion"]
         tip = torch.log(torch.linalg.det(F)) >= 3 * p["cohesion"]
@@ -90,13 +111,17 @@ def polar_gradient() -> float:
     S = torch.tensor(values, dtype=torch.float64).repeat(10, 1)
     F = torch.cat([rotations(len(S), 1) @ torch.diag_embed(S) @ rotations(len(S), 2), eyes(1)])
     S = torch.cat([S, torch.ones(1, 3).double()])
-    h = (3e-3 * torch.minimum(S[:, 1] + S[:, 2], (S - 0.05).abs().amin(1)).clamp(max=1.0))[:, None, None]
+    h = (3e-3 * torch.minimum(S[:, 1] + S[:, 2], (S - 0.05).abs().amin(1)).clamp(max=1.0))[
+        :, None, None
+    ]
     g, one, worst = torch.Generator().manual_seed(3), torch.ones(len(F)).double(), 0.0
     for name in ("rotation", "stretch"):
         seed, dF = (torch.randn(F.shape, generator=g, dtype=torch.float64) for _ in "sd")
         dF = dF / torch.linalg.matrix_norm(dF)[:, None, None]
         adjoint, _ = run_adjoint(name, F, one, seed)
-        expected = (seed * directional(lambda s, name=name, dF=dF: run(name, F + s * dF, one), h)).sum((1, 2))
+        expected = (
+            seed * directional(lambda s, name=name, dF=dF: run(name, F + s * dF, one), h)
+        ).sum((1, 2))
         scale = torch.linalg.matrix_norm(adjoint).clamp_min(1.0)
         worst = max(worst, float((((adjoint * dF).sum((1, 2)) - expected).abs() / scale).max()))
     return worst
@@ -110,7 +135,9 @@ def twin(law: str) -> float | None:
     if law_named(law).reference is not None:
         tensors["reference"] = reference.polar(state.F)
     try:
-        other = reference.substep(law, state, tensors, volume, DENSITY, dx=0.04, dt=2e-4, gravity=(0.0, -9.8, 0.0))
+        other = reference.substep(
+            law, state, tensors, volume, DENSITY, dx=0.04, dt=2e-4, gravity=(0.0, -9.8, 0.0)
+        )
     except ConfigError:
         return None
     sim = Simulator(law, dx=0.04, substeps=1, frame_dt=2e-4, dtype=torch.float64)
@@ -119,7 +146,11 @@ def twin(law: str) -> float | None:
     return max(float((a - b).abs().max() / b.abs().max()) for a, b in pairs)
 
 
-PROBES = {"neo_hookean": "probe_neo_hookean", "von_mises": "probe_von_mises_gic", "drucker_prager": "probe_drucker_prager"}
+PROBES = {
+    "neo_hookean": "probe_neo_hookean",
+    "von_mises": "probe_von_mises_gic",
+    "drucker_prager": "probe_drucker_prager",
+}
 TRAJECTORIES = {
     "elastic_torus_sticky": ("neo_hookean", Ground(0.0), 1e-12),
     "elastic_cube_slip": ("neo_hookean", Ground(0.0, "slip"), 1e-12),
@@ -131,9 +162,16 @@ TRAJECTORIES = {
 
 def oracle(folder: Path, name: str) -> dict:
     with np.load(folder / "oracle" / f"{name}.npz", allow_pickle=False) as file:
-        arrays = {k: torch.from_numpy(np.asarray(file[k])).double() for k in file.files if file[k].dtype.kind in "fi"}
+        arrays = {
+            k: torch.from_numpy(np.asarray(file[k])).double()
+            for k in file.files
+            if file[k].dtype.kind in "fi"
+        }
         meta = json.loads(str(file["meta"])) if "meta" in file.files else {}
-    return {**{k: torch.tensor(v).double() for k, v in meta.items() if isinstance(v, int | float)}, **arrays}
+    return {
+        **{k: torch.tensor(v).double() for k, v in meta.items() if isinstance(v, int | float)},
+        **arrays,
+    }
 
 
 def probe(folder: Path, law: str) -> torch.Tensor:
@@ -152,13 +190,19 @@ def trajectory(folder: Path, name: str) -> float:
     """Largest distance [m] to a trajectory of the oracle over 8 frames (800 substeps), float64."""
     law, ground, _ = TRAJECTORIES[name]
     data = oracle(folder, name)
-    p, n, dx = {k: data[k] for k in law_named(law).parameters}, data["x"].shape[1], float(data["dx"])
+    p, n, dx = (
+        {k: data[k] for k in law_named(law).parameters},
+        data["x"].shape[1],
+        float(data["dx"]),
+    )
     sim = Simulator(law, dx=dx, frame_dt=1 / 24, substeps=100, gravity=data.get("gravity", torch.tensor([0.0, -9.8, 0.0])),
                     up=(0.0, 1.0, 0.0), dtype=torch.float64, ground=ground, options=LawOptions(
                         mass_cutoff=1e-8 * dx**3, init_affine="zero", norm_eps=0.0 if law == "neo_hookean" else 1e-8,
                         on_inversion="ignore", rebuild=law == "drucker_prager"))  # fmt: skip
     F = eyes(n)
-    start = ParticleState(data["x0"].contiguous(), data["v0"].contiguous(), torch.zeros(n, 3, 3).double(), F, F)
+    start = ParticleState(
+        data["x0"].contiguous(), data["v0"].contiguous(), torch.zeros(n, 3, 3).double(), F, F
+    )
     with torch.no_grad():
         out = sim.rollout(start, p, torch.full((n,), float(data["p_vol"])).double(), 1000.0, 9)
     return float((out.x - data["x"][:9]).abs().max())

@@ -63,7 +63,13 @@ def cameras(count: int, size: int) -> Cameras:
     K, w2c = [], []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * i / count, 0.15 + 0.75 * (i % 3) / 2
-        back = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(elevation), np.sin(azimuth) * np.cos(elevation)])
+        back = np.array(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+            ]
+        )
         z = -back
         x = np.cross(z, [0, 1.0, 0])
         x /= np.linalg.norm(x)
@@ -81,13 +87,17 @@ def cameras(count: int, size: int) -> Cameras:
     )
 
 
-def draw(view: Cameras, time: float, last: float, oversample: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def draw(
+    view: Cameras, time: float, last: float, oversample: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     """Image (H, W, 3) on white and matte (H, W) of one camera: sphere tracing in rest space, then averaging of sub-pixels."""
     size = view.width * oversample
     pixel = (np.arange(size) + 0.5) / oversample
     u, v = np.meshgrid(pixel, pixel)
     K, w2c = view.K[0].double().numpy(), view.w2c[0].double().numpy()
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1).reshape(-1, 3)
+    rays = np.stack(
+        [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1
+    ).reshape(-1, 3)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     rays, start = rays @ w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3]
     centre = forward(np.zeros((1, 3)), time, last)[0]
@@ -104,7 +114,10 @@ def draw(view: Cameras, time: float, last: float, oversample: int = 2) -> tuple[
     image = np.ones((len(rays), 3))
     image[hit] = color(backward(start + depth[hit, None] * rays[hit], time, last))
     blocks = (view.height, oversample, view.width, oversample)
-    return (image.reshape(*blocks, 3).mean((1, 3)).astype(np.float32), hit.reshape(blocks).mean((1, 3)).astype(np.float32))
+    return (
+        image.reshape(*blocks, 3).mean((1, 3)).astype(np.float32),
+        hit.reshape(blocks).mean((1, 3)).astype(np.float32),
+    )
 
 
 def make_scene(*, views: int = 8, frames: int = 8, size: int = 96, frame_dt: float = 0.02) -> Scene:

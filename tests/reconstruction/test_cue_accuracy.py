@@ -10,7 +10,13 @@ import squashed_body
 import torch
 
 from mosa.errors import DataError
-from mosa.evaluation.analysis.cue_error import cue_errors, motionless, rotation_error, strain_direction_error, true_motion
+from mosa.evaluation.analysis.cue_error import (
+    cue_errors,
+    motionless,
+    rotation_error,
+    strain_direction_error,
+    true_motion,
+)
 from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues, polar
 from mosa.reconstruction.pipeline import reconstruct, spacing_for
 from mosa.reconstruction.settings import build_settings
@@ -22,7 +28,11 @@ def analytic_deformation(points: np.ndarray, time: float, last: float) -> torch.
     """(M, 3, 3) by central differences of the closed-form motion, relative to its frame 0, at rest points of frame 0."""
     rest, step = squashed_body.backward(points, 0.0, last), 1e-5
     columns = [
-        (squashed_body.forward(rest + step * e, time, last) - squashed_body.forward(rest - step * e, time, last)) / (2 * step)
+        (
+            squashed_body.forward(rest + step * e, time, last)
+            - squashed_body.forward(rest - step * e, time, last)
+        )
+        / (2 * step)
         for e in np.eye(3)
     ]
     return torch.as_tensor(np.stack(columns, -1))
@@ -38,7 +48,9 @@ def inner_points(scene, count: int = 300) -> torch.Tensor:
 def test_rotation_error_is_the_angle_between(degrees):
     half = np.deg2rad(degrees) / 2
     axis = torch.tensor([0.6, 0.0, 0.8])
-    turn = quaternion_to_matrix(torch.cat([torch.tensor([np.cos(half)]), np.sin(half) * axis]).float())
+    turn = quaternion_to_matrix(
+        torch.cat([torch.tensor([np.cos(half)]), np.sin(half) * axis]).float()
+    )
     start = quaternion_to_matrix(torch.tensor([0.5, 0.1, -0.7, 0.4]))
     assert float(rotation_error(turn @ start, start)) == pytest.approx(degrees, abs=2e-5, rel=1e-3)
 
@@ -53,7 +65,9 @@ def test_truth_of_an_affine_motion_is_exact():
     assert torch.allclose(true.positions[1], points @ F.T + 2.0, atol=1e-5)
     assert true.inside.tolist() == [True, True, False]
     rotation, stretch = polar(F)
-    assert torch.allclose(true.rotation[1, 0], rotation, atol=1e-5) and torch.allclose(true.stretch[1, 0], stretch, atol=1e-5)
+    assert torch.allclose(true.rotation[1, 0], rotation, atol=1e-5) and torch.allclose(
+        true.stretch[1, 0], stretch, atol=1e-5
+    )
     with pytest.raises(DataError, match="at least 24 true points, found 10"):
         true_motion(replace(truth, rest=rest[:10], positions=truth.positions[:, :10]), points)
 
@@ -70,17 +84,32 @@ def test_truth_of_the_squashed_body_against_its_closed_form(squashed):
 
 def test_errors_are_those_that_were_put_in(squashed):
     true = true_motion(squashed.truth, inner_points(squashed, 100))
-    turn = quaternion_to_matrix(torch.tensor([np.cos(np.deg2rad(2.5)), np.sin(np.deg2rad(2.5)), 0, 0]).float())
+    turn = quaternion_to_matrix(
+        torch.tensor([np.cos(np.deg2rad(2.5)), np.sin(np.deg2rad(2.5)), 0, 0]).float()
+    )
     ones = torch.ones_like(true.stretch[..., 0])
-    cues = MotionCues(true.positions + 0.003, true.rotation @ turn, true.stretch + 0.01, ones, torch.zeros_like(true.rotation))
+    cues = MotionCues(
+        true.positions + 0.003,
+        true.rotation @ turn,
+        true.stretch + 0.01,
+        ones,
+        torch.zeros_like(true.rotation),
+    )
     errors = cue_errors(cues, true, squashed.times)
-    assert errors["rotation_deg_median"] == pytest.approx(5.0, abs=1e-3) == errors["rotation_deg_p90"]
-    assert errors["stretch_median"] == pytest.approx(0.01, abs=1e-5) and errors["stretch_rms"] == pytest.approx(0.01, abs=1e-5)
+    assert (
+        errors["rotation_deg_median"] == pytest.approx(5.0, abs=1e-3) == errors["rotation_deg_p90"]
+    )
+    assert errors["stretch_median"] == pytest.approx(0.01, abs=1e-5) and errors[
+        "stretch_rms"
+    ] == pytest.approx(0.01, abs=1e-5)
     # a constant offset leaves the velocity as it is
     assert errors["velocity_m_s_p90"] < 1e-4
     assert errors["position_rms_m"] == pytest.approx(0.003 * 3**0.5, rel=1e-3)
     silent = cue_errors(motionless(true), true, squashed.times)
-    assert silent["stretch_rms"] == pytest.approx(silent["stretch_signal_rms"]) and silent["stretch_rms"] > 0.03
+    assert (
+        silent["stretch_rms"] == pytest.approx(silent["stretch_signal_rms"])
+        and silent["stretch_rms"] > 0.03
+    )
     # weight 0 takes a particle out of everything but positions
     half = replace(cues, weight=ones * (torch.arange(100) % 2), rotation=true.rotation)
     assert cue_errors(half, true, squashed.times)["known"] == pytest.approx(0.5)
@@ -98,9 +127,18 @@ def seen(squashed):
         carried={"iterations": 1},
     )  # fmt: skip
     blind = replace(squashed, truth=None)
-    result = reconstruct(blind, settings=settings, spacing=spacing_for(squashed, 600, settings), cache_dir=None, progress=False)
+    result = reconstruct(
+        blind,
+        settings=settings,
+        spacing=spacing_for(squashed, 600, settings),
+        cache_dir=None,
+        progress=False,
+    )
     cues, rest = result.cues, result.splats.means
-    forms = {"gaussian": cues, "neighbourhood": neighbourhood_cues(cues.positions, cues.covariances, neighbourhood(rest))}
+    forms = {
+        "gaussian": cues,
+        "neighbourhood": neighbourhood_cues(cues.positions, cues.covariances, neighbourhood(rest)),
+    }
     true = true_motion(squashed.truth, rest)
     return {name: cue_errors(form, true, squashed.times) for name, form in forms.items()}, true
 
@@ -112,7 +150,9 @@ def test_neighbourhood_form_against_truth(squashed, seen):
     found, silent = errors["neighbourhood"], cue_errors(motionless(true), true, squashed.times)
     assert silent["rotation_deg_median"] > 10
     assert found["rotation_deg_median"] < 1.6 and found["rotation_deg_p90"] < 4.5
-    assert found["stretch_median"] < 0.03 and found["stretch_rms"] < 0.4 * found["stretch_signal_rms"]
+    assert (
+        found["stretch_median"] < 0.03 and found["stretch_rms"] < 0.4 * found["stretch_signal_rms"]
+    )
     assert found["known"] == 1 and found["outside"] < 0.02
 
 

@@ -12,7 +12,14 @@ import torch
 from mosa.data.hull import visual_hull
 from mosa.errors import ConfigError
 from mosa.reconstruction.gaussians import densification
-from mosa.reconstruction.gaussians.densification import MarkovChain, perturb, prune, refine, relocate, shared_opacity
+from mosa.reconstruction.gaussians.densification import (
+    MarkovChain,
+    perturb,
+    prune,
+    refine,
+    relocate,
+    shared_opacity,
+)
 from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
 from mosa.reconstruction.gaussians.initial import random_splats
 from mosa.reconstruction.gaussians.static import StaticSettings, fit_splats, start_splats
@@ -30,7 +37,15 @@ BOUNDS = {"smallest": 0.25, "largest": 2.0, "axis_ratio": 10.0}
 def rendered(splats, windows, background=WHITE):
     state = torch.zeros(len(windows), dtype=torch.long)
     covariances = covariance_from(splats.scales, splats.rotations)[None]
-    return rasterize(splats.means[None], covariances, splats.opacities, splats.colors[None], windows.cameras, state, background)[0]
+    return rasterize(
+        splats.means[None],
+        covariances,
+        splats.opacities,
+        splats.colors[None],
+        windows.cameras,
+        state,
+        background,
+    )[0]
 
 
 def psnr(splats, windows):
@@ -42,7 +57,13 @@ def some_splats(count=6, seed=0):
     draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     rotations = torch.nn.functional.normalize(draw(count, 4) - 0.5, dim=-1)
     scales = 0.01 + 0.01 * draw(count, 1)
-    return Splats(0.1 * draw(count, 3), scales.repeat(1, 3), rotations, 0.2 + 0.6 * draw(count), 0.1 + 0.8 * draw(count, 3))
+    return Splats(
+        0.1 * draw(count, 3),
+        scales.repeat(1, 3),
+        rotations,
+        0.2 + 0.6 * draw(count),
+        0.1 + 0.8 * draw(count, 3),
+    )
 
 
 def free(splats, anisotropic=False):
@@ -51,7 +72,10 @@ def free(splats, anisotropic=False):
 
 def pull(gaussians, weights):
     """A step of the optimiser on a loss that tells Gaussians apart, and not those of equal weight."""
-    loss = sum((weights.view(-1, *[1] * (p.dim() - 1)) * (p - 0.3) ** 2).sum() for p in gaussians.parameters.values())
+    loss = sum(
+        (weights.view(-1, *[1] * (p.dim() - 1)) * (p - 0.3) ** 2).sum()
+        for p in gaussians.parameters.values()
+    )
     gaussians.optimizer.zero_grad(set_to_none=True)
     loss.backward()
     gaussians.optimizer.step()
@@ -69,13 +93,24 @@ def test_moments_follow_their_gaussians(anisotropic):
     for group in moved.optimizer.param_groups:
         p = moved.parameters[group["name"]]
         state = moved.optimizer.state[p]
-        assert group["params"][0] is p and p.requires_grad and state["exp_avg"].shape == state["exp_avg_sq"].shape == p.shape
-        assert state["exp_avg"][:6].abs().min() > 0 and state["exp_avg"][6:].abs().max() == state["exp_avg_sq"][6:].max() == 0
-    assert len(moved.optimizer.state) == len(moved.parameters)  # nothing is left of the tensors before
+        assert (
+            group["params"][0] is p
+            and p.requires_grad
+            and state["exp_avg"].shape == state["exp_avg_sq"].shape == p.shape
+        )
+        assert (
+            state["exp_avg"][:6].abs().min() > 0
+            and state["exp_avg"][6:].abs().max() == state["exp_avg_sq"][6:].max() == 0
+        )
+    assert len(moved.optimizer.state) == len(
+        moved.parameters
+    )  # nothing is left of the tensors before
     pull(plain, weights), pull(moved, weights[source])
     for name, p in plain.parameters.items():
         assert torch.equal(moved.parameters[name][:6], p[source[:6]]), name
-    assert not torch.equal(moved.parameters["means"][6], moved.parameters["means"][4])  # the copy has no momentum
+    assert not torch.equal(
+        moved.parameters["means"][6], moved.parameters["means"][4]
+    )  # the copy has no momentum
 
 
 def test_shared_opacity_is_the_papers_formula():
@@ -84,7 +119,11 @@ def test_shared_opacity_is_the_papers_formula():
         for o in (0.05, 0.5, 0.95):
             each, factor = shared_opacity(torch.tensor([o], dtype=torch.float64), torch.tensor([n]))
             new = 1 - (1 - o) ** (1 / n)
-            terms = [math.comb(i, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1) for i in range(n) for k in range(i + 1)]
+            terms = [
+                math.comb(i, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+                for i in range(n)
+                for k in range(i + 1)
+            ]
             assert float(each) == pytest.approx(new, rel=1e-12)
             assert float(factor) == pytest.approx(o / sum(terms), rel=1e-10)
 
@@ -99,7 +138,9 @@ def test_copies_in_one_place_leave_the_image_as_it_is(still, monkeypatch):
     def change(spread, share=True):
         monkeypatch.setattr(densification, "SPREAD", spread)
         if not share:
-            monkeypatch.setattr(densification, "shared_opacity", lambda o, n: (o, torch.ones_like(o)))
+            monkeypatch.setattr(
+                densification, "shared_opacity", lambda o, n: (o, torch.ones_like(o))
+            )
         gaussians = free(splats)
         refine(gaussians, torch.Generator().manual_seed(0), growth=1.0, most=300)
         assert len(gaussians) == 300
@@ -112,10 +153,14 @@ def test_copies_in_one_place_leave_the_image_as_it_is(still, monkeypatch):
 def random_splats_of_the_body(still, count):
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(3)) * 2 - 1
     radii = torch.as_tensor(squashed_body.RADII, dtype=torch.float32)
-    points = torch.nn.functional.normalize(points, dim=-1) * radii + torch.tensor([0.02, 0.30, 0.01])
+    points = torch.nn.functional.normalize(points, dim=-1) * radii + torch.tensor(
+        [0.02, 0.30, 0.01]
+    )
     rotations = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
     colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(4))
-    return Splats(points, torch.full((count, 3), 0.012), rotations, torch.full((count,), 0.7), colors)
+    return Splats(
+        points, torch.full((count, 3), 0.012), rotations, torch.full((count,), 0.7), colors
+    )
 
 
 def test_the_vanished_are_moved_onto_others():
@@ -127,7 +172,9 @@ def test_the_vanished_are_moved_onto_others():
         found = gaussians.splats()
         assert len(gaussians) == 8 and found.opacities.min() > 0.05
         distance = torch.cdist(found.means[2:4], splats.means[[0, 1, 4, 5, 6, 7]]).amin(1)
-        assert (distance < 0.05).all() and (found.means[2:4] - splats.means[2:4]).norm(dim=1).min() > 1e-3
+        assert (distance < 0.05).all() and (found.means[2:4] - splats.means[2:4]).norm(
+            dim=1
+        ).min() > 1e-3
 
 
 def test_noise_moves_those_about_to_vanish_only_and_pruning_drops_them():
@@ -150,11 +197,15 @@ def test_the_number_never_exceeds_its_bound(hull, still, monkeypatch):
         counts.append(len(gaussians))
 
     monkeypatch.setattr(MarkovChain, "after_step", noted)
-    settings = StaticSettings(iterations=40, densify="mcmc", max_points=157, refine_every=3, growth=0.07)
+    settings = StaticSettings(
+        iterations=40, densify="mcmc", max_points=157, refine_every=3, growth=0.07
+    )
     start = start_splats(hull, still, settings, count=100, seed=0)
     found = fit_splats(start, still, WHITE, settings, move=True, seed=0)
     assert counts[0] == 100 and max(counts) == 157 and counts == sorted(counts)
-    assert 100 < len(found.means) <= 157 and len({len(value) for value in vars(found).values()}) == 1
+    assert (
+        100 < len(found.means) <= 157 and len({len(value) for value in vars(found).values()}) == 1
+    )
     kept = StaticSettings(iterations=12, densify="mcmc", refine_every=3)
     counts.clear()
     fit_splats(start, still, WHITE, kept, move=True, seed=0)
@@ -165,7 +216,10 @@ def test_a_random_start_needs_the_densification(hull, still):
     """From 100 uniform in the box (neither the hull's values nor its surface are read) to 600, against the same 100 left alone."""
     blank = type(hull)(torch.zeros_like(hull.values), hull.origin, hull.pitch)
     found = {}
-    for name, more in {"alone": {"relocate_every": 0}, "mcmc": {"densify": "mcmc", "max_points": 600, "growth": 0.3}}.items():
+    for name, more in {
+        "alone": {"relocate_every": 0},
+        "mcmc": {"densify": "mcmc", "max_points": 600, "growth": 0.3},
+    }.items():
         settings = StaticSettings(start="random", iterations=120, **more)
         start = start_splats(blank, still, settings, count=100, seed=0)
         found[name] = psnr(fit_splats(start, still, WHITE, settings, move=True, seed=0), still)
@@ -199,12 +253,22 @@ def test_anisotropic_gaussians_fit_a_rod_better(monkeypatch):
     assert len(free.means) == len(found["isotropic"].means) == 8
     assert psnr(free, still) > psnr(found["isotropic"], still) + 0.5
     axes = quaternion_to_matrix(free.rotations)[torch.arange(8), :, free.scales.argmax(1)]
-    assert (free.scales.amax(1) / free.scales.amin(1)).median() > 1.3 and axes[:, 1].abs().median() > 0.9
+    assert (free.scales.amax(1) / free.scales.amin(1)).median() > 1.3 and axes[
+        :, 1
+    ].abs().median() > 0.9
     torch.testing.assert_close(free.rotations.norm(dim=1), torch.ones(8))
 
 
 def test_the_axis_ratio_is_bounded():
-    gaussians = FreeGaussians(some_splats(), RATES, move=True, anisotropic=True, smallest=0.01, largest=5.0, axis_ratio=3.0)
+    gaussians = FreeGaussians(
+        some_splats(),
+        RATES,
+        move=True,
+        anisotropic=True,
+        smallest=0.01,
+        largest=5.0,
+        axis_ratio=3.0,
+    )
     gaussians.parameters["log_scale"].data += torch.tensor([2.0, 0.0, -2.0])
     gaussians.bound()
     scales = gaussians.splats().scales
@@ -214,10 +278,18 @@ def test_the_axis_ratio_is_bounded():
 
 def test_the_same_seed_gives_the_same_bits(hull, still):
     settings = StaticSettings(
-        iterations=24, start="random", densify="mcmc", max_points=200, refine_every=4, growth=0.3, shape="anisotropic"
+        iterations=24,
+        start="random",
+        densify="mcmc",
+        max_points=200,
+        refine_every=4,
+        growth=0.3,
+        shape="anisotropic",
     )
     start = start_splats(hull, still, settings, count=120, seed=5)
-    first, again, other = (fit_splats(start, still, WHITE, settings, move=True, seed=seed) for seed in (5, 5, 6))
+    first, again, other = (
+        fit_splats(start, still, WHITE, settings, move=True, seed=seed) for seed in (5, 5, 6)
+    )
     for name, value in vars(first).items():
         assert torch.equal(value, getattr(again, name)), name
     assert not torch.equal(first.means[:100], other.means[:100])
@@ -225,7 +297,9 @@ def test_the_same_seed_gives_the_same_bits(hull, still):
 
 def test_copies_of_anisotropic_gaussians_keep_their_axes():
     """Shifted along the axes of their own: a rod's copies lie along the rod."""
-    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.2], [0.7, 0.0, -0.4], [-0.2, 0.4, 0.0]]))
+    turn = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.7, 0.2], [0.7, 0.0, -0.4], [-0.2, 0.4, 0.0]])
+    )
     gaussians = free(some_splats(1), anisotropic=True)
     gaussians.parameters["rotation"].data[:] = matrix_to_quaternion(turn)
     gaussians.fixed["lower"] -= 10

@@ -31,7 +31,12 @@ def hull(squashed):
 
 def truly_inside(volume: Volume) -> np.ndarray:
     points = volume.points().double().numpy()
-    return squashed_body.inside(points.reshape(-1, 3) - CENTRE.double().numpy()).reshape(points.shape[:3]) < 0
+    return (
+        squashed_body.inside(points.reshape(-1, 3) - CENTRE.double().numpy()).reshape(
+            points.shape[:3]
+        )
+        < 0
+    )
 
 
 def ball(radius: float = 0.1, pitch: float = 0.004) -> Volume:
@@ -129,4 +134,6 @@ def test_debris_goes_and_cavities_close():
     middle = values.shape[0] // 2
     values[middle, middle, middle] = 0
     values[1, 1, 1] = 1
-    assert body_volume(Volume(values, volume.origin, volume.pitch)) == pytest.approx(body_volume(volume))
+    assert body_volume(Volume(values, volume.origin, volume.pitch)) == pytest.approx(
+        body_volume(volume)
+    )

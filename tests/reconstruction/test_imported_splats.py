@@ -25,8 +25,13 @@ def test_a_ply_replaces_the_static_stage(squashed, tmp_path, monkeypatch):
     still = object_windows(squashed, squashed.training_cameras, [0], margin=6)
     splats = initial_splats(object_hull(squashed, settings), still, count=150, seed=0)
     green = replace(splats, colors=torch.tensor([0.1, 0.9, 0.2]).expand(150, 3))
-    far = replace(green, means=green.means + 100)  # the room around the object, outside of the scene's box
-    save_ply(tmp_path / "own.ply", type(green)(*(torch.cat([getattr(s, n) for s in (green, far)]) for n in vars(green))))
+    far = replace(
+        green, means=green.means + 100
+    )  # the room around the object, outside of the scene's box
+    save_ply(
+        tmp_path / "own.ply",
+        type(green)(*(torch.cat([getattr(s, n) for s in (green, far)]) for n in vars(green))),
+    )
     fitted, fit = [], pipeline.fit_splats
 
     def noted(start, *arguments, **options):
@@ -34,10 +39,17 @@ def test_a_ply_replaces_the_static_stage(squashed, tmp_path, monkeypatch):
         return fit(start, *arguments, **options)
 
     monkeypatch.setattr(pipeline, "fit_splats", noted)
-    run = lambda: reconstruct(squashed, settings=settings, spacing=0.03, cache_dir=tmp_path, progress=False)  # noqa: E731
+
+    def run():
+        return reconstruct(
+            squashed, settings=settings, spacing=0.03, cache_dir=tmp_path, progress=False
+        )
+
     result = run()
     assert [move for move, _ in fitted] == [False]
-    torch.testing.assert_close(fitted[0][1], torch.tensor([0.1, 0.9, 0.2]).expand_as(fitted[0][1]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        fitted[0][1], torch.tensor([0.1, 0.9, 0.2]).expand_as(fitted[0][1]), atol=1e-5, rtol=0
+    )
     assert torch.isfinite(result.cues.positions).all()
     save_ply(tmp_path / "own.ply", replace(splats, colors=0.5 * splats.colors))
     run()
@@ -47,9 +59,13 @@ def test_a_ply_replaces_the_static_stage(squashed, tmp_path, monkeypatch):
 def test_splats_of_another_world_are_refused(squashed, tmp_path):
     means = 100 + torch.rand(20, 3)
     rotations = torch.tensor([1.0, 0, 0, 0]).expand(20, 4)
-    splats = pipeline.Splats(means, torch.full((20, 3), 0.1), rotations, torch.full((20,), 0.5), torch.rand(20, 3))
+    splats = pipeline.Splats(
+        means, torch.full((20, 3), 0.1), rotations, torch.full((20,), 0.5), torch.rand(20, 3)
+    )
     settings = build_settings(splats=str(save_ply(tmp_path / "far.ply", splats)), **QUICK)
-    with pytest.raises(DataError, match=r"far.ply: expected Gaussians in the scene's box .*found 0 of 20"):
+    with pytest.raises(
+        DataError, match=r"far.ply: expected Gaussians in the scene's box .*found 0 of 20"
+    ):
         reconstruct(squashed, settings=settings, spacing=0.03, cache_dir=None, progress=False)
 
 
@@ -64,7 +80,11 @@ def test_splats_beside_the_object_are_refused(squashed, tmp_path, change, unit):
     splats = initial_splats(object_hull(squashed, settings), still, count=150, seed=0)
     save_ply(tmp_path / "own.ply", splats)
     assert len(pipeline.imported_splats(str(tmp_path / "own.ply"), squashed).splats.means) == 150
-    moved = replace(splats, means=change(splats.means, splats.means.mean(0)), scales=unit * splats.scales)
+    moved = replace(
+        splats, means=change(splats.means, splats.means.mean(0)), scales=unit * splats.scales
+    )
     save_ply(tmp_path / "own.ply", moved)
-    with pytest.raises(DataError, match="expected Gaussians where the mattes of frame 0 show the object"):
+    with pytest.raises(
+        DataError, match="expected Gaussians where the mattes of frame 0 show the object"
+    ):
         pipeline.imported_splats(str(tmp_path / "own.ply"), squashed)

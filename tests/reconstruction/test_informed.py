@@ -10,7 +10,12 @@ import torch
 from mosa.errors import ConfigError
 from mosa.reconstruction.motion.cues import neighbourhood
 from mosa.reconstruction.motion.dynamic import DynamicSettings, Scaffold
-from mosa.reconstruction.motion.informed import InformedSettings, informed_motion, laid_onto, project
+from mosa.reconstruction.motion.informed import (
+    InformedSettings,
+    informed_motion,
+    laid_onto,
+    project,
+)
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.motion.observed import object_windows
@@ -34,18 +39,40 @@ def bent(scaffold):
     """(windows, body, true positions) of a body that bends far."""
     truth = ModalMotion(OFFSETS, scaffold.modes.energy, reach=0.1)
     with torch.no_grad():
-        truth.amplitude[1:, 4:10] = 0.04 * torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(5))
+        truth.amplitude[1:, 4:10] = 0.04 * torch.randn(
+            2, 6, 3, generator=torch.Generator().manual_seed(5)
+        )
         scene = rendered_windows(scaffold, truth, 3)
-        shifted = Splats(**{**vars(scaffold.splats), "means": scaffold.splats.means + torch.tensor([0.04, 0.25, 0.0])})
+        shifted = Splats(
+            **{
+                **vars(scaffold.splats),
+                "means": scaffold.splats.means + torch.tensor([0.04, 0.25, 0.0]),
+            }
+        )
         true = truth(EVERY, shifted, scaffold.modes).positions
-    return object_windows(scene, list(range(6)), list(range(3))), Scaffold(shifted, scaffold.modes, scaffold.around), true
+    return (
+        object_windows(scene, list(range(6)), list(range(3))),
+        Scaffold(shifted, scaffold.modes, scaffold.around),
+        true,
+    )
 
 
 def fitted(bent, predicted, seen, **settings):
     windows, body, _ = bent
     chosen = InformedSettings(**{"iterations": 60, "lr": 0.01} | settings)
-    motion, _ = informed_motion(body, body, windows, OFFSETS, torch.ones(3), predicted, seen, chosen,
-                                DynamicSettings(carriers="particles"), reach=0.1, seed=0)
+    motion, _ = informed_motion(
+        body,
+        body,
+        windows,
+        OFFSETS,
+        torch.ones(3),
+        predicted,
+        seen,
+        chosen,
+        DynamicSettings(carriers="particles"),
+        reach=0.1,
+        seed=0,
+    )
     with torch.no_grad():
         return motion(EVERY, body.splats, body.modes, body.around).positions
 
@@ -54,14 +81,23 @@ def test_a_body_in_another_light_is_followed_where_its_shades_are_known(scaffold
     """Frames that a light makes brighter on one side and darker on the other: without their shades the colours pull the body."""
     truth = ModalMotion(OFFSETS, scaffold.modes.energy, reach=0.1)
     with torch.no_grad():
-        truth.amplitude[1:, 4:8] = 0.02 * torch.randn(2, 4, 3, generator=torch.Generator().manual_seed(2))
+        truth.amplitude[1:, 4:8] = 0.02 * torch.randn(
+            2, 4, 3, generator=torch.Generator().manual_seed(2)
+        )
         side = scaffold.splats.means[:, 0] / scaffold.splats.means[:, 0].abs().max()
         lit = replace(scaffold, shades=torch.stack([0 * side, 0.4 * side, -0.4 * side]).exp())
         scene = rendered_windows(lit, truth, 3)
-        shifted = replace(scaffold.splats, means=scaffold.splats.means + torch.tensor([0.04, 0.25, 0.0]))
+        shifted = replace(
+            scaffold.splats, means=scaffold.splats.means + torch.tensor([0.04, 0.25, 0.0])
+        )
         true = truth(EVERY, shifted, scaffold.modes).positions
-    windows, body = object_windows(scene, list(range(6)), list(range(3))), replace(scaffold, splats=shifted)
-    known = fitted((windows, replace(body, shades=lit.shades), None), true, true, bending=0.01, elastic=0.01)
+    windows, body = (
+        object_windows(scene, list(range(6)), list(range(3))),
+        replace(scaffold, splats=shifted),
+    )
+    known = fitted(
+        (windows, replace(body, shades=lit.shades), None), true, true, bending=0.01, elastic=0.01
+    )
     unknown = fitted((windows, body, None), true, true, bending=0.01, elastic=0.01)
     assert away(known, true) < 0.2
     assert away(known, true) < 0.3 * away(unknown, true)
@@ -73,20 +109,26 @@ def away(a, b) -> float:
 
 def test_a_frame_is_laid_onto_what_was_seen_by_a_rigid_motion(scaffold):
     rest = scaffold.splats.means
-    turn = quaternion_to_matrix(torch.nn.functional.normalize(torch.tensor([[0.9, 0.3, -0.2, 0.1]]), dim=-1))
+    turn = quaternion_to_matrix(
+        torch.nn.functional.normalize(torch.tensor([[0.9, 0.3, -0.2, 0.1]]), dim=-1)
+    )
     bent = torch.stack([rest, rest + 0.1 * rest[:, :1] ** 2 / 0.1])
     moved = bent @ turn.mT + torch.tensor([0.3, -0.2, 0.1])
     assert torch.allclose(laid_onto(bent, moved), moved, atol=1e-6)
     # and never by a mirror image
     mirrored = laid_onto(bent, bent * torch.tensor([1.0, 1.0, -1.0]))
-    volume = torch.linalg.det((mirrored - mirrored.mean(1, keepdim=True)).mT @ (bent - bent.mean(1, keepdim=True)))
+    volume = torch.linalg.det(
+        (mirrored - mirrored.mean(1, keepdim=True)).mT @ (bent - bent.mean(1, keepdim=True))
+    )
     assert bool((volume > 0).all())
 
 
 def test_amplitudes_of_a_motion_are_found_again(scaffold):
     truth, found = (ModalMotion(OFFSETS, scaffold.modes.energy, reach=0.1) for _ in range(2))
     with torch.no_grad():
-        truth.amplitude[1:] = 0.02 * torch.randn(2, 24, 3, generator=torch.Generator().manual_seed(1))
+        truth.amplitude[1:] = 0.02 * torch.randn(
+            2, 24, 3, generator=torch.Generator().manual_seed(1)
+        )
         project(found, scaffold, truth(EVERY, scaffold.splats, scaffold.modes).positions)
     assert torch.allclose(found.amplitude[1:], truth.amplitude[1:], atol=1e-5)
 
@@ -106,7 +148,9 @@ def test_images_correct_a_wrong_prediction_wherever_it_is(bent):
     half = still + 0.5 * (true - still)
     before = away(half, true)
     near = away(fitted(bent, half, half), true)
-    turn = quaternion_to_matrix(torch.nn.functional.normalize(torch.tensor([[0.8, 0.1, 0.5, -0.2]]), dim=-1))
+    turn = quaternion_to_matrix(
+        torch.nn.functional.normalize(torch.tensor([[0.8, 0.1, 0.5, -0.2]]), dim=-1)
+    )
     far = away(fitted(bent, half @ turn.mT + 0.1, half), true)
     assert near < 0.65 * before and abs(far - near) < 0.02
 
@@ -127,8 +171,19 @@ def test_a_prediction_that_is_no_body_is_not_followed(bent, share):
     wrong = true.clone()
     wrong[2, :, 1] = wrong[2, :, 1].mean() + share * (wrong[2, :, 1] - wrong[2, :, 1].mean())
     for predicted, followed in ((wrong, False), (true, True)):
-        found = informed_motion(body, body, windows, OFFSETS, torch.ones(3), predicted, true, InformedSettings(iterations=30),
-                                DynamicSettings(carriers="particles"), reach=0.1, seed=0)
+        found = informed_motion(
+            body,
+            body,
+            windows,
+            OFFSETS,
+            torch.ones(3),
+            predicted,
+            true,
+            InformedSettings(iterations=30),
+            DynamicSettings(carriers="particles"),
+            reach=0.1,
+            seed=0,
+        )
         assert (found is not None) == followed
 
 

@@ -39,13 +39,22 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(squashed, spacing, cache):
     # the truth is taken away: reading it would be an error
-    return reconstruct(replace(squashed, truth=None), settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
+    return reconstruct(
+        replace(squashed, truth=None),
+        settings=SETTINGS,
+        spacing=spacing,
+        cache_dir=cache,
+        progress=False,
+    )
 
 
 def true_positions(squashed, particles):
     last = float(squashed.times[-1])
     rest = squashed_body.backward(particles.double().numpy(), 0.0, last)
-    return torch.as_tensor(np.stack([squashed_body.forward(rest, float(t), last) for t in squashed.times]), dtype=torch.float32)
+    return torch.as_tensor(
+        np.stack([squashed_body.forward(rest, float(t), last) for t in squashed.times]),
+        dtype=torch.float32,
+    )
 
 
 def test_particles_fill_the_body(squashed, found, spacing):
@@ -72,12 +81,18 @@ def test_cues_against_truth(squashed, found):
     true = true_positions(squashed, found.splats.means)
     expected = neighbourhood_cues(true, found.cues.covariances, neighbourhood(found.splats.means))
     turn = expected.rotation.transpose(-1, -2) @ found.cues.rotation
-    angle = torch.rad2deg(torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)))
+    angle = torch.rad2deg(
+        torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
+    )
     assert float(angle[1:].median()) < 3.0
     signal = (expected.stretch[-1] - 1).pow(2).mean().sqrt()
     assert float(signal) > 0.08
-    assert float((expected.stretch[-1] - found.cues.stretch[-1]).pow(2).mean().sqrt()) < 0.5 * float(signal)
-    assert torch.equal(found.cues.rotation[0], torch.eye(3).expand_as(found.cues.rotation[0])) or torch.allclose(
+    assert float(
+        (expected.stretch[-1] - found.cues.stretch[-1]).pow(2).mean().sqrt()
+    ) < 0.5 * float(signal)
+    assert torch.equal(
+        found.cues.rotation[0], torch.eye(3).expand_as(found.cues.rotation[0])
+    ) or torch.allclose(
         found.cues.rotation[0], torch.eye(3).expand_as(found.cues.rotation[0]), atol=1e-5
     )
 
@@ -96,13 +111,22 @@ def test_results_come_from_the_cache(squashed, found, spacing, cache, monkeypatc
     monkeypatch.setattr(pipeline, "fit_splats", None)
     monkeypatch.setattr(moved, "fit_motion", None)
     monkeypatch.setattr(pipeline, "fit_carried", None)
-    again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
-    assert torch.equal(again.cues.positions, found.cues.positions) and torch.equal(again.splats.colors, found.splats.colors)
+    again = reconstruct(
+        squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False
+    )
+    assert torch.equal(again.cues.positions, found.cues.positions) and torch.equal(
+        again.splats.colors, found.splats.colors
+    )
     assert torch.equal(again.appearance.harmonics, found.appearance.harmonics)
     assert pipeline.stored(squashed, lambda: spacing, SETTINGS, cache_dir=cache)
-    folders = [{p.name for p in folder.iterdir()} for folder in sorted((cache / "reconstruction").iterdir())]
+    folders = [
+        {p.name for p in folder.iterdir()}
+        for folder in sorted((cache / "reconstruction").iterdir())
+    ]
     # the geometry does not depend on the particles' spacing, and nothing on the carried splats
-    carried, geometry, rest = sorted(folders, key=lambda names: (len(names), "geometry.pt" in names))
+    carried, geometry, rest = sorted(
+        folders, key=lambda names: (len(names), "geometry.pt" in names)
+    )
     assert carried == {"key.json", "carried.pt"} and geometry == {"key.json", "geometry.pt"}
     assert {"static.png", "particles.png", "motion.png", "key.json", "motion.pt"} <= rest
     assert not any(n.endswith(".tmp") for n in rest)
@@ -115,7 +139,9 @@ def test_the_second_look_takes_what_the_first_motion_was_fitted_with(squashed, f
     monkeypatch.setattr(moved, "hull_centroid", None)
     settings = replace(SETTINGS, informed=InformedSettings(iterations=1))
     again = moved.SecondLook(squashed, found, settings, progress=False).about(found.cues.positions)
-    assert again.positions.shape == found.cues.positions.shape and bool(torch.isfinite(again.positions).all())
+    assert again.positions.shape == found.cues.positions.shape and bool(
+        torch.isfinite(again.positions).all()
+    )
 
 
 def test_the_second_look_compares_what_was_fitted_to_all_frames(squashed, found):
@@ -125,25 +151,39 @@ def test_the_second_look_compares_what_was_fitted_to_all_frames(squashed, found)
     carried = fitted._carried
     assert torch.equal(carried.splats.means, found.appearance.splats.means)
     assert carried.shades.shape == (len(found.cues.positions), len(carried.splats.means))
-    torch.testing.assert_close(carried.shades[0], torch.ones_like(carried.shades[0]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        carried.shades[0], torch.ones_like(carried.shades[0]), atol=1e-4, rtol=0
+    )
     assert first._carried is found.moving.carried
-    assert moved.SecondLook(squashed, replace(found, appearance=None), fitted.settings, progress=False)._carried.shades is None
+    assert (
+        moved.SecondLook(
+            squashed, replace(found, appearance=None), fitted.settings, progress=False
+        )._carried.shades
+        is None
+    )
 
 
 def test_a_body_that_flows_is_not_compared_as_the_first_motion_carried_it(squashed, found):
     law = []  # the fit chooses it, after the look was made
-    one, other = (moved.SecondLook(squashed, found, SETTINGS, progress=False, plastic=lambda: "liquid" in law) for _ in range(2))
+    one, other = (
+        moved.SecondLook(squashed, found, SETTINGS, progress=False, plastic=lambda: "liquid" in law)
+        for _ in range(2)
+    )
     assert one.settings.informed.carriers == "auto"
     assert one._carried.shades is not None
     law.append("liquid")
     assert other._carried is found.moving.carried
 
 
-def test_a_damaged_stage_is_computed_again_and_the_rest_kept(squashed, found, spacing, cache, monkeypatch):
+def test_a_damaged_stage_is_computed_again_and_the_rest_kept(
+    squashed, found, spacing, cache, monkeypatch
+):
     damaged = next((cache / "reconstruction").glob("*/geometry.pt"))
     damaged.write_bytes(b"half a file")
     monkeypatch.setattr(moved, "fit_motion", None)
-    again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
+    again = reconstruct(
+        squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False
+    )
     assert torch.equal(again.cues.positions, found.cues.positions)
     assert damaged.stat().st_size > 1000
 
@@ -157,7 +197,9 @@ def test_held_out_cameras_and_frames_have_no_influence(squashed):
     images[2], mattes[2], images[:, 4], mattes[:, 4] = 0.1, 0.0, 0.9, 0.0
     spoiled = replace(held, images=images, mattes=mattes)
     results = [
-        reconstruct(s, settings=quick, spacing=spacing_for(s, 200, quick), cache_dir=None, progress=False)
+        reconstruct(
+            s, settings=quick, spacing=spacing_for(s, 200, quick), cache_dir=None, progress=False
+        )
         for s in (held, spoiled)
     ]
     assert results[0].cues.positions.shape[0] == 4
@@ -174,7 +216,13 @@ def test_gaussian_cues_come_from_free_shapes(squashed):
         build_settings(**quick, cue="gaussian", dynamic=dynamic)
     settings = build_settings(**quick, cue="gaussian", dynamic=dynamic | {"free_shape": True})
     scene = replace(squashed, holdout_frames=(3, 4))
-    cues = reconstruct(scene, settings=settings, spacing=spacing_for(scene, 200, settings), cache_dir=None, progress=False).cues
+    cues = reconstruct(
+        scene,
+        settings=settings,
+        spacing=spacing_for(scene, 200, settings),
+        cache_dir=None,
+        progress=False,
+    ).cues
     assert torch.allclose(cues.stretch[0], torch.ones_like(cues.stretch[0]), atol=1e-5)
     assert float((cues.stretch[1] - 1).abs().max()) > 1e-6 and cues.weight.min() == 1
     assert torch.allclose(torch.linalg.det(cues.rotation), torch.ones_like(cues.weight), atol=1e-4)
@@ -215,24 +263,44 @@ def turned_scene(scene, Q, shift):
 
 def test_a_known_body_is_followed_through_another_sequence(squashed, found, tmp_path):
     """Its cues are those of the first sequence in the turned world: rotations relative to the pose at frame 0."""
-    Q = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.9, 0.3], [0.9, 0.0, -0.5], [-0.3, 0.5, 0.0]]))
+    Q = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.9, 0.3], [0.9, 0.0, -0.5], [-0.3, 0.5, 0.0]])
+    )
     shift, middle = torch.tensor([0.03, 0.05, -0.02]), found.splats.means.mean(0)
     other = turned_scene(squashed, Q, shift)
     pose = {"rotation": Q, "center": Q @ middle + shift, "rest_center": middle}
-    result = follow(other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False)
+    result = follow(
+        other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False
+    )
     true = true_positions(squashed, found.splats.means) @ Q.T + shift
     error = (result.cues.positions - true).norm(dim=-1)[1:]
     assert error.square().mean().sqrt() < 0.002
-    assert torch.equal(result.volume, found.volume) and torch.equal(result.splats.colors, found.splats.colors)
+    assert torch.equal(result.volume, found.volume) and torch.equal(
+        result.splats.colors, found.splats.colors
+    )
     known = (result.cues.weight > 0) & (found.cues.weight > 0)
     change = (result.cues.rotation - Q @ found.cues.rotation @ Q.T)[known].flatten(1).norm(dim=1)
     assert torch.rad2deg(change / 2**0.5).median() < 2.0 and known.float().mean() > 0.9
     # colours known in another light than that of this film: its first frame says what they are here
     normals = surface_normals(found.static.means, found.splats.means)
     light = torch.tensor([0.3, -0.2, 0.4, 0, 0, 0, 0, 0])
-    relit = replace(found, static=replace(found.static, colors=found.static.colors / shading(light, normals, Q)[:, None]))
-    started = follow(other, squashed, relit, **pose, settings=SETTINGS, cache_dir=None, progress=False).static
-    off, before = ((known.colors - found.static.colors).abs().mean() for known in (started, relit.static))
+    relit = replace(
+        found,
+        static=replace(
+            found.static, colors=found.static.colors / shading(light, normals, Q)[:, None]
+        ),
+    )
+    started = follow(
+        other, squashed, relit, **pose, settings=SETTINGS, cache_dir=None, progress=False
+    ).static
+    off, before = (
+        (known.colors - found.static.colors).abs().mean() for known in (started, relit.static)
+    )
     assert off < 0.5 * before
-    stored = follow(other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False)
-    assert torch.equal(stored.cues.positions, result.cues.positions) and len(list(tmp_path.rglob("motion.pt"))) == 1
+    stored = follow(
+        other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False
+    )
+    assert (
+        torch.equal(stored.cues.positions, result.cues.positions)
+        and len(list(tmp_path.rglob("motion.pt"))) == 1
+    )

@@ -29,7 +29,10 @@ OFFSETS = torch.tensor([[0.0, 0.0, 0.0], [0.09, 0.05, 0.0], [-0.06, 0.03, 0.07]]
 def lattice_body(spacing: float, *, ball: bool = False) -> Splats:
     """Splats on a lattice inside three unequal ellipsoids (or one ball), about 0.25 m large, with a smooth pattern."""
     axis = torch.arange(-0.2, 0.2, spacing)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3) + spacing / 3
+    points = (
+        torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+        + spacing / 3
+    )
     axes, offsets = (torch.full((1, 3), 0.1), torch.zeros(1, 3)) if ball else (AXES, OFFSETS)
     means = points[(((points[:, None] - offsets) / axes).square().sum(-1) < 1).any(1)]
     waves = torch.tensor([[40.0, 10.0, -20.0], [0.0, 45.0, 30.0], [25.0, -30.0, 35.0]])
@@ -52,12 +55,17 @@ def ring(views: int, size: int) -> Cameras:
     return Cameras(K.repeat(views, 1, 1), w2c, size, size, tuple(f"c{i}" for i in range(views)))
 
 
-def film(splats: Splats, poses: Poses, cameras: Cameras, *, shading: float = 0.0, noise: float = 0.01):
+def film(
+    splats: Splats, poses: Poses, cameras: Cameras, *, shading: float = 0.0, noise: float = 0.01
+):
     """Images (V, T, H, W, 3) and mattes (V, T, H, W); light from above that does not turn with the body."""
     body = RigidBody.of(splats, REST_CENTER)
     frames = []
     for R, c in zip(poses.rotation, poses.center):
-        lit = replace(body, colors=(body.colors * fixed_light(outward(splats) @ R.T, shading)[:, None]).clamp(0, 1))
+        lit = replace(
+            body,
+            colors=(body.colors * fixed_light(outward(splats) @ R.T, shading)[:, None]).clamp(0, 1),
+        )
         frames.append(lit.render(Poses(R[None], c[None]), cameras, WHITE))
     seen = torch.cat(frames).transpose(0, 1)
     seen = seen + noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(7))
@@ -94,7 +102,9 @@ def test_pose_of_the_same_body():
     """The same splats, noisy images, half a turn away: only noise limits the fit."""
     splats, truth, cameras = lattice_body(0.022), turned(2.0, -1.2, 1.9), ring(5, 112)
     images, mattes = found_pose(splats, truth, cameras)
-    Q, center, _ = register_pose(splats, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER)
+    Q, center, _ = register_pose(
+        splats, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER
+    )
     assert degrees(Q, truth.rotation[0]) < 0.1
     assert float((center - truth.center[0]).norm()) < 1e-4
     assert float((Q @ Q.T - torch.eye(3)).abs().max()) < 1e-5 and float(torch.linalg.det(Q)) > 0
@@ -102,7 +112,12 @@ def test_pose_of_the_same_body():
 
 def test_pose_of_a_body_known_only_roughly():
     """Filmed with five times as many splats and shaded by a fixed light: 0.5 degrees and 0.5 mm of 0.25 m at 160 px."""
-    fine, coarse, truth, cameras = lattice_body(0.0075), lattice_body(0.0125), turned(-0.4, 0.9, 0.5), ring(6, 160)
+    fine, coarse, truth, cameras = (
+        lattice_body(0.0075),
+        lattice_body(0.0125),
+        turned(-0.4, 0.9, 0.5),
+        ring(6, 160),
+    )
     images, mattes = found_pose(fine, truth, cameras, shading=0.25)
     options = dict(background=WHITE, rest_center=REST_CENTER, rotations=300, starts=12)
     Q, center, _ = register_pose(coarse, images, mattes, cameras, **options)
@@ -146,15 +161,24 @@ def test_velocity_of_free_flight(frames):
 def test_flight_is_ballistic():
     """Position by the parabola, rotation at a constant rate about fixed axes."""
     times = torch.tensor([0.0, 0.1, 0.3])
-    poses = flight(turned(0.0, 0.0, 1.0), torch.tensor([0.0] * 6 + [1.0, 0.0, 0.0] + [0.0, 0.0, 2.0]), times, GRAVITY)
+    poses = flight(
+        turned(0.0, 0.0, 1.0),
+        torch.tensor([0.0] * 6 + [1.0, 0.0, 0.0] + [0.0, 0.0, 2.0]),
+        times,
+        GRAVITY,
+    )
     fallen = poses.center - poses.center[0]
     torch.testing.assert_close(fallen[2], torch.tensor([0.3, -0.5 * 9.8 * 0.09, 0.0]))
     torch.testing.assert_close(poses.rotation[2], rotation_exp(torch.tensor([0.0, 0.0, 1.6])))
 
 
 def test_flight_jacobian_against_differences():
-    motion = torch.tensor([0.01, 0.02, -0.01, 0.1, -0.2, 0.05, 1.0, -2.0, 0.5, 3.0, -4.0, 2.0], dtype=torch.float64)
-    start = Poses(rotation_exp(torch.tensor([[0.5, 1.0, -0.3]]).double()), torch.zeros(1, 3).double())
+    motion = torch.tensor(
+        [0.01, 0.02, -0.01, 0.1, -0.2, 0.05, 1.0, -2.0, 0.5, 3.0, -4.0, 2.0], dtype=torch.float64
+    )
+    start = Poses(
+        rotation_exp(torch.tensor([[0.5, 1.0, -0.3]]).double()), torch.zeros(1, 3).double()
+    )
     times, gravity, radius, h = torch.tensor([0.0, 0.02, 0.1]).double(), GRAVITY.double(), 0.1, 1e-6
     J = flight_jacobian(motion, times, radius)
     middle = flight(start, motion, times, gravity)
@@ -172,7 +196,9 @@ def test_flight_jacobian_against_differences():
 def test_rotations_cover_the_sphere_of_rotations():
     """Any rotation has one of 600 within 30 degrees (spread evenly, a cell of them is about 22 degrees wide)."""
     R = spread_rotations(600).double()
-    torch.testing.assert_close(R @ R.transpose(1, 2), torch.eye(3).double().expand(600, 3, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        R @ R.transpose(1, 2), torch.eye(3).double().expand(600, 3, 3), atol=1e-6, rtol=0
+    )
     g = torch.Generator().manual_seed(0)
     probes = rotation_exp(torch.randn(300, 3, generator=g, dtype=torch.float64) * 1.5)
     trace = torch.einsum("aij,bij->ab", probes, R)
@@ -185,7 +211,9 @@ def test_too_little_to_go_by_is_an_error():
     images, mattes = film(splats, turned(0.0, 0.0, 0.0), cameras)
     mattes[1:] = 0
     with pytest.raises(DataError, match="1 of 3 views"):
-        register_pose(splats, images[:, 0], mattes[:, 0], cameras, background=WHITE, rest_center=REST_CENTER)
+        register_pose(
+            splats, images[:, 0], mattes[:, 0], cameras, background=WHITE, rest_center=REST_CENTER
+        )
     with pytest.raises(DataError, match="at least 2 are needed"):
         initial_velocity(
             splats,
@@ -212,10 +240,14 @@ def test_a_light_that_stays_does_not_turn_the_body():
     lit = register_pose(known, images, mattes, cameras, normals=normals, **options)
     assert unlit.light is None
     assert degrees(lit.rotation, truth.rotation[0]) < 0.15
-    assert degrees(lit.rotation, truth.rotation[0]) < 0.5 * degrees(unlit.rotation, truth.rotation[0])
+    assert degrees(lit.rotation, truth.rotation[0]) < 0.5 * degrees(
+        unlit.rotation, truth.rotation[0]
+    )
     # what the light makes of the colours, not its numbers: one pose leaves some of them open
     pose = (truth.rotation[0], truth.center[0])
-    light = light_of(known, normals, pose, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER)
+    light = light_of(
+        known, normals, pose, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER
+    )
     seen = fixed_light(normals @ truth.rotation[0].T, 0.35) / fixed_light(normals, 0.35)
     surface = (ball.means - REST_CENTER).norm(dim=1) > 0.09
     for found in (light, lit.light):

@@ -10,7 +10,14 @@ from mosa.reconstruction.motion.dynamic import DynamicSettings
 from mosa.reconstruction.motion.informed import InformedSettings, informed_motion
 from mosa.reconstruction.motion.modes import Modes
 from mosa.reconstruction.motion.moved import SecondLook
-from mosa.reconstruction.motion.response import BENT, Response, image_matrices, measured, response_of, responses
+from mosa.reconstruction.motion.response import (
+    BENT,
+    Response,
+    image_matrices,
+    measured,
+    response_of,
+    responses,
+)
 from tests.reconstruction.test_informed import EVERY, OFFSETS, away, bent, scaffold  # noqa: F401
 
 K, N, T = 5, 40, 4
@@ -38,7 +45,9 @@ def test_what_stays_is_the_share_of_what_holds_in_all_there_is(known):
     for a in (1e-3 * unit, unit):
         U = share(a)
         assert not U[0].any()
-        assert torch.allclose((H + a * Q) @ U[1:], (a * Q).expand_as(H), rtol=1e-9, atol=1e-9 * unit)
+        assert torch.allclose(
+            (H + a * Q) @ U[1:], (a * Q).expand_as(H), rtol=1e-9, atol=1e-9 * unit
+        )
     blind = torch.linalg.eigh(H).eigenvectors[..., :2]  # seen by no camera
     assert torch.allclose(share(unit)[1:] @ blind, blind, atol=1e-6)
 
@@ -67,16 +76,25 @@ def test_a_motion_is_compared_as_it_would_have_been_found(known):
 
     def moved(c):
         """Positions and deformation gradients under coefficients (T, K, 3)."""
-        return rest + torch.einsum("nk,tkd->tnd", modes.values, c), torch.eye(3).double() + torch.einsum(
-            "tki,njk->tnij", c, modes.gradient)
+        return rest + torch.einsum("nk,tkd->tnd", modes.values, c), torch.eye(
+            3
+        ).double() + torch.einsum("tki,njk->tnij", c, modes.gradient)
 
-    truth, predicted = (0.1 * torch.randn(T, K, 3, generator=generator, dtype=torch.float64) for _ in range(2))
-    found = truth + torch.einsum("tij,tj->ti", U, (predicted - truth).flatten(1)).unflatten(1, (K, 3))
-    turn = torch.linalg.matrix_exp(torch.tensor([[0, 0.3, 0], [-0.3, 0, 0.2], [0, -0.2, 0]]).double())
+    truth, predicted = (
+        0.1 * torch.randn(T, K, 3, generator=generator, dtype=torch.float64) for _ in range(2)
+    )
+    found = truth + torch.einsum("tij,tj->ti", U, (predicted - truth).flatten(1)).unflatten(
+        1, (K, 3)
+    )
+    turn = torch.linalg.matrix_exp(
+        torch.tensor([[0, 0.3, 0], [-0.3, 0, 0.2], [0, -0.2, 0]]).double()
+    )
     response = Response(moved(predicted)[0], U, modes.values, modes.gradient)
     x, F = moved(truth)
     as_found, gradient = response.seen(x, F @ turn, turn)
-    assert torch.allclose(as_found, moved(found)[0], atol=1e-12) and torch.allclose(gradient, moved(found)[1] @ turn, atol=1e-12)
+    assert torch.allclose(as_found, moved(found)[0], atol=1e-12) and torch.allclose(
+        gradient, moved(found)[1] @ turn, atol=1e-12
+    )
     for t in range(T):  # of the observer, frame by frame and of several worlds at once
         assert torch.allclose(x[t] - response.unseen(x[t], t), as_found[t], atol=1e-12)
     worlds = torch.stack([x[1], moved(predicted)[0][1]])
@@ -99,7 +117,9 @@ def test_of_a_body_that_is_filmed(bent):  # noqa: F811
     H = image_matrices(body, body, windows, OFFSETS, torch.ones(3), found[0][0], reach=0.1, views=6)
     assert H.shape == (2, 72, 72) and torch.allclose(H, H.mT, atol=1e-5 * float(H.max()))
     assert float(torch.linalg.eigvalsh(H).min()) > -1e-5 * float(H.max())
-    response, _, left = response_of(body.modes, H, found[0][1], found[0][0], found[1][1], found[1][0], 1)
+    response, _, left = response_of(
+        body.modes, H, found[0][1], found[0][0], found[1][1], found[1][0], 1
+    )
     flat = torch.eye(3).expand(*true.shape, 3)
     seen = response.seen(true, flat, torch.eye(3))[0]
     assert left < 0.2 and away(found[0][0], seen) < 0.4 * away(found[0][0], true)
@@ -110,10 +130,14 @@ def test_of_a_body_that_is_filmed(bent):  # noqa: F811
 def test_the_response_of_another_sequence_is_refused(known):
     class Body:
         scene = type("", (), {"training_frames": list(range(T))})
-        reconstruction = type("", (), {"moving": type("", (), {"scaffold": type("", (), {"modes": known[2]})})})
+        reconstruction = type(
+            "", (), {"moving": type("", (), {"scaffold": type("", (), {"modes": known[2]})})}
+        )
 
     H, energies, modes = known
-    good = Response(torch.zeros(T, N, 3).double(), responses(H, energies)[0](1.0), modes.values, modes.gradient)
+    good = Response(
+        torch.zeros(T, N, 3).double(), responses(H, energies)[0](1.0), modes.values, modes.gradient
+    )
     again = SecondLook.response(Body, good.written())
     assert torch.equal(again.share, good.share) and torch.equal(again.values, good.values)
     assert SecondLook.response(Body, None) is None
@@ -124,6 +148,8 @@ def test_the_response_of_another_sequence_is_refused(known):
 def test_a_part_of_large_pictures_tells_what_all_of_them_do(bent, monkeypatch):  # noqa: F811
     windows, body, true = bent
     whole = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
-    monkeypatch.setattr("mosa.reconstruction.motion.response.VALUES", windows.images[0].numel() // 5)
+    monkeypatch.setattr(
+        "mosa.reconstruction.motion.response.VALUES", windows.images[0].numel() // 5
+    )
     part = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
     assert not torch.equal(part, whole) and float((part - whole).norm() / whole.norm()) < 0.2

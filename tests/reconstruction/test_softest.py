@@ -12,7 +12,9 @@ from mosa.reconstruction.motion.softest import softest_vectors
 @pytest.fixture(scope="module")
 def body():
     """900 points of a bent slab, of unequal sides."""
-    points = torch.rand(900, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 0.2, 0.1])
+    points = torch.rand(900, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [0.3, 0.2, 0.1]
+    )
     points[:, 2] += 2 * points[:, 0] ** 2
     return points, neighbourhood(points)
 
@@ -44,7 +46,9 @@ def test_modes_of_large_bodies_are_those_of_small_ones(body, monkeypatch):
     turn = filtered.values.T @ direct.values / len(points)
     assert torch.allclose(turn @ turn.T, torch.eye(24), atol=1e-4)
     assert torch.allclose(
-        torch.einsum("nik,kl->nil", filtered.gradient, turn), direct.gradient, atol=1e-3 * float(direct.gradient.abs().max())
+        torch.einsum("nik,kl->nil", filtered.gradient, turn),
+        direct.gradient,
+        atol=1e-3 * float(direct.gradient.abs().max()),
     )
 
 

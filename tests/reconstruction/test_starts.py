@@ -9,7 +9,12 @@ from mosa.errors import DataError
 from mosa.reconstruction.pose import starts
 from mosa.types import Ground
 
-GRAVITY, FPS, HEIGHT, SPEED = -9.8, 50.0, 0.20, 2.0  # the lowest point is at 0.1: contact between frames 2 and 3
+GRAVITY, FPS, HEIGHT, SPEED = (
+    -9.8,
+    50.0,
+    0.20,
+    2.0,
+)  # the lowest point is at 0.1: contact between frames 2 and 3
 
 
 def drop(monkeypatch, seen_wrongly, frames=9, last_free_frame=None, height=HEIGHT):
@@ -31,17 +36,26 @@ def drop(monkeypatch, seen_wrongly, frames=9, last_free_frame=None, height=HEIGH
     def fitted(splats, pose, images, mattes, views, *, times, **_):
         asked.append(len(times))
         fallen = heights[: len(times)] - heights[0] - 0.5 * GRAVITY * times**2
-        return torch.tensor([0.0, float((times @ fallen) / times.square().sum()), 0.0]), torch.zeros(3)
+        return torch.tensor(
+            [0.0, float((times @ fallen) / times.square().sum()), 0.0]
+        ), torch.zeros(3)
 
     monkeypatch.setattr(starts, "initial_velocity", fitted)
-    return lambda: starts.sequence_start(body, SimpleNamespace(splats=None), scene, register=False), asked, body, scene
+    return (
+        lambda: starts.sequence_start(body, SimpleNamespace(splats=None), scene, register=False),
+        asked,
+        body,
+        scene,
+    )
 
 
 def test_two_frames_that_say_too_little_speed_are_corrected(monkeypatch):
     """Frame 1 seen 2 cm too high says 1 m/s, and that frames 0 to 3 are free; a fit to these puts frame 3 after the contact."""
     start, asked, body, scene = drop(monkeypatch, {1: 0.02})
     found = start()
-    assert starts.first_contact(body, found, scene) >= asked[-1], "fitted to frames after its own contact"
+    assert starts.first_contact(body, found, scene) >= asked[-1], (
+        "fitted to frames after its own contact"
+    )
     assert asked == [2, 4, 3]
     assert float(found.velocity[1]) == pytest.approx(-SPEED, abs=0.25)
 
@@ -66,5 +80,7 @@ def test_free_frames_that_are_known_or_many_are_used_at_once(monkeypatch):
 
 def test_contact_before_the_second_frame_is_an_error(monkeypatch):
     start, *_ = drop(monkeypatch, {}, height=0.12)
-    with pytest.raises(DataError, match="cube/train: the object touches the ground before the second frame"):
+    with pytest.raises(
+        DataError, match="cube/train: the object touches the ground before the second frame"
+    ):
         start()

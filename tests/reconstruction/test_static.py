@@ -41,14 +41,23 @@ def psnr(a, b):
 
 @pytest.fixture(scope="module")
 def fitted(hull, still):
-    return fit_splats(initial_splats(hull, still, count=1500, seed=0), still, torch.ones(3), QUICK, move=True, seed=0)
+    return fit_splats(
+        initial_splats(hull, still, count=1500, seed=0),
+        still,
+        torch.ones(3),
+        QUICK,
+        move=True,
+        seed=0,
+    )
 
 
 def test_ssim_agrees_with_torchmetrics():
     generator = torch.Generator().manual_seed(1)
     a = torch.rand(2, 40, 33, 3, generator=generator)
     b = (a + 0.2 * torch.rand(2, 40, 33, 3, generator=generator)).clamp(0, 1)
-    expected = structural_similarity_index_measure(a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2), data_range=1.0)
+    expected = structural_similarity_index_measure(
+        a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2), data_range=1.0
+    )
     # torchmetrics averages over a border that it filled by reflection and does not quite cut off again
     assert float(ssim(a, b)) == pytest.approx(float(expected), abs=1e-3)
     assert float(1 - ssim(a, b)) == pytest.approx(float(1 - expected), rel=0.02)
@@ -57,7 +66,11 @@ def test_ssim_agrees_with_torchmetrics():
 
 def test_windows_show_what_the_shifted_cameras_see(squashed):
     windows = object_windows(squashed, [0, 3], [0, 4], margin=5)
-    assert len(windows) == 4 and windows.view.tolist() == [0, 0, 3, 3] and windows.frame.tolist() == [0, 4, 0, 4]
+    assert (
+        len(windows) == 4
+        and windows.view.tolist() == [0, 0, 3, 3]
+        and windows.frame.tolist() == [0, 4, 0, 4]
+    )
     assert windows.cameras.width % 8 == 0 and windows.cameras.height % 8 == 0
     for b in range(4):
         v, t = int(windows.view[b]), int(windows.frame[b])
@@ -69,7 +82,9 @@ def test_windows_show_what_the_shifted_cameras_see(squashed):
         xa, xb = max(x0, 0), min(x0 + windows.cameras.width, 96)
         part = windows.images[b, ya - y0 : yb - y0, xa - x0 : xb - x0]
         assert torch.equal(part, squashed.images[v, t, ya:yb, xa:xb])
-        assert float(windows.mattes[b].sum()) == pytest.approx(float(squashed.mattes[v, t].sum()), rel=1e-5)
+        assert float(windows.mattes[b].sum()) == pytest.approx(
+            float(squashed.mattes[v, t].sum()), rel=1e-5
+        )
         assert windows.mattes[b, 0].max() == 0 and windows.mattes[b, :, -1].max() == 0
 
 
@@ -101,13 +116,19 @@ def test_points_that_every_view_sees_from_behind_have_a_colour(hull, still):
     eyes = -(still.cameras.w2c[:, :3, :3].mT @ still.cameras.w2c[:, :3, 3:])[..., 0]
     hidden = ((eyes[:, None] - points) @ torch.tensor(DOWN)).amax(0) < 0
     assert hidden.sum() > 100
-    behind, facing = projected_colors(points, away, still)[hidden].mean(1), projected_colors(points, normals, still).mean(1)
+    behind, facing = (
+        projected_colors(points, away, still)[hidden].mean(1),
+        projected_colors(points, normals, still).mean(1),
+    )
     assert float(behind.min()) > 0.9 * float(facing.min()) and float(facing.min()) > 0.1
 
 
 def test_static_gaussians_reproduce_the_frame(hull, still, fitted):
     start = initial_splats(hull, still, count=1500, seed=0)
-    before, after = psnr(rendered(start, still)[0], still.images), psnr(rendered(fitted, still)[0], still.images)
+    before, after = (
+        psnr(rendered(start, still)[0], still.images),
+        psnr(rendered(fitted, still)[0], still.images),
+    )
     assert after > before + 5 and after > 26
     _, alpha = rendered(fitted, still)
     a, b = alpha > 0.5, still.mattes > 0.5
@@ -133,17 +154,32 @@ def test_hardly_seen_particles_keep_their_first_colour(squashed, hull, fitted):
     """Of two neighbouring views most of the surface is seen by grazing rays or not at all: its colours may not drift to whatever
     explains the rim of a silhouette, and what the views do see has to fit as well as without."""
     two = object_windows(squashed, [0, 1], [0, 1]).of_frame(0)
-    start = scaffold_splats(fill(hull, spacing=(body_volume(hull) / 1500) ** (1 / 3)), fitted, "cpu")
-    fits = {keep: fit_splats(start, two, torch.ones(3), replace(QUICK, keep=keep), move=False, seed=0) for keep in (0.0, 1.0)}
+    start = scaffold_splats(
+        fill(hull, spacing=(body_volume(hull) / 1500) ** (1 / 3)), fitted, "cpu"
+    )
+    fits = {
+        keep: fit_splats(start, two, torch.ones(3), replace(QUICK, keep=keep), move=False, seed=0)
+        for keep in (0.0, 1.0)
+    }
     features = torch.zeros(1, len(start.means), 1, requires_grad=True)
-    covariances, state = isotropic_covariances(start.scales[:, 0])[None], torch.zeros(2, dtype=torch.long)
-    image, _ = rasterize(start.means[None], covariances, start.opacities, features, two.cameras, state)
+    covariances, state = (
+        isotropic_covariances(start.scales[:, 0])[None],
+        torch.zeros(2, dtype=torch.long),
+    )
+    image, _ = rasterize(
+        start.means[None], covariances, start.opacities, features, two.cameras, state
+    )
     pixels = torch.autograd.grad(image.sum(), features)[0][0, :, 0]
     faint = (pixels > 1e-3) & (pixels < 0.3)
     assert faint.sum() > 100
-    drift = {keep: float((fit.colors - start.colors)[faint].abs().mean()) for keep, fit in fits.items()}
+    drift = {
+        keep: float((fit.colors - start.colors)[faint].abs().mean()) for keep, fit in fits.items()
+    }
     assert drift[1.0] < 0.5 * drift[0.0]
-    assert psnr(rendered(fits[1.0], two)[0], two.images) > psnr(rendered(fits[0.0], two)[0], two.images) - 0.3
+    assert (
+        psnr(rendered(fits[1.0], two)[0], two.images)
+        > psnr(rendered(fits[0.0], two)[0], two.images) - 0.3
+    )
 
 
 def test_fits_are_deterministic(hull, still):

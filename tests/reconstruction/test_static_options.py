@@ -26,7 +26,13 @@ def elongated(count=60):
     means = 0.1 * torch.rand(count, 3, generator=generator)
     scales = 0.002 + 0.01 * torch.rand(count, 3, generator=generator)
     rotations = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1)
-    return Splats(means, scales, rotations, torch.full((count,), 0.7), torch.rand(count, 3, generator=generator))
+    return Splats(
+        means,
+        scales,
+        rotations,
+        torch.full((count,), 0.7),
+        torch.rand(count, 3, generator=generator),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +59,12 @@ def test_a_scene_is_reconstructed_with_every_option(squashed, cache, static, app
     free = found.static.scales.amax(1) / found.static.scales.amin(1)
     assert (float(free.max()) > 1.01) == (static.get("shape") == "anisotropic")
     assert torch.isfinite(found.cues.positions).all() and torch.isfinite(found.cues.stretch).all()
-    torch.testing.assert_close(found.cues.covariances[0], covariance_from(found.splats.scales, found.splats.rotations))
-    torch.testing.assert_close(found.cues.stretch[0], torch.ones_like(found.cues.stretch[0]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        found.cues.covariances[0], covariance_from(found.splats.scales, found.splats.rotations)
+    )
+    torch.testing.assert_close(
+        found.cues.stretch[0], torch.ones_like(found.cues.stretch[0]), atol=1e-4, rtol=0
+    )
     again = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache, progress=False)
     assert torch.equal(again.static.scales, found.static.scales)
     if more.get("cue") == "gaussian":
@@ -84,6 +94,10 @@ def test_elongated_gaussians_are_turned_and_written(tmp_path):
     splats = elongated()
     expected = covariance_from(splats.scales, splats.rotations)
     turned = posed(splats, TURN, torch.zeros(3), torch.zeros(3))
-    torch.testing.assert_close(covariance_from(turned.scales, turned.rotations), TURN @ expected @ TURN.T)
+    torch.testing.assert_close(
+        covariance_from(turned.scales, turned.rotations), TURN @ expected @ TURN.T
+    )
     read, _ = load_ply(save_ply(tmp_path / "static.ply", splats))
-    torch.testing.assert_close(covariance_from(read.scales, read.rotations), expected, rtol=1e-5, atol=1e-10)
+    torch.testing.assert_close(
+        covariance_from(read.scales, read.rotations), expected, rtol=1e-5, atol=1e-10
+    )

@@ -20,7 +20,10 @@ def test_windows_are_cut_from_images_on_a_background(squashed, margin):
     for b, (v, t) in enumerate([(1, 0), (1, 1), (3, 0), (3, 1)]):
         x, y = (pad + int(scene.cameras.K[v, a, 2] - windows.cameras.K[b, a, 2]) for a in (0, 1))
         frame = (pad,) * 4
-        whole = [F.pad(scene.images[v, t, ..., c], frame, value=float(scene.background[c])) for c in range(3)]
+        whole = [
+            F.pad(scene.images[v, t, ..., c], frame, value=float(scene.background[c]))
+            for c in range(3)
+        ]
         cut = slice(y, y + windows.cameras.height), slice(x, x + windows.cameras.width)
         assert torch.equal(windows.images[b], torch.stack(whole, -1)[cut])
         assert torch.equal(windows.mattes[b], F.pad(scene.mattes[v, t], frame)[cut])
@@ -30,7 +33,9 @@ def test_windows_are_cut_from_images_on_a_background(squashed, margin):
 def test_occupancy_is_the_smallest_matte_of_all_views(squashed):
     mattes, cameras = squashed.mattes[:, 0], squashed.cameras
     bounds = hull.hull_bounds(mattes, cameras, squashed.box)
-    points = bounds[0] + (bounds[1] - bounds[0]) * torch.rand(5000, 3, generator=torch.Generator().manual_seed(0))
+    points = bounds[0] + (bounds[1] - bounds[0]) * torch.rand(
+        5000, 3, generator=torch.Generator().manual_seed(0)
+    )
     wanted = hull.matte_values(points, mattes, cameras).amin(0)
     assert 0.1 < float((wanted > 0.5).float().mean()) < 0.9
     assert torch.allclose(hull.occupancy(points, mattes, cameras, chunk=2000), wanted, atol=1e-5)
@@ -44,9 +49,10 @@ def test_grown_mattes_are_maxima_over_squares(squashed):
 
 
 def test_a_small_body_in_a_wide_box_is_found():
-    """A ball of 5 cm in a box of 3.2 m, large in every picture: mattes grown by half a cell of the box reach the pictures' borders.
-    """
-    rig = ring_of_cameras(6, 100, target=(0, 0, 0), distance=0.3, elevations=(0.1, 0.8), field=0.035, turn=0.1)
+    """A ball of 5 cm in a box of 3.2 m fills every picture: mattes grown by half a cell reach the borders."""
+    rig = ring_of_cameras(
+        6, 100, target=(0, 0, 0), distance=0.3, elevations=(0.1, 0.8), field=0.035, turn=0.1
+    )
     axis = torch.linspace(-0.025, 0.025, 41)
     ball = torch.cartesian_prod(axis, axis, axis)
     ball = ball[ball.norm(dim=1) <= 0.025]

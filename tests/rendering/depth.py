@@ -32,19 +32,30 @@ def rasterize_with_depth(
     """
     depths = depth_channel(means, cameras, state_index)
     stacked = torch.cat((features.expand(len(cameras), -1, -1), depths), -1)
-    image, alpha = rasterize(means, covariances, opacities, stacked, cameras, state_index, preset=preset, backend=backend)
+    image, alpha = rasterize(
+        means, covariances, opacities, stacked, cameras, state_index, preset=preset, backend=backend
+    )
     over = 0 if background is None else (1 - alpha)[..., None] * background.to(image)
     return image[..., :-1] + over, alpha, image[..., -1]
 
 
 def expected_depth(
-    means: Tensor, covariances: Tensor, opacities: Tensor, cameras: Cameras, state_index: Tensor, preset: str = "gsplat"
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    cameras: Cameras,
+    state_index: Tensor,
+    preset: str = "gsplat",
 ) -> tuple[Tensor, Tensor]:
     """Mean depth sum_i w_i z_i / alpha [m] per pixel, infinite where nothing is seen, and alpha; both (B, H, W).
 
     Gradients to means, covariances, opacities and cameras where something is seen.
     """
     depths = depth_channel(means, cameras, state_index)
-    image, alpha = rasterize(means, covariances, opacities, depths, cameras, state_index, preset=preset)
+    image, alpha = rasterize(
+        means, covariances, opacities, depths, cameras, state_index, preset=preset
+    )
     seen = alpha > 0
-    return torch.where(seen, image[..., 0] / torch.where(seen, alpha, torch.ones_like(alpha)), torch.inf), alpha
+    return torch.where(
+        seen, image[..., 0] / torch.where(seen, alpha, torch.ones_like(alpha)), torch.inf
+    ), alpha

@@ -11,17 +11,29 @@ from mosa.types import Cameras
 NAMES = ("means", "covariances", "opacities", "features")
 
 
-def ring(views: int, width: int, height: int, *, distance: float = 1.0, focal: float = 1.3) -> Cameras:
+def ring(
+    views: int, width: int, height: int, *, distance: float = 1.0, focal: float = 1.3
+) -> Cameras:
     """Cameras around the origin at changing heights, principal point off the centre, focal length in image widths."""
     angle = torch.linspace(0, 2 * torch.pi, views + 1, dtype=torch.float64)[:-1] + 0.3
     eye = distance * torch.stack((angle.cos(), 0.4 * (2 * angle).sin(), angle.sin()), -1)
     w2c = look_at(eye, torch.zeros(3).double(), torch.tensor([0.0, 1.0, 0.0]).double())
     f = focal * width
-    K = torch.tensor([[f, 0, 0.48 * width], [0, 1.05 * f, 0.53 * height], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor(
+        [[f, 0, 0.48 * width], [0, 1.05 * f, 0.53 * height], [0, 0, 1]], dtype=torch.float64
+    )
     return Cameras(K.repeat(views, 1, 1), w2c, width, height, tuple(f"c{i}" for i in range(views)))
 
 
-def draw(count: int, *, states: int = 2, images: int = 3, channels: int = 3, seed: int = 0, size: float = 0.06):
+def draw(
+    count: int,
+    *,
+    states: int = 2,
+    images: int = 3,
+    channels: int = 3,
+    seed: int = 0,
+    size: float = 0.06,
+):
     """Means, anisotropic covariances, opacities from 0.15 to 0.95 and features, float64, with cameras and
     background."""
     g = torch.Generator().manual_seed(seed)
@@ -54,7 +66,9 @@ def objective(image, alpha):
 def gradients(scene, function, **options):
     """Gradients of `objective` with respect to the four differentiable inputs."""
     leaves = {name: getattr(scene, name).detach().clone().requires_grad_() for name in NAMES}
-    return torch.autograd.grad(objective(*render(scene, function, **leaves, **options)), list(leaves.values()))
+    return torch.autograd.grad(
+        objective(*render(scene, function, **leaves, **options)), list(leaves.values())
+    )
 
 
 def dense():

@@ -20,16 +20,21 @@ def back_to_warp():
     use_backend("warp")
 
 
-needs_no_gsplat = pytest.mark.skipif(gsplat_backend.why_unavailable() is None, reason="gsplat runs on this machine")
+needs_no_gsplat = pytest.mark.skipif(
+    gsplat_backend.why_unavailable() is None, reason="gsplat runs on this machine"
+)
 
 
 @needs_no_gsplat
 def test_gsplat_is_refused_with_the_reason_where_it_cannot_run():
     with pytest.raises(
-        ConfigError, match=r"gsplat cannot be used here: .*(not installed|no CUDA device|nvcc|not import).*rendering=warp"
+        ConfigError,
+        match=r"gsplat cannot be used here: .*(not installed|no CUDA device|nvcc|not import).*rendering=warp",
     ):
         use_backend("gsplat")
-    with pytest.raises(ConfigError, match=r"gsplat backend cannot be used for this call: .*use backend='warp'"):
+    with pytest.raises(
+        ConfigError, match=r"gsplat backend cannot be used for this call: .*use backend='warp'"
+    ):
         render(draw(5), rasterize, backend="gsplat")
 
 
@@ -43,7 +48,9 @@ def test_gsplat_that_is_not_required_leaves_the_work_to_warp(monkeypatch, back_t
 
 
 def test_unknown_backends_are_named():
-    with pytest.raises(ConfigError, match=r"rendering.backend: expected one of warp, gsplat, found 'opengl'"):
+    with pytest.raises(
+        ConfigError, match=r"rendering.backend: expected one of warp, gsplat, found 'opengl'"
+    ):
         use_backend("opengl")
     with pytest.raises(ConfigError, match="unknown backend 'opengl'"):
         render(draw(5), rasterize, backend="opengl")
@@ -64,7 +71,9 @@ def test_what_gsplat_has_no_kernels_for_is_said_or_stays_with_warp(monkeypatch, 
     assert "no preset inria" in gsplat_backend.obstacle(on_cuda, cameras, "inria", None)
     assert "kernels of warp" in gsplat_backend.obstacle(on_cuda, cameras, "gsplat", "tile")
     learned = replace(cameras, K=cameras.K.clone().requires_grad_())
-    assert "no gradient to the intrinsics" in gsplat_backend.obstacle(on_cuda, learned, "gsplat", None)
+    assert "no gradient to the intrinsics" in gsplat_backend.obstacle(
+        on_cuda, learned, "gsplat", None
+    )
     skewed = replace(cameras, K=cameras.K + torch.tensor([[0.0, 0.1, 0.0], [0.0] * 3, [0.0] * 3]))
     assert "skew" in gsplat_backend.obstacle(on_cuda, skewed, "gsplat", None)
     on_cuda.dtype = torch.float64
@@ -73,14 +82,43 @@ def test_what_gsplat_has_no_kernels_for_is_said_or_stays_with_warp(monkeypatch, 
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("own_opacities", [False, True])
-def test_states_and_images_keep_their_order_on_the_way_through_gsplat(monkeypatch, shared, own_opacities):
+def test_states_and_images_keep_their_order_on_the_way_through_gsplat(
+    monkeypatch, shared, own_opacities
+):
     """A stand-in with gsplat's documented signature and shapes that draws with warp: every image comes back in its place."""
 
-    def rasterization(*, means, quats, scales, covars, opacities, colors, viewmats, Ks, width, height, near_plane, eps2d, packed):
+    def rasterization(
+        *,
+        means,
+        quats,
+        scales,
+        covars,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane,
+        eps2d,
+        packed,
+    ):
         views, count = len(viewmats), len(means)
-        assert means.shape == (count, 3) and covars.shape == (count, 3, 3) and opacities.shape == (count,)
-        assert viewmats.shape == (views, 4, 4) and Ks.shape == (views, 3, 3) and quats is None and scales is None
-        assert colors.shape[:-1] in ((count,), (views, count)) and (near_plane, eps2d) == (0.01, 0.3)
+        assert (
+            means.shape == (count, 3)
+            and covars.shape == (count, 3, 3)
+            and opacities.shape == (count,)
+        )
+        assert (
+            viewmats.shape == (views, 4, 4)
+            and Ks.shape == (views, 3, 3)
+            and quats is None
+            and scales is None
+        )
+        assert colors.shape[:-1] in ((count,), (views, count)) and (near_plane, eps2d) == (
+            0.01,
+            0.3,
+        )
         cameras = replace(scene.cameras, K=Ks, w2c=viewmats)
         colors = colors if colors.dim() == 3 else colors[None]
         index = torch.zeros(views, dtype=torch.long)
@@ -98,7 +136,8 @@ def test_states_and_images_keep_their_order_on_the_way_through_gsplat(monkeypatc
         scene.opacities = torch.stack((scene.opacities, scene.opacities.flip(0)))
     values = [getattr(scene, name) for name in NAMES]
     for ours, wanted in zip(
-        gsplat_backend.splat(*values, scene.cameras, scene.state_index), rasterize(*values, scene.cameras, scene.state_index)
+        gsplat_backend.splat(*values, scene.cameras, scene.state_index),
+        rasterize(*values, scene.cameras, scene.state_index),
     ):
         torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-13)
 
@@ -112,10 +151,14 @@ def away_from_rims(scene, *, slack=1e-4):
     masks = []
     for b, s in enumerate(scene.state_index.tolist()):
         camera = (scene.cameras.K[b].double(), scene.cameras.w2c[b].double(), width, height)
-        center, M, _ = visible_covariance(scene.means[s].double(), scene.covariances[s].double(), *camera)
+        center, M, _ = visible_covariance(
+            scene.means[s].double(), scene.covariances[s].double(), *camera
+        )
         d = pixels - center
         q = (torch.linalg.inv(M) @ d[..., None])[..., 0].mul(d).sum(-1)
-        rim = (255 * scene.opacities.double() * torch.exp(-0.5 * q) - 1).abs().amin(1).view(1, 1, height, width) < slack
+        rim = (255 * scene.opacities.double() * torch.exp(-0.5 * q) - 1).abs().amin(1).view(
+            1, 1, height, width
+        ) < slack
         masks.append(torch.nn.functional.max_pool2d(rim.float(), 3, 1, 1)[0, 0] == 0)
     return torch.stack(masks)
 
@@ -124,7 +167,12 @@ def parity_scene():
     """1000 Gaussians in 2 states seen by 4 cameras, nine channels (colour and flow), float32. Opacities up to 0.95: what
     the stop at 1e-4 leaves out then is below the tolerance."""
     scene = draw(1000, states=2, images=4, channels=9, size=0.05)
-    scene.cameras = replace(scene.cameras, width=96, height=80, K=4 * scene.cameras.K * torch.tensor([[1.0], [1.0], [0.25]]))
+    scene.cameras = replace(
+        scene.cameras,
+        width=96,
+        height=80,
+        K=4 * scene.cameras.K * torch.tensor([[1.0], [1.0], [0.25]]),
+    )
     clear = away_from_rims(scene)
     for name in (*NAMES, "background"):
         setattr(scene, name, getattr(scene, name).float())
@@ -142,11 +190,17 @@ def outcome(scene, clear, way):
     """Image, alpha and the gradients of all inputs, by name, of an objective that looks at the clear pixels only."""
     leaves = {name: getattr(scene, name).detach().clone().requires_grad_() for name in NAMES}
     w2c = scene.cameras.w2c.detach().clone().requires_grad_()
-    image, alpha = way(*leaves.values(), replace(scene.cameras, w2c=w2c), scene.state_index, scene.background)
+    image, alpha = way(
+        *leaves.values(), replace(scene.cameras, w2c=w2c), scene.state_index, scene.background
+    )
     g = torch.Generator().manual_seed(8)
     weights = [torch.randn(x.shape, generator=g).to(x) for x in (image, alpha)]
     total = (image * weights[0] * clear[..., None]).sum() + (alpha * weights[1] * clear).sum()
-    return image.detach(), alpha.detach(), dict(zip((*NAMES, "w2c"), torch.autograd.grad(total, [*leaves.values(), w2c])))
+    return (
+        image.detach(),
+        alpha.detach(),
+        dict(zip((*NAMES, "w2c"), torch.autograd.grad(total, [*leaves.values(), w2c]))),
+    )
 
 
 def compare(scene, clear, one, other):
@@ -159,14 +213,25 @@ def compare(scene, clear, one, other):
     for name, (rtol, atol) in GRADIENT_TOLERANCES.items():
         ours, theirs = gradients[name], wanted_gradients[name]
         scale = float(theirs.abs().max())
-        torch.testing.assert_close(ours, theirs, rtol=rtol, atol=atol * scale, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(
+            ours,
+            theirs,
+            rtol=rtol,
+            atol=atol * scale,
+            msg=lambda text, name=name: f"{name}: {text}",
+        )
 
 
 def test_both_orders_of_work_agree_in_float32():
     """What the comparison with gsplat rests on: pixel by pixel and Gaussian by Gaussian, float32 rounding stays inside its
     tolerances."""
     scene, clear = parity_scene()
-    compare(scene, clear, lambda *x: rasterize(*x, scan="tile"), lambda *x: rasterize(*x, scan="gaussian"))
+    compare(
+        scene,
+        clear,
+        lambda *x: rasterize(*x, scan="tile"),
+        lambda *x: rasterize(*x, scan="gaussian"),
+    )
 
 
 @pytest.mark.gpu
@@ -177,4 +242,9 @@ def test_parity_with_gsplat():
     scene, clear = parity_scene()
     for name in (*NAMES, "background", "state_index", "cameras"):
         setattr(scene, name, getattr(scene, name).to("cuda"))
-    compare(scene, clear.to("cuda"), lambda *x: rasterize(*x, backend="warp"), lambda *x: rasterize(*x, backend="gsplat"))
+    compare(
+        scene,
+        clear.to("cuda"),
+        lambda *x: rasterize(*x, backend="warp"),
+        lambda *x: rasterize(*x, backend="gsplat"),
+    )

@@ -6,7 +6,15 @@ from drawn_splats import draw, ring
 from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError, DataError
-from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images, look_at, project, rays, scale_cameras
+from mosa.rendering.cameras import (
+    crop_boxes,
+    crop_cameras,
+    crop_images,
+    look_at,
+    project,
+    rays,
+    scale_cameras,
+)
 from mosa.rendering.covariance import (
     covariance_from,
     matrix_to_quaternion,
@@ -34,10 +42,16 @@ def test_rays_pass_through_their_pixel_centres():
 
 def test_look_at_axes():
     """The target lies on the axis ahead, up is up in the image (y falls), right-handed."""
-    eye, target, up = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.5, 0.0]), torch.tensor([0.0, 1.0, 0.0])
+    eye, target, up = (
+        torch.tensor([1.0, 2.0, 3.0]),
+        torch.tensor([0.0, 0.5, 0.0]),
+        torch.tensor([0.0, 1.0, 0.0]),
+    )
     w2c = look_at(eye, target, up)
     seen = w2c[:3, :3] @ target + w2c[:3, 3]
-    torch.testing.assert_close(seen, torch.tensor([0.0, 0.0, float((target - eye).norm())]), atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(
+        seen, torch.tensor([0.0, 0.0, float((target - eye).norm())]), atol=1e-6, rtol=1e-6
+    )
     above = w2c[:3, :3] @ (target + 0.1 * up) + w2c[:3, 3]
     assert float(above[1]) < 0 and abs(float(above[0])) < 1e-6
     assert float(torch.linalg.det(w2c[:3, :3])) == pytest.approx(1, abs=1e-6)
@@ -94,7 +108,9 @@ def test_quaternions_agree_with_scipy():
     product = quaternion_multiply(q[:5], q[5:])
     torch.testing.assert_close(quaternion_to_matrix(product), wanted[:5] @ wanted[5:])
     scales = torch.rand(10, 3, dtype=torch.float64)
-    torch.testing.assert_close(covariance_from(scales, q), wanted @ torch.diag_embed(scales**2) @ wanted.transpose(1, 2))
+    torch.testing.assert_close(
+        covariance_from(scales, q), wanted @ torch.diag_embed(scales**2) @ wanted.transpose(1, 2)
+    )
 
 
 def test_projected_gaussians_are_those_of_the_rasteriser():
@@ -129,17 +145,23 @@ def test_square_root_and_its_gradient_at_equal_eigenvalues():
     round_one = torch.tensor([4.0, 0.0, 4.0], dtype=torch.float64, requires_grad=True)
     gradient = torch.autograd.functional.jacobian(square_root, round_one)
     torch.testing.assert_close(gradient, torch.eye(3).double() / 4)
-    assert torch.autograd.gradcheck(square_root, (M.flatten(1)[:5, [0, 1, 3]].requires_grad_(),), rtol=1e-6)
+    assert torch.autograd.gradcheck(
+        square_root, (M.flatten(1)[:5, [0, 1, 3]].requires_grad_(),), rtol=1e-6
+    )
 
 
 def test_scales_and_rotations_rebuild_the_covariance():
     """Round, flat and needle-like ones, half turns about every axis included."""
     g = torch.Generator().manual_seed(2)
     q = torch.cat((torch.randn(40, 4, generator=g, dtype=torch.float64), torch.eye(4).double()))
-    torch.testing.assert_close(quaternion_to_matrix(matrix_to_quaternion(quaternion_to_matrix(q))), quaternion_to_matrix(q))
+    torch.testing.assert_close(
+        quaternion_to_matrix(matrix_to_quaternion(quaternion_to_matrix(q))), quaternion_to_matrix(q)
+    )
     scales = torch.rand(44, 3, generator=g, dtype=torch.float64)
     scales[:5], scales[5:10, 1:] = 0.3, 0.01
     covariances = covariance_from(scales, q)
     found, rotations = scales_and_rotations(covariances)
-    torch.testing.assert_close(covariance_from(found, rotations), covariances, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(
+        covariance_from(found, rotations), covariances, rtol=1e-10, atol=1e-12
+    )
     torch.testing.assert_close(found, scales.sort(1).values, rtol=1e-10, atol=1e-10)

@@ -22,7 +22,9 @@ def lattice(side: int = 7, spacing: float = 0.1) -> torch.Tensor:
 
 def drawn_splats(count: int = 60, seed: int = 0) -> torch.Tensor:
     """Inside of the lattice and half a spacing outside of it."""
-    return -0.05 + 0.7 * torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return -0.05 + 0.7 * torch.rand(
+        count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def a_rotation(seed: int = 0) -> torch.Tensor:
@@ -34,13 +36,20 @@ def twisted(X: torch.Tensor) -> torch.Tensor:
     x, y, z = X.unbind(-1)
     angle = 1.5 * z
     return torch.stack(
-        (x * angle.cos() - y * angle.sin(), x * angle.sin() + y * angle.cos() + 0.4 * x * z, 1.2 * z + 0.3 * y * y), -1
+        (
+            x * angle.cos() - y * angle.sin(),
+            x * angle.sin() + y * angle.cos() + 0.4 * x * z,
+            1.2 * z + 0.3 * y * y,
+        ),
+        -1,
     )
 
 
 def test_an_affine_motion_is_followed_exactly():
     P, X = lattice(), drawn_splats()
-    A = torch.eye(3).double() + 0.3 * torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    A = torch.eye(3).double() + 0.3 * torch.randn(
+        3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
     shift = torch.tensor([0.3, -2.0, 1.0]).double()
     carried = bind(X, P).carry((P @ A.T + shift)[None])
     torch.testing.assert_close(carried.means[0], X @ A.T + shift, rtol=0, atol=1e-12)
@@ -52,7 +61,8 @@ def test_gradients_are_those_of_the_interpolated_map():
     moved = twisted(P)[None]
     found = bind(X, P).carry(moved).gradients[0]
     columns = [
-        (bind(X + h * axis, P).carry(moved).means[0] - bind(X - h * axis, P).carry(moved).means[0]) / (2 * h)
+        (bind(X + h * axis, P).carry(moved).means[0] - bind(X - h * axis, P).carry(moved).means[0])
+        / (2 * h)
         for axis in torch.eye(3).double()
     ]
     torch.testing.assert_close(found, torch.stack(columns, -1), rtol=0, atol=1e-7)
@@ -60,7 +70,9 @@ def test_gradients_are_those_of_the_interpolated_map():
 
 def test_a_smooth_motion_is_followed_to_second_order():
     """Half the spacing, a quarter of the error, for centres and for carried covariances."""
-    X = 0.05 + 0.5 * torch.rand(80, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    X = 0.05 + 0.5 * torch.rand(
+        80, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
     S = 1e-4 * torch.eye(3).double().expand(len(X), 3, 3)
     true = torch.func.vmap(torch.func.jacrev(twisted))(X)
     errors = []
@@ -97,14 +109,17 @@ def test_gradients_reach_the_particles():
     P, X = lattice(4), drawn_splats(5)
     bound = bind(0.5 * X, P)
     moved = twisted(P)[None].requires_grad_(True)
-    assert torch.autograd.gradcheck(lambda x: (bound.carry(x).means, bound.carry(x).gradients), (moved,), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda x: (bound.carry(x).means, bound.carry(x).gradients), (moved,), fast_mode=True
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_turned_harmonics_have_the_colour_of_the_direction_turned_back(degree):
     generator = torch.Generator().manual_seed(degree)
     R = torch.stack(
-        [a_rotation(seed) for seed in range(6)] + [torch.eye(3).double(), torch.diag(torch.tensor([-1.0, -1, 1])).double()]
+        [a_rotation(seed) for seed in range(6)]
+        + [torch.eye(3).double(), torch.diag(torch.tensor([-1.0, -1, 1])).double()]
     )
     c = torch.randn(8, (degree + 1) ** 2, 3, dtype=torch.float64, generator=generator)
     d = torch.randn(40, 3, dtype=torch.float64, generator=generator)
@@ -116,7 +131,9 @@ def test_turned_harmonics_have_the_colour_of_the_direction_turned_back(degree):
 def test_turning_harmonics_keeps_their_size_and_composes():
     c = torch.randn(5, 16, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     A, B = a_rotation(1), a_rotation(2)
-    torch.testing.assert_close(rotated(c, A).square().sum(1), c.square().sum(1), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        rotated(c, A).square().sum(1), c.square().sum(1), rtol=1e-12, atol=1e-12
+    )
     torch.testing.assert_close(rotated(rotated(c, B), A), rotated(c, A @ B), rtol=0, atol=1e-12)
 
 
@@ -124,7 +141,9 @@ def test_a_rigid_motion_renders_as_the_moved_camera_sees_the_body_at_rest():
     P, X = lattice(), drawn_splats(80)
     generator = torch.Generator().manual_seed(5)
     scales = 0.01 + 0.04 * torch.rand(80, 3, dtype=torch.float64, generator=generator)
-    covariances = covariance_from(scales, torch.randn(80, 4, dtype=torch.float64, generator=generator))
+    covariances = covariance_from(
+        scales, torch.randn(80, 4, dtype=torch.float64, generator=generator)
+    )
     c = 0.3 * torch.randn(80, 16, 3, dtype=torch.float64, generator=generator)
     opacities = torch.rand(80, dtype=torch.float64, generator=generator)
     Q, shift = a_rotation(7), torch.tensor([0.2, 1.0, -0.4]).double()
@@ -138,11 +157,18 @@ def test_a_rigid_motion_renders_as_the_moved_camera_sees_the_body_at_rest():
         eye = -(w2c[0, :3, :3].T @ w2c[0, :3, 3])
         camera = Cameras(K, w2c, 48, 48, ("a",))
         return rasterize(
-            means[None], covariances[None], opacities, colors_in(coefficients, means - eye)[None], camera, torch.zeros(1).long()
+            means[None],
+            covariances[None],
+            opacities,
+            colors_in(coefficients, means - eye)[None],
+            camera,
+            torch.zeros(1).long(),
         )[0]
 
     carried = bind(X, P).carry((P @ Q.T + shift)[None])
-    moved = seen(carried.means[0], carried.covariances(covariances)[0], rotated(c, carried.rotations[0]), w2c)
+    moved = seen(
+        carried.means[0], carried.covariances(covariances)[0], rotated(c, carried.rotations[0]), w2c
+    )
     still = seen(X, covariances, c, w2c @ motion)
     assert float(still.max()) > 0.3
     torch.testing.assert_close(moved, still, rtol=0, atol=1e-10)

@@ -32,7 +32,9 @@ def shoot(
     covariances = (sigma[:, None, None] ** 2 * shape)[None]
     features = torch.eye(len(pixels)).tolist() if channels is None else channels
     features = torch.tensor(features, dtype=torch.float64)[None]
-    K = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]], dtype=torch.float64)[None]
+    K = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]], dtype=torch.float64)[
+        None
+    ]
     camera = Cameras(K, torch.eye(4)[None], SIZE, SIZE, ("front",))
     image, alpha = rasterize(
         means,
@@ -55,7 +57,9 @@ def test_pixel_centres_and_low_pass(scan):
     _, alpha = shoot([(24.0, 24.0)], [0.0], [0.8], scan=scan)
     for y, x in ((23, 23), (23, 24), (24, 23), (24, 24)):
         assert float(alpha[y, x]) == pytest.approx(0.8 * math.exp(-0.5 * 0.5 / 0.3), rel=1e-12)
-    assert float(alpha[24, 25]) == pytest.approx(0.8 * math.exp(-0.5 * (1.5**2 + 0.5**2) / 0.3), rel=1e-12)
+    assert float(alpha[24, 25]) == pytest.approx(
+        0.8 * math.exp(-0.5 * (1.5**2 + 0.5**2) / 0.3), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("preset, cap", [("gsplat", 0.999), ("inria", 0.99)])
@@ -91,21 +95,31 @@ def test_front_to_back_by_depth(scan):
 @pytest.mark.parametrize("scan", ["gaussian", "tile"])
 def test_stop_before_the_gaussian_that_exhausts_the_light(scan):
     """0.9 four times leaves 1e-4: the fourth is not added, nor is the faint fifth behind it."""
-    image, alpha = shoot([(24.5, 24.5)] * 5, [2.0] * 5, [0.9, 0.9, 0.9, 0.905, 0.2], [1.0, 2.0, 3.0, 4.0, 5.0], scan=scan)
+    image, alpha = shoot(
+        [(24.5, 24.5)] * 5,
+        [2.0] * 5,
+        [0.9, 0.9, 0.9, 0.905, 0.2],
+        [1.0, 2.0, 3.0, 4.0, 5.0],
+        scan=scan,
+    )
     assert image[24, 24].tolist() == pytest.approx([0.9, 0.09, 0.009, 0.0, 0.0], rel=1e-9)
     assert float(alpha[24, 24]) == pytest.approx(0.999, rel=1e-12)
 
 
 def test_background_fills_what_is_left():
     background = torch.tensor([0.2, 0.4, 1.0], dtype=torch.float64)
-    image, _ = shoot([(24.5, 24.5)], [2.0], [0.25], channels=[[1.0, 0.0, 0.0]], background=background)
+    image, _ = shoot(
+        [(24.5, 24.5)], [2.0], [0.25], channels=[[1.0, 0.0, 0.0]], background=background
+    )
     assert image[24, 24].tolist() == pytest.approx([0.25 + 0.75 * 0.2, 0.75 * 0.4, 0.75], rel=1e-12)
     assert torch.equal(image[0, 0], background)
 
 
 @pytest.mark.parametrize("channels", [1, 9])
 def test_any_number_of_channels(channels):
-    image, alpha = shoot([(24.5, 24.5)], [2.0], [0.25], channels=[[1.0 + c for c in range(channels)]])
+    image, alpha = shoot(
+        [(24.5, 24.5)], [2.0], [0.25], channels=[[1.0 + c for c in range(channels)]]
+    )
     assert image.shape == (SIZE, SIZE, channels)
     torch.testing.assert_close(image, alpha[..., None] * (1.0 + torch.arange(channels)))
 
@@ -118,6 +132,6 @@ def test_inria_extent_is_three_sigma_in_whole_tiles(scan):
     alpha = shoot([(23.2, 24.5)], [math.sqrt(10.45)], [0.98], preset="inria", scan=scan)[1][24]
     assert float(alpha[12]) == pytest.approx(0.98 * math.exp(-0.5 * 10.7**2 / 10.75), rel=1e-9)
     assert float(alpha[32]) == 0
-    assert float(shoot([(23.2, 24.5)], [math.sqrt(10.45)], [0.98], scan=scan)[1][24, 32]) == pytest.approx(
-        0.98 * math.exp(-0.5 * 9.3**2 / 10.75), rel=1e-9
-    )
+    assert float(
+        shoot([(23.2, 24.5)], [math.sqrt(10.45)], [0.98], scan=scan)[1][24, 32]
+    ) == pytest.approx(0.98 * math.exp(-0.5 * 9.3**2 / 10.75), rel=1e-9)

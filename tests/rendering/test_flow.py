@@ -19,12 +19,19 @@ def exact_flow(means, covariances, opacities, camera, b):
     """sum_i w_i [B_2 B_1^-1 (u - m_1) + m_2 - u] at every pixel centre u of camera b; states 0 to 1: (H, W, 2)
     [px]."""
     sides = [
-        visible_covariance(means[s], covariances[s], camera.K[b], camera.w2c[b], camera.width, camera.height) for s in (0, 1)
+        visible_covariance(
+            means[s], covariances[s], camera.K[b], camera.w2c[b], camera.width, camera.height
+        )
+        for s in (0, 1)
     ]
     (m1, M1, depth), (m2, M2, _) = sides
     order = depth.argsort()
-    weights, _ = composite(alphas(m1[order], M1[order], opacities[order], camera.width, camera.height))
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    weights, _ = composite(
+        alphas(m1[order], M1[order], opacities[order], camera.width, camera.height)
+    )
+    y, x = torch.meshgrid(
+        torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
+    )
     u = torch.stack((x, y), -1).reshape(-1, 1, 2).double()
     A = root(M2) @ torch.linalg.inv(root(M1))
     moved = ((A @ (u - m1)[..., None])[..., 0] + m2 - u)[:, order]
@@ -67,10 +74,14 @@ def test_translation_across_the_image_moves_every_pixel_alike():
     """One sheet of Gaussians parallel to the image shifts by fx dx / z; the flow is that shift times alpha."""
     g = torch.Generator().manual_seed(0)
     camera = ring(1, 40, 30)
-    seen = torch.cat((0.1 * torch.randn(50, 2, generator=g, dtype=torch.float64), torch.zeros(50, 1).double()), 1)
+    seen = torch.cat(
+        (0.1 * torch.randn(50, 2, generator=g, dtype=torch.float64), torch.zeros(50, 1).double()), 1
+    )
     seen[:, 2] = 1.0
     R, t = camera.w2c[0, :3, :3], camera.w2c[0, :3, 3]
-    means = torch.stack(((seen - t) @ R, (seen + torch.tensor([0.02, -0.01, 0.0], dtype=torch.float64) - t) @ R))
+    means = torch.stack(
+        ((seen - t) @ R, (seen + torch.tensor([0.02, -0.01, 0.0], dtype=torch.float64) - t) @ R)
+    )
     flat = R.T @ torch.diag(torch.tensor([0.05**2, 0.05**2, 0.0], dtype=torch.float64)) @ R
     covariances = flat.expand(2, 50, 3, 3)
     opacities = torch.full((50,), 0.6, dtype=torch.float64)
@@ -86,7 +97,10 @@ def test_gradients(isotropic):
     """Central differences of the features in all inputs that live; finite for isotropic Gaussians too."""
     scene, means, covariances = moving(isotropic)
     cameras = scene.cameras.select([0])
-    inputs = [x[:, :4].clone().requires_grad_() for x in (means[:1], covariances[:1], means[1:], covariances[1:])]
+    inputs = [
+        x[:, :4].clone().requires_grad_()
+        for x in (means[:1], covariances[:1], means[1:], covariances[1:])
+    ]
     live = lambda *x: flow_features(*x, cameras, detach_first=False)  # noqa: E731
     assert torch.autograd.gradcheck(live, inputs, eps=1e-7, rtol=1e-6, atol=1e-5)
 
@@ -98,7 +112,9 @@ def test_first_frame_is_a_constant_by_default():
     flow_features(a, covariances[:1], b, covariances[1:], cameras).sum().backward()
     assert a.grad is None and float(b.grad.abs().max()) > 0
     b.grad = None
-    flow_features(a, covariances[:1], b, covariances[1:], cameras, detach_first=False).sum().backward()
+    flow_features(
+        a, covariances[:1], b, covariances[1:], cameras, detach_first=False
+    ).sum().backward()
     assert float(a.grad.abs().max()) > 0
 
 

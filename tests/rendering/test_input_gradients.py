@@ -24,7 +24,11 @@ def agree(picture, leaves):
             scale = float(wanted.abs().max())
             assert scale > 0
             torch.testing.assert_close(
-                gradient, wanted, rtol=1e-6, atol=1e-6 * scale, msg=lambda text, name=name: f"{name}: {text}"
+                gradient,
+                wanted,
+                rtol=1e-6,
+                atol=1e-6 * scale,
+                msg=lambda text, name=name: f"{name}: {text}",
             )
 
 
@@ -38,14 +42,20 @@ def test_camera_poses_and_intrinsics(case, scan):
     K[:, 0, 1] = 0.4  # a skewed sensor
 
     def picture(top, upper):
-        cameras = replace(scene.cameras, K=torch.cat((upper, K[:, 2:]), 1), w2c=torch.cat((top, w2c[:, 3:]), 1))
+        cameras = replace(
+            scene.cameras, K=torch.cat((upper, K[:, 2:]), 1), w2c=torch.cat((top, w2c[:, 3:]), 1)
+        )
         values = [getattr(scene, name) for name in NAMES]
-        return objective(*rasterize(*values, cameras, scene.state_index, scene.background, scan=scan))
+        return objective(
+            *rasterize(*values, cameras, scene.state_index, scene.background, scan=scan)
+        )
 
     upper = K[:, :2].clone()
     live = upper.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(picture(w2c[:, :3], live), live)
-    assert torch.equal(gradient[:, 1, 0], torch.zeros(len(K)).double())  # K[1, 0] is no parameter of a camera
+    assert torch.equal(
+        gradient[:, 1, 0], torch.zeros(len(K)).double()
+    )  # K[1, 0] is no parameter of a camera
     agree(picture, {"top": w2c[:, :3].clone(), "upper": upper})
 
 
@@ -54,7 +64,10 @@ def test_poses_agree_with_autograd_through_the_reference():
     scene = draw(40, images=3)
     found = []
     for function in (rasterize, rasterize_reference):
-        K, w2c = scene.cameras.K.clone().requires_grad_(), scene.cameras.w2c.clone().requires_grad_()
+        K, w2c = (
+            scene.cameras.K.clone().requires_grad_(),
+            scene.cameras.w2c.clone().requires_grad_(),
+        )
         cameras = replace(scene.cameras, K=K, w2c=w2c)
         values = [getattr(scene, name) for name in NAMES]
         output = function(*values, cameras, scene.state_index, scene.background)
@@ -74,7 +87,9 @@ def test_a_camera_finds_its_pose():
     for _ in range(120):
         w, t = twist[:, :3], twist[:, 3:]
         zero = torch.zeros_like(w[:, 0])
-        cross = torch.stack((zero, -w[:, 2], w[:, 1], w[:, 2], zero, -w[:, 0], -w[:, 1], w[:, 0], zero), -1).view(-1, 3, 3)
+        cross = torch.stack(
+            (zero, -w[:, 2], w[:, 1], w[:, 2], zero, -w[:, 0], -w[:, 1], w[:, 0], zero), -1
+        ).view(-1, 3, 3)
         motion = torch.cat((torch.cat((torch.matrix_exp(cross), t[..., None]), 2), true[:, 3:]), 1)
         scene.cameras = replace(scene.cameras, w2c=motion @ true)
         loss = (render(scene, rasterize)[0] - target).square().mean()
@@ -105,7 +120,8 @@ def test_spherical_harmonics(degree):
     g = torch.Generator().manual_seed(6)
     w2c = scene.cameras.w2c
     leaves = {
-        "coefficients": 0.3 * torch.randn(10, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64),
+        "coefficients": 0.3
+        * torch.randn(10, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64),
         "means": scene.means,
         "top": w2c[:, :3].clone(),
     }
@@ -113,7 +129,11 @@ def test_spherical_harmonics(degree):
     def picture(coefficients, means, top):
         cameras = replace(scene.cameras, w2c=torch.cat((top, w2c[:, 3:]), 1))
         colors = view_colors(coefficients, means, cameras, scene.state_index)
-        return objective(*rasterize(means, scene.covariances, scene.opacities, colors, cameras, scene.state_index))
+        return objective(
+            *rasterize(
+                means, scene.covariances, scene.opacities, colors, cameras, scene.state_index
+            )
+        )
 
     agree(picture, leaves)
 
@@ -133,7 +153,9 @@ def test_depth(expected):
             depth, alpha = expected_depth(*arguments, cameras, scene.state_index)
             depth = torch.where(alpha > 0, depth, torch.zeros_like(depth)) * alpha.square()
         else:
-            _, alpha, depth = rasterize_with_depth(*arguments, scene.features, cameras, scene.state_index)
+            _, alpha, depth = rasterize_with_depth(
+                *arguments, scene.features, cameras, scene.state_index
+            )
         return objective(depth[..., None], torch.zeros_like(depth))
 
     agree(picture, leaves | {"top": w2c[:, :3].clone()})
@@ -143,12 +165,21 @@ def test_depth(expected):
 def test_camera_gradients_on_cuda_match_cpu():
     """1500 Gaussians of float64, nine channels, more than one block of threads to a camera and ragged tiles at the border."""
     scene = draw(1500, states=2, images=4, channels=9, size=0.04)
-    scene.cameras = replace(scene.cameras, width=100, height=90, K=4 * scene.cameras.K * torch.tensor([[1.0], [1.0], [0.25]]))
+    scene.cameras = replace(
+        scene.cameras,
+        width=100,
+        height=90,
+        K=4 * scene.cameras.K * torch.tensor([[1.0], [1.0], [0.25]]),
+    )
     found = []
     for device in ("cpu", "cuda"):
-        K, w2c = (x.clone().to(device).requires_grad_() for x in (scene.cameras.K, scene.cameras.w2c))
+        K, w2c = (
+            x.clone().to(device).requires_grad_() for x in (scene.cameras.K, scene.cameras.w2c)
+        )
         values = [getattr(scene, name).to(device).requires_grad_() for name in NAMES]
-        output = rasterize(*values, replace(scene.cameras, K=K, w2c=w2c), scene.state_index.to(device))
+        output = rasterize(
+            *values, replace(scene.cameras, K=K, w2c=w2c), scene.state_index.to(device)
+        )
         found.append([g.cpu() for g in torch.autograd.grad(objective(*output), [K, w2c, *values])])
     for ours, wanted in zip(*found):
         torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-10 * float(wanted.abs().max()))

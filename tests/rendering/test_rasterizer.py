@@ -21,13 +21,20 @@ def thresholds(scene):
     pixels = torch.stack((x, y), -1).reshape(-1, 1, 2).double()
     for b, s in enumerate(scene.state_index.tolist()):
         K, w2c = scene.cameras.K[b], scene.cameras.w2c[b]
-        center, M, z = visible_covariance(scene.means[s], scene.covariances[s], K, w2c, width, height)
+        center, M, z = visible_covariance(
+            scene.means[s], scene.covariances[s], K, w2c, width, height
+        )
         order = z.argsort()[(z.sort().values > 0.01)]
         d = pixels - center[order]
-        raw = scene.opacities[order] * torch.exp(-0.5 * (d * torch.linalg.solve(M[order], d[..., None])[..., 0]).sum(-1))
+        raw = scene.opacities[order] * torch.exp(
+            -0.5 * (d * torch.linalg.solve(M[order], d[..., None])[..., 0]).sum(-1)
+        )
         alpha = alphas(center[order], M[order], scene.opacities[order], width, height)
         after = torch.cumprod(1 - torch.where(alpha >= 1 / 255, alpha, 0), 1)
-        gaps += [float((value / limit - 1).abs().min()) for value, limit in ((raw, 1 / 255), (raw, 0.999), (after, 1e-4))]
+        gaps += [
+            float((value / limit - 1).abs().min())
+            for value, limit in ((raw, 1 / 255), (raw, 0.999), (after, 1e-4))
+        ]
         capped |= bool((raw > 0.999).any())
         stopped |= bool((after < 1e-4).any())
     return min(gaps), capped, stopped
@@ -41,9 +48,13 @@ def test_matches_the_reference(scan, own_opacities):
         scene.opacities = torch.stack((scene.opacities, scene.opacities.flip(0)))
     if scan == "tile":
         scene.features = scene.features[:1]  # shared by all images
-    for ours, wanted in zip(render(scene, rasterize, scan=scan), render(scene, rasterize_reference)):
+    for ours, wanted in zip(
+        render(scene, rasterize, scan=scan), render(scene, rasterize_reference)
+    ):
         torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-13)
-    for ours, wanted in zip(gradients(scene, rasterize, scan=scan), gradients(scene, rasterize_reference)):
+    for ours, wanted in zip(
+        gradients(scene, rasterize, scan=scan), gradients(scene, rasterize_reference)
+    ):
         torch.testing.assert_close(ours, wanted, rtol=1e-10, atol=1e-12 * float(wanted.abs().max()))
 
 
@@ -71,7 +82,10 @@ def test_the_cases_reach_what_they_are_for():
     image only."""
     assert thresholds(dense())[1:] == (True, True)
     scene = edge()
-    p = scene.means[0] @ scene.cameras.w2c[:, :3, :3].transpose(1, 2) + scene.cameras.w2c[:, None, :3, 3]
+    p = (
+        scene.means[0] @ scene.cameras.w2c[:, :3, :3].transpose(1, 2)
+        + scene.cameras.w2c[:, None, :3, 3]
+    )
     limit = 1.3 * 0.5 * scene.cameras.width / scene.cameras.K[0, 0, 0]
     beside = (p[..., 2] > 0.01) & ((p[..., 0] / p[..., 2]).abs() > limit)
     grads = gradients(scene, rasterize)[3].abs().sum(-1)
@@ -109,7 +123,9 @@ def test_nothing_in_view_is_background():
 def test_expected_depth_of_an_opaque_gaussian():
     scene = draw(1, states=1, images=2)
     scene.means = torch.zeros(1, 1, 3).double()
-    depth, alpha = expected_depth(scene.means, scene.covariances, scene.opacities, scene.cameras, scene.state_index)
+    depth, alpha = expected_depth(
+        scene.means, scene.covariances, scene.opacities, scene.cameras, scene.state_index
+    )
     distance = scene.cameras.w2c[:, 2, 3]
     for b in range(2):
         seen = depth[b][alpha[b] > 0]
@@ -128,7 +144,9 @@ def test_memory_follows_visible_pairs_not_gaussians_times_pixels(scan):
         scene.means = scene.means + torch.tensor([0.0, aside, 0.0])
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in NAMES}
         total = []
-        with torch.autograd.graph.saved_tensors_hooks(lambda x: total.append(x.numel() * x.element_size()) or x, lambda x: x):
+        with torch.autograd.graph.saved_tensors_hooks(
+            lambda x: total.append(x.numel() * x.element_size()) or x, lambda x: x
+        ):
             render(scene, rasterize, scan=scan, **leaves)
         return sum(total)
 
@@ -136,7 +154,9 @@ def test_memory_follows_visible_pairs_not_gaussians_times_pixels(scan):
     assert (more - small) / 500 < 400
     assert (wide - small) / (2 * (256**2 - 64**2)) < 16
     hidden = kept(500, 256, aside=50.0)
-    assert (wide > hidden + 4 * 500) if scan == "tile" else (wide == hidden)  # who is out of view has no entry
+    assert (
+        (wide > hidden + 4 * 500) if scan == "tile" else (wide == hidden)
+    )  # who is out of view has no entry
 
 
 @pytest.mark.parametrize(

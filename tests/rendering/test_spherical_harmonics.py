@@ -8,7 +8,13 @@ from drawn_splats import draw
 from scipy.special import sph_harm_y
 
 from mosa.errors import ConfigError
-from mosa.rendering.appearance.spherical_harmonics import basis, colors_in, constant_coefficients, mean_colors, view_colors
+from mosa.rendering.appearance.spherical_harmonics import (
+    basis,
+    colors_in,
+    constant_coefficients,
+    mean_colors,
+    view_colors,
+)
 
 
 def test_basis_is_the_real_one_of_the_complex_harmonics():
@@ -19,9 +25,13 @@ def test_basis_is_the_real_one_of_the_complex_harmonics():
     index = 0
     for degree in range(4):
         for m in range(-degree, degree + 1):
-            value = sph_harm_y(degree, abs(m), [math.acos(c) for c in z], [math.atan2(b, a) for a, b in zip(x, y)])
+            value = sph_harm_y(
+                degree, abs(m), [math.acos(c) for c in z], [math.atan2(b, a) for a, b in zip(x, y)]
+            )
             wanted = value.real if m == 0 else math.sqrt(2) * (value.imag if m < 0 else value.real)
-            torch.testing.assert_close(found[:, index], torch.as_tensor(wanted), rtol=1e-12, atol=1e-13)
+            torch.testing.assert_close(
+                found[:, index], torch.as_tensor(wanted), rtol=1e-12, atol=1e-13
+            )
             index += 1
     assert found.shape == (50, 16) == (50, index)
 
@@ -30,7 +40,9 @@ def test_a_constant_colour_is_the_same_from_everywhere():
     colors = torch.rand(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     coefficients = constant_coefficients(colors)
     assert coefficients.shape == (6, 1, 3)
-    directions = torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    directions = torch.randn(
+        4, 6, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
     torch.testing.assert_close(colors_in(coefficients, directions), colors.expand(4, 6, 3))
     torch.testing.assert_close(mean_colors(coefficients), colors)
 

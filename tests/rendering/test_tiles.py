@@ -20,9 +20,13 @@ from mosa.rendering.tile_kernels import BLOCK_HEIGHT, BLOCK_WIDTH, reach_functio
 
 def agree(scene, rtol=1e-10):
     """Image, alpha and gradients by tiles and by the reference."""
-    for ours, wanted in zip(render(scene, rasterize, scan="tile"), render(scene, rasterize_reference)):
+    for ours, wanted in zip(
+        render(scene, rasterize, scan="tile"), render(scene, rasterize_reference)
+    ):
         torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-13)
-    for ours, wanted in zip(gradients(scene, rasterize, scan="tile"), gradients(scene, rasterize_reference)):
+    for ours, wanted in zip(
+        gradients(scene, rasterize, scan="tile"), gradients(scene, rasterize_reference)
+    ):
         torch.testing.assert_close(ours, wanted, rtol=rtol, atol=1e-12 * float(wanted.abs().max()))
 
 
@@ -56,7 +60,9 @@ def test_warps_of_32_lanes_agree_with_one(channels, shared):
     for name in (*NAMES, "background", "state_index", "cameras"):
         setattr(scene, name, getattr(scene, name).to("cuda"))
     for ours, value in zip((*render(scene, rasterize), *gradients(scene, rasterize)), wanted):
-        torch.testing.assert_close(ours.cpu(), value, rtol=1e-9, atol=1e-10 * float(value.abs().max()))
+        torch.testing.assert_close(
+            ours.cpu(), value, rtol=1e-9, atol=1e-10 * float(value.abs().max())
+        )
 
 
 @pytest.mark.gpu
@@ -93,8 +99,12 @@ def test_gradients_against_differences(channels, shared):
         scene.features = scene.features[:1]
     ours = dict(zip(NAMES, gradients(scene, rasterize, scan="tile")))
     for name in ("means", "features"):
-        wanted = slopes(lambda: objective(*render(scene, rasterize, scan="tile")), getattr(scene, name))
-        torch.testing.assert_close(ours[name], wanted, rtol=1e-6, atol=1e-6 * float(wanted.abs().max()))
+        wanted = slopes(
+            lambda: objective(*render(scene, rasterize, scan="tile")), getattr(scene, name)
+        )
+        torch.testing.assert_close(
+            ours[name], wanted, rtol=1e-6, atol=1e-6 * float(wanted.abs().max())
+        )
 
 
 def test_nothing_in_view():
@@ -113,7 +123,9 @@ def test_lists_hold_what_touches_a_tile_by_depth(dtype):
     K, w2c = scene.cameras.K.to(dtype), scene.cameras.w2c.to(dtype)
     start_warp()
     g = Geometry(scene.state_index.to(torch.int32), 37, 50, PRESETS["gsplat"], "tile")
-    records, depths = project(scene.means.to(dtype), scene.covariances.to(dtype), scene.opacities.to(dtype), K, w2c, g)
+    records, depths = project(
+        scene.means.to(dtype), scene.covariances.to(dtype), scene.opacities.to(dtype), K, w2c, g
+    )
     depth = depths[:150].view(3, 50).clone()
     entries, starts = depth_lists(depths, records, g)
     bits = records.view(torch.int32 if dtype == torch.float32 else torch.int64)
@@ -124,7 +136,10 @@ def test_lists_hold_what_touches_a_tile_by_depth(dtype):
         b, top, left = tile // 12, tile // 3 % 4 * TILE, tile % 3 * TILE
         touches = (seen & (x0 < left + TILE) & (x1 > left) & (y0 < top + TILE) & (y1 > top))[b]
         by_depth = depth[b].argsort(stable=True)
-        assert entries[starts[tile] : starts[tile + 1]].tolist() == (50 * b + by_depth[touches[by_depth]]).tolist()
+        assert (
+            entries[starts[tile] : starts[tile + 1]].tolist()
+            == (50 * b + by_depth[touches[by_depth]]).tolist()
+        )
 
 
 def test_blocks_skip_only_what_does_not_reach_them():
@@ -147,17 +162,28 @@ def test_blocks_skip_only_what_does_not_reach_them():
         found[i] = int(reaches(r, 96, 100, BLOCK_WIDTH, BLOCK_HEIGHT))
 
     g = torch.Generator().manual_seed(0)
-    centers, opacities = 200 * torch.rand(count, 2, generator=g), 1 / 255 + torch.rand(count, generator=g) ** 2 * (1 - 1 / 255)
+    centers, opacities = (
+        200 * torch.rand(count, 2, generator=g),
+        1 / 255 + torch.rand(count, generator=g) ** 2 * (1 - 1 / 255),
+    )
     long = 0.5 * 120 ** torch.rand(count, generator=g)
     wide = (long * 0.01 ** torch.rand(count, generator=g)).clamp(min=0.3**0.5)
     turn = torch.pi * torch.rand(count, generator=g)
     axis = torch.stack((turn.cos(), turn.sin()), -1)
-    M = (1 / wide**2)[:, None, None] * torch.eye(2) + (1 / long**2 - 1 / wide**2)[:, None, None] * axis[:, :, None] * axis[:, None]
+    M = (1 / wide**2)[:, None, None] * torch.eye(2) + (1 / long**2 - 1 / wide**2)[
+        :, None, None
+    ] * axis[:, :, None] * axis[:, None]
     conics = torch.stack((M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]), -1).contiguous()
     found = torch.empty(count, dtype=torch.int32)
-    inputs = [wp.from_torch(centers, wp.vec2), wp.from_torch(opacities), wp.from_torch(conics, wp.vec3)]
+    inputs = [
+        wp.from_torch(centers, wp.vec2),
+        wp.from_torch(opacities),
+        wp.from_torch(conics, wp.vec3),
+    ]
     wp.launch(test, dim=count, inputs=inputs, outputs=[wp.from_torch(found)], device="cpu")
-    y, x = torch.meshgrid(torch.arange(BLOCK_HEIGHT) + 100.5, torch.arange(BLOCK_WIDTH) + 96.5, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(BLOCK_HEIGHT) + 100.5, torch.arange(BLOCK_WIDTH) + 96.5, indexing="ij"
+    )
     d = torch.stack((x, y), -1).view(1, -1, 2) - centers[:, None]
     a, b, c = conics[:, None].unbind(-1)
     q = a * d[..., 0] ** 2 + 2 * b * d[..., 0] * d[..., 1] + c * d[..., 1] ** 2

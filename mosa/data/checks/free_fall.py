@@ -69,7 +69,13 @@ def track_of(scene: Scene) -> Track | None:
         radius = max(radius, float((radii * depth).mean()))
         noise = max(noise, float((depth / scene.cameras.K[chosen, 0, 0].double()).mean()))
     dt = float(scene.times.double().diff().median())
-    return Track(torch.stack(points), torch.tensor(low).double(), max(PIXELS * noise, RADII * radius), radius, dt)
+    return Track(
+        torch.stack(points),
+        torch.tensor(low).double(),
+        max(PIXELS * noise, RADII * radius),
+        radius,
+        dt,
+    )
 
 
 def lowest_seen(scene: Scene, camera: int, frame: int, depth: float) -> float:
@@ -96,7 +102,9 @@ def parabola(track: Track, frames: int) -> tuple[Tensor, float]:
         return solution[2] / track.dt**2, 3 * track.noise * spread / track.dt**2
     free = 3 * (frames - 3)
     scatter = float((x - design @ solution).square().sum() / free) ** 0.5
-    return solution[2] / track.dt**2, max(3 * FINE * track.noise, float(student.ppf(0.9987, free)) * scatter) * spread / track.dt**2
+    return solution[2] / track.dt**2, max(
+        3 * FINE * track.noise, float(student.ppf(0.9987, free)) * scatter
+    ) * spread / track.dt**2
 
 
 def check_fall(scene: Scene, label: str) -> None:
@@ -111,8 +119,11 @@ def check_fall(scene: Scene, label: str) -> None:
         for frames in range(3, scene.frames + 1):
             a, error = parabola(track, frames)
             if float(a.norm()) - error > WEIGHTLESS:
-                warnings.warn(f"{label}: in the first {frames} frames the object's speed changes by {float(a.norm()):.3g} "
-                              f"+- {error:.2g} m/s^2, under a stated gravity of 0: check scene.gravity", stacklevel=3)
+                warnings.warn(
+                    f"{label}: in the first {frames} frames the object's speed changes by {float(a.norm()):.3g} "
+                    f"+- {error:.2g} m/s^2, under a stated gravity of 0: check scene.gravity",
+                    stacklevel=3,
+                )
                 return
         return
     check_order(scene, track, label)
@@ -124,28 +135,44 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
     """The pictures go on while the object moves. Of a body at rest they may be alike to the bit: what counts is that those of all
     cameras stop, or go on, from one frame to the next. Errors: DataError naming the frames."""
     step = math.ceil(max(scene.mattes.shape[2:]) / COARSE)
-    frames = [(scene.images[:, t, ::step, ::step], scene.mattes[:, t, ::step, ::step] > 0.5) for t in range(scene.frames)]
-    change = torch.stack([((b - a).abs().mean(3) * (m | n)).sum() / (m | n).sum() for (a, m), (b, n) in pairwise(frames)])
+    frames = [
+        (scene.images[:, t, ::step, ::step], scene.mattes[:, t, ::step, ::step] > 0.5)
+        for t in range(scene.frames)
+    ]
+    change = torch.stack(
+        [
+            ((b - a).abs().mean(3) * (m | n)).sum() / (m | n).sum()
+            for (a, m), (b, n) in pairwise(frames)
+        ]
+    )
     if not bool(change.any()):
-        raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
+        raise DataError(
+            f"{label}: all {scene.frames} frames are identical: expected a film of a moving object"
+        )
     same = change <= torch.minimum(2 * change.min(), change.max() / ABRUPT)
     ends = torch.nn.functional.pad(same.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
     seen = [images.numpy().tobytes() for images, _ in frames]
     for t, first in ((t, seen.index(each)) for t, each in enumerate(seen)):
         away = float((track.points[first : t + 1] - track.points[t]).norm(dim=1).max())
         if away > MOVED * track.radius and change[first:t].any():
-            raise DataError(f"{label}: expected new pictures, found those of frame {first} in frame {t} of all cameras, after "
-                            f"the object was {away:.3g} m away: is a part of the film there twice? Leave it out (scene.frames)")
+            raise DataError(
+                f"{label}: expected new pictures, found those of frame {first} in frame {t} of all cameras, after "
+                f"the object was {away:.3g} m away: is a part of the film there twice? Leave it out (scene.frames)"
+            )
     moves, fall = track.points.diff(dim=0), float(scene.gravity.double().norm()) * track.dt**2
     for first, last in zip(ends[::2], ends[1::2]):
         level = ABRUPT * float(change[first:last].max())
         sides = [k for k in (first - 1, last) if 0 <= k < len(change) and float(change[k]) > level]
         if last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
             continue  # where it turns round it may look the same before and after
-        moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)  # what is let go starts to fall
-        said = (f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, and an object moving "
-                f"by {moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "
-                "brought to another frame rate? Leave these frames out (scene.frames), or each one that is there again")
+        moved = max(
+            (float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0
+        )  # what is let go starts to fall
+        said = (
+            f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, and an object moving "
+            f"by {moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "
+            "brought to another frame rate? Leave these frames out (scene.frames), or each one that is there again"
+        )
         if moved > MOVED * track.radius:
             raise DataError(said)
         if moved > track.noise:
@@ -156,11 +183,15 @@ def check_size(track: Track, label: str) -> None:
     """Lengths and speeds of things that are filmed."""
     keys = "the unit of the poses, scene.box and scene.fps"
     if not SIZES[0] < track.radius < SIZES[1]:
-        raise DataError(f"{label}: expected an object of {SIZES[0]:g} to {SIZES[1]:g} m, found a radius of {track.radius:.3g} m: "
-                        f"check {keys}")
+        raise DataError(
+            f"{label}: expected an object of {SIZES[0]:g} to {SIZES[1]:g} m, found a radius of {track.radius:.3g} m: "
+            f"check {keys}"
+        )
     speed = float(track.points.diff(dim=0).norm(dim=1).max()) / track.dt
     if speed > FASTEST:
-        raise DataError(f"{label}: expected an object of at most {FASTEST:g} m/s, found {speed:.3g} m/s: check {keys}")
+        raise DataError(
+            f"{label}: expected an object of at most {FASTEST:g} m/s, found {speed:.3g} m/s: check {keys}"
+        )
 
 
 def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
@@ -171,11 +202,17 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
         a, error = parabola(track, frames)
         along = float(a @ down)
         if along > SURE * g and along - error > SUSPECT * g:
-            raise DataError(f"{label}: in the first {frames} frames the object falls with {along:.3g} +- {error:.2g} m/s^2, under "
-                            f"a stated gravity of {g:.3g}: check {keys}")
+            raise DataError(
+                f"{label}: in the first {frames} frames the object falls with {along:.3g} +- {error:.2g} m/s^2, under "
+                f"a stated gravity of {g:.3g}: check {keys}"
+            )
     ground = -math.inf if scene.ground is None else scene.ground.height
     clear = (track.low > ground + 0.3 * track.radius).int().cumprod(0)
-    free = int(clear.sum()) if scene.last_free_frame is None else min(int(clear.sum()), scene.last_free_frame + 1)
+    free = (
+        int(clear.sum())
+        if scene.last_free_frame is None
+        else min(int(clear.sum()), scene.last_free_frame + 1)
+    )
     if free < 3:
         return
     a, error = parabola(track, free)
@@ -184,12 +221,17 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
     found = f"{label}: above the ground, in frames 0 to {free - 1}, the object falls with {along:.3g} +- {error:.2g} m/s^2"
     slow = along < g / SURE and along + error < g / SUSPECT
     if slow or across - error > g / SURE:
-        raise DataError(f"{found} along the stated gravity of {g:.3g}, and moves with {across:.3g} across: check {keys}")
+        raise DataError(
+            f"{found} along the stated gravity of {g:.3g}, and moves with {across:.3g} across: check {keys}"
+        )
     if (along < g / SUSPECT and along + error < g) or (along > SUSPECT * g and along - error > g):
         warnings.warn(f"{found}, under a stated gravity of {g:.3g}: check {keys}", stacklevel=4)
     elif not g / ODD < along < ODD * g or across > ASIDE * g:
-        warnings.warn(f"{found} along the stated gravity of {g:.3g}, and with {across:.3g} across, which so few frames may "
-                      f"excuse: check {keys}", stacklevel=4)
+        warnings.warn(
+            f"{found} along the stated gravity of {g:.3g}, and with {across:.3g} across, which so few frames may "
+            f"excuse: check {keys}",
+            stacklevel=4,
+        )
 
 
 def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
@@ -201,8 +243,10 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
     error = (2**0.5 / track.dt * speed + g) * track.noise
     start, last = float(energy[0]), int((energy - 3 * error).argmax())
     beyond = float(energy[last] - 3 * error[last]) > start + 3 * float(error[0])
-    found = (f"{label}: the object has {float(energy[last]):.3g} J/kg in frames {last} to {last + 1}, {start:.3g} at the start: "
-             "expected a fall, in which the ground takes energy")
+    found = (
+        f"{label}: the object has {float(energy[last]):.3g} J/kg in frames {last} to {last + 1}, {start:.3g} at the start: "
+        "expected a fall, in which the ground takes energy"
+    )
     cause = "a film that runs backwards (times negated, frames in descending order)?"
     if scene.ground is not None and float(track.low[0]) < scene.ground.height + 0.3 * track.radius:
         cause = "a film that begins after contact (start it earlier, scene.frames), or one that runs backwards?"
@@ -223,11 +267,22 @@ def check_order(scene: Scene, track: Track, label: str) -> None:
     for i, j in combinations(range(scene.frames), 2):
         swapped, reverse = track.points.clone(), track.points.clone()
         swapped[[i, j]] = track.points[[j, i]]
-        best, pair = min((best, pair), (rough(swapped), (i, j, f"frames {i} and {j} seem to be in each other's place: swapping")))
+        best, pair = min(
+            (best, pair),
+            (
+                rough(swapped),
+                (i, j, f"frames {i} and {j} seem to be in each other's place: swapping"),
+            ),
+        )
         if 3 <= j - i < scene.frames - 1:
             reverse[i : j + 1] = track.points[i : j + 1].flip(0)
-            best, pair = min((best, pair), (rough(reverse), (i, j, f"frames {i} to {j} seem to be in reverse order: turning")))
+            best, pair = min(
+                (best, pair),
+                (rough(reverse), (i, j, f"frames {i} to {j} seem to be in reverse order: turning")),
+            )
     floor = 6 * scene.frames * track.noise**2  # of second differences of noise
     if now > SWAPPED * (best + floor):
-        raise DataError(f"{label}: {pair[2]} them makes the object's path {now / best:.3g} times smoother; put them in order, or "
-                        "restrict scene.frames")
+        raise DataError(
+            f"{label}: {pair[2]} them makes the object's path {now / best:.3g} times smoother; put them in order, or "
+            "restrict scene.frames"
+        )

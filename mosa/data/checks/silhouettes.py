@@ -43,17 +43,26 @@ def check_particles(scene: Scene, label: str) -> None:
     track = None if scene.particles is None else track_of(scene)
     if track is None:
         return
-    far = torch.stack([(cloud.double().mean(0) - point).norm() for cloud, point in zip(scene.particles, track.points)])
+    far = torch.stack(
+        [
+            (cloud.double().mean(0) - point).norm()
+            for cloud, point in zip(scene.particles, track.points)
+        ]
+    )
     frame = int(far.argmax())
     extent = float((scene.particles[0].amax(0) - scene.particles[0].amin(0)).max())
-    said = (f"{label}: scene.particles: expected the particles of frame {frame} where the cameras see the object, at "
-            f"{[round(x, 3) for x in track.points[frame].tolist()]} m, found their middle "
-            f"{float(far[frame]):.3g} m beside it: check their unit and axes, and which file is which frame")
+    said = (
+        f"{label}: scene.particles: expected the particles of frame {frame} where the cameras see the object, at "
+        f"{[round(x, 3) for x in track.points[frame].tolist()]} m, found their middle "
+        f"{float(far[frame]):.3g} m beside it: check their unit and axes, and which file is which frame"
+    )
     if float(far[frame]) > LOST * track.radius:
         raise DataError(said)
     if not 0.5 * track.radius < extent < 8 * track.radius:
-        raise DataError(f"{label}: scene.particles: expected a cloud of the object's size, whose radius is {track.radius:.3g} m, "
-                        f"found one of {len(scene.particles[0])} particles over {extent:.3g} m")
+        raise DataError(
+            f"{label}: scene.particles: expected a cloud of the object's size, whose radius is {track.radius:.3g} m, "
+            f"found one of {len(scene.particles[0])} particles over {extent:.3g} m"
+        )
     if float(far[frame]) > STRAY * track.radius:
         warnings.warn(said, stacklevel=3)
 
@@ -71,19 +80,31 @@ def left_open(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) ->
     return open_and_apart(points, pitch, mattes, cameras)[0]
 
 
-def open_and_apart(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> tuple[Tensor, list[int]]:
+def open_and_apart(
+    points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras
+) -> tuple[Tensor, list[int]]:
     """What `left_open` says, and how many pixels of each matte are in pieces of which all is open."""
     shares, islands = [], []
     for matte, K, w2c in zip(mattes, cameras.K, cameras.w2c):
         seen = points @ w2c[:3, :3].T + w2c[:3, 3]
         pixel = seen @ K.T
         column, row = (pixel[:, :2] / pixel[:, 2:].clamp(min=1e-6)).floor().long().T
-        shown = (seen[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < cameras.width) & (row < cameras.height)
+        shown = (
+            (seen[:, 2] > 0)
+            & (column >= 0)
+            & (row >= 0)
+            & (column < cameras.width)
+            & (row < cameras.height)
+        )
         covered = np.zeros(tuple(matte.shape), np.uint8)
         covered[row[shown].numpy(), column[shown].numpy()] = 1
-        reach = math.ceil(pitch * float(K[[0, 1], [0, 1]].max()) / float(seen[:, 2].mean().clamp(min=1e-6)))
+        reach = math.ceil(
+            pitch * float(K[[0, 1], [0, 1]].max()) / float(seen[:, 2].mean().clamp(min=1e-6))
+        )
         reach = min(max(reach, 1), max(tuple(matte.shape)))
-        covered = cv2.dilate(covered, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(bool)
+        covered = cv2.dilate(covered, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(
+            bool
+        )
         inside = (matte > 0.5).numpy()
         shares.append(float((inside & ~covered).sum() / max(inside.sum(), 1)))
         _, pieces = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
@@ -120,7 +141,9 @@ def check_outlines(scene: Scene, label: str) -> None:
             continue  # thinner than a voxel
         shares, islands = open_and_apart(points, pitch, mattes, cameras)
         worst = max(worst, most_open(shares, cameras.names, frame, label))
-        if frame == 0 and max(islands) >= ISLAND:  # later it may splash, and drops are thinner than a voxel
+        if (
+            frame == 0 and max(islands) >= ISLAND
+        ):  # later it may splash, and drops are thinner than a voxel
             v = islands.index(max(islands))
             many = sum(pixels >= ISLAND for pixels in islands)
             warnings.warn(f"{label}: the matte of camera {cameras.names[v]}, frame 0, has {islands[v]} pixels apart from the "
@@ -147,7 +170,11 @@ def check_outlines(scene: Scene, label: str) -> None:
 def most_open(shares: Tensor, names: tuple[str, ...], frame: int, label: str) -> tuple[float, str]:
     """The largest share of a matte that is open, and what is said of it."""
     order = shares.argsort(descending=True)[:4].tolist()
-    listed = ", ".join(f"{names[v]} ({float(shares[v]):.0%})" for v in order if float(shares[v]) > 0.25 * float(shares.max()))
+    listed = ", ".join(
+        f"{names[v]} ({float(shares[v]):.0%})"
+        for v in order
+        if float(shares[v]) > 0.25 * float(shares.max())
+    )
     return float(shares.max()), (
         f"{label}: the outlines of frame {frame} are not those of one solid: what all cameras see together should fill every "
         f"matte, and leaves open of the cameras {listed}: check focal lengths (fl_x, fl_y), principal points, lens distortion, "

@@ -53,12 +53,16 @@ def validate(scene: Scene) -> Scene:
             raise DataError(f"{label}: {name}: expected shape {expected}, found {tuple(found)}")
     for name in ("images", "mattes"):
         value = getattr(scene, name)
-        if value.numel() and all(map(math.isfinite, map(float, value.aminmax()))):  # of which NaN is the least and the largest
+        if value.numel() and all(
+            map(math.isfinite, map(float, value.aminmax()))
+        ):  # of which NaN is the least and the largest
             continue
         for v in range(V):
             for t in range(T):
                 if not bool(torch.isfinite(value[v, t]).all()):
-                    raise DataError(f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}")
+                    raise DataError(
+                        f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
+                    )
     check_cameras(scene, label)
     check_times(scene, label)
     check_mattes(scene, label)
@@ -72,8 +76,10 @@ def validate(scene: Scene) -> Scene:
                 warnings.simplefilter("ignore")  # they are said
                 check_film(scene, label)
         except DataError as error:
-            warnings.warn(f"{error} (nothing is learned from cameras that are held out; figures of their images count on them)",
-                          stacklevel=2)
+            warnings.warn(
+                f"{error} (nothing is learned from cameras that are held out; figures of their images count on them)",
+                stacklevel=2,
+            )
     if not scene.synthetic:
         check_colors(scene, label)
     holes = None if scene.synthetic else holes_report(scene)
@@ -102,24 +108,38 @@ def check_cameras(scene: Scene, label: str) -> None:
     for v, name in enumerate(cameras.names):
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
             raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
-        if (far := float(places[v].norm())) > FARTHEST and far > APART * spread:  # else the unit is wrong, which is said below
-            raise DataError(f"{label}: camera {name}: expected within {FARTHEST:g} m of the origin, where float32 has digits for "
-                            f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids")
+        if (
+            far := float(places[v].norm())
+        ) > FARTHEST and far > APART * spread:  # else the unit is wrong, which is said below
+            raise DataError(
+                f"{label}: camera {name}: expected within {FARTHEST:g} m of the origin, where float32 has digits for "
+                f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids"
+            )
         if not bool((cameras.K[v].diagonal()[:2] > 0).all()):
             raise DataError(
                 f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}"
             )
         check_pixels(cameras.K[v], f"{label}: camera {name}")
         R = cameras.w2c[v, :3, :3].double()
-        if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
-            raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
+        if (
+            float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3
+            or float(torch.linalg.det(R)) < 0
+        ):
+            raise DataError(
+                f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}"
+            )
         cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
         inside = 0 < cx < cameras.width and 0 < cy < cameras.height
         centred = max(abs(cx) / cameras.width, abs(cy) / cameras.height) < CORNER
-        said = (f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
-                f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: ")
-        said += ("measured from their centre? Expected from the upper left corner: add half of their size" if centred else
-                 "intrinsics of another resolution?")
+        said = (
+            f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
+            f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: "
+        )
+        said += (
+            "measured from their centre? Expected from the upper left corner: add half of their size"
+            if centred
+            else "intrinsics of another resolution?"
+        )
         if not inside:
             raise DataError(said)
         if centred:
@@ -129,12 +149,19 @@ def check_cameras(scene: Scene, label: str) -> None:
 def check_pixels(K: torch.Tensor, label: str) -> None:
     """A pinhole camera's matrix, and both focal lengths nearly one. Errors: DataError where one is twice the other; a warning where
     they differ visibly."""
-    if float((K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max()) > 1e-6:
-        raise DataError(f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}")
+    if (
+        float((K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max())
+        > 1e-6
+    ):
+        raise DataError(
+            f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
+        )
     across, down = K[0, 0].item(), K[1, 1].item()
     ratio = max(across / down, down / across)
-    said = (f"{label}: expected focal lengths of square pixels, found fl_x = {across:.5g} and fl_y = {down:.5g} px: were the "
-            "images stretched, or one of them taken for another size?")
+    said = (
+        f"{label}: expected focal lengths of square pixels, found fl_x = {across:.5g} and fl_y = {down:.5g} px: were the "
+        "images stretched, or one of them taken for another size?"
+    )
     if ratio >= SQUARE:
         raise DataError(said)
     if ratio > NEARLY:
@@ -145,7 +172,9 @@ def check_times(scene: Scene, label: str) -> None:
     """Increasing times at one frame rate."""
     steps = scene.times.double().diff()
     if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
-        raise DataError(f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}")
+        raise DataError(
+            f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}"
+        )
     # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
     allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
     worst = int((steps - steps.median()).abs().argmax())
@@ -169,14 +198,19 @@ def check_mattes(scene: Scene, label: str) -> None:
             t = int(covered[v].argmax())
             every = "; the footage has no matte (an alpha channel that is opaque everywhere?)"
             one = ": an opaque alpha channel, or an object too near; matte it, or restrict scene.frames"
-            raise DataError(f"{label}: camera {name}, frame {t}: the matte covers {float(covered[v, t]):.0%} of the image"
-                            f"{every if float(covered[v].min()) > FULL else one}")
+            raise DataError(
+                f"{label}: camera {name}, frame {t}: the matte covers {float(covered[v, t]):.0%} of the image"
+                f"{every if float(covered[v].min()) > FULL else one}"
+            )
     check_gaps(scene, covered > 0, label)
     most = scene.mattes.amax((1, 2, 3))
     if float(most.min()) < CLEAR:
         v = int(most.argmin())
-        warnings.warn(f"{label}: camera {scene.cameras.names[v]}: the matte is nowhere more than {float(most[v]):.2f} in any "
-                      "frame: expected 1 inside of the object; what is missing mixes the background into its colours", stacklevel=3)
+        warnings.warn(
+            f"{label}: camera {scene.cameras.names[v]}: the matte is nowhere more than {float(most[v]):.2f} in any "
+            "frame: expected 1 inside of the object; what is missing mixes the background into its colours",
+            stacklevel=3,
+        )
 
 
 def check_gaps(scene: Scene, seen: torch.Tensor, label: str) -> None:
@@ -186,8 +220,10 @@ def check_gaps(scene: Scene, seen: torch.Tensor, label: str) -> None:
     views = seen.sum(0)
     if bool((lost := (views < 2) & (later.sum(0) >= 2)).any()):
         t = int(lost.int().argmax())
-        raise DataError(f"{label}: {int(views[t])} of {len(seen)} cameras have a matte of the object in frame {t}, and more of "
-                        "them in a later one: expected two at least in every frame between; matte it, or restrict scene.frames")
+        raise DataError(
+            f"{label}: {int(views[t])} of {len(seen)} cameras have a matte of the object in frame {t}, and more of "
+            "them in a later one: expected two at least in every frame between; matte it, or restrict scene.frames"
+        )
     if bool(gap.any()):
         v, t = (int(i) for i in gap.nonzero()[0])
         warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t}: the matte is empty, where it shows the object in a "
@@ -199,18 +235,27 @@ def check_colors(scene: Scene, label: str) -> None:
     """A warning where the object's mean colour jumps in one frame of a camera and comes back: a frame that was not exposed, or
     dropped and filled with black. And one where all cameras' changes over the film: another exposure, or a light that changes."""
     inside = (scene.mattes > CLEAR).float()
-    means = (scene.images * inside[..., None]).sum((2, 3)) / inside.sum((2, 3))[..., None].clamp(min=1)
+    means = (scene.images * inside[..., None]).sum((2, 3)) / inside.sum((2, 3))[..., None].clamp(
+        min=1
+    )
     seen = inside.sum((2, 3)) > 0
-    jump = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2).abs().amax(2) * (seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:])
+    jump = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2).abs().amax(2) * (
+        seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
+    )
     if jump.numel() and float(jump.max()) > FLASH:
         v, t = divmod(int(jump.argmax()), jump.shape[1])
-        warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t + 1}: the object's mean colour is "
-                      f"{float(jump[v, t]):.2f} beside that of the frames before and after: a dropped or flashed frame? expected "
-                      "one light", stacklevel=3)
+        warnings.warn(
+            f"{label}: camera {scene.cameras.names[v]}, frame {t + 1}: the object's mean colour is "
+            f"{float(jump[v, t]):.2f} beside that of the frames before and after: a dropped or flashed frame? expected "
+            "one light",
+            stacklevel=3,
+        )
         return
     chosen = scene.training_cameras
     weight = inside[chosen]
-    together = (scene.images[chosen] * weight[..., None]).sum((0, 2, 3)) / weight.sum((0, 2, 3))[:, None].clamp(min=1)
+    together = (scene.images[chosen] * weight[..., None]).sum((0, 2, 3)) / weight.sum((0, 2, 3))[
+        :, None
+    ].clamp(min=1)
     shown = weight.sum((0, 2, 3)) > 0
     if int(shown.sum()) < 2:
         return
@@ -218,24 +263,36 @@ def check_colors(scene: Scene, label: str) -> None:
     if float(change.max()) > DRIFT:
         channel = int(change.argmax())
         values = torch.where(shown, together[:, channel], torch.nan)
-        first, last = (int(i) for i in (values.nan_to_num(2.0).argmin(), values.nan_to_num(-1.0).argmax()))
+        first, last = (
+            int(i) for i in (values.nan_to_num(2.0).argmin(), values.nan_to_num(-1.0).argmax())
+        )
         name = ("red", "green", "blue")[channel]
-        warnings.warn(f"{label}: the object's mean {name} over all cameras is {float(values[first]):.2f} in frame {first} and "
-                      f"{float(values[last]):.2f} in frame {last}: does the exposure, the white balance or the light change? "
-                      "expected one; colours are compared from frame to frame", stacklevel=3)
+        warnings.warn(
+            f"{label}: the object's mean {name} over all cameras is {float(values[first]):.2f} in frame {first} and "
+            f"{float(values[last]):.2f} in frame {last}: does the exposure, the white balance or the light change? "
+            "expected one; colours are compared from frame to frame",
+            stacklevel=3,
+        )
 
 
 def check_borders(scene: Scene, label: str) -> None:
     """The first frame, which says where the object is, shows all of it to two learning cameras at least."""
     covered = scene.mattes > 0.5
-    cut = torch.cat([covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2).any(2)
+    cut = torch.cat(
+        [covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2
+    ).any(2)
     names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v, 0])]
     if len(scene.training_cameras) - len(names) < 2:
-        raise DataError(f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected two "
-                        "that see all of it; film from farther away, or start with another frame (scene.frames)")
+        raise DataError(
+            f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected two "
+            "that see all of it; film from farther away, or start with another frame (scene.frames)"
+        )
     if names:
-        warnings.warn(f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}; what is outside "
-                      "is known to the others alone", stacklevel=3)
+        warnings.warn(
+            f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}; what is outside "
+            "is known to the others alone",
+            stacklevel=3,
+        )
 
 
 def fingerprint(scene: Scene) -> str:

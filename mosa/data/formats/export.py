@@ -23,7 +23,9 @@ def rgba(scene: Scene, camera: int, frame: int) -> np.ndarray:
     """(H, W, 4) uint8 with straight alpha: the background is taken out of pixels that it shows through."""
     alpha = scene.mattes[camera, frame].numpy()[..., None]
     behind = (1 - alpha) * scene.background.numpy()
-    color = np.where(alpha > 0, (scene.images[camera, frame].numpy() - behind) / np.maximum(alpha, 1e-6), 1.0)
+    color = np.where(
+        alpha > 0, (scene.images[camera, frame].numpy() - behind) / np.maximum(alpha, 1e-6), 1.0
+    )
     return np.round(255 * np.clip(np.concatenate([color, alpha], -1), 0, 1)).astype(np.uint8)
 
 
@@ -36,7 +38,9 @@ def export_pacnerf(scene: Scene, folder: str | Path) -> Path:
         pose, K = opengl_pose(scene.cameras.w2c[v])[:3].tolist(), scene.cameras.K[v].tolist()
         for t, time in enumerate(scene.times.tolist()):
             iio.imwrite(folder / "data" / f"a_{v}_{t}.png", rgba(scene, v, t))
-            entries.append({"file_path": f"./data/r_{v}_{t}.png", "time": time, "c2w": pose, "intrinsic": K})
+            entries.append(
+                {"file_path": f"./data/r_{v}_{t}.png", "time": time, "c2w": pose, "intrinsic": K}
+            )
     (folder / "all_data.json").write_text(json.dumps(entries, indent=1))
     return folder
 
@@ -75,7 +79,9 @@ def export_spring_gaus(scene: Scene, folder: str | Path) -> Path:
         for t in range(len(scene.times)):
             iio.imwrite(folder / f"camera_{name}" / f"{t:03d}.png", rgba(scene, v, t))
     (folder / "camera.json").write_text(json.dumps(cameras, indent=1))
-    (folder / "frame.json").write_text(json.dumps([{f"{t:03d}": time} for t, time in enumerate(scene.times.tolist())], indent=1))
+    (folder / "frame.json").write_text(
+        json.dumps([{f"{t:03d}": time} for t, time in enumerate(scene.times.tolist())], indent=1)
+    )
     return folder
 
 
@@ -84,6 +90,8 @@ def export_particles(positions: torch.Tensor, folder: str | Path) -> Path:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for t, points in enumerate(positions.numpy()):
-        vertices = np.array([tuple(p) for p in points.astype("f4")], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+        vertices = np.array(
+            [tuple(p) for p in points.astype("f4")], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")]
+        )
         PlyData([PlyElement.describe(vertices, "vertex")]).write(folder / f"{t:03d}.ply")
     return folder

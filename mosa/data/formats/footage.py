@@ -50,7 +50,9 @@ def each_once(pairs: list[tuple[str, object]]) -> dict:
     found: dict[str, object] = {}
     for key, value in pairs:
         if key in found and found[key] != value:
-            raise TwiceError(f"the key {key[:60]!r} twice, as {str(found[key])[:40]} and as {str(value)[:40]}")
+            raise TwiceError(
+                f"the key {key[:60]!r} twice, as {str(found[key])[:40]} and as {str(value)[:40]}"
+            )
         found[key] = value
     return found
 
@@ -67,7 +69,9 @@ def read_json(path: Path):
             f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}"
         ) from error
     except RecursionError as error:
-        raise DataError(f"{path}: expected JSON of a few levels, found brackets in brackets beyond any depth") from error
+        raise DataError(
+            f"{path}: expected JSON of a few levels, found brackets in brackets beyond any depth"
+        ) from error
     except ValueError as error:  # a number of thousands of digits
         if isinstance(error, UnicodeDecodeError):
             raise DataError(f"{path}: expected JSON text, found bytes that are no UTF-8") from error
@@ -81,17 +85,25 @@ def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
     """A finite matrix of that shape from nested lists. Errors: DataError beginning with `where`."""
     try:
         array = np.array(value, dtype=np.float64)
-        whole = array.ndim == 2 and all(isinstance(x, (int, float)) and not isinstance(x, bool) for row in value for x in row)
+        whole = array.ndim == 2 and all(
+            isinstance(x, (int, float)) and not isinstance(x, bool) for row in value for x in row
+        )
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}") from error
+        raise DataError(
+            f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}"
+        ) from error
     if array.ndim == 2 and not whole:
         raise DataError(f"{where}: expected numbers, found texts or flags: {str(value)[:80]}")
     if array.shape == (4, 4) and shape == (3, 4):
         if not np.abs(array[3] - (0, 0, 0, 1)).max() <= 1e-6:
-            raise DataError(f"{where}: expected 0, 0, 0, 1 in the fourth row, found {array[3].tolist()}; transposed, or scaled?")
+            raise DataError(
+                f"{where}: expected 0, 0, 0, 1 in the fourth row, found {array[3].tolist()}; transposed, or scaled?"
+            )
         array = array[:3]
     if array.shape != shape:
-        raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix, found shape {array.shape}")
+        raise DataError(
+            f"{where}: expected a {shape[0]}x{shape[1]} matrix, found shape {array.shape}"
+        )
     if not np.isfinite(array).all():
         raise DataError(f"{where}: expected finite numbers, found {array[~np.isfinite(array)][0]}")
     return array
@@ -131,21 +143,33 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
     """
     if wanted is not None:
         wanted = list(wanted) if isinstance(wanted, (list, tuple)) else [wanted]
-        if len(wanted) != 2 or not all(isinstance(f, int) and not isinstance(f, bool) for f in wanted):
+        if len(wanted) != 2 or not all(
+            isinstance(f, int) and not isinstance(f, bool) for f in wanted
+        ):
             raise ConfigError(f"scene.frames: expected [first, last], found {wanted}")
         for end in wanted:
             if end not in present:
-                raise ConfigError(f"scene.frames: {where} has no frame {end}, only {min(present)} to {max(present)}")
+                raise ConfigError(
+                    f"scene.frames: {where} has no frame {end}, only {min(present)} to {max(present)}"
+                )
         present = [f for f in present if wanted[0] <= f <= wanted[1]]
     missing = sorted(set(range(present[0], present[-1] + 1)) - set(present)) if present else []
     if missing:
-        raise DataError(f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames")
+        raise DataError(
+            f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames"
+        )
     if len(present) < 2:
         raise DataError(f"{where}: expected at least two frames, found {len(present)}")
     return present
 
 
-def merge_time(times: dict[int, tuple[float, str]], frame: int, time: float, where: str, fps: float | None = None) -> None:
+def merge_time(
+    times: dict[int, tuple[float, str]],
+    frame: int,
+    time: float,
+    where: str,
+    fps: float | None = None,
+) -> None:
     """Note the time of a frame, the first that is given. Errors: DataError where another camera gave the same frame a time that
     is another by more than a quarter of a frame, or, without frames per second, at all."""
     known, first = times.setdefault(frame, (time, where))
@@ -177,34 +201,65 @@ def told_rate(times: list[float], fps: float, where: str) -> None:
     steps = np.diff(np.asarray(times, dtype=np.float64))
     middle = float(np.median(steps)) if len(steps) else 0.0
     if middle > 0 and abs(middle * fps - 1) > RATE:
-        warnings.warn(f"{where}: scene.fps = {fps:g} takes the place of the file's own times, which say {1 / middle:.5g} frames "
-                      "per second: expected the same rate, but for a film in slow motion", stacklevel=2)
+        warnings.warn(
+            f"{where}: scene.fps = {fps:g} takes the place of the file's own times, which say {1 / middle:.5g} frames "
+            "per second: expected the same rate, but for a film in slow motion",
+            stacklevel=2,
+        )
 
 
 def scaled(K: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
     """K (3, 3) [px] of images that were brought from `full` to `size`, (width, height) [px] each."""
-    K = K.astype(np.float32)  # as a scene keeps it: what was read before has the same bits, and so the same place in the cache
+    K = K.astype(
+        np.float32
+    )  # as a scene keeps it: what was read before has the same bits, and so the same place in the cache
     K[0] *= size[0] / full[0]
     K[1] *= size[1] / full[1]
     return K
 
 
 def footage_of(
-    calibration: dict[str, tuple[np.ndarray, np.ndarray]], images: list[np.ndarray], mattes: list[np.ndarray], frames: list[int],
-    times: list[float], where: str,
+    calibration: dict[str, tuple[np.ndarray, np.ndarray]],
+    images: list[np.ndarray],
+    mattes: list[np.ndarray],
+    frames: list[int],
+    times: list[float],
+    where: str,
 ) -> Footage:
     """Footage from name -> (K, w2c) and, in the same order, (T, h, w, 3) images on white and (T, h, w) mattes, whose sizes may
     differ between cameras. Errors: DataError beginning with `where` (`mosa.data.images.one_size`)."""
     for name in calibration:  # it stands in messages and figures
         if not name.strip() or len(name) > 100 or not name.isprintable():
-            raise DataError(f"{where}: expected names of cameras of at most 100 printable characters, found {name[:60]!r}")
-    K, stack, coverage = one_size(np.stack([k for k, _ in calibration.values()]), images, mattes, background=WHITE,
-                                  names=list(calibration), where=where)
+            raise DataError(
+                f"{where}: expected names of cameras of at most 100 printable characters, found {name[:60]!r}"
+            )
+    K, stack, coverage = one_size(
+        np.stack([k for k, _ in calibration.values()]),
+        images,
+        mattes,
+        background=WHITE,
+        names=list(calibration),
+        where=where,
+    )
     w2c = np.stack([w for _, w in calibration.values()])
-    cameras = Cameras(torch.tensor(K, dtype=torch.float32), torch.tensor(w2c, dtype=torch.float32), coverage.shape[3],
-                      coverage.shape[2], tuple(calibration))
+    cameras = Cameras(
+        torch.tensor(K, dtype=torch.float32),
+        torch.tensor(w2c, dtype=torch.float32),
+        coverage.shape[3],
+        coverage.shape[2],
+        tuple(calibration),
+    )
     moments = np.array(times)
-    if np.spacing(np.abs(moments).max(), dtype=np.float32) > 0.1 * TIME_JITTER * np.diff(moments).min():
+    if (
+        np.spacing(np.abs(moments).max(), dtype=np.float32)
+        > 0.1 * TIME_JITTER * np.diff(moments).min()
+    ):
         moments -= moments[0]  # seconds of a clock, which single precision does not keep
-    return Footage(cameras, tuple(frames), torch.from_numpy(moments).float(), torch.from_numpy(stack),
-                   torch.from_numpy(coverage), torch.ones(3))
+    return Footage(
+        cameras,
+        tuple(frames),
+        torch.from_numpy(moments).float(),
+        torch.from_numpy(stack),
+        torch.from_numpy(coverage),
+        torch.ones(3),
+    )

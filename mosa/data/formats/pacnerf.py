@@ -48,7 +48,9 @@ PUBLISHED = {
 """Published parameters by folder name (SI, degrees): compared with at the end, never read by learning, in no config."""
 
 
-def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
+def read_pacnerf(
+    path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0
+) -> Footage:
     """Footage of a folder in PAC-NeRF's layout; only all_data.json and data/ are opened.
 
     Raw images without mattes are matted from the empty plates of their cameras. frames: (first, last) or None for all there
@@ -58,7 +60,9 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise DataError(f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)")
+        raise DataError(
+            f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)"
+        )
     listing = folder / "all_data.json"
     calibration, times = read_listing(listing, fps)
     prefix, present = usable_frames(folder, calibration)
@@ -69,7 +73,10 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
     else:
         told_rate([times[f][0] for f in numbers], fps, str(listing))
     if prefix == "r":
-        log.info("%s: raw images without mattes; matted from the background plates r_<camera>_-1.png", folder)
+        log.info(
+            "%s: raw images without mattes; matted from the background plates r_<camera>_-1.png",
+            folder,
+        )
 
     @lru_cache(maxsize=1)  # one at a time: cameras come one after the other
     def plate(camera: str) -> np.ndarray | None:
@@ -78,7 +85,9 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / "data" / f"{prefix}_{camera}_{frame}.png",
         lambda camera, file, pixels: split(file, pixels, plate(camera)), listing.name, scale=scale, fill=fill)  # fmt: skip
-    return footage_of(scaled_calibration, images, mattes, numbers, [times[f][0] for f in numbers], str(listing))
+    return footage_of(
+        scaled_calibration, images, mattes, numbers, [times[f][0] for f in numbers], str(listing)
+    )
 
 
 def read_listing(
@@ -87,22 +96,30 @@ def read_listing(
     """Calibration (camera name -> K, w2c) in order of camera number, and frame -> (time, where it was read)."""
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list with one object per image, found {type(entries).__name__}")
+        raise DataError(
+            f"{path}: expected a list with one object per image, found {type(entries).__name__}"
+        )
     calibration, times = {}, {}
     for i, entry in enumerate(entries):
         where = f"{path}, entry {i}"
         for key in ("file_path", "time", "c2w", "intrinsic"):
             if not isinstance(entry, dict) or key not in entry:
-                raise DataError(f"{where}: expected the keys file_path, time, c2w and intrinsic, found no {key}")
+                raise DataError(
+                    f"{where}: expected the keys file_path, time, c2w and intrinsic, found no {key}"
+                )
         found = NAME.search(str(entry["file_path"]))
         if found is None:
-            raise DataError(f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}")
+            raise DataError(
+                f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}"
+            )
         camera, frame = found[2], int(found[3])
         K = matrix(entry["intrinsic"], (3, 3), f"{where}, intrinsic")
         w2c = world_to_camera(matrix(entry["c2w"], (3, 4), f"{where}, c2w"), f"{where}, c2w")
         if not same_camera(known := calibration.setdefault(camera, (K, w2c)), K, w2c):
             other = "another pose" if same_camera(known, K, known[1]) else "other intrinsics"
-            raise DataError(f"{where}: camera {camera} has {other} than before; cameras must not move, focus or zoom")
+            raise DataError(
+                f"{where}: camera {camera} has {other} than before; cameras must not move, focus or zoom"
+            )
         if frame >= 0:
             merge_time(times, frame, number(entry["time"], f"{where}, time"), where, fps)
     return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times
@@ -123,7 +140,11 @@ def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
         if present[kind]:
             return kind, sorted(present[kind])
     if present["r"]:
-        bare = [camera for camera in calibration if not (folder / "data" / f"r_{camera}_-1.png").is_file()]
+        bare = [
+            camera
+            for camera in calibration
+            if not (folder / "data" / f"r_{camera}_-1.png").is_file()
+        ]
         if bare:
             raise DataError(
                 f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png "
@@ -140,22 +161,34 @@ def read_plate(file: Path) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
 
 
-def split(file: Path, pixels: np.ndarray, plate: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def split(
+    file: Path, pixels: np.ndarray, plate: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Colour (H, W, 3) and matte (H, W): the alpha channel of an a_ file, what is not white in an m_ file, what differs from the
     plate in an r_ file."""
     if file.name.startswith("a_"):
         return split_alpha(file, pixels)
     color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
     if plate is not None:
-        expect_size(file, pixels, *plate.shape[1::-1], reason="as the background plate of its camera")
+        expect_size(
+            file, pixels, *plate.shape[1::-1], reason="as the background plate of its camera"
+        )
         return matte_from_plate(color, plate)
     return color, (color.min(-1) < WHITE_LEVEL).astype(np.float32)
 
 
 def load_pacnerf(
-    path: str | Path, *, frames=None, scale: float = 1.0, fill_holes: int = 0, name: str | None = None, **world
+    path: str | Path,
+    *,
+    frames=None,
+    scale: float = 1.0,
+    fill_holes: int = 0,
+    name: str | None = None,
+    **world,
 ) -> Scene:
     """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_pacnerf(path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes)
     folder = Path(path).resolve().name
-    return scene_from_footage(footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world)
+    return scene_from_footage(
+        footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world
+    )

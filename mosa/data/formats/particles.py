@@ -44,8 +44,12 @@ def read_clouds(folder: Path, frames: Sequence[int]) -> tuple[Tensor, ...]:
     their numbers is the frames'. Errors: DataError where the folder is missing, or neither says which file is which frame.
     """
     if not Path(folder).is_dir():
-        raise DataError(f"{folder}: folder not found; scene.particles is the folder of ground-truth PLY files, or null")
-    files = sorted(Path(folder).glob("*.ply"), key=lambda f: [int(n) for n in re.findall(r"\d+", f.stem)])
+        raise DataError(
+            f"{folder}: folder not found; scene.particles is the folder of ground-truth PLY files, or null"
+        )
+    files = sorted(
+        Path(folder).glob("*.ply"), key=lambda f: [int(n) for n in re.findall(r"\d+", f.stem)]
+    )
     numbered = {int(numbers[-1]): f for f in files if (numbers := re.findall(r"\d+", f.stem))}
     if len(numbered) == len(files) and all(frame in numbered for frame in frames):
         files = [numbered[frame] for frame in frames]

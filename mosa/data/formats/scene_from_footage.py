@@ -63,19 +63,25 @@ def scene_from_footage(
     try:
         low, high = box
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}") from error
+        raise ConfigError(
+            f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}"
+        ) from error
     box = torch.stack([vector(low, "box"), vector(high, "box")])
     if not bool((box[1] > box[0]).all()):
         raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
     if float(box.abs().max()) > WIDEST:
         raise ConfigError(f"scene.box: expected metres within {WIDEST:g}, found {box.tolist()}")
     if not is_number(density) or not DENSITIES[0] <= density <= DENSITIES[1]:
-        raise ConfigError(f"scene.density: expected a positive number of {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3, "
-                          f"found {density!r}")
+        raise ConfigError(
+            f"scene.density: expected a positive number of {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3, "
+            f"found {density!r}"
+        )
     times = footage.times
     if fps is not None:
         check_fps(fps)
-        times = torch.tensor([(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32)
+        times = torch.tensor(
+            [(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32
+        )
     if last_free_frame is not None:
         if isinstance(last_free_frame, bool) or last_free_frame not in footage.frames:
             raise ConfigError(
@@ -84,8 +90,11 @@ def scene_from_footage(
         last_free_frame = footage.frames.index(last_free_frame)
     check_ground(ground, up / up.norm(), pull, box)
     if density < LIGHT:
-        warnings.warn(f"scene.density: {density:g} kg/m^3 is lighter than nearly all solids; was it meant in g/cm^3? Moduli scale "
-                      "with it", stacklevel=4)
+        warnings.warn(
+            f"scene.density: {density:g} kg/m^3 is lighter than nearly all solids; was it meant in g/cm^3? Moduli scale "
+            "with it",
+            stacklevel=4,
+        )
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
         gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
@@ -98,7 +107,9 @@ def scene_from_footage(
     return replace(scene, fingerprint=fingerprint(scene))
 
 
-def check_ground(ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, box: torch.Tensor) -> None:
+def check_ground(
+    ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, box: torch.Tensor
+) -> None:
     """The ground lies in the box, and what falls falls onto it: a warning where it is an incline. up: (3,) unit vector.
 
     Errors: ConfigError naming scene.box."""
@@ -107,10 +118,14 @@ def check_ground(ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, bo
     corners = torch.stack(torch.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3) @ up
     low, high = float(corners.min()), float(corners.max())
     if not low <= ground.height < high:
-        raise ConfigError(f"scene.box: expected one that the ground at scene.ground.height={ground.height:g} m lies in, found "
-                          f"{box.tolist()}, which reaches from {low:.4g} to {high:.4g} m along scene.up")
+        raise ConfigError(
+            f"scene.box: expected one that the ground at scene.ground.height={ground.height:g} m lies in, found "
+            f"{box.tolist()}, which reaches from {low:.4g} to {high:.4g} m along scene.up"
+        )
     if float(pull.norm()) > 0:
-        angle = math.degrees(math.acos(min(1.0, float(-(pull.double() @ up.double()) / pull.double().norm()))))
+        angle = math.degrees(
+            math.acos(min(1.0, float(-(pull.double() @ up.double()) / pull.double().norm())))
+        )
         if angle > STEEP:
             warnings.warn(f"scene.gravity: pulls at {angle:.3g} degrees from scene.up, so that the ground is an incline: set "
                           "scene.up along -scene.gravity where it is not", stacklevel=5)  # fmt: skip
@@ -118,7 +133,9 @@ def check_ground(ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, bo
 
 def vector(value, key: str) -> torch.Tensor:
     """(3,) float32. Errors: ConfigError naming the key."""
-    if isinstance(value, (str, Mapping)) or (isinstance(value, (list, tuple)) and any(isinstance(v, (bool, str)) for v in value)):
+    if isinstance(value, (str, Mapping)) or (
+        isinstance(value, (list, tuple)) and any(isinstance(v, (bool, str)) for v in value)
+    ):
         raise ConfigError(f"scene.{key}: expected three numbers, found {value!r}")
     try:
         result = torch.tensor([float(v) for v in value], dtype=torch.float32)
@@ -138,11 +155,15 @@ def check_fps(fps) -> None:
 def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
     """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where under two are left."""
     if names is not None and not isinstance(names, (list, tuple)):
-        raise ConfigError(f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}")
+        raise ConfigError(
+            f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}"
+        )
     indices = []
     for name in names or ():
         if str(name) not in footage_names:
-            raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}")
+            raise ConfigError(
+                f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}"
+            )
         indices.append(footage_names.index(str(name)))
     if len(footage_names) < 2:
         raise ConfigError(f"scene: expected at least two cameras, found {len(footage_names)}")
@@ -159,7 +180,9 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
     Errors: ConfigError where a number is unknown, where they are not the end of the sequence, or under three are left.
     """
     if isinstance(numbers, bool) or not isinstance(numbers, (int, list, tuple, type(None))):
-        raise ConfigError(f"scene.holdout_frames: expected a list of frame numbers or how many are held out, found {numbers!r}")
+        raise ConfigError(
+            f"scene.holdout_frames: expected a list of frame numbers or how many are held out, found {numbers!r}"
+        )
     if isinstance(numbers, int):
         if numbers < 0:
             raise ConfigError(f"scene.holdout_frames: expected a number >= 0, found {numbers}")
@@ -167,7 +190,9 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
     indices = set()
     for number in numbers or ():
         if number not in frames:
-            raise ConfigError(f"scene.holdout_frames: no frame {number}; the scene has {frames[0]} to {frames[-1]}")
+            raise ConfigError(
+                f"scene.holdout_frames: no frame {number}; the scene has {frames[0]} to {frames[-1]}"
+            )
         indices.add(frames.index(number))
     if indices and sorted(indices) != list(range(len(frames) - len(indices), len(frames))):
         raise ConfigError(
@@ -175,7 +200,9 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
             "what comes after a gap cannot be learned from"
         )
     if len(frames) < 3:
-        raise ConfigError(f"scene.frames: expected at least three frames to learn from, found {len(frames)}")
+        raise ConfigError(
+            f"scene.frames: expected at least three frames to learn from, found {len(frames)}"
+        )
     if len(frames) - len(indices) < 3:
         raise ConfigError(
             f"scene.holdout_frames: {len(indices)} of {len(frames)} frames held out; three must be left to learn from"

@@ -26,7 +26,9 @@ from mosa.types import Scene
 PICTURE = re.compile(r"(\d{3,})\.png$")
 
 
-def read_spring_gaus(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
+def read_spring_gaus(
+    path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0
+) -> Footage:
     """Footage of a folder in Spring-Gaus' layout: RGBA pictures whose alpha is the matte, of cameras that stay where they are.
 
     frames: (first, last) or None for all there are; fps: given where the file's times are not to be used; scale: image scale in
@@ -34,26 +36,36 @@ def read_spring_gaus(path: str | Path, *, frames=None, fps: float | None = None,
     Errors: DataError naming the file (missing, damaged, of another size, without a matte), ConfigError."""
     folder = Path(path)
     if not folder.is_dir():
-        raise DataError(f"{folder}: folder not found; set scene.path to a body in Spring-Gaus' layout (camera.json, frame.json, "
-                        "a folder of pictures for each camera)")
+        raise DataError(
+            f"{folder}: folder not found; set scene.path to a body in Spring-Gaus' layout (camera.json, frame.json, "
+            "a folder of pictures for each camera)"
+        )
     calibration, times = read_cameras(folder / "camera.json"), read_times(folder / "frame.json")
     present = sorted({int(found[1]) for camera in calibration for file in pictures(folder / camera)
                       if (found := PICTURE.fullmatch(file.name)) is not None})  # fmt: skip
     if not present:
-        raise DataError(f"{folder}: expected pictures {next(iter(calibration))}/000.png and so on, found none")
+        raise DataError(
+            f"{folder}: expected pictures {next(iter(calibration))}/000.png and so on, found none"
+        )
     numbers, listing = frame_range(present, frames, str(folder)), str(folder / "frame.json")
     if numbers[-1] >= len(times):
-        raise DataError(f"{listing}: expected a time for each frame up to {numbers[-1]}, found {len(times)}; add them, or restrict "
-                        "scene.frames")
+        raise DataError(
+            f"{listing}: expected a time for each frame up to {numbers[-1]}, found {len(times)}; add them, or restrict "
+            "scene.frames"
+        )
     chosen = [times[frame] for frame in numbers]
     if fps is None:
-        even_times(chosen, numbers, listing, "correct them, restrict scene.frames, or set scene.fps")
+        even_times(
+            chosen, numbers, listing, "correct them, restrict scene.frames, or set scene.fps"
+        )
     else:
         told_rate(chosen, fps, listing)
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / camera / f"{frame:03}.png",
         lambda _, file, pixels: split_alpha(file, pixels), "camera.json", scale=scale, fill=fill)  # fmt: skip
-    return footage_of(scaled_calibration, images, mattes, numbers, chosen, str(folder / "camera.json"))
+    return footage_of(
+        scaled_calibration, images, mattes, numbers, chosen, str(folder / "camera.json")
+    )
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -67,7 +79,9 @@ def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Calibration (folder of the camera -> K, w2c) from a list of {"camera": folder, "K": 3x3 [px], "c2w": 4x4 in OpenGL axes}."""
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list with one object per camera, found {type(entries).__name__}")
+        raise DataError(
+            f"{path}: expected a list with one object per camera, found {type(entries).__name__}"
+        )
     calibration = {}
     for i, entry in enumerate(entries):
         where = f"{path}, entry {i}"
@@ -76,7 +90,9 @@ def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
                 raise DataError(f"{where}: expected the keys camera, K and c2w, found no {key}")
         name = entry["camera"]
         if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
-            raise DataError(f"{where}, camera: expected the name of a folder beside {path.name}, found {str(name)[:80]!r}")
+            raise DataError(
+                f"{where}, camera: expected the name of a folder beside {path.name}, found {str(name)[:80]!r}"
+            )
         if name in calibration:
             raise DataError(f"{where}: camera {name!r} twice")
         calibration[name] = (matrix(entry["K"], (3, 3), f"{where}, K"),
@@ -88,18 +104,30 @@ def read_times(path: Path) -> list[float]:
     """Time [s] of each frame, from a list of objects that have one entry each."""
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list with one object per frame, found {type(entries).__name__}")
+        raise DataError(
+            f"{path}: expected a list with one object per frame, found {type(entries).__name__}"
+        )
     times = []
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict) or len(entry) != 1:
-            raise DataError(f"{path}, entry {i}: expected an object with one entry, a time [s], found {str(entry)[:80]}")
+            raise DataError(
+                f"{path}, entry {i}: expected an object with one entry, a time [s], found {str(entry)[:80]}"
+            )
         times.append(number(next(iter(entry.values())), f"{path}, entry {i}"))
     return times
 
 
 def load_spring_gaus(
-    path: str | Path, *, frames=None, scale: float = 1.0, fill_holes: int = 0, name: str | None = None, **world
+    path: str | Path,
+    *,
+    frames=None,
+    scale: float = 1.0,
+    fill_holes: int = 0,
+    name: str | None = None,
+    **world,
 ) -> Scene:
     """Scene of a folder in Spring-Gaus' layout. `world`: the keyword arguments of `scene_from_footage`."""
-    footage = read_spring_gaus(path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes)
+    footage = read_spring_gaus(
+        path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes
+    )
     return scene_from_footage(footage, name=name or Path(path).resolve().name, **world)

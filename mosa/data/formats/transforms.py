@@ -65,7 +65,9 @@ class Shot:
     fisheye: bool = False
 
 
-def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
+def read_transforms(
+    path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0
+) -> Footage:
     """Footage of a transforms.json (path: the file, or its folder).
 
     Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h, the lens' k1 to k4, p1, p2, camera_model (see
@@ -107,8 +109,11 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
                 picture, matte = lens.straighten(picture, matte, WHITE)
             pictures.append((resize(picture, *size), resize(matte, *size)))
         if cut > CUT:
-            warnings.warn(f"{file}: camera {name}: undoing its lens distortion cuts off up to {cut:.1%} of the object, too close "
-                          "to the border of the image", stacklevel=2)
+            warnings.warn(
+                f"{file}: camera {name}: undoing its lens distortion cuts off up to {cut:.1%} of the object, too close "
+                "to the border of the image",
+                stacklevel=2,
+            )
         images.append(np.stack([p[0] for p in pictures]))
         mattes.append(np.stack([p[1] for p in pictures]))
     return footage_of(calibration, images, mattes, wanted, [times[f] for f in wanted], str(file))
@@ -116,30 +121,53 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
 
 def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
     """The entries of a document. Errors: DataError naming entry and key."""
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+    if (
+        not isinstance(document, dict)
+        or not isinstance(document.get("frames"), list)
+        or not document["frames"]
+    ):
         raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
     shared = {k: number(v, f"{file}, {k}") for k, v in document.items() if k in intrinsic_keys()}
     shots = []
-    counting = counting_place([str(e.get("file_path")) for e in document["frames"] if isinstance(e, dict) and "time" not in e])
+    counting = counting_place(
+        [
+            str(e.get("file_path"))
+            for e in document["frames"]
+            if isinstance(e, dict) and "time" not in e
+        ]
+    )
     for i, entry in enumerate(document["frames"]):
         where = f"{file}, frames[{i}]"
         for key in ("file_path", "transform_matrix"):
             if not isinstance(entry, dict) or key not in entry:
                 raise DataError(f"{where}: expected the key {key}")
         if bent := [k for k in FOREIGN if entry.get(k, document.get(k))]:
-            raise DataError(f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
-                            "rational or thin prism model; undistort the images first")
-        intrinsics = shared | {k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()}
-        fisheye = is_fisheye(entry.get("camera_model", document.get("camera_model")),
-                             entry.get("is_fisheye", document.get("is_fisheye")), where)
+            raise DataError(
+                f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
+                "rational or thin prism model; undistort the images first"
+            )
+        intrinsics = shared | {
+            k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()
+        }
+        fisheye = is_fisheye(
+            entry.get("camera_model", document.get("camera_model")),
+            entry.get("is_fisheye", document.get("is_fisheye")),
+            where,
+        )
         image = locate(file.parent, str(entry["file_path"]), where)
-        mask = locate(file.parent, str(entry["mask_path"]), where) if entry.get("mask_path") else None
+        mask = (
+            locate(file.parent, str(entry["mask_path"]), where) if entry.get("mask_path") else None
+        )
         pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
         time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
         if time is None:
             time = counted_time(image, fps, where, counting)
         camera = str(entry["camera"]) if entry.get("camera") is not None else None
-        shots.append(Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye))
+        shots.append(
+            Shot(
+                where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye
+            )
+        )
     return shots
 
 
@@ -150,7 +178,9 @@ def intrinsic_keys() -> tuple[str, ...]:
 def locate(folder: Path, name: str, where: str) -> Path:
     """The file a path names, its extension left out or not. Errors: DataError where there is none."""
     if len(name) > LONGEST or "\0" in name:
-        raise DataError(f"{where}: expected a path of at most {LONGEST} characters, found {len(name)}: {name[:60]!r} ...")
+        raise DataError(
+            f"{where}: expected a path of at most {LONGEST} characters, found {len(name)}: {name[:60]!r} ..."
+        )
     for extension in EXTENSIONS:
         candidate = folder / (name + extension)
         if candidate.is_file():
@@ -162,7 +192,9 @@ def counted_time(image: Path, fps: float | None, where: str, place: int) -> floa
     """Time [s] from the number at that place of a file name."""
     counter = re.findall(r"\d+", image.stem)
     if fps is None or not counter:
-        raise DataError(f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps")
+        raise DataError(
+            f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps"
+        )
     return int(counter[place]) / fps
 
 
@@ -181,39 +213,68 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
     """
     members: dict[str, list[Shot]] = {}
     for shot in shots:
-        same = (n for n, (s, *_) in members.items() if s.camera is None and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c))
-        members.setdefault(next(same, str(len(members))) if shot.camera is None else shot.camera, []).append(shot)
+        same = (
+            n
+            for n, (s, *_) in members.items()
+            if s.camera is None and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
+        )
+        members.setdefault(
+            next(same, str(len(members))) if shot.camera is None else shot.camera, []
+        ).append(shot)
     places = np.array([-s.w2c[:3, :3].T @ s.w2c[:3, 3] for s in shots])
     spread = float(np.linalg.norm(places - places.mean(0), axis=1).max()) or 1.0
 
     def apart(a: Shot, b: Shot) -> float:
-        turn, way = a.w2c[:3, :3] - b.w2c[:3, :3], a.w2c[:3, :3].T @ a.w2c[:3, 3] - b.w2c[:3, :3].T @ b.w2c[:3, 3]
+        turn, way = (
+            a.w2c[:3, :3] - b.w2c[:3, :3],
+            a.w2c[:3, :3].T @ a.w2c[:3, 3] - b.w2c[:3, :3].T @ b.w2c[:3, 3],
+        )
         return max(float(np.abs(turn).max()), float(np.linalg.norm(way)) / spread)
 
     if len(shots) > 2 and len(members) == len(shots):
         close = sum(any(apart(a, b) < JITTER for b in shots if b is not a) for a in shots)
         still = 2 * close > len(shots) >= 2 * len({shot.time for shot in shots})
-        cause = ("they seem to, with poses solved for each image: name the camera of each entry (`camera`)"
-                 if still else "a single moving camera cannot be used")
-        raise DataError(f"{file}: {len(shots)} entries with {len(members)} different poses: expected cameras that stand still and "
-                        f"see every frame; {cause}")
+        cause = (
+            "they seem to, with poses solved for each image: name the camera of each entry (`camera`)"
+            if still
+            else "a single moving camera cannot be used"
+        )
+        raise DataError(
+            f"{file}: {len(shots)} entries with {len(members)} different poses: expected cameras that stand still and "
+            f"see every frame; {cause}"
+        )
     for name, (known, *others) in members.items():
         for shot in others:
-            if key := next((k for k in intrinsic_keys() if known.intrinsics.get(k) != shot.intrinsics.get(k)), None):
-                raise DataError(f"{shot.where}: camera {name} has {key} = {shot.intrinsics.get(key)}, {known.intrinsics.get(key)} "
-                                f"in {known.where}: expected one lens, focus and zoom a camera; write one set in all its entries")
+            if key := next(
+                (k for k in intrinsic_keys() if known.intrinsics.get(k) != shot.intrinsics.get(k)),
+                None,
+            ):
+                raise DataError(
+                    f"{shot.where}: camera {name} has {key} = {shot.intrinsics.get(key)}, {known.intrinsics.get(key)} "
+                    f"in {known.where}: expected one lens, focus and zoom a camera; write one set in all its entries"
+                )
         off, where = max(((apart(known, shot), shot.where) for shot in others), default=(0.0, ""))
-        found = (f"{where}: camera {name} has another pose than in {known.where}, {off:.2%} away (of a radian, or of the cameras' "
-                 "distance from their middle)")
+        found = (
+            f"{where}: camera {name} has another pose than in {known.where}, {off:.2%} away (of a radian, or of the cameras' "
+            "distance from their middle)"
+        )
         if off > JITTER:
             raise DataError(f"{found}; cameras must not move")
         if off > 1e-5:
-            warnings.warn(f"{found}: solved for each image? The pose nearest to the mean is taken for all", stacklevel=4)
+            warnings.warn(
+                f"{found}: solved for each image? The pose nearest to the mean is taken for all",
+                stacklevel=4,
+            )
     middle = {name: np.mean([shot.w2c for shot in own], 0) for name, own in members.items()}
-    return {name: min(own, key=lambda shot: float(np.abs(shot.w2c - middle[name]).sum())) for name, own in members.items()}, members
+    return {
+        name: min(own, key=lambda shot: float(np.abs(shot.w2c - middle[name]).sum()))
+        for name, own in members.items()
+    }, members
 
 
-def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[list[float], list[list[Shot]]]:
+def synchronise(
+    by_camera: dict[str, list[Shot]], fps: float | None
+) -> tuple[list[float], list[list[Shot]]]:
     """Times of the frames [s], and the shots [camera][frame]. DataError where one is missing or doubled."""
     tolerance = 1e-6 if fps is None else 0.25 / fps
     times: list[float] = []
@@ -226,7 +287,9 @@ def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[li
         for shot in shots:
             index = int(np.abs(np.array(times) - shot.time).argmin())
             if row[index] is not None:
-                raise DataError(f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}")
+                raise DataError(
+                    f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}"
+                )
             row[index] = shot
         missing = [round(t, 6) for t, s in zip(times, row) if s is None]
         if missing:
@@ -247,8 +310,10 @@ def clocks(by_camera: dict[str, list[Shot]], fps: float | None) -> str:
     rate = (count - 1) / float(np.median([row[-1] - row[0] for row in rows]))
     apart = max(max(moment) - min(moment) for moment in zip(*rows))
     if fps is None and apart < 0.25 / rate:
-        return (f"their clocks are at most {1e3 * apart:.3g} ms apart: scene.fps={rate:.4g} takes images that belong together as "
-                "one frame, and evenly spaced times")
+        return (
+            f"their clocks are at most {1e3 * apart:.3g} ms apart: scene.fps={rate:.4g} takes images that belong together as "
+            "one frame, and evenly spaced times"
+        )
     return f"their clocks are up to {1e3 * apart:.3g} ms apart, of a frame of {1e3 / rate:.3g} ms: shift the times of late cameras"
 
 
@@ -279,11 +344,21 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
         focal = known["fl_x"], known.get("fl_y", known["fl_x"])
     elif "camera_angle_x" in known:
         if not 0 < known["camera_angle_x"] < math.pi:
-            raise DataError(f"{shot.where}: camera_angle_x: expected radians between 0 and pi, found {known['camera_angle_x']:g}")
+            raise DataError(
+                f"{shot.where}: camera_angle_x: expected radians between 0 and pi, found {known['camera_angle_x']:g}"
+            )
         focal = (0.5 * width / math.tan(0.5 * known["camera_angle_x"]),) * 2
     else:
-        raise DataError(f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
-    return np.array([[focal[0], 0, known.get("cx", width / 2)], [0, focal[1], known.get("cy", height / 2)], [0, 0, 1]])
+        raise DataError(
+            f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither"
+        )
+    return np.array(
+        [
+            [focal[0], 0, known.get("cx", width / 2)],
+            [0, focal[1], known.get("cy", height / 2)],
+            [0, 0, 1],
+        ]
+    )
 
 
 def load_transforms(
@@ -299,4 +374,6 @@ def load_transforms(
     """Scene of a transforms.json. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_transforms(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
     folder = Path(path).resolve()
-    return scene_from_footage(footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world)
+    return scene_from_footage(
+        footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world
+    )

@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from mosa.data.formats.footage import WHITE, scaled
-from mosa.data.images.reading import check_amount, composite, expect_size, faintless, fill_holes, read_image, resize, scaled_size
+from mosa.data.images.reading import (
+    check_amount,
+    composite,
+    expect_size,
+    faintless,
+    fill_holes,
+    read_image,
+    resize,
+    scaled_size,
+)
 from mosa.errors import DataError
 
 Calibration = Mapping[str, tuple[np.ndarray, np.ndarray]]
@@ -16,8 +25,14 @@ Calibration = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
 def read_views(
-    calibration: Calibration, frames: Sequence[int], file: Callable[[str, int], Path],
-    split: Callable[[str, Path, np.ndarray], tuple[np.ndarray, np.ndarray]], listing: str, *, scale: float = 1.0, fill: int = 0,
+    calibration: Calibration,
+    frames: Sequence[int],
+    file: Callable[[str, int], Path],
+    split: Callable[[str, Path, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    listing: str,
+    *,
+    scale: float = 1.0,
+    fill: int = 0,
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], list[np.ndarray], list[np.ndarray]]:
     """(calibration of the scaled images, (T, h, w, 3) images on white, (T, h, w) mattes), cameras in the order of `calibration`.
 
@@ -52,5 +67,7 @@ def read_views(
 def split_alpha(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colour (H, W, 3) and matte (H, W) of RGBA with the matte as alpha. Errors: DataError for other channels, a faint matte."""
     if pixels.shape[2] != 4:
-        raise DataError(f"{path}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels")
+        raise DataError(
+            f"{path}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels"
+        )
     return pixels[..., :3], faintless(path, np.ascontiguousarray(pixels[..., 3]))

@@ -21,9 +21,9 @@ from mosa.errors import DataError
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 FOREIGN = ("k5", "k6", "s1", "s2", "s3", "s4")
 """Of the rational and thin prism models, which are not undone."""
-MODELS = {name: False for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")} | {
-    name: True for name in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
-}
+MODELS = {
+    name: False for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+} | {name: True for name in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")}
 """camera_model as COLMAP names it -> whether it is a fisheye's."""
 ZOOM = 4.0
 """Largest change of the focal length that still counts as undoing a lens."""
@@ -38,7 +38,9 @@ class Lens:
     places: np.ndarray
     kept: np.ndarray
 
-    def straighten(self, picture: np.ndarray, matte: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def straighten(
+        self, picture: np.ndarray, matte: np.ndarray, background: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """A picture (H, W, 3) composited on a background colour (3,) and its matte (H, W) as the pinhole camera sees them.
 
         What the lens did not show is background. Bicubic: 2 dB closer to a pinhole's picture than bilinear. Overshoots at edges are
@@ -46,8 +48,12 @@ class Lens:
         """
         x, y = self.places[..., 0], self.places[..., 1]
         behind = tuple(float(c) for c in background)
-        seen = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=behind).clip(0, 1)
-        matte = cv2.remap(matte, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0).clip(0, 1)
+        seen = cv2.remap(
+            picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=behind
+        ).clip(0, 1)
+        matte = cv2.remap(
+            matte, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0
+        ).clip(0, 1)
         return np.where(matte[..., None] > 0, seen, background), matte
 
     def lost(self, matte: np.ndarray) -> float:
@@ -62,11 +68,21 @@ def is_fisheye(model, flag, where: str) -> bool:
     if model is None:
         return bool(flag)
     if not isinstance(model, str) or model.upper() not in MODELS:
-        raise DataError(f"{where}: camera_model: expected one of {', '.join(MODELS)}, found {model!r}; undistort the images first")
+        raise DataError(
+            f"{where}: camera_model: expected one of {', '.join(MODELS)}, found {model!r}; undistort the images first"
+        )
     return MODELS[model.upper()] or bool(flag)
 
 
-def lens_of(K: np.ndarray, coefficients: Mapping[str, float], width: int, height: int, *, fisheye: bool, where: str) -> Lens | None:
+def lens_of(
+    K: np.ndarray,
+    coefficients: Mapping[str, float],
+    width: int,
+    height: int,
+    *,
+    fisheye: bool,
+    where: str,
+) -> Lens | None:
     """The lens of a camera with K (3, 3) [px, pixel centres at half integers] and images of width x height px; None: a pinhole.
 
     The pinhole camera's view is the largest rectangle that the lens shows in full, so that all its pixels are seen ones (but for
@@ -80,14 +96,20 @@ def lens_of(K: np.ndarray, coefficients: Mapping[str, float], width: int, height
     K = np.asarray(K, dtype=np.float64) - centres
     if fisheye:
         if p1 or p2:
-            raise DataError(f"{where}: a fisheye has no p1, p2: expected k1 to k4 only, found {p1:g}, {p2:g}")
+            raise DataError(
+                f"{where}: a fisheye has no p1, p2: expected k1 to k4 only, found {p1:g}, {p2:g}"
+            )
         D = np.array([k1, k2, k3, k4])
-        pinhole = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, D, size, np.eye(3), balance=0.0)
+        pinhole = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+            K, D, size, np.eye(3), balance=0.0
+        )
         build = cv2.fisheye.initUndistortRectifyMap
     else:
         if k4:
-            raise DataError(f"{where}: k4 = {k4:g}: programs disagree on its meaning without camera_model OPENCV_FISHEYE; "
-                            "expected k1, k2, k3, p1, p2; undistort the images first")
+            raise DataError(
+                f"{where}: k4 = {k4:g}: programs disagree on its meaning without camera_model OPENCV_FISHEYE; "
+                "expected k1, k2, k3, p1, p2; undistort the images first"
+            )
         D = np.array([k1, k2, p1, p2, k3])
         pinhole, _ = cv2.getOptimalNewCameraMatrix(K, D, size, 0.0)
         build = cv2.initUndistortRectifyMap
@@ -96,9 +118,13 @@ def lens_of(K: np.ndarray, coefficients: Mapping[str, float], width: int, height
     if np.isfinite(pinhole).all() and (focal > 1 / ZOOM).all() and (focal < ZOOM).all():
         places = np.stack(build(K, D, np.eye(3), pinhole, size, cv2.CV_32FC1), -1)
     if places is None or folded(places):
-        written = ", ".join(f"{name} = {coefficients[name]:g}" for name in COEFFICIENTS if coefficients.get(name))
-        raise DataError(f"{where}: the lens distortion {written or '(fisheye)'} cannot be undone over the whole image: expected "
-                        "coefficients of normalised coordinates, in OpenCV's model; correct them, or undistort the images")
+        written = ", ".join(
+            f"{name} = {coefficients[name]:g}" for name in COEFFICIENTS if coefficients.get(name)
+        )
+        raise DataError(
+            f"{where}: the lens distortion {written or '(fisheye)'} cannot be undone over the whole image: expected "
+            "coefficients of normalised coordinates, in OpenCV's model; correct them, or undistort the images"
+        )
     return Lens(pinhole + centres, places, inside(places))
 
 

@@ -23,7 +23,13 @@ FINER = 1.5
 
 
 def one_size(
-    K: np.ndarray, images: list[np.ndarray], mattes: list[np.ndarray], *, background: np.ndarray, names: list[str], where: str
+    K: np.ndarray,
+    images: list[np.ndarray],
+    mattes: list[np.ndarray],
+    *,
+    background: np.ndarray,
+    names: list[str],
+    where: str,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """K (V, 3, 3) [px], images (V, T, H, W, 3) and mattes (V, T, H, W) of one size.
 
@@ -37,7 +43,11 @@ def one_size(
         for v, (images_, mattes_) in enumerate(zip(images, mattes)):
             height, width = sizes[v]
             factor = (fewest / (height * width)) ** 0.5
-            size = (round(width * factor), round(height * factor)) if factor**2 < 1 / FINER else (width, height)
+            size = (
+                (round(width * factor), round(height * factor))
+                if factor**2 < 1 / FINER
+                else (width, height)
+            )
             images[v] = np.stack([resize(image, *size) for image in images_])
             mattes[v] = np.stack([resize(matte, *size) for matte in mattes_])
             K[v, 0] *= size[0] / width
@@ -45,11 +55,19 @@ def one_size(
         height, width = (max(matte.shape[axis] for matte in mattes) for axis in (1, 2))
         for v, name in enumerate(names):
             down, right = place(mattes[v], (height, width), f"{where}: camera {name}")
-            images[v], mattes[v] = surround(images[v], mattes[v], (height, width), (down, right), background)
+            images[v], mattes[v] = surround(
+                images[v], mattes[v], (height, width), (down, right), background
+            )
             K[v, 0, 2] += right
             K[v, 1, 2] += down
         said = ", ".join(f"{name} {w}x{h}" for name, (h, w) in zip(names, sizes))
-        log.info("%s: cameras of different image sizes (px: %s), brought to %dx%d px", where, said, width, height)
+        log.info(
+            "%s: cameras of different image sizes (px: %s), brought to %dx%d px",
+            where,
+            said,
+            width,
+            height,
+        )
     return K, np.stack(images), np.stack(mattes)
 
 
@@ -61,7 +79,9 @@ def place(mattes: np.ndarray, size: tuple[int, int], label: str) -> tuple[int, i
         room = wanted - mattes.shape[axis]
         low, high = (bool((mattes.take(end, axis) > 0.5).any()) for end in (0, -1))
         if room and low and high:
-            sides, extent = (("top", "bottom"), "height") if axis == 1 else (("left", "right"), "width")
+            sides, extent = (
+                (("top", "bottom"), "height") if axis == 1 else (("left", "right"), "width")
+            )
             raise DataError(
                 f"{label}: expected images of the other cameras' size, or the object within the {sides[0]} or the {sides[1]} "
                 "border of these smaller ones, found it cut by both: cut the images of all cameras to one "
@@ -72,7 +92,11 @@ def place(mattes: np.ndarray, size: tuple[int, int], label: str) -> tuple[int, i
 
 
 def surround(
-    images: np.ndarray, mattes: np.ndarray, size: tuple[int, int], start: tuple[int, int], background: np.ndarray
+    images: np.ndarray,
+    mattes: np.ndarray,
+    size: tuple[int, int],
+    start: tuple[int, int],
+    background: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Images (T, h, w, 3) and mattes (T, h, w) as parts, from row and column `start`, of (height, width) `size` images."""
     frames, height, width = mattes.shape

@@ -30,7 +30,9 @@ def read_image(path: Path) -> np.ndarray:
             with Image.open(path) as picture:
                 pixels = np.asarray(picture.convert(plain_mode(picture)))
     except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again") from error
+        raise DataError(
+            f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again"
+        ) from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.float32) / 255
     elif pixels.dtype == np.uint16:
@@ -38,13 +40,19 @@ def read_image(path: Path) -> np.ndarray:
     elif np.issubdtype(pixels.dtype, np.floating) or pixels.dtype == bool:
         pixels = pixels.astype(np.float32)
     else:
-        raise DataError(f"{path}: expected 8 or 16 bits per channel or floating point, found {pixels.dtype}")
+        raise DataError(
+            f"{path}: expected 8 or 16 bits per channel or floating point, found {pixels.dtype}"
+        )
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
-        raise DataError(f"{path}: expected a picture with 1, 3 or 4 channels, found an array of shape {pixels.shape}")
+        raise DataError(
+            f"{path}: expected a picture with 1, 3 or 4 channels, found an array of shape {pixels.shape}"
+        )
     if not np.isfinite(pixels).all():
-        raise DataError(f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite")
+        raise DataError(
+            f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite"
+        )
     return np.clip(pixels, 0, 1)
 
 
@@ -61,11 +69,18 @@ def matte_of(path: Path, pixels: np.ndarray) -> np.ndarray:
     """(H, W) of a mask's pixels, white = object. Errors: DataError for colours, whose first channel would be taken for it, for an
     alpha channel beside them, and for labels of 1, 2, ..., which are nearly black."""
     if pixels.shape[2] == 4 and float(np.ptp(pixels[..., 3])) > GREY:
-        raise DataError(f"{path}: expected a grey mask, white = object, found an alpha channel that differs over the picture; "
-                        "write it as the mask, or leave mask_path out where the image itself has that alpha")
-    if pixels.shape[2] >= 3 and float((pixels[..., :3].max(-1) - pixels[..., :3].min(-1)).max()) > GREY:
-        raise DataError(f"{path}: expected a grey mask, white = object, found colours (a label's palette, or the picture itself); "
-                        "write white where the object is")
+        raise DataError(
+            f"{path}: expected a grey mask, white = object, found an alpha channel that differs over the picture; "
+            "write it as the mask, or leave mask_path out where the image itself has that alpha"
+        )
+    if (
+        pixels.shape[2] >= 3
+        and float((pixels[..., :3].max(-1) - pixels[..., :3].min(-1)).max()) > GREY
+    ):
+        raise DataError(
+            f"{path}: expected a grey mask, white = object, found colours (a label's palette, or the picture itself); "
+            "write white where the object is"
+        )
     return faintless(path, np.ascontiguousarray(pixels[..., 0]))
 
 
@@ -73,8 +88,10 @@ def faintless(path: Path, matte: np.ndarray) -> np.ndarray:
     """The matte. Errors: DataError where all of it that is not empty is below half coverage."""
     most = float(matte.max())
     if most < FAINT and int((matte > 0).sum()) > SLIVER:
-        raise DataError(f"{path}: expected a matte that is white (255) where the object is, found {255 * most:.3g} at most: the "
-                        "number of a label, or a matte that is half transparent? write 255 in its place")
+        raise DataError(
+            f"{path}: expected a matte that is white (255) where the object is, found {255 * most:.3g} at most: the "
+            "number of a label, or a matte that is half transparent? write 255 in its place"
+        )
     return matte
 
 
@@ -85,15 +102,24 @@ def check_pixels(path: Path) -> None:
         # pages of a TIFF are small copies too, and the second picture of a phone's JPEG is its preview
         several = getattr(picture, "n_frames", 1) if picture.format in ("PNG", "GIF", "WEBP") else 1
     if several > 1:
-        raise DataError(f"{path}: expected one picture, found an animation of {several}; write each of them as a file")
+        raise DataError(
+            f"{path}: expected one picture, found an animation of {several}; write each of them as a file"
+        )
     if width * height > MOST_PIXELS:
-        raise DataError(f"{path}: expected at most {MOST_PIXELS / 1e6:.0f} million pixels, found {width}x{height}: scale it down")
+        raise DataError(
+            f"{path}: expected at most {MOST_PIXELS / 1e6:.0f} million pixels, found {width}x{height}: scale it down"
+        )
 
 
 def check_amount(pictures: int, width: int, height: int) -> None:
     """Errors: ConfigError where that many pictures with mattes, of that size, do not fit into this machine's memory."""
     # colours and matte in single precision, and once more while they are put together
-    counted("scene.scale: pixels of all pictures", (pictures, width, height), "lower it, or restrict scene.frames", each=16)
+    counted(
+        "scene.scale: pixels of all pictures",
+        (pictures, width, height),
+        "lower it, or restrict scene.frames",
+        each=16,
+    )
 
 
 def plain_mode(picture: Image.Image) -> str:
@@ -107,7 +133,12 @@ def deep_png(path: Path) -> np.ndarray | None:
     """Pixels of a colour PNG with 16 bits per channel, which Pillow would cut to 8; None for any other file."""
     with path.open("rb") as file:
         header = file.read(26)
-    if header[:8] != b"\x89PNG\r\n\x1a\n" or len(header) < 26 or header[24] != 16 or header[25] not in (2, 6):
+    if (
+        header[:8] != b"\x89PNG\r\n\x1a\n"
+        or len(header) < 26
+        or header[24] != 16
+        or header[25] not in (2, 6)
+    ):
         return None
     with Image.open(path) as picture:
         picture.load()  # OpenCV fills the rest of a truncated file with black, Pillow says so
@@ -123,7 +154,9 @@ def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
     Errors: ConfigError for a size that is none.
     """
     if isinstance(largest, bool) or not isinstance(largest, int) or largest < 0:
-        raise ConfigError(f"scene.fill_holes: expected a number of pixels, 0 or more, found {largest!r}")
+        raise ConfigError(
+            f"scene.fill_holes: expected a number of pixels, 0 or more, found {largest!r}"
+        )
     if largest == 0:
         return matte
     labels, areas = enclosed_holes(matte)
@@ -133,7 +166,9 @@ def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
 def enclosed_holes(matte: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels (H, W) of the pieces of a matte (H, W) below half coverage, and the area (n,) [px] of each label: 0 of what is covered
     and of pieces that reach the border."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((matte < 0.5).astype(np.uint8), connectivity=4)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        (matte < 0.5).astype(np.uint8), connectivity=4
+    )
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
     areas[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 0
@@ -160,7 +195,9 @@ def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
         raise ConfigError(f"scene.scale: expected a number in (0, 1], found {scale!r}")
     size = round(width * scale), round(height * scale)
     if min(size) < 16:
-        raise ConfigError(f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed")
+        raise ConfigError(
+            f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed"
+        )
     return size
 
 

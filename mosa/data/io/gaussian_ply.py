@@ -14,7 +14,12 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from mosa.errors import DataError
-from mosa.rendering.appearance.spherical_harmonics import DEGREES, constant_coefficients, degree_of, mean_colors
+from mosa.rendering.appearance.spherical_harmonics import (
+    DEGREES,
+    constant_coefficients,
+    degree_of,
+    mean_colors,
+)
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.system.ply import check_ply
 from mosa.system.whole_files import written_whole
@@ -46,7 +51,9 @@ def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = Non
         ("nx", "ny", "nz"): torch.zeros_like(splats.means),
         CONSTANT: coefficients[:, 0],
         tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
-        ("opacity",): torch.logit(splats.opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))[:, None],
+        ("opacity",): torch.logit(splats.opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))[
+            :, None
+        ],
         SCALES: splats.scales.clamp(min=SMALLEST).log(),
         ROTATIONS: splats.rotations,
     }
@@ -75,7 +82,9 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
         document = PlyData.read(path)
         vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
     except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: expected a PLY file with an element vertex, found a damaged or other one ({error})") from error
+        raise DataError(
+            f"{path}: expected a PLY file with an element vertex, found a damaged or other one ({error})"
+        ) from error
     rest = [name for name in vertices if name.startswith("f_rest_")]
     per_channel, left = divmod(len(rest), 3)
     if left or per_channel + 1 not in DEGREES:
@@ -90,25 +99,42 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
                     f"{path}: no field {name}, which 3D Gaussians have; found {', '.join(list(vertices)[:8])} ...: "
                     "a point cloud or mesh cannot be used"
                 )
-        columns = [_finite(np.asarray(vertices[name], dtype=np.float32), name, path, "found") for name in fields]
-        return torch.from_numpy(np.stack(columns, -1)) if columns else torch.empty(len(vertices["x"]), 0)
+        columns = [
+            _finite(np.asarray(vertices[name], dtype=np.float32), name, path, "found")
+            for name in fields
+        ]
+        return (
+            torch.from_numpy(np.stack(columns, -1))
+            if columns
+            else torch.empty(len(vertices["x"]), 0)
+        )
 
     means = read(AXES)
     if len(means) == 0:
         raise DataError(f"{path}: expected Gaussians, found none")
     scales, opacity, rotations = read(SCALES).exp(), read(("opacity",))[:, 0], read(ROTATIONS)
     if not bool(torch.isfinite(scales).all()):
-        raise DataError(f"{path}: field scale_*: expected logarithms of standard deviations, found some too large for exp")
+        raise DataError(
+            f"{path}: field scale_*: expected logarithms of standard deviations, found some too large for exp"
+        )
     length = rotations.norm(dim=1, keepdim=True)
     if float(length.min()) == 0:
-        raise DataError(f"{path}: field rot_*: expected quaternions, found zero at vertex {int(length.argmin())}")
-    higher = read(tuple(f"f_rest_{i}" for i in range(len(rest)))).view(len(means), 3, per_channel).transpose(1, 2)
+        raise DataError(
+            f"{path}: field rot_*: expected quaternions, found zero at vertex {int(length.argmin())}"
+        )
+    higher = (
+        read(tuple(f"f_rest_{i}" for i in range(len(rest))))
+        .view(len(means), 3, per_channel)
+        .transpose(1, 2)
+    )
     coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)
     colors = mean_colors(coefficients)
     return Splats(means, scales, rotations / length, torch.sigmoid(opacity), colors), coefficients
 
 
-def export_splats(splats: Splats, positions: Tensor, covariances: Tensor, folder: str | Path) -> Path:
+def export_splats(
+    splats: Splats, positions: Tensor, covariances: Tensor, folder: str | Path
+) -> Path:
     """Write moving Gaussians as <frame>.ply, frame numbers of three digits.
 
     positions: (T, N, 3) [m]; covariances: (T, N, 3, 3) [m^2], A_t = F_tot A_0 F_tot^T; opacities and colours of `splats`.
@@ -116,7 +142,10 @@ def export_splats(splats: Splats, positions: Tensor, covariances: Tensor, folder
     folder = Path(folder)
     for t in range(len(positions)):
         scales, rotations = scales_and_rotations(covariances[t])
-        save_ply(folder / f"{t:03d}.ply", Splats(positions[t], scales, rotations, splats.opacities, splats.colors))
+        save_ply(
+            folder / f"{t:03d}.ply",
+            Splats(positions[t], scales, rotations, splats.opacities, splats.colors),
+        )
     return folder
 
 

@@ -23,7 +23,9 @@ from mosa.system.whole_files import written_whole
 from mosa.types import Appearance, Splats
 
 FORMATS = ("ply", "splat", "spz", "usd")
-SPLAT = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+SPLAT = np.dtype(
+    [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
+)
 """32 bytes of a Gaussian of a `.splat` file, as antimatter15's viewer has them: m, standard deviations in m, 8-bit RGBA, quaternion
 wxyz as 128 + 128 q."""
 
@@ -34,7 +36,11 @@ SPZ_BITS = 16
 
 def splats_at(shown: Seen, frame: int) -> Appearance:
     """The Gaussians of a frame in the world's axes and in that frame's light, on the CPU."""
-    harmonics = shown.harmonics if shown.rotations is None else rotated(shown.harmonics, shown.rotations[frame])
+    harmonics = (
+        shown.harmonics
+        if shown.rotations is None
+        else rotated(shown.harmonics, shown.rotations[frame])
+    )
     if shown.shades is not None:
         shade = shown.shades[frame][:, None, None]
         harmonics = harmonics * shade
@@ -48,7 +54,9 @@ def save_splat(path: str | Path, splats: Splats) -> Path:
     """Write a `.splat` file: no header, the largest and most opaque first, colours without their dependence on the direction.
     Errors: DataError for a number that is not finite."""
     path = Path(path)
-    numbers = torch.cat([splats.means, splats.scales, splats.rotations, splats.opacities[:, None], splats.colors], 1)
+    numbers = torch.cat(
+        [splats.means, splats.scales, splats.rotations, splats.opacities[:, None], splats.colors], 1
+    )
     if not bool(torch.isfinite(numbers).all()):
         raise DataError(f"{path}: expected finite numbers to write, found NaN or infinity")
     order = (-splats.scales.prod(1) * splats.opacities).argsort().numpy()
@@ -68,17 +76,30 @@ def load_splat(path: str | Path) -> Splats:
     """Gaussians of a `.splat` file, float32. Errors: DataError naming the file: not whole, or not of such numbers."""
     path = Path(path)
     if not path.is_file() or path.stat().st_size == 0 or path.stat().st_size % SPLAT.itemsize:
-        raise DataError(f"{path}: expected a .splat file of {SPLAT.itemsize} bytes a Gaussian, found "
-                        f"{f'{path.stat().st_size} bytes' if path.is_file() else 'no file'}")
+        raise DataError(
+            f"{path}: expected a .splat file of {SPLAT.itemsize} bytes a Gaussian, found "
+            f"{f'{path.stat().st_size} bytes' if path.is_file() else 'no file'}"
+        )
     rows = np.fromfile(path, SPLAT)
-    finite = np.isfinite(rows["position"]).all() and np.isfinite(rows["scale"]).all() and (rows["scale"] > 0).all()
+    finite = (
+        np.isfinite(rows["position"]).all()
+        and np.isfinite(rows["scale"]).all()
+        and (rows["scale"] > 0).all()
+    )
     rotation = (rows["rotation"].astype(np.float32) - 128) / 128
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     if not finite or not (length > 0.5).all():
-        raise DataError(f"{path}: expected finite positions, standard deviations above 0, unit quaternions; another format?")
+        raise DataError(
+            f"{path}: expected finite positions, standard deviations above 0, unit quaternions; another format?"
+        )
     color = torch.from_numpy(rows["color"].astype(np.float32) / 255)
-    return Splats(torch.from_numpy(rows["position"].copy()), torch.from_numpy(rows["scale"].copy()),
-                  torch.from_numpy(rotation / length), color[:, 3], color[:, :3])
+    return Splats(
+        torch.from_numpy(rows["position"].copy()),
+        torch.from_numpy(rows["scale"].copy()),
+        torch.from_numpy(rotation / length),
+        color[:, 3],
+        color[:, :3],
+    )
 
 
 def save_spz(path: str | Path, appearance: Appearance) -> Path:
@@ -87,7 +108,9 @@ def save_spz(path: str | Path, appearance: Appearance) -> Path:
         from gsply import GSData
         from gsply.spz import write_spz
     except ImportError as error:
-        raise ConfigError("formats: spz needs the package gsply: pip install 'mosa[spz]', or gsply by itself") from error
+        raise ConfigError(
+            "formats: spz needs the package gsply: pip install 'mosa[spz]', or gsply by itself"
+        ) from error
     splats, harmonics = appearance.splats, appearance.harmonics
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,14 +131,20 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
 
         define = UsdVol.ParticleField3DGaussianSplat.Define
     except (ImportError, AttributeError) as error:
-        raise ConfigError("formats: usd needs the package usd-core, 26.3 or newer: pip install 'mosa[usd]', or usd-core by "
-                          "itself") from error
+        raise ConfigError(
+            "formats: usd needs the package usd-core, 26.3 or newer: pip install 'mosa[usd]', or usd-core by "
+            "itself"
+        ) from error
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")  # USD tells its format by the name
+    unfinished = path.with_name(
+        f"{path.stem}.{os.getpid()}.partial{path.suffix}"
+    )  # USD tells its format by the name
     unfinished.unlink(missing_ok=True)
     stage = Usd.Stage.CreateNew(str(unfinished))
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if int(up.abs().argmax()) == 2 else UsdGeom.Tokens.y)
+    UsdGeom.SetStageUpAxis(
+        stage, UsdGeom.Tokens.z if int(up.abs().argmax()) == 2 else UsdGeom.Tokens.y
+    )
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)
@@ -124,15 +153,24 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
     field = define(stage, "/body")
     stage.SetDefaultPrim(field.GetPrim())
     field.GetRadianceSphericalHarmonicsDegreeAttr().Set(degree_of(frames[0].harmonics))
-    field.GetOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(frames[0].splats.opacities.contiguous().numpy()))
+    field.GetOpacitiesAttr().Set(
+        Vt.FloatArray.FromNumpy(frames[0].splats.opacities.contiguous().numpy())
+    )
     for t, frame in enumerate(frames):
-        splats, vectors = frame.splats, lambda values: Vt.Vec3fArray.FromNumpy(values.reshape(-1, 3).contiguous().numpy())
+        splats, vectors = (
+            frame.splats,
+            lambda values: Vt.Vec3fArray.FromNumpy(values.reshape(-1, 3).contiguous().numpy()),
+        )
         field.GetPositionsAttr().Set(vectors(splats.means), t)
         field.GetScalesAttr().Set(vectors(splats.scales), t)
-        field.GetOrientationsAttr().Set(Vt.QuatfArray([Gf.Quatf(*q) for q in splats.rotations.tolist()]), t)
+        field.GetOrientationsAttr().Set(
+            Vt.QuatfArray([Gf.Quatf(*q) for q in splats.rotations.tolist()]), t
+        )
         field.GetRadianceSphericalHarmonicsCoefficientsAttr().Set(vectors(frame.harmonics), t)
         reach = 3 * splats.scales.amax()
-        field.GetExtentAttr().Set(vectors(torch.stack([splats.means.amin(0) - reach, splats.means.amax(0) + reach])), t)
+        field.GetExtentAttr().Set(
+            vectors(torch.stack([splats.means.amin(0) - reach, splats.means.amax(0) + reach])), t
+        )
     stage.Save()
     with written_whole(path) as partial:
         os.replace(unfinished, partial)
@@ -152,7 +190,14 @@ def drop_later_frames(folder: Path, suffix: str, count: int) -> None:
             old.unlink()
 
 
-def save_frames(shown: Seen, folder: str | Path, formats: Sequence[str], *, rate: float = 30.0, up: Tensor | None = None) -> Path:
+def save_frames(
+    shown: Seen,
+    folder: str | Path,
+    formats: Sequence[str],
+    *,
+    rate: float = 30.0,
+    up: Tensor | None = None,
+) -> Path:
     """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `splat/000.splat`, `spz/000.spz`, and `splats.usdc` for all.
 
     rate [1/s], up (3,): of the USD stage. Errors: ConfigError for another format, or where a package is missing; DataError.
@@ -172,5 +217,10 @@ def save_frames(shown: Seen, folder: str | Path, formats: Sequence[str], *, rate
         if "usd" in formats:
             frames.append(frame)
     if frames:
-        save_usd(folder / "splats.usdc", frames, rate=rate, up=torch.tensor([0.0, 1, 0]) if up is None else up)
+        save_usd(
+            folder / "splats.usdc",
+            frames,
+            rate=rate,
+            up=torch.tensor([0.0, 1, 0]) if up is None else up,
+        )
     return folder

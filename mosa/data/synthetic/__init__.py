@@ -74,7 +74,11 @@ def load_builtin(
         tensor(take.velocity),
         hidden.summary(),
     )
-    box = BOX if body.reach is None else ((-body.reach, BOX[0][1], -body.reach), (body.reach, BOX[1][1], body.reach))
+    box = (
+        BOX
+        if body.reach is None
+        else ((-body.reach, BOX[0][1], -body.reach), (body.reach, BOX[1][1], body.reach))
+    )
     return scene_from_footage(
         footage, name=name, gravity=GRAVITY, box=box, ground=Ground(0.0, "sticky"), density=hidden.density, sequence=sequence,
         last_free_frame=last_free_frame, holdout_cameras=holdout_cameras, holdout_frames=holdout_frames, truth=truth,

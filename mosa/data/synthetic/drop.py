@@ -34,7 +34,9 @@ class Fall:
     substeps: int
 
 
-def place(points: np.ndarray, center: np.ndarray, drop: Drop, lowest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def place(
+    points: np.ndarray, center: np.ndarray, drop: Drop, lowest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Points of the shape's frame at frame 0 of a drop, and where `center` goes. lowest: surface points (M, 3) that decide the
     height: free fall brings the lowest of them to the ground at time drop.contact."""
     Q = drop.rotation
@@ -50,17 +52,31 @@ def simulate(
 ) -> Fall:  # fmt: skip
     """Particles (N, 3) of the shape's frame through a drop; surface: (M, 3) points of the shape's frame."""
     center = particles.mean(0)
-    center[[0, 2]] = 0.0  # turned about an axis through the shape's own origin: offsets stay what the drop says
+    center[[0, 2]] = (
+        0.0  # turned about an axis through the shape's own origin: offsets stay what the drop says
+    )
     rest, _ = place(particles, center, training, surface)
     start, _ = place(particles, center, drop, surface)
     frame_dt, dx = 1 / body.footage.fps, 2 * body.spacing
     reach = drop.speed + 9.8 * frame_dt * body.footage.frames
     substeps = required_substeps(
-        material.wave_modulus(), material.density, frame_dt, dx, v_max=reach, courant=COURANT, limit=5000,
+        material.wave_modulus(),
+        material.density,
+        frame_dt,
+        dx,
+        v_max=reach,
+        courant=COURANT,
+        limit=5000,
         viscosity=material.viscosity(),
     )
     simulator = Simulator(
-        material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, ground=Ground(0.0), up=(0.0, 1.0, 0.0),
+        material.law,
+        dx=dx,
+        substeps=substeps,
+        frame_dt=frame_dt,
+        gravity=GRAVITY,
+        ground=Ground(0.0),
+        up=(0.0, 1.0, 0.0),
         options=material.options,
     )
     velocity = np.array([0.0, -drop.speed, 0.0])
@@ -70,10 +86,17 @@ def simulate(
     F = tensor(drop.rotation).expand(n, 3, 3).contiguous()
     # velocities half a substep early: symplectic Euler then follows the parabola exactly
     early = tensor(velocity) - 0.5 * frame_dt / substeps * tensor(GRAVITY)
-    state = ParticleState(tensor(start + lift), early.expand(n, 3).contiguous(), torch.zeros(n, 3, 3), F, F)
+    state = ParticleState(
+        tensor(start + lift), early.expand(n, 3).contiguous(), torch.zeros(n, 3, 3), F, F
+    )
     volume = torch.full((n,), body.spacing**3)
     with torch.no_grad():
         rollout = simulator.rollout(
-            state, material.parameters(tensor(rest)), volume, material.density, body.footage.frames, progress=progress
+            state,
+            material.parameters(tensor(rest)),
+            volume,
+            material.density,
+            body.footage.frames,
+            progress=progress,
         )
     return Fall(rest, rollout.x.double().numpy() - lift, drop.rotation, velocity, substeps)

@@ -17,7 +17,15 @@ from mosa.data.synthetic.bodies.objects import OBJECTS, BuiltinObject, drop_name
 from mosa.data.synthetic.bodies.shapes import SHAPES
 from mosa.data.synthetic.drop import simulate
 from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
-from mosa.data.synthetic.surface import LEVEL, Skin, Surface, bind, extract_surface, fill, flowing_surface
+from mosa.data.synthetic.surface import (
+    LEVEL,
+    Skin,
+    Surface,
+    bind,
+    extract_surface,
+    fill,
+    flowing_surface,
+)
 from mosa.errors import ConfigError, DataError
 from mosa.system.caches import cache_home
 from mosa.system.npz import read_npz
@@ -60,7 +68,9 @@ def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
     )  # fmt: skip
 
 
-def take_file(name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None) -> Path:
+def take_file(
+    name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None
+) -> Path:
     """Where a take lies once it has been made."""
     hidden = object_named(name).material.variant(material)
     made_of: tuple = (VERSION, object_named(name), hidden, drop_named(name, sequence), seed)
@@ -99,7 +109,9 @@ def make(
 
 
 @functools.lru_cache(maxsize=1)
-def built(shape_name: str, pitch: float, spacing: float, seed: int) -> tuple[Surface, np.ndarray, Skin]:
+def built(
+    shape_name: str, pitch: float, spacing: float, seed: int
+) -> tuple[Surface, np.ndarray, Skin]:
     """Surface, particles (N, 3) [m] and skin of an object, the same in every sequence and material: not to be changed."""
     shape = SHAPES[shape_name]
     # one generator a purpose: the same texture, lattice and cameras in every sequence and material of a seed
@@ -115,14 +127,22 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
     surface, particles, skin = built(body.shape, body.pitch, body.spacing, seed)
     label = f"{name}/{sequence} (synthetic, {material})"
     with tqdm(
-        total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True
+        total=film.frames - 1,
+        desc=f"{label}: simulate",
+        unit="frame",
+        disable=not progress,
+        dynamic_ncols=True,
     ) as bar:
         fall = simulate(
             body, body.material.variant(material), particles, surface.vertices, drop, body.drops["train"],
             progress=lambda frame: bar.update(),
         )  # fmt: skip
     cameras = cameras_of(body, seed)
-    paint = SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1])) if body.remesh else None  # as the surface's
+    paint = (
+        SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1]))
+        if body.remesh
+        else None
+    )  # as the surface's
 
     def film_at(x: np.ndarray) -> np.ndarray:
         if not body.remesh:
@@ -131,7 +151,13 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
         return render_surface(found, found.vertices, cameras)
 
     film_frame = threaded(film_at, fall.positions)
-    with tqdm(total=film.frames, desc=f"{label}: film", unit="frame", disable=not progress, dynamic_ncols=True) as bar:
+    with tqdm(
+        total=film.frames,
+        desc=f"{label}: film",
+        unit="frame",
+        disable=not progress,
+        dynamic_ncols=True,
+    ) as bar:
         pictures = []
         for picture in film_frame:
             pictures.append(picture)
@@ -152,7 +178,12 @@ def read_take(file: Path) -> Film | None:
         stored = read_npz(file)
         take = Film(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
         shapes = take.pictures.shape[1:2] + take.rest.shape, take.positions.shape
-        if take.pictures.ndim != 5 or shapes[0] != shapes[1] or take.rotation.shape != (3, 3) or take.velocity.shape != (3,):
+        if (
+            take.pictures.ndim != 5
+            or shapes[0] != shapes[1]
+            or take.rotation.shape != (3, 3)
+            or take.velocity.shape != (3,)
+        ):
             raise DataError(f"{file}: not a film of a built-in scene")
         return take
     except (DataError, KeyError) as error:
@@ -167,10 +198,15 @@ def write_take(file: Path, take: Film) -> None:
         np.savez_compressed(stream, **vars(take))
 
 
-def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures_to_footage(
+    pictures: np.ndarray, size: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
     V, T, H, W = pictures.shape[:4]
-    images, mattes = np.empty((V, T, size[1], size[0], 3), np.float32), np.empty((V, T, size[1], size[0]), np.float32)
+    images, mattes = (
+        np.empty((V, T, size[1], size[0], 3), np.float32),
+        np.empty((V, T, size[1], size[0]), np.float32),
+    )
 
     def convert(index: tuple[int, int]) -> None:
         alpha = pictures[*index, ..., 3]
@@ -179,7 +215,10 @@ def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[to
         if len(rows):  # around the object there is nothing but white
             window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
             part = pictures[*index, *window].astype(np.float32) / 255
-            image[window], matte[window] = composite(part[..., :3], part[..., 3], WHITE), part[..., 3]
+            image[window], matte[window] = (
+                composite(part[..., :3], part[..., 3], WHITE),
+                part[..., 3],
+            )
         images[index], mattes[index] = resize(image, *size), resize(matte, *size)
 
     for _ in threaded(convert, list(np.ndindex(V, T))):

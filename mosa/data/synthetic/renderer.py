@@ -39,7 +39,9 @@ def render_surface(surface: Surface, vertices: np.ndarray, cameras: Cameras) -> 
     return pictures
 
 
-def window(vertices: np.ndarray, K: np.ndarray, w2c: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
+def window(
+    vertices: np.ndarray, K: np.ndarray, w2c: np.ndarray, width: int, height: int
+) -> tuple[int, int, int, int]:
     """Pixels (x0, y0, x1, y1) that the projected vertices lie in."""
     seen = vertices @ w2c[:3, :3].T + w2c[:3, 3]
     pixel = seen @ K.T
@@ -49,14 +51,27 @@ def window(vertices: np.ndarray, K: np.ndarray, w2c: np.ndarray, width: int, hei
 
 
 def ring_of_cameras(
-    count: int, size: int, *, target, distance: float, elevations: tuple[float, ...], field: float, turn: float
+    count: int,
+    size: int,
+    *,
+    target,
+    distance: float,
+    elevations: tuple[float, ...],
+    field: float,
+    turn: float,
 ) -> Cameras:
     """Cameras around a target, looking at it, at elevations [rad] that take turns. field: half width seen at the target [m];
     turn: azimuth of the first one [rad]."""
     K, w2c = [], []
     for i in range(count):
         azimuth, elevation = turn + 2 * np.pi * i / count, elevations[i % len(elevations)]
-        back = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(elevation), np.sin(azimuth) * np.cos(elevation)])
+        back = np.array(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+            ]
+        )
         right = np.cross(-back, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         pose = np.eye(4)

@@ -34,7 +34,11 @@ def extract_surface(shape: Shape, pitch: float, rng: np.random.Generator) -> Sur
     )
     vertices = vertices.numpy().astype(np.float64) * pitch + low
     gradient = level_gradient(shape, vertices)
-    vertices -= shape.distance(vertices)[:, None] * gradient / np.maximum((gradient**2).sum(-1, keepdims=True), 0.25)
+    vertices -= (
+        shape.distance(vertices)[:, None]
+        * gradient
+        / np.maximum((gradient**2).sum(-1, keepdims=True), 0.25)
+    )
     triangles = indices.numpy().reshape(-1, 3).astype(np.int32)
     corner = vertices[triangles]
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -45,13 +49,22 @@ def extract_surface(shape: Shape, pitch: float, rng: np.random.Generator) -> Sur
 
 def level_gradient(shape: Shape, points: np.ndarray, h: float = 1e-4) -> np.ndarray:
     """Gradient (M, 3) of the distance by central differences."""
-    return np.stack([(shape.distance(points + e) - shape.distance(points - e)) / (2 * h) for e in h * np.eye(3)], -1)
+    return np.stack(
+        [
+            (shape.distance(points + e) - shape.distance(points - e)) / (2 * h)
+            for e in h * np.eye(3)
+        ],
+        -1,
+    )
 
 
 def fill(shape: Shape, spacing: float, rng: np.random.Generator) -> np.ndarray:
     """Particles (N, 3) [m] on a lattice of `spacing` inside the shape, the lattice shifted at random."""
     offset = rng.uniform(0, spacing, 3)
-    axes = [np.arange(a, b + spacing, spacing) for a, b in zip(shape.bounds[0] - spacing + offset, shape.bounds[1])]
+    axes = [
+        np.arange(a, b + spacing, spacing)
+        for a, b in zip(shape.bounds[0] - spacing + offset, shape.bounds[1])
+    ]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return points[shape.distance(points) < 0]
 
@@ -93,7 +106,11 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     corner = vertices[triangles]
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normals = np.stack(
-        [np.bincount(triangles.ravel(), np.repeat(facing[:, d], 3), len(vertices)) for d in range(3)], -1
+        [
+            np.bincount(triangles.ravel(), np.repeat(facing[:, d], 3), len(vertices))
+            for d in range(3)
+        ],
+        -1,
     )
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
 
@@ -105,7 +122,9 @@ LEVEL = 0.76
 too much), or every silhouette would be that of a larger body than the one that fell."""
 
 
-def flowing_surface(positions: np.ndarray, colors: np.ndarray, spacing: float, pitch: float) -> Surface:
+def flowing_surface(
+    positions: np.ndarray, colors: np.ndarray, spacing: float, pitch: float
+) -> Surface:
     """Surface of particles (N, 3) [m] that no skin could follow, with the particles' colors (N, 3).
 
     The level |x - mean of the particles around x| = LEVEL spacings (Zhu and Bridson 2005), weights (1 - (d/3 spacings)^2)^3.
@@ -116,8 +135,16 @@ def flowing_surface(positions: np.ndarray, colors: np.ndarray, spacing: float, p
         """(weights (M, k) with a column of sums at least 1e-12, indices (M, k), whether any particle is near (M,))."""
         distance, index = tree.query(points, k=min(24, len(positions)), distance_upper_bound=reach)
         near = np.isfinite(distance[:, 0])
-        weight = np.where(np.isfinite(distance), np.maximum(1 - (np.minimum(distance, reach) / reach) ** 2, 0) ** 3, 0.0)
-        return weight / np.maximum(weight.sum(1, keepdims=True), 1e-12), np.minimum(index, len(positions) - 1), near
+        weight = np.where(
+            np.isfinite(distance),
+            np.maximum(1 - (np.minimum(distance, reach) / reach) ** 2, 0) ** 3,
+            0.0,
+        )
+        return (
+            weight / np.maximum(weight.sum(1, keepdims=True), 1e-12),
+            np.minimum(index, len(positions) - 1),
+            near,
+        )
 
     def distance(points: np.ndarray) -> np.ndarray:
         weight, index, near = around(points)
@@ -129,4 +156,6 @@ def flowing_surface(positions: np.ndarray, colors: np.ndarray, spacing: float, p
         return np.einsum("mk,mkd->md", weight, colors[index])
 
     bounds = np.stack([positions.min(0) - 2 * spacing, positions.max(0) + 2 * spacing])
-    return extract_surface(Shape(distance, color, bounds), max(pitch, 0.8 * spacing), np.random.default_rng(0))
+    return extract_surface(
+        Shape(distance, color, bounds), max(pitch, 0.8 * spacing), np.random.default_rng(0)
+    )

@@ -25,7 +25,13 @@ def origin(name: str) -> np.ndarray:
     body = object_named(name)
     drop, shape = body.drops["train"], SHAPES[body.shape]
     lowest = extract_surface(shape, body.pitch, np.random.default_rng(0)).vertices[:, 1].min()
-    return np.array([drop.offset[0], drop.speed * drop.contact + 0.5 * 9.8 * drop.contact**2 - lowest, drop.offset[1]])
+    return np.array(
+        [
+            drop.offset[0],
+            drop.speed * drop.contact + 0.5 * 9.8 * drop.contact**2 - lowest,
+            drop.offset[1],
+        ]
+    )
 
 
 def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, float]:
@@ -39,7 +45,10 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
         raise ConfigError(f"scene {scene.name}: the true shape is known for built-in scenes only")
     shape = SHAPES[object_named(scene.name).shape]
     shift = origin(scene.name)
-    points, held = rest.detach().double().cpu().numpy() - shift, volume.detach().double().cpu().numpy()
+    points, held = (
+        rest.detach().double().cpu().numpy() - shift,
+        volume.detach().double().cpu().numpy(),
+    )
     lattice = min(LATTICE, object_named(scene.name).spacing)
     axes = [np.arange(a, b + lattice, lattice) for a, b in zip(*shape.bounds)]
     true = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -50,5 +59,7 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
         "floor/geometry/outside_share": float((shape.distance(points) > OUTSIDE * spacing).mean()),
         "floor/geometry/missing_share": float((away > FARTHEST * spacing).mean()),
         "floor/geometry/volume_error": float(held.sum() / (len(true) * lattice**3) - 1),
-        "floor/geometry/center_error_m": float(np.linalg.norm(held @ points / held.sum() - true.mean(0))),
+        "floor/geometry/center_error_m": float(
+            np.linalg.norm(held @ points / held.sum() - true.mean(0))
+        ),
     }

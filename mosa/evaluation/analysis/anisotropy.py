@@ -46,14 +46,20 @@ def dyads(directions: Tensor) -> Tensor:
     return mandel(torch.stack([n[:, i] * n[:, j] for i, j in pairs], -1))
 
 
-def directions_in_plane(first: Sequence[float], second: Sequence[float], count: int = 37) -> tuple[Tensor, Tensor]:
+def directions_in_plane(
+    first: Sequence[float], second: Sequence[float], count: int = 37
+) -> tuple[Tensor, Tensor]:
     """(angles (K,) [rad] from 0 to pi, unit vectors (K, 3)) from `first` towards `second`, orthogonalised. float64."""
     a, b = (torch.tensor(v, dtype=torch.float64) for v in (first, second))
     b = b - (b @ a) / (a @ a) * a
     if not (float(a.norm()) > 0 and float(b.norm()) > 1e-9):
-        raise ConfigError(f"plane: expected two directions that differ, found {list(first)} and {list(second)}")
+        raise ConfigError(
+            f"plane: expected two directions that differ, found {list(first)} and {list(second)}"
+        )
     angles = torch.linspace(0, math.pi, count, dtype=torch.float64)
-    return angles, torch.cos(angles)[:, None] * a / a.norm() + torch.sin(angles)[:, None] * b / b.norm()
+    return angles, torch.cos(angles)[:, None] * a / a.norm() + torch.sin(angles)[
+        :, None
+    ] * b / b.norm()
 
 
 def golden_turns(count: int) -> Tensor:
@@ -98,8 +104,10 @@ def response_of(states: States, adapter: AdapterProtocol | None) -> Callable[[Te
 
     Errors: ConfigError for the default adapter, whose operator is a stiffness."""
     if adapter is not None and adapter.strain is not None:
-        raise ConfigError("anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its in "
-                          "mosa.evaluation.analysis.stiffness")
+        raise ConfigError(
+            "anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its in "
+            "mosa.evaluation.analysis.stiffness"
+        )
     adapter = None if adapter is None else adapter.in_double()
 
     def response(strain: Tensor) -> Tensor:
@@ -115,7 +123,9 @@ def response_of(states: States, adapter: AdapterProtocol | None) -> Callable[[Te
     return response
 
 
-def uniaxial_stress(response: Callable[[Tensor], Tensor], directions: Tensor, strain: float, iterations: int = 20) -> Tensor:
+def uniaxial_stress(
+    response: Callable[[Tensor], Tensor], directions: Tensor, strain: float, iterations: int = 20
+) -> Tensor:
     """Axial stress (K,) [Pa] at Hencky strain `strain` along each of (K, 3), all other stress components zero.
 
     Newton's method on the strain and the axial stress. Errors: SimulationDiverged naming the direction without an equilibrium.
@@ -127,9 +137,17 @@ def uniaxial_stress(response: Callable[[Tensor], Tensor], directions: Tensor, st
         H = H.detach().requires_grad_(True)
         with torch.enable_grad():
             stress = response(H)
-            tangent = torch.stack([torch.autograd.grad(stress[:, i].sum(), H, retain_graph=True)[0] for i in range(6)], 1)
+            tangent = torch.stack(
+                [
+                    torch.autograd.grad(stress[:, i].sum(), H, retain_graph=True)[0]
+                    for i in range(6)
+                ],
+                1,
+            )
         stress = stress.detach()
-        residual = torch.cat([stress - axial[:, None] * N, ((N * H).sum(-1) - strain)[:, None].detach()], -1)
+        residual = torch.cat(
+            [stress - axial[:, None] * N, ((N * H).sum(-1) - strain)[:, None].detach()], -1
+        )
         matrix = torch.zeros(K, 7, 7, dtype=torch.float64)
         matrix[:, :6, :6], matrix[:, :6, 6], matrix[:, 6, :6] = tangent, -N, N
         # in units of the stiffness, or the strain equation would drown in the stress equations
@@ -148,7 +166,9 @@ def uniaxial_stress(response: Callable[[Tensor], Tensor], directions: Tensor, st
     )
 
 
-def directional_modulus(states: States, adapter: AdapterProtocol | None, directions: Tensor, strain: float = 5e-3) -> Tensor:
+def directional_modulus(
+    states: States, adapter: AdapterProtocol | None, directions: Tensor, strain: float = 5e-3
+) -> Tensor:
     """E(n) (K,) [Pa] along (K, 3): central difference of the uniaxial stress at +-strain, lateral stress free.
 
     states: of the prior at its global parameters; adapter: None for the prior alone, whose E(n) is Young's modulus.
@@ -161,12 +181,19 @@ def directional_modulus(states: States, adapter: AdapterProtocol | None, directi
 def directions_about(axis: Tensor, radius: float, count: int) -> Tensor:
     """(K, 3) unit vectors spread over the cap of `radius` [rad] about a unit vector (3,), itself the first (spiral of the golden
     angle). float64."""
-    turn, off = golden_turns(count), math.tan(radius) * torch.linspace(0, 1, count, dtype=torch.float64).sqrt()
+    turn, off = (
+        golden_turns(count),
+        math.tan(radius) * torch.linspace(0, 1, count, dtype=torch.float64).sqrt(),
+    )
     across = torch.linalg.svd(axis.double()[None]).Vh[1:]
-    return torch.nn.functional.normalize(axis.double() + off[:, None] * torch.stack([turn.cos(), turn.sin()], -1) @ across, dim=-1)
+    return torch.nn.functional.normalize(
+        axis.double() + off[:, None] * torch.stack([turn.cos(), turn.sin()], -1) @ across, dim=-1
+    )
 
 
-def stiffest_axis(states: States, adapter: AdapterProtocol | None, count: int = 200, strain: float = 5e-3) -> tuple[Tensor, float]:
+def stiffest_axis(
+    states: States, adapter: AdapterProtocol | None, count: int = 200, strain: float = 5e-3
+) -> tuple[Tensor, float]:
     """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of `count` directions, and as many about the best of
     them: which way a learned law is stiff, to be compared with a known fibre. 200: to 1.2 degrees, where those of the half sphere
     alone are up to 8 away."""
@@ -175,4 +202,6 @@ def stiffest_axis(states: States, adapter: AdapterProtocol | None, count: int = 
     beyond_neighbours = math.sqrt(4 * math.pi / count)
     nearby = directions_about(directions[int(modulus.argmax())], beyond_neighbours, count)
     closer = directional_modulus(states, adapter, nearby, strain)
-    return nearby[int(closer.argmax())], float(max(modulus.max(), closer.max()) / min(modulus.min(), closer.min()))
+    return nearby[int(closer.argmax())], float(
+        max(modulus.max(), closer.max()) / min(modulus.min(), closer.min())
+    )

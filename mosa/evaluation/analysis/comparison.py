@@ -12,7 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.evaluation.analysis.figures import FONT, fitted, side_by_side, text_width, to_uint8, write_strip, write_video
+from mosa.evaluation.analysis.figures import (
+    FONT,
+    fitted,
+    side_by_side,
+    text_width,
+    to_uint8,
+    write_strip,
+    write_video,
+)
 from mosa.evaluation.evaluate import Sequence, true_motion
 from mosa.modules.body.body import Body
 from mosa.physics.world import World
@@ -47,7 +55,9 @@ class Comparison:
 
 
 @torch.no_grad()
-def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, width: int = 320) -> Comparison:
+def compare(
+    body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, width: int = 320
+) -> Comparison:
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
@@ -63,22 +73,43 @@ def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, wid
     seen = {variant: drawn(body, variants[variant], cameras, scene) for variant in known}
 
     def finished(images: Tensor) -> np.ndarray:
-        return np.stack([on_ground(enlarge(to_uint8(image), times), lines, times, scene.background) for image in images])
+        return np.stack(
+            [
+                on_ground(enlarge(to_uint8(image), times), lines, times, scene.background)
+                for image in images
+            ]
+        )
 
     target = true_motion(body, scene)
     if target is None:
         label, high, colors = "difference of the images", f"{DIFFERENCE:g}", "Reds"
-        errors = {v: paint((images - real).abs().mean(-1) / DIFFERENCE, colors) for v, images in seen.items()}
+        errors = {
+            v: paint((images - real).abs().mean(-1) / DIFFERENCE, colors)
+            for v, images in seen.items()
+        }
     else:
         far = {v: (variants[v].x.cpu() - target.cpu()).norm(dim=-1) for v in known}
-        limit = round_up(max(float(torch.quantile(d.flatten()[: 2**24], 0.99)) for d in far.values()))
+        limit = round_up(
+            max(float(torch.quantile(d.flatten()[: 2**24], 0.99)) for d in far.values())
+        )
         label, high, colors = "distance to the true motion", f"{1e3 * limit:g} mm", "viridis"
-        errors = {v: drawn(body, variants[v], cameras, scene, paint(d / limit, colors)) for v, d in far.items()}
-    return Comparison({"real": finished(real)} | {TITLES[v]: finished(images) for v, images in seen.items()},
-                      {TITLES[v]: finished(images) for v, images in errors.items()}, label, high, colors, scene.times.tolist())
+        errors = {
+            v: drawn(body, variants[v], cameras, scene, paint(d / limit, colors))
+            for v, d in far.items()
+        }
+    return Comparison(
+        {"real": finished(real)} | {TITLES[v]: finished(images) for v, images in seen.items()},
+        {TITLES[v]: finished(images) for v, images in errors.items()},
+        label,
+        high,
+        colors,
+        scene.times.tolist(),
+    )
 
 
-def drawn(body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: Tensor | None = None) -> Tensor:
+def drawn(
+    body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: Tensor | None = None
+) -> Tensor:
     """(T, H, W, 3) images of a rollout from one camera, on the CPU. colors: (T, N, 3) of its particles in place of
     the body's appearance."""
     device = body.rest.device
@@ -87,7 +118,14 @@ def drawn(body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: 
         return seen(body, rollout.x, rollout.F_tot).images(cameras, background)[0].clamp(0, 1).cpu()
     covariances = deformed_covariances(rollout.F_tot, body.covariances)
     parts = [
-        observe(rollout.x[[t]], covariances[[t]], body.opacities, colors[t].to(body.colors), cameras, background).images[0]
+        observe(
+            rollout.x[[t]],
+            covariances[[t]],
+            body.opacities,
+            colors[t].to(body.colors),
+            cameras,
+            background,
+        ).images[0]
         for t in range(len(rollout.x))
     ]
     return torch.cat(parts).clamp(0, 1).cpu()
@@ -95,7 +133,9 @@ def drawn(body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: 
 
 def paint(share: Tensor, colors: str) -> Tensor:
     """(..., 3) colours of values (...), of which 1 has the last colour and what is above too."""
-    return torch.from_numpy(matplotlib.colormaps[colors](share.clamp(0, 1).numpy())[..., :3]).float()
+    return torch.from_numpy(
+        matplotlib.colormaps[colors](share.clamp(0, 1).numpy())[..., :3]
+    ).float()
 
 
 def round_up(value: float) -> float:
@@ -111,16 +151,23 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
         return []
     up, w2c, K = scene.up.double(), cameras.w2c[0].double(), cameras.K[0].double()
     eye = -w2c[:3, :3].T @ w2c[:3, 3]
-    ray = w2c[:3, :3].T @ torch.linalg.solve(K, K.new_tensor([cameras.width / 2, cameras.height, 1.0]))
+    ray = w2c[:3, :3].T @ torch.linalg.solve(
+        K, K.new_tensor([cameras.width / 2, cameras.height, 1.0])
+    )
     fall = float(ray @ up)
-    if fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height:  # a camera below the ground, or looking up
+    if (
+        fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height
+    ):  # a camera below the ground, or looking up
         return []
     middle = eye + (scene.ground.height - float(eye @ up)) / fall * ray
     across = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
     across = across / across.norm()
     along = torch.linalg.cross(up, across)
     cell, count = 0.5 * size, 12
-    steps, places = torch.linspace(-count, count, 8 * count + 1).double() * cell, torch.arange(-count, count + 1) * cell
+    steps, places = (
+        torch.linspace(-count, count, 8 * count + 1).double() * cell,
+        torch.arange(-count, count + 1) * cell,
+    )
     lines = []
     for one, other in ((across, along), (along, across)):
         for place in places.tolist():
@@ -133,15 +180,23 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
 
 
 def enlarge(image: np.ndarray, times: int) -> np.ndarray:
-    return image if times == 1 else cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    return (
+        image
+        if times == 1
+        else cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    )
 
 
-def on_ground(image: np.ndarray, lines: list[np.ndarray], times: int, background: Tensor) -> np.ndarray:
+def on_ground(
+    image: np.ndarray, lines: list[np.ndarray], times: int, background: Tensor
+) -> np.ndarray:
     """An image (H, W, 3) uint8, enlarged `times`, with ground lines [px before that] where it shows the background."""
     if not lines:
         return image
     ink = np.zeros(image.shape[:2], np.uint8)
-    fixed = [np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines]  # of 1/16 px
+    fixed = [
+        np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines
+    ]  # of 1/16 px
     cv2.polylines(ink, fixed, False, 255, 1, cv2.LINE_AA, shift=4)
     behind = np.abs(image - 255.0 * background.numpy()).max(-1) <= NEAR_BACKGROUND
     share = 0.5 * (ink / 255 * behind)[..., None]
@@ -152,11 +207,18 @@ def legend(shown: Comparison) -> np.ndarray:
     """(H, W, 3) uint8: the colours of the errors, as large as an image."""
     height, width = shown.images["real"].shape[1:3]
     picture = np.full((height, width, 3), 255, np.uint8)
-    bar = to_uint8(paint(torch.linspace(0, 1, int(0.8 * width)), shown.colors)[None].expand(max(8, height // 20), -1, -1))
+    bar = to_uint8(
+        paint(torch.linspace(0, 1, int(0.8 * width)), shown.colors)[None].expand(
+            max(8, height // 20), -1, -1
+        )
+    )
     top, left = height // 2, int(0.1 * width)
     picture[top : top + bar.shape[0], left : left + bar.shape[1]] = bar
     text, scale = fitted(shown.label, width - left, 0.42)
-    write = lambda text, x, y: cv2.putText(picture, text, (x, y), FONT, scale, (30, 30, 30), 1, cv2.LINE_AA)  # noqa: E731
+
+    def write(text, x, y):
+        return cv2.putText(picture, text, (x, y), FONT, scale, (30, 30, 30), 1, cv2.LINE_AA)
+
     write(text, left, top - 10)
     write("0", left, top + bar.shape[0] + 18)
     write(shown.high, left + bar.shape[1] - text_width(shown.high, scale), top + bar.shape[0] + 18)
@@ -174,5 +236,8 @@ def write_comparisons(folder: Path, shown: Mapping[str, Comparison]) -> None:
     for prefix, each in shown.items():
         notes[f"{prefix}: real"] = each.moments
         rows |= {f"{prefix}: {title}": images for title, images in each.images.items()}
-        rows |= {f"{prefix}: {title}, {each.label}, 0 to {each.high}": images for title, images in each.errors.items()}
+        rows |= {
+            f"{prefix}: {title}, {each.label}, 0 to {each.high}": images
+            for title, images in each.errors.items()
+        }
     write_strip(folder / "strip.png", rows, notes=notes)

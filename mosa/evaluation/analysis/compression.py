@@ -74,10 +74,16 @@ def press(
     # a start that is pressed already all over, or the plates would send a wave through it
     shear = rate * torch.diag(torch.tensor([poisson, poisson, -1.0]).double())
     motions = [Motion((0, 0, s * HEIGHT), velocity=(0, 0, -s * rate * HEIGHT / 2)) for s in (-1, 1)]
-    plates = [Collider(Box((4 * HEIGHT, 4 * HEIGHT, HEIGHT)), "slip", motion=motion) for motion in motions]
-    numbers = {name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()}
+    plates = [
+        Collider(Box((4 * HEIGHT, 4 * HEIGHT, HEIGHT)), "slip", motion=motion) for motion in motions
+    ]
+    numbers = {
+        name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()
+    }
     stiffest = stiffening * float(wave_modulus(law, numbers))
-    substeps = required_substeps(stiffest, density, duration / FRAMES, dx, v_max=rate * HEIGHT, courant=0.5)
+    substeps = required_substeps(
+        stiffest, density, duration / FRAMES, dx, v_max=rate * HEIGHT, courant=0.5
+    )
     steady = adapter is None or adapter.steady
     simulator = Simulator(
         law, dx=dx, substeps=substeps if steady else -(-substeps // stride) * stride, frame_dt=duration / FRAMES, gravity=(0, 0, 0),
@@ -90,13 +96,17 @@ def press(
         held = adapter.in_double()
         held.follow(torch.tensor(poisson).double())
     volume = torch.full((n,), (dx / 2) ** 3).double()
-    found = simulator.rollout(state, numbers, volume, density, FRAMES + 1, adapter=held, stride=None if steady else stride)
+    found = simulator.rollout(
+        state, numbers, volume, density, FRAMES + 1, adapter=held, stride=None if steady else stride
+    )
     force = 0.5 * (found.reactions[..., 0, 2] - found.reactions[..., 1, 2]).mean(1).abs()
     middle = x[:, 2].abs() < HEIGHT / 4
     stretch = (found.F_tot[:, middle] @ Q.T)[..., 2, 2].mean(1)
     strain = 1 - 0.5 * (stretch[1:] + stretch[:-1])
     area = float(volume.sum()) / HEIGHT
-    late = slice(FRAMES // 4, None)  # before, the plates have not reached the body: a grid contact is felt half a cell off
+    late = slice(
+        FRAMES // 4, None
+    )  # before, the plates have not reached the body: a grid contact is felt half a cell off
     powers = torch.stack([strain, strain**2], 1)[late]
     fitted = torch.linalg.lstsq(powers, (force / area)[late][:, None]).solution
     return Pressed(strain, force, float(fitted[0]))

@@ -45,7 +45,9 @@ def true_motion(truth: Truth, points: Tensor, *, neighbours: int = 24) -> TrueMo
     """
     start = truth.positions[0].double().numpy()
     if len(start) < neighbours:
-        raise DataError(f"true_motion: expected at least {neighbours} true points, found {len(start)}; ask for fewer neighbours")
+        raise DataError(
+            f"true_motion: expected at least {neighbours} true points, found {len(start)}; ask for fewer neighbours"
+        )
     tree, where = cKDTree(start), points.detach().cpu().double().numpy()
     distance, index = tree.query(where, k=neighbours)
     pitch = float(np.median(tree.query(start, k=2)[0][:, 1]))
@@ -60,7 +62,9 @@ def true_motion(truth: Truth, points: Tensor, *, neighbours: int = 24) -> TrueMo
     deformation = (solved[:, :, 1:] / scale).transpose(-1, -2)
     rotation, stretch = polar(deformation)
     inside = torch.as_tensor(distance[:, 0] < OUTSIDE * pitch)
-    return TrueMotion(solved[:, :, 0].float(), deformation.float(), rotation.float(), stretch.float(), inside)
+    return TrueMotion(
+        solved[:, :, 0].float(), deformation.float(), rotation.float(), stretch.float(), inside
+    )
 
 
 def rotation_error(found: Tensor, true: Tensor) -> Tensor:
@@ -74,7 +78,9 @@ def _median_and_90(values: Tensor) -> tuple[float, float]:
     return float(ordered[0]), float(ordered[1])
 
 
-def cue_errors(cues: MotionCues, true: TrueMotion, times: Tensor, *, first: int = 1) -> dict[str, float]:
+def cue_errors(
+    cues: MotionCues, true: TrueMotion, times: Tensor, *, first: int = 1
+) -> dict[str, float]:
     """Median and 90th percentile of cue errors over particles with truth and weight, frames `first` to the last.
 
     rotation_deg; stretch: |Lambda - true Lambda| over the three sorted axes; velocity_m_s: norm of the error of
@@ -87,7 +93,11 @@ def cue_errors(cues: MotionCues, true: TrueMotion, times: Tensor, *, first: int 
     angle = rotation_error(cues.rotation, true.rotation)[first:][keep]
     stretch = (cues.stretch - true.stretch).abs()[first:][keep].flatten()
     dt = times.diff()[:, None, None]
-    speed = ((cues.positions.diff(dim=0) - true.positions.diff(dim=0)) / dt).norm(dim=-1)[first - 1 :, true.inside].flatten()
+    speed = (
+        ((cues.positions.diff(dim=0) - true.positions.diff(dim=0)) / dt)
+        .norm(dim=-1)[first - 1 :, true.inside]
+        .flatten()
+    )
     squared = (cues.positions - true.positions).square().sum(-1)[first:, true.inside]
     result = {}
     for name, values in (("rotation_deg", angle), ("stretch", stretch), ("velocity_m_s", speed)):
@@ -100,7 +110,9 @@ def cue_errors(cues: MotionCues, true: TrueMotion, times: Tensor, *, first: int 
     return result
 
 
-def strain_direction_error(cues: MotionCues, true: TrueMotion, floor: float, *, first: int = 1) -> dict[str, float]:
+def strain_direction_error(
+    cues: MotionCues, true: TrueMotion, floor: float, *, first: int = 1
+) -> dict[str, float]:
     """Angle [degrees] between Lambda - 1 of cue and truth, all that L_s compares, where the cue's largest |Lambda - 1| is above
     `floor`: median, 90th percentile, and the share of particles and frames that are above.
 
@@ -114,10 +126,18 @@ def strain_direction_error(cues: MotionCues, true: TrueMotion, floor: float, *, 
         return {"floor": floor, "share": 0.0}
     cosine = torch.nn.functional.cosine_similarity(seen[keep].double(), real[keep].double(), dim=-1)
     median, high = _median_and_90(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))))
-    usual = torch.nn.functional.cosine_similarity(torch.tensor(USUAL_STRETCH).double() - 1, real[keep].double(), dim=-1)
+    usual = torch.nn.functional.cosine_similarity(
+        torch.tensor(USUAL_STRETCH).double() - 1, real[keep].double(), dim=-1
+    )
     constant, _ = _median_and_90(torch.rad2deg(torch.acos(usual.clamp(-1, 1))))
     share = float(keep.float().sum() / valid.float().sum())
-    return {"floor": floor, "share": share, "median_deg": median, "p90_deg": high, "constant_median_deg": constant}
+    return {
+        "floor": floor,
+        "share": share,
+        "median_deg": median,
+        "p90_deg": high,
+        "constant_median_deg": constant,
+    }
 
 
 def motionless(true: TrueMotion) -> MotionCues:
@@ -125,5 +145,9 @@ def motionless(true: TrueMotion) -> MotionCues:
     identity = torch.eye(3).expand_as(true.rotation)
     positions = true.positions[:1].expand_as(true.positions)
     return MotionCues(
-        positions, identity, torch.ones_like(true.stretch), torch.ones_like(true.stretch[..., 0]), torch.zeros_like(identity)
+        positions,
+        identity,
+        torch.ones_like(true.stretch),
+        torch.ones_like(true.stretch[..., 0]),
+        torch.zeros_like(identity),
     )

@@ -22,13 +22,19 @@ def ffmpeg(key: str) -> str:
 
         return get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
-        raise ConfigError(f"{key}: expected false, or an ffmpeg to write it with (set IMAGEIO_FFMPEG_EXE, or install "
-                          f"imageio-ffmpeg), found none ({' '.join(str(error).split())[:200]})") from error
+        raise ConfigError(
+            f"{key}: expected false, or an ffmpeg to write it with (set IMAGEIO_FFMPEG_EXE, or install "
+            f"imageio-ffmpeg), found none ({' '.join(str(error).split())[:200]})"
+        ) from error
 
 
 def to_uint8(image: Tensor | np.ndarray) -> np.ndarray:
     """(H, W, 3) float in [0, 1] to uint8; what is that already stays."""
-    return image if isinstance(image, np.ndarray) else (image.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
+    return (
+        image
+        if isinstance(image, np.ndarray)
+        else (image.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
+    )
 
 
 FONT, SIZE, SMALLEST, LEFT = cv2.FONT_HERSHEY_SIMPLEX, 0.48, 0.3, 6
@@ -69,12 +75,17 @@ Images = Mapping[str, Tensor | np.ndarray]
 """Name -> (T, H, W, 3), float in [0, 1] or uint8."""
 
 
-def side_by_side(columns: Images, *, below: Images | None = None, footer: list[str] | None = None) -> list[np.ndarray]:
+def side_by_side(
+    columns: Images, *, below: Images | None = None, footer: list[str] | None = None
+) -> list[np.ndarray]:
     """Frames with the columns beside each other. below: a second row, of as many; footer: a text under each frame."""
     frames = []
     for t in range(min(len(c) for c in columns.values())):
-        rows = [np.concatenate([label(to_uint8(images[t]), name) for name, images in row.items()], 1)
-                for row in (columns, below) if row]
+        rows = [
+            np.concatenate([label(to_uint8(images[t]), name) for name, images in row.items()], 1)
+            for row in (columns, below)
+            if row
+        ]
         if footer is not None:
             rows.append(bar(rows[0].shape[1], [footer[t]]))
         frames.append(np.concatenate(rows))
@@ -95,7 +106,9 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
     # imageio takes the kind of file from its name, which has it only once the file is whole
     size, options = (width + width % 2, height + height % 2), {"quality": 8, "macro_block_size": 2}
     with written_whole(path) as partial:
-        writer = write_frames(str(partial), size, fps=fps, codec="libx264", output_params=["-f", "mp4"], **options)
+        writer = write_frames(
+            str(partial), size, fps=fps, codec="libx264", output_params=["-f", "mp4"], **options
+        )
         try:
             writer.send(None)
             for frame in frames:
@@ -104,12 +117,24 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
             raise OSError(errno.EIO, "ffmpeg has ended while it wrote", str(path)) from error
         finally:
             writer.close()
-        if (found := int(cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT))) != len(frames):  # ffmpeg says nothing of it
-            raise OSError(errno.EIO, f"{found} of {len(frames)} pictures are in it: is the disk full?", str(path))
+        if (found := int(cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT))) != len(
+            frames
+        ):  # ffmpeg says nothing of it
+            raise OSError(
+                errno.EIO,
+                f"{found} of {len(frames)} pictures are in it: is the disk full?",
+                str(path),
+            )
     return path
 
 
-def write_strip(path: str | Path, columns: Images, frames: int = 6, *, notes: Mapping[str, list[str]] | None = None) -> Path:
+def write_strip(
+    path: str | Path,
+    columns: Images,
+    frames: int = 6,
+    *,
+    notes: Mapping[str, list[str]] | None = None,
+) -> Path:
     """PNG of about `frames` frames from left to right, one captioned row per entry of `columns`, whose sizes may differ. notes: of
     some rows, a text over each frame."""
     path, notes = Path(path), notes or {}
@@ -122,7 +147,10 @@ def write_strip(path: str | Path, columns: Images, frames: int = 6, *, notes: Ma
             row = np.concatenate([bar(row.shape[1], [notes[name][t] for t in chosen], 22), row])
         rows.append(label(row, name))
     width = max(row.shape[1] for row in rows)
-    rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    rows = [
+        np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255)
+        for row in rows
+    ]
     with written_whole(path) as partial:
         imageio.imwrite(partial, np.concatenate(rows), format="PNG")
     return path

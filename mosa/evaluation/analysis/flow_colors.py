@@ -16,7 +16,9 @@ def flow_colors(flow: Tensor, largest: float | None = None) -> Tensor:
     largest: None for the largest length in `flow`. Errors: DataError where a number is not finite.
     """
     if not bool(torch.isfinite(flow).all()):
-        raise DataError(f"flow_colors: expected finite flow, found {int((~torch.isfinite(flow)).sum())} NaN or infinite numbers")
+        raise DataError(
+            f"flow_colors: expected finite flow, found {int((~torch.isfinite(flow)).sum())} NaN or infinite numbers"
+        )
     flow = flow.detach().cpu().float()
     length = flow.norm(dim=-1)
     if largest is None:
@@ -31,4 +33,6 @@ def color_wheel(size: int) -> Tensor:
     axis = (torch.arange(size) + 0.5) * 2 / size - 1
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     flow = torch.stack((x, y), -1)
-    return flow_colors(torch.where(flow.norm(dim=-1, keepdim=True) <= 1, flow, torch.zeros_like(flow)), 1.0)
+    return flow_colors(
+        torch.where(flow.norm(dim=-1, keepdim=True) <= 1, flow, torch.zeros_like(flow)), 1.0
+    )

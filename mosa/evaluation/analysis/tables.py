@@ -7,16 +7,29 @@ from collections.abc import Mapping
 
 from mosa.evaluation.metrics import IMAGE_METRICS, MOTION_METRICS
 from mosa.modules.body.material import RELATIVE, unit_of
-from mosa.modules.fitting.search.ground_choice import EXPLAINED, NEARER, alike, contact, learned_on, taken_of
+from mosa.modules.fitting.search.ground_choice import (
+    EXPLAINED,
+    NEARER,
+    alike,
+    contact,
+    learned_on,
+    taken_of,
+)
 from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
-UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
-         "cd_m": ("CD [mm]", 1e3, 2), "emd_m": ("EMD [mm]", 1e3, 1), "psnr_crop": ("PSNR crop", 1, 2),
-         "ssim_crop": ("SSIM crop", 1, 4)}
+UNITS = {
+    "rms_m": ("rms [mm]", 1e3, 2),
+    "cd_m": ("CD [mm]", 1e3, 2),
+    "emd_m": ("EMD [mm]", 1e3, 1),
+    "psnr_crop": ("PSNR crop", 1, 2),
+    "ssim_crop": ("SSIM crop", 1, 4),
+}
 
 
-def results_table(figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_crop", "ssim_crop")) -> str:
+def results_table(
+    figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_crop", "ssim_crop")
+) -> str:
     """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence, of these metrics and
     those that were registered."""
     sequences = [s for s in _sequences(figures)]
@@ -28,7 +41,9 @@ def results_table(figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_
         for name, prefix in MODELS:
             values = [figures.get(f"{prefix}{s}/{metric}") for s in sequences]
             if any(v is not None for v in values):
-                rows.append([label, name, *("" if v is None else f"{v * scale:.{digits}f}" for v in values)])
+                rows.append(
+                    [label, name, *("" if v is None else f"{v * scale:.{digits}f}" for v in values)]
+                )
     return markdown(["figure", "model", *sequences], rows)
 
 
@@ -39,14 +54,20 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
     if "train" not in columns:
         return ""
     parts = [f"`train` is the recording {recording}"]
-    parts += ["`train/...` the others that were learned from"] * any(column.startswith("train/") for column in columns)
-    parts += ["`test/...` those held out, `test` their mean"] * any(column.startswith("test/") for column in columns)
+    parts += ["`train/...` the others that were learned from"] * any(
+        column.startswith("train/") for column in columns
+    )
+    parts += ["`test/...` those held out, `test` their mean"] * any(
+        column.startswith("test/") for column in columns
+    )
     return f"Columns: {', '.join(parts)}."
 
 
 def _sequences(figures: Mapping[str, float]) -> list[str]:
     names = {key.rsplit("/", 1)[0] for key in figures if key.endswith("/psnr_crop")}
-    plain = {n for n in names if n.split("/")[0] in ("train", "frames", "camera") and n.count("/") == 0}
+    plain = {
+        n for n in names if n.split("/")[0] in ("train", "frames", "camera") and n.count("/") == 0
+    }
     others = [sorted(n for n in names if n.startswith(start)) for start in ("train/", "test")]
     return sorted(plain, key=("train", "frames", "camera").index) + others[0] + others[1]
 
@@ -54,8 +75,13 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 def parameter_table(figures: Mapping[str, float], law: str) -> str:
     """Markdown table of identified parameters: after calibration, after the joint stage, each with its relative error where the
     truth is known. law: of the prior, which says what they are measured in."""
-    names = [k.split("/", 1)[1] for k in figures
-             if k.startswith("id_prior/") and k.count("/") == 1 and not k.endswith(("_relative_error", "_ratio"))]
+    names = [
+        k.split("/", 1)[1]
+        for k in figures
+        if k.startswith("id_prior/")
+        and k.count("/") == 1
+        and not k.endswith(("_relative_error", "_ratio"))
+    ]
     stages = ("id_prior", "id")
     rows = [[with_unit(law, n), *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
@@ -84,7 +110,11 @@ def ground_table(distances: Mapping[str, float], gains: Mapping[str, float]) -> 
     gains: as in `ground_text`."""
     if len(distances) <= LISTED:
         return ""
-    header = ["a body that ...", "calibrated law: distance [mm]", "learned law: gain in log likelihood"]
+    header = [
+        "a body that ...",
+        "calibrated law: distance [mm]",
+        "learned law: gain in log likelihood",
+    ]
     rows = [[_words(name), f"{1e3 * distances[name]:.2f}" if name in distances else "",
              f"{gains[name]:+.1f}" if name in gains else ""]
             for name in sorted({**distances, **gains}, key=lambda name: distances.get(name, math.inf))]  # fmt: skip
@@ -96,9 +126,14 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     motion does not tell. gains: of other contacts, about the learned law, where those were asked."""
     taken = taken_of(distances)
     touches, said = (learned_on(taken, gains), [_asked(gains)]) if gains else (taken, [])
-    if touches != "sticky" and (taken == "sticky" or not gains):  # only the isotropic law was asked for its friction
+    if touches != "sticky" and (
+        taken == "sticky" or not gains
+    ):  # only the isotropic law was asked for its friction
         said.append(_guessed(distances, contact(touches)[0]))
-    listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
+    listed = ", ".join(
+        f"{_words(name)} {distances[name] * 1e3:.2f} mm"
+        for name in sorted(distances, key=distances.get)
+    )
     where = f": {listed}" if len(distances) <= LISTED else " in the table below"
     first = f"Ground: the body {_words(touches)} (mean distance from the training motion after calibration{where})."
     if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
@@ -110,7 +145,9 @@ def _asked(gains: Mapping[str, float]) -> str:
     """What the learned law says of the best of the contacts that it was asked for, and what is left open."""
     best = max(gains, key=gains.get)
     gain = gains[best]
-    better = f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f} of the logarithm of the likelihood"
+    better = (
+        f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f} of the logarithm of the likelihood"
+    )
     said = f"About the learned law, a body that {_words(best)} explains the motion {better}."
     if -EXPLAINED < gain <= EXPLAINED:
         said += f" Which of the two it is, is *not* determined: that takes {EXPLAINED:g}."
@@ -120,25 +157,38 @@ def _asked(gains: Mapping[str, float]) -> str:
 def _words(name: str) -> str:
     """A contact by `named` in words; both modes with friction leave the ground freely, so the mode is said as well."""
     mode, friction = contact(name)
-    return f"leaves it freely, friction {friction:.3g} ({mode})" if mode in RUBBING else "sticks to it"
+    return (
+        f"leaves it freely, friction {friction:.3g} ({mode})" if mode in RUBBING else "sticks to it"
+    )
 
 
 def _guessed(distances: Mapping[str, float], mode: str) -> str:
     near = ", ".join(f"{friction:.3g}" for friction in alike(distances, mode))
-    return ("Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
-            f"{near}, and is wrong itself.")
+    return (
+        "Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
+        f"{near}, and is wrong itself."
+    )
 
 
 def determined_text(figures: Mapping[str, float], law: str) -> str:
     """What the data determine and what they do not, in sentences; empty where a run kept no posterior. law: of the prior, which
     says what its parameters are measured in."""
-    compared = {k.removeprefix("id_prior/compared/").removesuffix("_m"): v for k, v in figures.items()
-                if k.startswith("id_prior/compared/")}
+    compared = {
+        k.removeprefix("id_prior/compared/").removesuffix("_m"): v
+        for k, v in figures.items()
+        if k.startswith("id_prior/compared/")
+    }
     lines = []
     if compared:
         taken = min(compared, key=compared.get)
-        listed = ", ".join(f"{law} {distance * 1e3:.2f} mm" for law, distance in sorted(compared.items(), key=lambda each: each[1]))
-        lines = [f"Backbone: {taken}, which is nearest to the training motion (mean distance after calibration: {listed}).", ""]
+        listed = ", ".join(
+            f"{law} {distance * 1e3:.2f} mm"
+            for law, distance in sorted(compared.items(), key=lambda each: each[1])
+        )
+        lines = [
+            f"Backbone: {taken}, which is nearest to the training motion (mean distance after calibration: {listed}).",
+            "",
+        ]
     touched, gains = ({k.removeprefix("id_prior/ground/").removesuffix(end): v for k, v in figures.items()
                        if k.startswith("id_prior/ground/") and k.endswith(end)} for end in ("_m", "_gain"))  # fmt: skip
     if touched:
@@ -149,33 +199,56 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     lines += ["What the data determine:", ""]
     for name in RELATIVE:
         if f"posterior/{name}_relative_sd" in figures:
-            lines.append(f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, with a standard deviation of "
-                         f"{figures[f'posterior/{name}_relative_sd']:.1%}.")
+            lines.append(
+                f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, with a standard deviation of "
+                f"{figures[f'posterior/{name}_relative_sd']:.1%}."
+            )
     if "posterior/friction_angle_sd" in figures:
-        lines.append(f"- friction angle = {figures['id/friction_angle']:.3g} degrees, with a standard deviation of "
-                     f"{figures['posterior/friction_angle_sd']:.2g}.")
+        lines.append(
+            f"- friction angle = {figures['id/friction_angle']:.3g} degrees, with a standard deviation of "
+            f"{figures['posterior/friction_angle_sd']:.2g}."
+        )
     if "posterior/nu_sd" in figures:
-        lines.append(f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}.")
+        lines.append(
+            f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}."
+        )
     if "posterior/stiffest_cone_deg" in figures:
         ratio, half = figures["id/stiffness_ratio"], figures["posterior/stiffest_cone_deg"]
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
         spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
         if ratio < NOTICEABLE:
-            lines.append(f"- No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as its prior.")
+            lines.append(
+                f"- No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as its prior."
+            )
         elif half > SURE_DEGREES:
-            lines.append(f"- Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* "
-                         f"determined: the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees.")
+            lines.append(
+                f"- Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* "
+                f"determined: the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees."
+            )
         else:
-            lines.append(f"- The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest "
-                         f"Young's modulus is {spread}.")
-    for name, what in (("operator", "numbers of the anisotropic stiffness"), ("stiffness", "modes of the stiffness over the body")):
+            lines.append(
+                f"- The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest "
+                f"Young's modulus is {spread}."
+            )
+    for name, what in (
+        ("operator", "numbers of the anisotropic stiffness"),
+        ("stiffness", "modes of the stiffness over the body"),
+    ):
         if f"posterior/{name}_numbers" in figures:
-            lines.append(f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
-                         f"{figures[f'posterior/{name}_determined']:.1f}; the rest is where the prior has it.")
+            lines.append(
+                f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
+                f"{figures[f'posterior/{name}_determined']:.1f}; the rest is where the prior has it."
+            )
     if "posterior/test/sd_m" in figures:
         sure = figures.get("posterior/test/coverage")
-        lines.append(f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms)"
-                     + ("." if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations."))
+        lines.append(
+            f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms)"
+            + (
+                "."
+                if sure is None
+                else f"; {sure:.0%} of the errors lie within two standard deviations."
+            )
+        )
     return "\n".join(lines)
 
 
@@ -185,9 +258,18 @@ def continued_text(figures: Mapping[str, float], law: str) -> str:
         return ""
     fine, coarse = (1e3 * figures[f"extrapolated/{name}"] for name in ("dx_m", "coarse_dx_m"))
     lines = [f"On grids of {fine:.3g} and {coarse:.3g} mm, and continued to 0:", ""]
-    for name in (k.removeprefix("extrapolated/").removesuffix("_coarse") for k in figures if k.endswith("_coarse")):
-        values = (figures[f"id/{name}"], *(figures[f"extrapolated/{name}{end}"] for end in ("_coarse", "", "_sd")))
-        lines.append("- {}: {:.4g}, {:.4g}, **{:.4g}** +- {:.2g}".format(with_unit(law, name), *values))
+    for name in (
+        k.removeprefix("extrapolated/").removesuffix("_coarse")
+        for k in figures
+        if k.endswith("_coarse")
+    ):
+        values = (
+            figures[f"id/{name}"],
+            *(figures[f"extrapolated/{name}{end}"] for end in ("_coarse", "", "_sd")),
+        )
+        lines.append(
+            "- {}: {:.4g}, {:.4g}, **{:.4g}** +- {:.2g}".format(with_unit(law, name), *values)
+        )
     return "\n".join(lines)
 
 
@@ -198,20 +280,36 @@ def geometry_lines(figures: Mapping[str, float]) -> str:
         lines.append(
             f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not "
             "told by the images to 0.7 particle spacings and is guessed between outlines; "
-            f"{get('free_frames'):.0f} free frames were used.")
+            f"{get('free_frames'):.0f} free frames were used."
+        )
     elif get("carved_share") is not None:
-        lines.append(f"Geometry: the visual hull, {get('carved_share'):.1%} of it rounded away; no colours were asked.")
-    true = {name.rsplit("/", 1)[1]: value for name, value in figures.items() if name.startswith("floor/geometry/")}
+        lines.append(
+            f"Geometry: the visual hull, {get('carved_share'):.1%} of it rounded away; no colours were asked."
+        )
+    true = {
+        name.rsplit("/", 1)[1]: value
+        for name, value in figures.items()
+        if name.startswith("floor/geometry/")
+    }
     if true:
         lines.append(
             f"Against the true shape: {true['outside_share']:.2%} of the particles outside, {true['missing_share']:.2%} of the "
-            f"body missing, volume {true['volume_error']:+.2%}, centre of mass {true['center_error_m'] * 1e3:.2f} mm off.")
+            f"body missing, volume {true['volume_error']:+.2%}, centre of mass {true['center_error_m'] * 1e3:.2f} mm off."
+        )
     return "\n".join(lines)
 
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:
     """A padded markdown table."""
     widths = [max(len(str(r[i])) for r in [header, *rows]) for i in range(len(header))]
+
     def line(cells) -> str:
         return "| " + " | ".join(str(c).ljust(w) for c, w in zip(cells, widths)) + " |"
-    return "\n".join([line(header), "|" + "|".join("-" * (w + 2) for w in widths) + "|", *(line(r) for r in rows)])
+
+    return "\n".join(
+        [
+            line(header),
+            "|" + "|".join("-" * (w + 2) for w in widths) + "|",
+            *(line(r) for r in rows),
+        ]
+    )

@@ -55,23 +55,45 @@ def vibration_growth(
     """
     E = longitudinal_modulus(material)
     dx, spacing = 1.0, 0.5
-    axes = [torch.arange(n, dtype=torch.float64) * spacing + spacing / 2 for n in (4 * cells, 2 * cells, 2 * cells)]
+    axes = [
+        torch.arange(n, dtype=torch.float64) * spacing + spacing / 2
+        for n in (4 * cells, 2 * cells, 2 * cells)
+    ]
     x = torch.cartesian_prod(*axes)
     n, length, speed = len(x), 2.0 * cells * dx, math.sqrt(E / density)
     k = math.pi / length
     v, C = torch.zeros(n, 3).double(), torch.zeros(n, 3, 3).double()
-    v[:, 0], C[:, 0, 0] = -amplitude * speed * torch.cos(k * x[:, 0]), amplitude * speed * k * torch.sin(k * x[:, 0])
+    v[:, 0], C[:, 0, 0] = (
+        -amplitude * speed * torch.cos(k * x[:, 0]),
+        amplitude * speed * k * torch.sin(k * x[:, 0]),
+    )
     F = torch.eye(3).double().expand(n, 3, 3).contiguous()
     frame_dt = 2 * length / speed / FRAMES
     margin = ADAPTER_MARGIN if adapter is None else adapter.stiffening(material.poisson())
-    rate = step_rate(math.sqrt(margin * float(material.max_modulus()) / density), float(material.max_viscosity()), density, dx,
-                     amplitude * speed, 0.5)
+    rate = step_rate(
+        math.sqrt(margin * float(material.max_modulus()) / density),
+        float(material.max_viscosity()),
+        density,
+        dx,
+        amplitude * speed,
+        0.5,
+    )
     needed = math.ceil(frame_dt * rate)
     steady = adapter is None or adapter.steady
     substeps = needed if steady else -(-needed // stride) * stride
-    simulator = Simulator(material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64,
-                          strain=None if adapter is None else adapter.strain, options=law_options)
-    parameters = {name: value.detach().double().cpu() for name, value in material.per_particle().items()}
+    simulator = Simulator(
+        material.law,
+        dx=dx,
+        substeps=substeps,
+        frame_dt=frame_dt,
+        gravity=(0, 0, 0),
+        dtype=torch.float64,
+        strain=None if adapter is None else adapter.strain,
+        options=law_options,
+    )
+    parameters = {
+        name: value.detach().double().cpu() for name, value in material.per_particle().items()
+    }
     held = None if adapter is None else adapter.in_double()
     if held is not None:
         held.follow(material.poisson().double().cpu())  # whatever it followed last
@@ -87,6 +109,12 @@ def vibration_growth(
     if adapter is None or adapter.strain is not None:
         # modes that meet lend kinetic energy to strain for a period and give it back: that is no growth where the law has an
         # energy. What it had before, the start's, is a bound. A law without one has to be caught while it grows from little
-        return max(later / before for before, later in zip(itertools.accumulate(maxima, max), maxima[1:]))
-    ratios = [later / earlier for earlier, later in itertools.pairwise(maxima) if earlier > NEGLIGIBLE * maxima[0]]
+        return max(
+            later / before for before, later in zip(itertools.accumulate(maxima, max), maxima[1:])
+        )
+    ratios = [
+        later / earlier
+        for earlier, later in itertools.pairwise(maxima)
+        if earlier > NEGLIGIBLE * maxima[0]
+    ]
     return max(ratios, default=0.0)

@@ -34,7 +34,9 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
     "NeuMA": {"color": "#23803c"},
     "black box": {"color": "#7a5ab5"},
     "four networks (paper)": {"color": "#f2a12e"},
-    "full": {"color": "#f2a12e"},  # of the ablations: the same four networks with all of their parts
+    "full": {
+        "color": "#f2a12e"
+    },  # of the ablations: the same four networks with all of their parts
     "ours": {"color": "#d4111f", "linewidth": 2.6, "zorder": 3},
 }
 """How a method is drawn in every picture, by its name in conf/experiment/paper/_shared.yaml."""
@@ -78,9 +80,14 @@ def say_cut(place) -> None:
     """Adds to the label of the y axis where it begins, unless it shows the 0."""
     low, high = place.get_ylim()
     if not low <= 0 <= high:
-        said = f"{'logarithmic axis from' if place.get_yscale() == 'log' else 'axis cut at'} {low:.4g}"
+        said = (
+            f"{'logarithmic axis from' if place.get_yscale() == 'log' else 'axis cut at'} {low:.4g}"
+        )
         known = place.get_ylabel()
-        place.set_ylabel(f"{known} ({said})" if known else said, fontsize=place.yaxis.label.get_size() if known else 8)
+        place.set_ylabel(
+            f"{known} ({said})" if known else said,
+            fontsize=place.yaxis.label.get_size() if known else 8,
+        )
 
 
 def wide(values: Sequence[float]) -> bool:
@@ -128,20 +135,34 @@ def save(canvas: Canvas, stem: Path) -> Path:
     """<stem>.png and .pdf; the path of the first."""
     with matplotlib.rc_context({"pdf.fonttype": 42}):
         with written_whole(stem.with_suffix(".pdf")) as partial:
-            canvas.savefig(partial, format="pdf", bbox_inches="tight", metadata={"CreationDate": None})
+            canvas.savefig(
+                partial, format="pdf", bbox_inches="tight", metadata={"CreationDate": None}
+            )
         with written_whole(stem.with_suffix(".png")) as partial:
-            canvas.savefig(partial, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None})
+            canvas.savefig(
+                partial, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None}
+            )
     return stem.with_suffix(".png")
 
 
 def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     """The experiment's picture, None where no job is complete."""
-    if not any(cell is not None and cell.count for rows in tables.values() for cells in rows.values() for cell in cells.values()):
+    if not any(
+        cell is not None and cell.count
+        for rows in tables.values()
+        for cells in rows.values()
+        for cell in cells.values()
+    ):
         return None
     names = list(next(iter(tables.values())))
     if experiment.plot == "bars":  # a row that nothing was run of would take a place
-        run = {row for rows in tables.values() for row, cells in rows.items() if any(cells.values())}
-        tables = {label: {row: cells for row, cells in rows.items() if row in run} for label, rows in tables.items()}
+        run = {
+            row for rows in tables.values() for row, cells in rows.items() if any(cells.values())
+        }
+        tables = {
+            label: {row: cells for row, cells in rows.items() if row in run}
+            for label, rows in tables.items()
+        }
     elif experiment.plot == "lines":
         names = [option.name for option in experiment.axes[experiment.columns]]
     styles = {name: style_of(name, names) for name in names}
@@ -150,7 +171,10 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     many = experiment.plot == "bars" and len(shown) * max(map(len, shown.values())) > MANY
     across = 1 if many or count == 1 else 2
     down = -(-count // across)
-    canvas = Canvas(figsize=(WIDTH, 0.6 + (2.3 if many else 3.4 if down == 1 else 2.8) * down), layout="constrained")
+    canvas = Canvas(
+        figsize=(WIDTH, 0.6 + (2.3 if many else 3.4 if down == 1 else 2.8) * down),
+        layout="constrained",
+    )
     places = canvas.subplots(down, across, squeeze=False).ravel()
     for place in places[count:]:
         place.remove()
@@ -159,23 +183,49 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
         place.set_title(figure.label + BETTER[figure.best], fontsize=10)
         how(place, experiment, tables[figure.label], figure, styles)
     if experiment.plot != "map":
-        legend(canvas, names, chain.from_iterable(tables[figure.label].values() for figure in experiment.figures))
-    elif any(cell is None for rows in tables.values() for cells in rows.values() for cell in cells.values()):
+        legend(
+            canvas,
+            names,
+            chain.from_iterable(tables[figure.label].values() for figure in experiment.figures),
+        )
+    elif any(
+        cell is None
+        for rows in tables.values()
+        for cells in rows.values()
+        for cell in cells.values()
+    ):
         canvas.supxlabel("white: not run", fontsize=9)
     return canvas
 
 
 def legend(
-    canvas: Canvas, names: Sequence[str], cells_of_rows: Iterable[Mapping[str, Cell | None]] = (), without: str = "not run"
+    canvas: Canvas,
+    names: Sequence[str],
+    cells_of_rows: Iterable[Mapping[str, Cell | None]] = (),
+    without: str = "not run",
 ) -> None:
     """One above all parts, in the order of `names`, with the words for the marks and gaps of these cells. without: what is said of
     those of `names` that no part shows."""
-    known = {text: handle for place in canvas.axes for handle, text in zip(*place.get_legend_handles_labels())}
-    ordered = [name for name in names if name in known] + [text for text in known if text not in names]
+    known = {
+        text: handle
+        for place in canvas.axes
+        for handle, text in zip(*place.get_legend_handles_labels())
+    }
+    ordered = [name for name in names if name in known] + [
+        text for text in known if text not in names
+    ]
     handles = [known[name] for name in ordered]
     rows = list(cells_of_rows)
-    marks = {mark_of(cell) for row in rows for cell in row.values() if cell is not None and not np.isfinite(cell.mean)}
-    handles += [Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark]) for mark in sorted(marks, reverse=True)]
+    marks = {
+        mark_of(cell)
+        for row in rows
+        for cell in row.values()
+        if cell is not None and not np.isfinite(cell.mean)
+    }
+    handles += [
+        Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
+        for mark in sorted(marks, reverse=True)
+    ]
     words = []
     if any(cell is None for row in rows for column, cell in row.items() if column != "mean"):
         words.append("gap: not run")
@@ -187,7 +237,14 @@ def legend(
         canvas.supxlabel("; ".join(words), fontsize=9)
     if len(handles) > 1:
         labels = [*ordered, *(handle.get_label() for handle in handles[len(ordered) :])]
-        canvas.legend(handles, labels, loc="outside upper center", ncols=min(len(handles), 5), fontsize=9, frameon=False)
+        canvas.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=min(len(handles), 5),
+            fontsize=9,
+            frameon=False,
+        )
 
 
 def mark_of(cell: Cell) -> str:
@@ -202,17 +259,28 @@ def marked(place, at: float, cell: Cell, color: str) -> None:
 
 
 def bars(
-    place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], figure: Figure, styles: Mapping[str, Mapping]
+    place,
+    experiment: Experiment,
+    rows: Mapping[str, Mapping[str, Cell | None]],
+    figure: Figure,
+    styles: Mapping[str, Mapping],
 ) -> None:
     """A group of bars for each column, a bar for each row; one of MARKS where it has no finite mean."""
     columns = list(next(iter(rows.values())))
     width, least, values = 0.84 / len(rows), np.inf, []
     for i, (row, cells) in enumerate(rows.items()):
-        color, at = styles[row]["color"], [j - 0.42 + width * (i + 0.5) for j in range(len(columns))]
+        color, at = (
+            styles[row]["color"],
+            [j - 0.42 + width * (i + 0.5) for j in range(len(columns))],
+        )
         for x, column in zip(at, columns):
             if cells.get(column) is not None and not np.isfinite(cells[column].mean):
                 marked(place, x, cells[column], color)
-        found = [(x, cells[c]) for x, c in zip(at, columns) if cells.get(c) is not None and np.isfinite(cells[c].mean)]
+        found = [
+            (x, cells[c])
+            for x, c in zip(at, columns)
+            if cells.get(c) is not None and np.isfinite(cells[c].mean)
+        ]
         if not found:
             place.bar([], [], label=row, color=color)
             continue
@@ -229,7 +297,11 @@ def bars(
 
 
 def lines(
-    place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], figure: Figure, styles: Mapping[str, Mapping]
+    place,
+    experiment: Experiment,
+    rows: Mapping[str, Mapping[str, Cell | None]],
+    figure: Figure,
+    styles: Mapping[str, Mapping],
 ) -> None:
     """A line for each column over the rows, at their values where these are numbers; a bar of one standard deviation where there
     are several seeds."""
@@ -238,14 +310,20 @@ def lines(
     at = [option.value if numeric else i for i, option in enumerate(options)]
     least, values = np.inf, []
     for column, style in styles.items():
-        cells = [(x, rows[o.name][column]) for x, o in zip(at, options) if rows[o.name].get(column) is not None]
+        cells = [
+            (x, rows[o.name][column])
+            for x, o in zip(at, options)
+            if rows[o.name].get(column) is not None
+        ]
         for x, cell in cells:
             if not np.isfinite(cell.mean):
                 marked(place, x, cell, style["color"])
         found = [(x, cell) for x, cell in cells if np.isfinite(cell.mean)]
         if not found:
             continue
-        place.plot([x for x, _ in found], [c.mean for _, c in found], marker=".", label=column, **style)
+        place.plot(
+            [x for x, _ in found], [c.mean for _, c in found], marker=".", label=column, **style
+        )
         if spread := [(x, c) for x, c in found if c.sd is not None]:
             place.errorbar([x for x, _ in spread], [c.mean for _, c in spread], yerr=[c.sd for _, c in spread], fmt="none",
                            ecolor=style["color"], elinewidth=1.0, capsize=2)  # fmt: skip
@@ -258,28 +336,67 @@ def lines(
 
 
 def heat_map(
-    place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], figure: Figure, styles: Mapping[str, Mapping]
+    place,
+    experiment: Experiment,
+    rows: Mapping[str, Mapping[str, Cell | None]],
+    figure: Figure,
+    styles: Mapping[str, Mapping],
 ) -> None:
     """Rows downwards, columns to the right, each cell with its number, the better the lighter; what was not run stays white, what
     diverged or failed says so. The cells of MARKED have a frame and their name."""
     options = experiment.axes[experiment.columns]
     cells = [[of.get(option.name) for option in options] for of in rows.values()]
-    values = np.array([[np.nan if cell is None or not np.isfinite(cell.mean) else cell.mean for cell in row] for row in cells])
-    image = place.imshow(values, aspect="auto", cmap="viridis_r" if figure.best == "least" else "viridis")
+    values = np.array(
+        [
+            [np.nan if cell is None or not np.isfinite(cell.mean) else cell.mean for cell in row]
+            for row in cells
+        ]
+    )
+    image = place.imshow(
+        values, aspect="auto", cmap="viridis_r" if figure.best == "least" else "viridis"
+    )
     if np.isfinite(values).any():
         middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
         for (i, j), value in np.ndenumerate(values):
             if np.isfinite(value):
                 color = "white" if (value < middle) != (figure.best == "least") else "black"
-                place.text(j, i, f"{value:.{figure.decimals}f}", ha="center", va="center", fontsize=9, color=color)
+                place.text(
+                    j,
+                    i,
+                    f"{value:.{figure.decimals}f}",
+                    ha="center",
+                    va="center",
+                    fontsize=9,
+                    color=color,
+                )
             elif cells[i][j] is not None:
-                place.text(j, i, MARKS[mark_of(cells[i][j])], ha="center", va="center", fontsize=8, color="0.3")
-    down, right = experiment.axes[experiment.rows], {option.value: j for j, option in enumerate(options)}
+                place.text(
+                    j,
+                    i,
+                    MARKS[mark_of(cells[i][j])],
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="0.3",
+                )
+    down, right = (
+        experiment.axes[experiment.rows],
+        {option.value: j for j, option in enumerate(options)},
+    )
     for what, (of_row, of_column) in MARKED.get((experiment.rows, experiment.columns), {}).items():
         for i, option in enumerate(down):
             if option.value == of_row and of_column in right:
                 j = right[of_column]
-                place.add_patch(Rectangle((j - 0.48, i - 0.47), 0.96, 0.94, fill=False, edgecolor="#d4111f", linewidth=2.2))
+                place.add_patch(
+                    Rectangle(
+                        (j - 0.48, i - 0.47),
+                        0.96,
+                        0.94,
+                        fill=False,
+                        edgecolor="#d4111f",
+                        linewidth=2.2,
+                    )
+                )
                 place.annotate(what, (j, i + 0.34), ha="center", va="center", fontsize=7.5, color="black",
                                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
     place.set_xticks(range(len(options)), [option.name for option in options], fontsize=9)

@@ -41,11 +41,18 @@ figures made here; the paper's own; and what of the claims holds here.
   complete."""
 
 
-def write_json(path: Path, tables: Tables, extra: str, lines: Sequence[str], pictures: Sequence[Path]) -> None:
+def write_json(
+    path: Path, tables: Tables, extra: str, lines: Sequence[str], pictures: Sequence[Path]
+) -> None:
     """What the page needs of an experiment's results. extra: what its analysis says; lines: where the figures come from."""
     cells = {label: {row: {c: None if cell is None else [cell.mean, cell.sd, cell.count] for c, cell in found.items()}
                      for row, found in rows.items()} for label, rows in tables.items()}  # fmt: skip
-    found = {"cells": cells, "extra": extra, "provenance": list(lines), "pictures": [picture.name for picture in pictures]}
+    found = {
+        "cells": cells,
+        "extra": extra,
+        "provenance": list(lines),
+        "pictures": [picture.name for picture in pictures],
+    }
     with written_whole(path) as partial:
         partial.write_text(json.dumps(found, indent=1) + "\n")
 
@@ -60,7 +67,9 @@ def read_tables(path: Path) -> tuple[Tables, dict[str, Any]] | None:
                           for row, cells in rows.items()} for label, rows in found["cells"].items()}  # fmt: skip
         return tables, {name: found[name] for name in EMPTY}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{path}: not the results of an experiment ({error}); write them again with --collect") from error
+        raise DataError(
+            f"{path}: not the results of an experiment ({error}); write them again with --collect"
+        ) from error
 
 
 def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
@@ -73,28 +82,59 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         parts.append(f"## {experiment.title}\n\n{experiment.note.strip()}")
         found = read_tables(results / f"{name}.json")
         tables, about = found if found is not None else ({}, EMPTY)
-        known = {option.name for option in experiment.axes[experiment.rows]}  # results of before may have other rows
-        tables = {label: {row: cells for row, cells in rows.items() if row in known} for label, rows in tables.items()}
-        lines.append([experiment.title, *state_of(about["provenance"]), *claims_of(experiment, tables)])
+        known = {
+            option.name for option in experiment.axes[experiment.rows]
+        }  # results of before may have other rows
+        tables = {
+            label: {row: cells for row, cells in rows.items() if row in known}
+            for label, rows in tables.items()
+        }
+        lines.append(
+            [experiment.title, *state_of(about["provenance"]), *claims_of(experiment, tables)]
+        )
         parts += older(about["provenance"])
-        if any(cell for rows in tables.values() for cells in rows.values() for cell in cells.values()):
+        if any(
+            cell for rows in tables.values() for cells in rows.values() for cell in cells.values()
+        ):
             parts += [ours(experiment, tables)] if experiment.listed else []
         else:
             parts.append(f"Here: {NOT_RUN}. `mosa-experiment {name}`")
         if about["extra"]:
             parts.append(about["extra"])
-        parts += [f"![{experiment.title}]({results.name}/{picture})" for picture in about["pictures"]]
+        parts += [
+            f"![{experiment.title}]({results.name}/{picture})" for picture in about["pictures"]
+        ]
         if experiment.printed is not None:
             parts.append(printed_table(experiment.printed))
         if experiment.claims:
-            parts.append("\n".join(f"- {claim.text}: **{verdict(experiment, claim, tables)}**" for claim in experiment.claims))
+            parts.append(
+                "\n".join(
+                    f"- {claim.text}: **{verdict(experiment, claim, tables)}**"
+                    for claim in experiment.claims
+                )
+            )
         if about["provenance"]:
-            parts.append(f"All of it: [{name}.md]({results.name}/{name}.md). " + "; ".join(about["provenance"]) + ".")
-    beside = [f"[{read_title(page)}]({results.name}/{page.name})" for page in sorted(results.glob("*_from_motion.md"))]
+            parts.append(
+                f"All of it: [{name}.md]({results.name}/{name}.md). "
+                + "; ".join(about["provenance"])
+                + "."
+            )
+    beside = [
+        f"[{read_title(page)}]({results.name}/{page.name})"
+        for page in sorted(results.glob("*_from_motion.md"))
+    ]
     if beside:
-        parts.append(f"## Without images\n\nLaws that were learned from the true motion of a body: {', '.join(beside)}.")
+        parts.append(
+            f"## Without images\n\nLaws that were learned from the true motion of a body: {', '.join(beside)}."
+        )
     page = results.parent / "results.md"
-    header = ["", "jobs complete", "commit (changes of the program since)", "the paper's claims", "claims about ours"]
+    header = [
+        "",
+        "jobs complete",
+        "commit (changes of the program since)",
+        "the paper's claims",
+        "claims about ours",
+    ]
     whole = [INTRODUCTION, markdown(header, lines), *parts]
     write_whole(page, "\n\n".join(whole) + "\n")
     return page
@@ -125,7 +165,9 @@ def claims_of(experiment: Experiment, tables: Tables) -> tuple[str, str]:
     counts: tuple[Counter, Counter] = Counter(), Counter()
     for claim in experiment.claims:
         said = verdict(experiment, claim, tables)
-        counts[claim.most is not None or claim.row == OURS][next(begins for begins in OUTCOMES if said.startswith(begins))] += 1
+        counts[claim.most is not None or claim.row == OURS][
+            next(begins for begins in OUTCOMES if said.startswith(begins))
+        ] += 1
     of_paper, of_ours = (", ".join(f"{found[begins]} {words[found[begins] > 1]}" for begins, words in OUTCOMES.items()
                                    if found[begins]) for found in counts)  # fmt: skip
     return of_paper, of_ours
@@ -145,7 +187,10 @@ def older(lines: Sequence[str]) -> list[str]:
 def ours(experiment: Experiment, tables: Tables) -> str:
     """A table of all figures: a column for each figure where there is one column, else figures side by side in a cell."""
     figures = [figure for figure in experiment.figures if figure.label in tables]
-    rows, columns = list(tables[figures[0].label]), list(next(iter(tables[figures[0].label].values())))
+    rows, columns = (
+        list(tables[figures[0].label]),
+        list(next(iter(tables[figures[0].label].values()))),
+    )
 
     def text(figure: Figure, row: str, column: str) -> str:
         found = tables[figure.label].get(row, {}).get(column)
@@ -154,35 +199,70 @@ def ours(experiment: Experiment, tables: Tables) -> str:
     if len(columns) == 1:
         shown = [f for f in figures if any(text(f, row, columns[0]) for row in rows)]
         lines = [[row, *(text(f, row, columns[0]) for f in shown)] for row in rows]
-        lines = [[row, *cells] if any(cells) else [row, NOT_RUN, *([""] * (len(shown) - 1))] for row, *cells in lines]
-        return f"Here ({columns[0]}):\n\n" + markdown([experiment.rows, *(f.label for f in shown)], lines)
+        lines = [
+            [row, *cells] if any(cells) else [row, NOT_RUN, *([""] * (len(shown) - 1))]
+            for row, *cells in lines
+        ]
+        return f"Here ({columns[0]}):\n\n" + markdown(
+            [experiment.rows, *(f.label for f in shown)], lines
+        )
     lines = []
     for row in rows:
         cells = [[text(f, row, column) for f in figures] for column in columns]
-        lines.append([row, *(side_by_side(values, "-" if column == "mean" else NOT_RUN) for column, values in zip(columns, cells))])
+        lines.append(
+            [
+                row,
+                *(
+                    side_by_side(values, "-" if column == "mean" else NOT_RUN)
+                    for column, values in zip(columns, cells)
+                ),
+            ]
+        )
     said = said_below(tables)
-    header = [f"{experiment.rows} \\ {experiment.columns}" if experiment.plot == "map" else experiment.rows, *columns]
-    return f"Here ({' / '.join(f.label for f in figures)}):\n\n" + markdown(header, lines) + (f"\n\n{said}" if said else "")
+    header = [
+        f"{experiment.rows} \\ {experiment.columns}"
+        if experiment.plot == "map"
+        else experiment.rows,
+        *columns,
+    ]
+    return (
+        f"Here ({' / '.join(f.label for f in figures)}):\n\n"
+        + markdown(header, lines)
+        + (f"\n\n{said}" if said else "")
+    )
 
 
 def side_by_side(values: Sequence[str], without: str) -> str:
     """Figures of a cell; one word where all say it; without: where there are none."""
-    return values[0] if len(set(values)) == 1 and values[0] in INSTEAD else (
-        " / ".join(values) if any(values) else without)
+    return (
+        values[0]
+        if len(set(values)) == 1 and values[0] in INSTEAD
+        else (" / ".join(values) if any(values) else without)
+    )
 
 
 def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
     """What the tables say of a claim, in words and figures."""
     figure = next(f for f in experiment.figures if f.label == claim.figure)
     rows = tables.get(claim.figure, {})
-    return within(experiment, claim, rows, tables) if claim.most is not None else ahead(figure, claim, rows)
+    return (
+        within(experiment, claim, rows, tables)
+        if claim.most is not None
+        else ahead(figure, claim, rows)
+    )
 
 
 def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | None:
     """The cell of a column; of none the mean, or the only one."""
     if column is not None:
         return cells.get(column)
-    return cells["mean"] if "mean" in cells else next(iter(cells.values())) if len(cells) == 1 else None
+    return (
+        cells["mean"]
+        if "mean" in cells
+        else next(iter(cells.values()))
+        if len(cells) == 1
+        else None
+    )
 
 
 @dataclass(frozen=True)
@@ -197,26 +277,39 @@ class Compared:
     of: int
 
 
-def compared(mine: Mapping[str, Cell | None], other: Mapping[str, Cell | None], column: str | None, sign: int) -> Compared | None:
+def compared(
+    mine: Mapping[str, Cell | None], other: Mapping[str, Cell | None], column: str | None, sign: int
+) -> Compared | None:
     """None where they share no column. sign: 1 where more is better, -1 where less is."""
-    names = [column] if column is not None else [each for each in mine if each != "mean"] or list(mine)
+    names = (
+        [column] if column is not None else [each for each in mine if each != "mean"] or list(mine)
+    )
     run = [each for each in names if mine.get(each) is not None and other.get(each) is not None]
-    shared = [each for each in run if math.isfinite(mine[each].mean) and math.isfinite(other[each].mean)]
+    shared = [
+        each for each in run if math.isfinite(mine[each].mean) and math.isfinite(other[each].mean)
+    ]
     if not shared:
         return None
     better = sum(1 for each in run if math.isfinite(mine[each].mean)
                  and not (each in shared and sign * (mine[each].mean - other[each].mean) <= 0))  # fmt: skip
     means = (mine.get("mean"), other.get("mean"))
     if len(shared) < len(names) or column is not None or None in means:
-        means = (averaged([mine[each] for each in shared]), averaged([other[each] for each in shared]))
-    return Compared(means[0], means[1], tuple(each for each in names if each not in shared), better, len(run))
+        means = (
+            averaged([mine[each] for each in shared]),
+            averaged([other[each] for each in shared]),
+        )
+    return Compared(
+        means[0], means[1], tuple(each for each in names if each not in shared), better, len(run)
+    )
 
 
 def averaged(cells: Sequence[Cell]) -> Cell:
     """Mean of means; their seeds differ independently."""
     sds = [each.sd for each in cells]
     sd = None if None in sds else math.sqrt(sum(each**2 for each in sds)) / len(sds)
-    return Cell(sum(each.mean for each in cells) / len(cells), sd, min(each.count for each in cells))
+    return Cell(
+        sum(each.mean for each in cells) / len(cells), sd, min(each.count for each in cells)
+    )
 
 
 def outcome(found: Compared, sign: int, spread: float) -> str:
@@ -245,35 +338,62 @@ def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | N
         own = each.mine.text(figure.decimals)
         notes = [row] + ([f"better in {each.better} of {each.of}"] if each.of > 1 else [])
         notes += [f"without {', '.join(each.without)}"] if each.without else []
-        parts.append(("" if own == last else f"{own} against ") + f"{each.other.text(figure.decimals)} ({'; '.join(notes)})")
+        parts.append(
+            ("" if own == last else f"{own} against ")
+            + f"{each.other.text(figure.decimals)} ({'; '.join(notes)})"
+        )
         last = own
     text = f"{word}, " + ", ".join(parts)
     one = any(each.mine.sd is None for each in known.values())
-    return text + (f"; {NOT_RUN}: {', '.join(missing)}" if missing else "") + ("; one seed" if one else "")
+    return (
+        text
+        + (f"; {NOT_RUN}: {', '.join(missing)}" if missing else "")
+        + ("; one seed" if one else "")
+    )
 
 
-def ahead_in_each(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], sign: int) -> str:
+def ahead_in_each(
+    figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], sign: int
+) -> str:
     """Whether a row is better than all others in every column, with those in which it is not."""
     mine = rows.get(claim.row, {})
     known: dict[str, str] = {}
     for column in mine:
-        others = {row: cell for row in claim.against if (cell := rows.get(row, {}).get(column)) is not None}
+        others = {
+            row: cell
+            for row in claim.against
+            if (cell := rows.get(row, {}).get(column)) is not None
+        }
         if column == "mean" or mine[column] is None or not others:
             continue
         if not math.isfinite(mine[column].mean):
             known[column] = f"{column}: {mine[column].text(figure.decimals)}"
             continue
-        found = {row: compared(mine, rows[row], column, sign) for row in others}  # None: the other one diverged
-        bad = [row for row, each in found.items() if each is not None and outcome(each, sign, claim.spread) != "ahead"]
-        known[column] = "" if not bad else f"{column}: {mine[column].text(figure.decimals)} against " + ", ".join(
-            f"{others[row].text(figure.decimals)} ({row})" for row in bad)
+        found = {
+            row: compared(mine, rows[row], column, sign) for row in others
+        }  # None: the other one diverged
+        bad = [
+            row
+            for row, each in found.items()
+            if each is not None and outcome(each, sign, claim.spread) != "ahead"
+        ]
+        known[column] = (
+            ""
+            if not bad
+            else f"{column}: {mine[column].text(figure.decimals)} against "
+            + ", ".join(f"{others[row].text(figure.decimals)} ({row})" for row in bad)
+        )
     if not known:
         return NOT_RUN
     good = [column for column, said in known.items() if not said]
     text = "holds" if len(good) == len(known) else "does not hold"
-    text += f", ahead in {len(good)} of {len(known)}" + (f" ({', '.join(good)})" if good and len(good) < len(known) else "")
+    text += f", ahead in {len(good)} of {len(known)}" + (
+        f" ({', '.join(good)})" if good and len(good) < len(known) else ""
+    )
     text += "".join(f"; {said}" for said in known.values() if said)
-    return text + ("; one seed" if all(cell is None or cell.sd is None for cell in mine.values()) else "")
+    return text + (
+        "; one seed" if all(cell is None or cell.sd is None for cell in mine.values()) else ""
+    )
 
 
 def covered(off: float, sd: float, scale: float | None) -> bool:
@@ -286,7 +406,12 @@ def covered(off: float, sd: float, scale: float | None) -> bool:
     return 2 * sd >= (math.log1p(off) if off >= 1 else -math.log1p(-off))
 
 
-def within(experiment: Experiment, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], tables: Tables) -> str:
+def within(
+    experiment: Experiment,
+    claim: Claim,
+    rows: Mapping[str, Mapping[str, Cell | None]],
+    tables: Tables,
+) -> str:
     """Of how many rows a figure is at most what is claimed; of the others, whether twice the posterior's deviation covers it."""
     known = {row: cell for row in rows if (cell := place_of(rows[row], claim.column)) is not None}
     if not known:
@@ -298,12 +423,18 @@ def within(experiment: Experiment, claim: Claim, rows: Mapping[str, Mapping[str,
         if (sd := place_of(tables.get(claim.unless, {}).get(row, {}), claim.column)) is not None
         and covered(cell.mean, sd.mean, scales.get(claim.unless))]  # fmt: skip
     wrong = {row: cell for row, cell in above.items() if row not in unsure}
-    undetermined = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
+    undetermined = (
+        "none is determined" if len(unsure) == len(known) else "holds where it is determined"
+    )
     text = f"{'holds' if not above else 'does not hold' if wrong else undetermined}, "
     unit = match[1] if (match := re.search(r"\[(.+)\]$", claim.figure)) else ""
     text += f"{len(known) - len(above)} of {len(known)} within {claim.most:g} {unit}".rstrip()
     if unsure:
-        text += "; not determined, and the posterior says so: " + ", ".join(f"{row} ({above[row].text(1)})" for row in unsure)
+        text += "; not determined, and the posterior says so: " + ", ".join(
+            f"{row} ({above[row].text(1)})" for row in unsure
+        )
     if wrong:
-        text += "; beyond it: " + ", ".join(f"{row} ({cell.text(1)})" for row, cell in wrong.items())
+        text += "; beyond it: " + ", ".join(
+            f"{row} ({cell.text(1)})" for row, cell in wrong.items()
+        )
     return text

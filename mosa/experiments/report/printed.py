@@ -16,4 +16,6 @@ def printed_table(name: str) -> str:
     entry = yaml.safe_load(PRINTED.read_text())[name]
     lines = [[row, *(" / ".join("" if v is None else str(v) for v in values) for values in cells)]
              for row, cells in entry["rows"].items()]  # fmt: skip
-    return f"The paper prints ({entry['title']}; {' / '.join(entry['labels'])}):\n\n" + markdown(["", *entry["columns"]], lines)
+    return f"The paper prints ({entry['title']}; {' / '.join(entry['labels'])}):\n\n" + markdown(
+        ["", *entry["columns"]], lines
+    )

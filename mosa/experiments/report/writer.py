@@ -15,7 +15,9 @@ class Writer:
 
     def __init__(self, planned: Mapping[str, Sequence[Job]], write: Callable[[str], None]) -> None:
         self.write = write
-        self.left: dict[str, set[Path]] = {name: {j.folder for j in jobs if not j.finished} for name, jobs in planned.items()}
+        self.left: dict[str, set[Path]] = {
+            name: {j.folder for j in jobs if not j.finished} for name, jobs in planned.items()
+        }
         self.pool = ThreadPoolExecutor(1)
         self.begun: dict[str, Future] = {}
 
@@ -38,7 +40,9 @@ class Writer:
         for name in self.left:
             if name not in self.begun:
                 self.begin(name)
-        failed = [error for future in self.begun.values() if (error := future.exception()) is not None]
+        failed = [
+            error for future in self.begun.values() if (error := future.exception()) is not None
+        ]
         if failed:  # the others are written
             raise failed[0]
 

@@ -58,16 +58,25 @@ def markdown_page(
     for figure in experiment.figures:
         rows = tables[figure.label]
         header = [experiment.rows, *next(iter(rows.values()))]
-        body = [[row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])] for row in rows]
-        parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
+        body = [
+            [row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])]
+            for row in rows
+        ]
+        parts.append(
+            f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body)
+        )
     parts += [said] if (said := said_below(tables)) else []
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
     if experiment.printed is not None:
         parts.append(printed_table(experiment.printed))
-    missing = [f"{'failed' if job.failed else 'not run'}: {job.folder.name} ({' '.join(job.overrides)})"
-               + (f": {job.failed}" if job.failed else "") for job in jobs if not job.finished]
+    missing = [
+        f"{'failed' if job.failed else 'not run'}: {job.folder.name} ({' '.join(job.overrides)})"
+        + (f": {job.failed}" if job.failed else "")
+        for job in jobs
+        if not job.finished
+    ]
     parts.append("\n".join(f"- {line}" for line in (*lines, *missing)))
     return "\n\n".join(parts) + "\n"
 
@@ -77,7 +86,12 @@ def arrow(figure: Figure) -> str:
 
 
 def cell_text(
-    rows: Mapping[str, Mapping[str, Cell | None]], row: str, column: str, figure: Figure, bold: str, plus: str = "±"
+    rows: Mapping[str, Mapping[str, Cell | None]],
+    row: str,
+    column: str,
+    figure: Figure,
+    bold: str,
+    plus: str = "±",
 ) -> str:
     found = rows[row].get(column)
     if found is None:
@@ -86,11 +100,17 @@ def cell_text(
     return bold.format(text) if best_of(rows, column, figure.best) == row else text
 
 
-def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str) -> list[str]:
+def provenance(
+    experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str
+) -> list[str]:
     """What the figures come from: commit, seeds, machine, time."""
     complete = [job for job in jobs if job.finished]
     devices = sorted(
-        {str(record.figures["time/device"]) for record in records if record.figures and "time/device" in record.figures}
+        {
+            str(record.figures["time/device"])
+            for record in records
+            if record.figures and "time/device" in record.figures
+        }
     )
     minutes = [minutes_taken(job) or 0.0 for job in complete]
     return [
@@ -134,7 +154,9 @@ def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> 
                 )
 
 
-def latex(experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
+def latex(
+    experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
+) -> str:
     """A tabular for each figure; needs booktabs."""
     bold, parts = "{}" if experiment.plot == "map" else r"\textbf{{{}}}", []
     for figure in experiment.figures:

@@ -11,7 +11,13 @@ from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.modules.adapters import microplane
-from mosa.modules.adapters.penalties import PENALTIES, OperatorStatistics, Penalty, statistics, statistics_of
+from mosa.modules.adapters.penalties import (
+    PENALTIES,
+    OperatorStatistics,
+    Penalty,
+    statistics,
+    statistics_of,
+)
 from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
@@ -76,7 +82,10 @@ class Adapter(nn.Module, AdapterProtocol):
         return None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None}  # it holds a graph, which can be neither copied nor pickled
+        return {
+            **self.__dict__,
+            "_last": None,
+        }  # it holds a graph, which can be neither copied nor pickled
 
     def switch_on(self, reference_modulus: Tensor | float, poisson: Tensor | float = 0.3) -> None:
         """They never change afterwards: a moving unit would make dL/dE wrong and the law irreproducible from its weights."""
@@ -97,7 +106,9 @@ class Adapter(nn.Module, AdapterProtocol):
         if self.E_ref.is_cuda and torch.cuda.is_current_stream_capturing():
             return  # a capture may not look; the pass ran before it was captured
         if not self.is_on:
-            raise ConfigError("adapter: no reference modulus; call switch_on(E) with the calibrated prior's before simulating")
+            raise ConfigError(
+                "adapter: no reference modulus; call switch_on(E) with the calibrated prior's before simulating"
+            )
 
     def note(self, entries: Tensor) -> None:
         """Keep what the answer departs from the prior by, (N, K) dimensionless numbers that are 0 at the prior: penalties and
@@ -111,7 +122,9 @@ class Adapter(nn.Module, AdapterProtocol):
 
     def statistics(self) -> OperatorStatistics:
         if self._last is None:
-            raise ConfigError("adapter: statistics are those of the last evaluation, and there was none yet")
+            raise ConfigError(
+                "adapter: statistics are those of the last evaluation, and there was none yet"
+            )
         if isinstance(self._last, Tensor):
             return statistics_of(self._last)
         C, pre, post = self._last

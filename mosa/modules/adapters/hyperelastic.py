@@ -32,7 +32,10 @@ NUMBERS = 19
 """Symmetric 6 x 6 matrices have 21 numbers, of which two are isotropic: the prior's own."""
 
 
-CONTRASTS = ((math.sqrt(1 / 2), -math.sqrt(1 / 2), 0.0), (math.sqrt(1 / 6), math.sqrt(1 / 6), -math.sqrt(2 / 3)))
+CONTRASTS = (
+    (math.sqrt(1 / 2), -math.sqrt(1 / 2), 0.0),
+    (math.sqrt(1 / 6), math.sqrt(1 / 6), -math.sqrt(2 / 3)),
+)
 """What parts three numbers from their mean."""
 
 
@@ -51,8 +54,14 @@ def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
             E[i, j] = E[j, i] = value if i == j else half * value
         return E
 
-    normal, shear, coupled = [(0, 0), (1, 1), (2, 2)], [(3, 3), (4, 4), (5, 5)], [(1, 2), (0, 2), (0, 1)]
-    parts = [dict(zip(three, weights)) for three in (normal, shear, coupled) for weights in CONTRASTS]
+    normal, shear, coupled = (
+        [(0, 0), (1, 1), (2, 2)],
+        [(3, 3), (4, 4), (5, 5)],
+        [(1, 2), (0, 2), (0, 1)],
+    )
+    parts = [
+        dict(zip(three, weights)) for three in (normal, shear, coupled) for weights in CONTRASTS
+    ]
     means = {**dict.fromkeys(normal, math.sqrt(2 / 15)), **dict.fromkeys(shear, -math.sqrt(2 / 15)),
              **dict.fromkeys(coupled, -math.sqrt(1 / 15))}  # fmt: skip
     others = [{(i, j): 1.0} for i in range(6) for j in range(max(i + 1, 3), 6)]
@@ -61,9 +70,13 @@ def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def root_stiffness(poisson: Tensor) -> Tensor:
     """(6, 6) C0^(1/2) in Mandel scaling and units of sqrt(2 mu); poisson: () below 1/2."""
-    one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=poisson.dtype, device=poisson.device) / math.sqrt(3)
+    one = torch.tensor(
+        [1.0, 1, 1, 0, 0, 0], dtype=poisson.dtype, device=poisson.device
+    ) / math.sqrt(3)
     bulk = ((1 + poisson) / (1 - 2 * poisson)).sqrt()
-    return torch.eye(6, dtype=poisson.dtype, device=poisson.device) + (bulk - 1) * torch.outer(one, one)
+    return torch.eye(6, dtype=poisson.dtype, device=poisson.device) + (bulk - 1) * torch.outer(
+        one, one
+    )
 
 
 class HyperelasticAdapter(Adapter):
@@ -83,7 +96,10 @@ class HyperelasticAdapter(Adapter):
         self._live: Tensor | None = None
 
     def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "_live": None if self._live is None else self._live.detach()}
+        return {
+            **super().__getstate__(),
+            "_live": None if self._live is None else self._live.detach(),
+        }
 
     @property
     def steady(self) -> bool:
@@ -92,8 +108,10 @@ class HyperelasticAdapter(Adapter):
     def unsuited(self, law: Law) -> str | None:
         if "mu" in law.offsets and law.viscosity is None:
             return None
-        return (f"{law.name} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness modes "
-                "alone (adapter=mosa corrects its stress by networks)")
+        return (
+            f"{law.name} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness modes "
+            "alone (adapter=mosa corrects its stress by networks)"
+        )
 
     def share(self) -> Tensor:
         """beta () float64: how much of the prior's energy the law keeps, 1 at the prior, with its graph.
@@ -101,7 +119,9 @@ class HyperelasticAdapter(Adapter):
         The smallest eigenvalue of exp(A), smoothed: what is then added, C0 + S - beta C0, is positive but for 3 %, so that no
         direction loses its stiffness where the strain measure grows faster than the prior (Green's in tension)."""
         values = torch.linalg.eigvalsh(self._matrix())
-        return torch.exp((math.log(len(values)) - torch.logsumexp(-SHARPNESS * values, 0)) / SHARPNESS)
+        return torch.exp(
+            (math.log(len(values)) - torch.logsumexp(-SHARPNESS * values, 0)) / SHARPNESS
+        )
 
     def follow(self, poisson: Tensor) -> None:
         """The prior's Poisson number now, (), with its graph: C0 is that of the law in use, so that C0 + S stays positive."""
@@ -112,7 +132,11 @@ class HyperelasticAdapter(Adapter):
 
     def _matrix(self) -> Tensor:
         """A (6, 6) float64."""
-        return torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
+        return torch.einsum(
+            "k,kij->ij",
+            self.numbers.double(),
+            anisotropic_basis(torch.float64, self.numbers.device),
+        )
 
     def _exponential(self) -> Tensor:
         """exp(A) (6, 6) float64."""
@@ -164,4 +188,6 @@ class HyperelasticAdapter(Adapter):
     def statistics(self) -> OperatorStatistics:
         """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the
         numbers."""
-        return OperatorStatistics(self.relative().abs().mean(), self.numbers, torch.zeros_like(self.numbers))
+        return OperatorStatistics(
+            self.relative().abs().mean(), self.numbers, torch.zeros_like(self.numbers)
+        )

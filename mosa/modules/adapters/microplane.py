@@ -37,7 +37,9 @@ def _placement(dtype: torch.dtype, device: torch.device) -> Tensor:
     result = torch.zeros(3, 3, 3, 6, 6, dtype=dtype)
     for plane, components in enumerate(PLANES):
         for row, target in enumerate(components):
-            weight = 1.0 if target in (XX, YY, ZZ) else 0.5  # each shear appears on two planes and is their mean
+            weight = (
+                1.0 if target in (XX, YY, ZZ) else 0.5
+            )  # each shear appears on two planes and is their mean
             for column, source in enumerate(components):
                 result[plane, row, column, target, source] += weight
     return result.reshape(27, 36).to(device)
@@ -46,7 +48,9 @@ def _placement(dtype: torch.dtype, device: torch.device) -> Tensor:
 def lu_factors(numbers: Tensor) -> tuple[Tensor, Tensor]:
     """Entries of the factors, (L, U), each (..., 3, 3), from (..., 12): upper triangle row by row, then lower."""
     upper, lower = _triangles(numbers.dtype, numbers.device)
-    return (numbers[..., 6:] @ lower).unflatten(-1, (3, 3)), (numbers[..., :6] @ upper).unflatten(-1, (3, 3))
+    return (numbers[..., 6:] @ lower).unflatten(-1, (3, 3)), (numbers[..., :6] @ upper).unflatten(
+        -1, (3, 3)
+    )
 
 
 def correction(numbers: Tensor) -> Tensor:
@@ -70,7 +74,9 @@ def redistribution(planes: Tensor, normal: Tensor) -> Tensor:
 
 def with_normal(T: Tensor, normal: Tensor) -> Tensor:
     """`redistribution` of a plane operator T - I (N, 6, 6)."""
-    block = torch.nn.functional.pad(normal, (0, 3))  # C_xyz I, in the columns of the normal components
+    block = torch.nn.functional.pad(
+        normal, (0, 3)
+    )  # C_xyz I, in the columns of the normal components
     return torch.cat([T[..., :3, :] + block + normal @ T[..., :3, :], T[..., 3:, :]], -2)
 
 
@@ -88,7 +94,9 @@ def stepwise_planes(stress: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
 
     t_x, t_y, t_z = on_plane(C_x, xx, xy, zx), on_plane(C_y, yy, yz, xy), on_plane(C_z, zz, zx, yz)
     normals = torch.stack([t_x[:, 0], t_y[:, 0], t_z[:, 0]], -1)
-    shears = torch.stack([t_y[:, 1] + t_z[:, 2], t_x[:, 2] + t_z[:, 1], t_x[:, 1] + t_y[:, 2]], -1) / 2
+    shears = (
+        torch.stack([t_y[:, 1] + t_z[:, 2], t_x[:, 2] + t_z[:, 1], t_x[:, 1] + t_y[:, 2]], -1) / 2
+    )
     return normals, shears
 
 

@@ -32,7 +32,14 @@ class _TwoHidden(torch.autograd.Function):
         outer = torch.ops.aten.silu_backward(inner @ W2, z1)
         grads = [outer @ W1 if needs[0] else None] + [None] * 6
         if weights:
-            grads[1:] = [outer.T @ x, outer.sum(0), inner.T @ silu(z1), inner.sum(0), seed.T @ silu(z2), seed.sum(0)]
+            grads[1:] = [
+                outer.T @ x,
+                outer.sum(0),
+                inner.T @ silu(z1),
+                inner.sum(0),
+                seed.T @ silu(z2),
+                seed.sum(0),
+            ]
         return tuple(g if need else None for g, need in zip(grads, needs))
 
 
@@ -40,11 +47,19 @@ class TwoHiddenLayers(nn.Sequential):
     """MLP with two hidden layers of SiLU: (N, inputs) to (N, outputs)."""
 
     def __init__(self, inputs: int, outputs: int, hidden: int) -> None:
-        super().__init__(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, outputs))
+        super().__init__(
+            nn.Linear(inputs, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, outputs),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         first, second, last = self[0], self[2], self[4]
-        return _TwoHidden.apply(x, first.weight, first.bias, second.weight, second.bias, last.weight, last.bias)
+        return _TwoHidden.apply(
+            x, first.weight, first.bias, second.weight, second.bias, last.weight, last.bias
+        )
 
     def features(self, x: Tensor) -> Tensor:
         """(N, hidden) what the last layer reads."""

@@ -43,14 +43,24 @@ class ProgressiveOperator(nn.Module):
         super().__init__()
         self.alpha, self.l_max, self.scale = alpha, l_max, input_scale
         self.alpha_normal = alpha if alpha_normal is None else alpha_normal
-        self.no_C, self.no_pre, self.no_post, self.no_prior_stress = no_C, no_pre, no_post, no_prior_stress
+        self.no_C, self.no_pre, self.no_post, self.no_prior_stress = (
+            no_C,
+            no_pre,
+            no_post,
+            no_prior_stress,
+        )
         self.constant, self.major_symmetry = state_dependence == "constant", major_symmetry
         self.phi = TwoHiddenLayers(12, 6, hidden)
         self.psi1 = TwoHiddenLayers(12, hidden, hidden)
         self.planes = nn.Linear(hidden, 36)
         self.psi2 = TwoHiddenLayers(hidden + 3, 12 + hidden, hidden)
         self.theta = TwoHiddenLayers(hidden + 12, 6, hidden)
-        for layer, rows in ((self.phi[-1], None), (self.planes, None), (self.psi2[-1], 12), (self.theta[-1], None)):
+        for layer, rows in (
+            (self.phi[-1], None),
+            (self.planes, None),
+            (self.psi2[-1], 12),
+            (self.theta[-1], None),
+        ):
             zero_outputs(layer, rows)
         self.free = nn.Parameter(torch.zeros(4, 12)) if self.constant and not no_C else None
         self.adaptive = not (no_C or self.constant)
@@ -81,13 +91,17 @@ class ProgressiveOperator(nn.Module):
             return s1.new_zeros(n, 3, 3, 3), l1
         if self.constant:
             return self.constant_corrections(s1)[:3].expand(n, 3, 3, 3), l1
-        return microplane.correction(self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))), l1
+        return microplane.correction(
+            self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))
+        ), l1
 
     def constant_corrections(self, like: Tensor) -> Tensor:
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
         # filled where they are used: a copy from the host would wait for all that a GPU has still to do
         bounds = ((3, self.alpha), (1, self.alpha_normal))
-        bound = torch.cat([torch.full((rows, 1), value, device=like.device) for rows, value in bounds]).to(like)
+        bound = torch.cat(
+            [torch.full((rows, 1), value, device=like.device) for rows, value in bounds]
+        ).to(like)
         return microplane.correction(bound * torch.tanh(self.scale * self.free).to(like))
 
     def constant_operator(self) -> Tensor:
@@ -109,7 +123,11 @@ class ProgressiveOperator(nn.Module):
 
     def last(self, l2: Tensor | None, kw: Tensor, s2: Tensor) -> Tensor:
         """Step 5: L_post (N, 6)."""
-        return torch.zeros_like(s2) if self.no_post else self.residual(self.theta, l2, kw, self.scale * s2)
+        return (
+            torch.zeros_like(s2)
+            if self.no_post
+            else self.residual(self.theta, l2, kw, self.scale * s2)
+        )
 
     def forward(self, w: Tensor, s: Tensor, poisson: Tensor | None = None) -> Correction:
         """The assembled form. w, s: (N, 6); poisson: () of the prior, for major_symmetry."""

@@ -27,7 +27,9 @@ def register_adapter(name: str, place: str) -> None:
 
     Errors: ConfigError if another adapter has the name."""
     if ADAPTERS.setdefault(name, place) != place:
-        raise ConfigError(f"adapter.name: there is an adapter {name!r} already; choose another name")
+        raise ConfigError(
+            f"adapter.name: there is an adapter {name!r} already; choose another name"
+        )
 
 
 def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
@@ -37,20 +39,28 @@ def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
     name, target = config.get("name"), config.get("_target_")
     if target is not None:
         if not isinstance(target, str) or target not in older:
-            raise ConfigError(f"adapter._target_: expected a known adapter ({', '.join(older)}), found {target!r}; "
-                              "nothing else is imported or called")
+            raise ConfigError(
+                f"adapter._target_: expected a known adapter ({', '.join(older)}), found {target!r}; "
+                "nothing else is imported or called"
+            )
         if name is not None and name != older[target]:
-            raise ConfigError(f"adapter: expected name or the older _target_, found both, {name!r} and {target!r}")
+            raise ConfigError(
+                f"adapter: expected name or the older _target_, found both, {name!r} and {target!r}"
+            )
         name = older[target]
     if name is None:
         return None
     if not isinstance(name, str) or name not in ADAPTERS:
-        raise ConfigError(f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}; one of another package is known "
-                          "once that is imported (extensions)")
+        raise ConfigError(
+            f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}; one of another package is known "
+            "once that is imported (extensions)"
+        )
     module, _, found = ADAPTERS[name].partition(":")
     try:
         adapter: type[nn.Module] = getattr(importlib.import_module(module), found)
         return adapter
     except (ImportError, AttributeError) as error:  # of another package's registration
-        raise ConfigError(f"adapter.name: {name!r} is registered as {ADAPTERS[name]}, which cannot be imported "
-                          f"({error})") from error
+        raise ConfigError(
+            f"adapter.name: {name!r} is registered as {ADAPTERS[name]}, which cannot be imported "
+            f"({error})"
+        ) from error

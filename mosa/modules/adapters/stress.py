@@ -51,19 +51,45 @@ class StressAdapter(Adapter):
     ) -> None:  # fmt: skip
         super().__init__()
         if no_prior_stress and no_pre:
-            raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone")
-        self.rest_free, self.recompute, self.fused, self.precision = rest_free, recompute, fused, precision
-        shape = {"alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden}
-        shape |= {"state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post}
-        bound = None if no_prior_stress else l_max  # without the prior the residuals have to carry the whole stress
-        self.operator = ProgressiveOperator(l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape)
+            raise ConfigError(
+                "adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone"
+            )
+        self.rest_free, self.recompute, self.fused, self.precision = (
+            rest_free,
+            recompute,
+            fused,
+            precision,
+        )
+        shape = {
+            "alpha": alpha,
+            "alpha_normal": alpha_normal,
+            "input_scale": input_scale,
+            "hidden": hidden,
+        }
+        shape |= {
+            "state_dependence": state_dependence,
+            "no_C": no_C,
+            "no_pre": no_pre,
+            "no_post": no_post,
+        }
+        bound = (
+            None if no_prior_stress else l_max
+        )  # without the prior the residuals have to carry the whole stress
+        self.operator = ProgressiveOperator(
+            l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape
+        )
         # C0 is a stiffness: it has no meaning for the strain in the yield function
         self.plastic_operator = ProgressiveOperator(l_max=l_max, **shape) if plastic else None
 
     @property
     def steady(self) -> bool:
         part = self.operator  # the plastic one has the same switches
-        return (part.constant or part.no_C) and part.no_pre and part.no_post and not part.no_prior_stress
+        return (
+            (part.constant or part.no_C)
+            and part.no_pre
+            and part.no_post
+            and not part.no_prior_stress
+        )
 
     def stiffening(self, poisson: Tensor | float) -> float:
         """That of the operator itself where there is only one, else the bound of all that alpha allows; `ADAPTER_MARGIN` at least.
@@ -86,7 +112,9 @@ class StressAdapter(Adapter):
         held.fused = "auto" if held.fused is True else held.fused  # the kernels run on CUDA only
         return held
 
-    def affine(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
+    def affine(
+        self, operator: ProgressiveOperator, w: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Correction]:
         """(A - I (N, 6, 6), b (N, 6), parts) of d(w, s) = (A - I) s + b, the rest term included."""
         zero = torch.zeros_like(w[:1])
         part = operator(torch.cat([w, zero]), torch.cat([s, zero]), self.poisson)
@@ -112,7 +140,9 @@ class StressAdapter(Adapter):
             G, b, _ = self.affine(self.operator, w, s)
             return apply(G, s) + b
         zero = torch.zeros_like(w[:1])
-        d = self.operator.stepwise(torch.cat([w, zero]), torch.cat([s, zero])) - torch.cat([s, zero])
+        d = self.operator.stepwise(torch.cat([w, zero]), torch.cat([s, zero])) - torch.cat(
+            [s, zero]
+        )
         return d[:-1] - d[-1:] if self.rest_free else d[:-1]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
@@ -128,7 +158,10 @@ class StressAdapter(Adapter):
         plastic_G = plastic_h = None
         if self.plastic_operator is not None and state.plastic_strain is not None:
             plastic_G, plastic_h, _ = self._evaluate(
-                self.plastic_operator, w, state.plastic_strain.to(inner), torch.ones_like(self.E_ref)
+                self.plastic_operator,
+                w,
+                state.plastic_strain.to(inner),
+                torch.ones_like(self.E_ref),
             )
             plastic_G, plastic_h = plastic_G.to(outer), plastic_h.to(outer)
         return AdapterOperator(G.to(outer), h.to(outer), plastic_G, plastic_h)
@@ -141,12 +174,20 @@ class StressAdapter(Adapter):
             from mosa.modules.adapters.fused.operation import Settings, fused_operator
 
             settings = Settings(
-                operator.alpha, operator.l_max, float(operator.scale), self.rest_free, PRECISIONS[self.precision]
+                operator.alpha,
+                operator.l_max,
+                float(operator.scale),
+                self.rest_free,
+                PRECISIONS[self.precision],
             )
-            G, h, numbers, pre, post = fused_operator(w, s, unit.reshape(1), settings, weights_of(operator))
+            G, h, numbers, pre, post = fused_operator(
+                w, s, unit.reshape(1), settings, weights_of(operator)
+            )
             return G, h, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))
         if self.recompute and torch.is_grad_enabled() and not backward_at_hand():
-            G, b, parts = checkpoint(self.affine, operator, w, s / unit, use_reentrant=False, preserve_rng_state=False)
+            G, b, parts = checkpoint(
+                self.affine, operator, w, s / unit, use_reentrant=False, preserve_rng_state=False
+            )
         else:
             G, b, parts = self.affine(operator, w, s / unit)
         return G, unit * b, parts

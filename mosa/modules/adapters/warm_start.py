@@ -18,7 +18,9 @@ def drawn_stretches(count: int, largest: float, generator: torch.Generator) -> T
     """(M, 3, 3) float64 right stretches exp(H), |H| log-uniform between 1e-3 and `largest`, all directions alike."""
     A = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
     H = 0.5 * (A + A.mT)
-    size = SMALLEST_STRAIN * (largest / SMALLEST_STRAIN) ** torch.rand(count, generator=generator, dtype=torch.float64)
+    size = SMALLEST_STRAIN * (largest / SMALLEST_STRAIN) ** torch.rand(
+        count, generator=generator, dtype=torch.float64
+    )
     return torch.matrix_exp(H * (size / H.norm(dim=(1, 2)))[:, None, None])
 
 
@@ -39,7 +41,9 @@ def warm_start(
     Errors: ConfigError for an adapter that has the prior stress or no E_ref.
     """
     if not adapter.operator.no_prior_stress:
-        raise ConfigError("warm_start: expected an adapter with no_prior_stress=true; the others start from the prior as it is")
+        raise ConfigError(
+            "warm_start: expected an adapter with no_prior_stress=true; the others start from the prior as it is"
+        )
     adapter.check_on()
     generator = torch.Generator().manual_seed(seed)
     network, k = adapter.operator.phi, adapter.operator.scale

@@ -68,7 +68,11 @@ class Body(nn.Module):
     ) -> None:
         super().__init__()
         for name, value in (
-            ("rest", rest), ("volume", volume), ("colors", colors), ("opacities", opacities), ("covariances", covariances),
+            ("rest", rest),
+            ("volume", volume),
+            ("colors", colors),
+            ("opacities", opacities),
+            ("covariances", covariances),
         ):
             self.register_buffer(name, value.detach().clone())
         self.splats: CarriedSplats | None = None
@@ -81,8 +85,12 @@ class Body(nn.Module):
         # the calibrated backbones that every later figure is compared with; filled when their stage ends
         self.contact = ContactOffset(settings.dx, settings.contact_offset)
         backbone = nn.ModuleDict({"material": material, "contact": self.contact})
-        self.frozen = nn.ModuleDict({"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)})
-        if heterogeneity is not None:  # the prior's is what a stage that starts from it goes back to; it is never simulated
+        self.frozen = nn.ModuleDict(
+            {"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)}
+        )
+        if (
+            heterogeneity is not None
+        ):  # the prior's is what a stage that starts from it goes back to; it is never simulated
             for variant in self.frozen.values():
                 variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
@@ -116,7 +124,11 @@ class Body(nn.Module):
         if variant not in self.frozen:
             raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         frozen = self.frozen[variant]
-        heterogeneity = frozen["heterogeneity"] if variant == "prior_eta" and "heterogeneity" in frozen else None
+        heterogeneity = (
+            frozen["heterogeneity"]
+            if variant == "prior_eta" and "heterogeneity" in frozen
+            else None
+        )
         return Model(frozen["material"], frozen["contact"], heterogeneity)
 
     def freeze(self, variant: str) -> None:
@@ -140,20 +152,37 @@ class Body(nn.Module):
         v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
         n = len(arm)
         F = Q.expand(n, 3, 3).contiguous()
-        far = float(start.center.detach().abs().max()) > PERIOD * self.settings.dx  # where float32 has few digits for a particle
+        far = (
+            float(start.center.detach().abs().max()) > PERIOD * self.settings.dx
+        )  # where float32 has few digits for a particle
         center = start.center.double() if far else start.center
-        return ParticleState(arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
+        return ParticleState(
+            arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F
+        )
 
     def stiffening(self, adapted: bool) -> float:
         """Modulus over the prior's that the time step allows for."""
         return self.adapter.stiffening(self.material.poisson()) if adapted else 1.0
 
-    def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool, viscosity: float = 0.0) -> int:
+    def substeps(
+        self,
+        parameters_modulus: float,
+        frame_dt: float,
+        speed: float,
+        adapted: bool,
+        viscosity: float = 0.0,
+    ) -> int:
         """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter and to `EVEN`."""
         settings = self.settings
         count = required_substeps(
-            modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt, dx=settings.dx, v_max=speed,
-            factor=self.stiffening(adapted), courant=settings.courant, limit=settings.max_substeps,
+            modulus_max=parameters_modulus,
+            density=self.density,
+            frame_dt=frame_dt,
+            dx=settings.dx,
+            v_max=speed,
+            factor=self.stiffening(adapted),
+            courant=settings.courant,
+            limit=settings.max_substeps,
             viscosity=viscosity,
         )
         multiple = settings.strides(EVEN)
@@ -192,9 +221,18 @@ class Body(nn.Module):
         every frame, where differences hold them fixed; None: as many as the time step bound asks for.
         Errors: SimulationDiverged, ConfigError (time step).
         """
-        ready = self.ready(start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps)
-        rollout = ready.simulate(frames, world.colliders, collect=collect, progress=progress, observed=observed, gain=gain,
-                                 unseen=unseen)
+        ready = self.ready(
+            start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps
+        )
+        rollout = ready.simulate(
+            frames,
+            world.colliders,
+            collect=collect,
+            progress=progress,
+            observed=observed,
+            gain=gain,
+            unseen=unseen,
+        )
         taken = rollout.counts
         self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
         return rollout
@@ -236,7 +274,13 @@ class Body(nn.Module):
             lift, timing = torch.zeros_like(lift), None
             state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
         else:
-            simulator = self.simulator(material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else None)
+            simulator = self.simulator(
+                material.law,
+                substeps,
+                frame_dt,
+                world,
+                adapter.strain if adapter is not None else None,
+            )
         state = replace(state, x=state.x + lift)
         state = state.to(dtype)
         arguments = {
@@ -246,7 +290,9 @@ class Body(nn.Module):
         }  # fmt: skip
         return Ready(simulator, state, lift, arguments, timing)
 
-    def simulator(self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None) -> Simulator:
+    def simulator(
+        self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None
+    ) -> Simulator:
         """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).
 
         strain: of an adapter whose operator is a stiffness (`Simulator`)."""
@@ -254,10 +300,20 @@ class Body(nn.Module):
         if getattr(self, "_simulator_key", None) != key or self._simulator_world is not world:
             dtype = torch.float64 if self.settings.precision == 64 else torch.float32
             self._simulator = Simulator(
-                law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
-                ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box,
-                dtype=dtype, device=self.rest.device, strain=strain, options=self.law_options,
+                law,
+                dx=self.settings.dx,
+                substeps=substeps,
+                frame_dt=frame_dt,
+                gravity=world.gravity,
+                up=world.up,
+                ground=world.ground,
+                planes=world.planes,
+                colliders=world.colliders,
+                box=world.box,
+                dtype=dtype,
+                device=self.rest.device,
+                strain=strain,
+                options=self.law_options,
             )
             self._simulator_key, self._simulator_world = key, world
         return self._simulator
-

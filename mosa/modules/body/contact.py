@@ -23,7 +23,9 @@ class ContactOffset(nn.Module):
     def __init__(self, dx: float, enabled: bool = True) -> None:
         super().__init__()
         self.dx, self.enabled = dx, enabled
-        self.cells = nn.Parameter(torch.tensor(self.START if enabled else 0.0), requires_grad=enabled)
+        self.cells = nn.Parameter(
+            torch.tensor(self.START if enabled else 0.0), requires_grad=enabled
+        )
 
     def forward(self) -> Tensor:
         return self.dx * self.cells

@@ -44,10 +44,14 @@ class StiffnessField(nn.Module):
     few_numbers = False
     """Whether Gauss-Newton can learn its numbers."""
 
-    def __init__(self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None) -> None:
+    def __init__(
+        self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None
+    ) -> None:
         super().__init__()
         if not bool((high > low).all()):
-            raise ConfigError(f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}")
+            raise ConfigError(
+                f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}"
+            )
         self.register_buffer("low", low.detach().clone())
         self.register_buffer("high", high.detach().clone())
         self.settings = settings or HeterogeneitySettings()
@@ -63,7 +67,9 @@ class StiffnessField(nn.Module):
 class HeterogeneityField(StiffnessField):
     """Coordinate network eta on rest positions normalised to the object's box."""
 
-    def __init__(self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None) -> None:
+    def __init__(
+        self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None
+    ) -> None:
         super().__init__(low, high, settings)
         self.frequencies = self.settings.frequencies
         self.net = TwoHiddenLayers(3 + 6 * self.frequencies, 1, self.settings.hidden)
@@ -72,5 +78,7 @@ class HeterogeneityField(StiffnessField):
     def forward(self, X: Tensor) -> Tensor:
         """eta (N,) at rest positions X (N, 3) [m]."""
         x = 2 * (X - self.low) / (self.high - self.low) - 1
-        waves = [f(torch.pi * 2**k * x) for k in range(self.frequencies) for f in (torch.sin, torch.cos)]
+        waves = [
+            f(torch.pi * 2**k * x) for k in range(self.frequencies) for f in (torch.sin, torch.cos)
+        ]
         return self.net(torch.cat([x, *waves], -1))[..., 0]

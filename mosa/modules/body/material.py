@@ -60,7 +60,9 @@ class Direction:
         """(3, 3) float64: the direction of `value`, (3,), and two unit vectors across it."""
         axis = torch.tensor([float(v) for v in value], dtype=torch.float64)
         axis = axis / axis.norm()
-        across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())])
+        across = torch.linalg.cross(
+            axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
+        )
         across = across / across.norm()
         return torch.stack([axis, across, torch.linalg.cross(axis, across)])
 
@@ -77,13 +79,22 @@ class Direction:
 
 LOG = Form(0.0, math.inf, (), math.log, torch.exp)
 LOG_OR_ZERO = LOG._replace(held=(0.0,))
-SOFTPLUS = Form(0.0, math.inf, (0.0,), lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus)
+SOFTPLUS = Form(
+    0.0, math.inf, (0.0,), lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus
+)
 FORMS: dict[str, Form | Direction] = {
     "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": LOG_OR_ZERO, "cohesion": SOFTPLUS,
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
 }  # fmt: skip
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
-UNITS = {"E": "Pa", "mu": "Pa", "kappa": "Pa", "yield_stress": "Pa", "viscosity": "Pa s", "friction_angle": "degrees"}
+UNITS = {
+    "E": "Pa",
+    "mu": "Pa",
+    "kappa": "Pa",
+    "yield_stress": "Pa",
+    "viscosity": "Pa s",
+    "friction_angle": "degrees",
+}
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
 RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity")
 """Parameters whose standard deviation is said relative: it is one of their logarithm."""
@@ -109,7 +120,10 @@ def unit_of(law: str, name: str) -> str:
     known = law_named(law)
     if name in known.parameters and known.viscosity is not None:
         ones = {each: torch.ones(()) for each in known.parameters}
-        if not torch.equal(known.explicit_viscosity(ones), known.explicit_viscosity(ones | {name: torch.full((), 2.0)})):
+        if not torch.equal(
+            known.explicit_viscosity(ones),
+            known.explicit_viscosity(ones | {name: torch.full((), 2.0)}),
+        ):
             return "Pa s"
     return UNITS.get(name, "")
 
@@ -126,19 +140,29 @@ class Material(nn.Module):
     """
 
     def __init__(
-        self, law: str, parameters: Mapping[str, float | Sequence[float]], frozen: Sequence[str] = (),
-        modulated: Sequence[str] | None = None, candidates: Sequence[str] = (),
+        self,
+        law: str,
+        parameters: Mapping[str, float | Sequence[float]],
+        frozen: Sequence[str] = (),
+        modulated: Sequence[str] | None = None,
+        candidates: Sequence[str] = (),
     ) -> None:
         super().__init__()
         if (law == AUTO) != bool(candidates):
-            raise ConfigError(f"prior.candidates: expected a list of laws with prior.law=auto and none otherwise, found "
-                              f"{list(candidates)} with law {law!r}")
+            raise ConfigError(
+                f"prior.candidates: expected a list of laws with prior.law=auto and none otherwise, found "
+                f"{list(candidates)} with law {law!r}"
+            )
         for each in candidates or (law,):
             self._check_names(each, parameters, frozen, modulated)
         self.candidates = tuple(candidates)
         self.law, self.names = candidates[0] if candidates else law, tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
-        self.modulated = tuple(modulated) if modulated is not None else tuple(n for n in STIFFNESS if n in parameters)
+        self.modulated = (
+            tuple(modulated)
+            if modulated is not None
+            else tuple(n for n in STIFFNESS if n in parameters)
+        )
         self.raw = nn.ParameterDict()
         self.begins: dict[str, float] = {}
         """Unconstrained values that the parameters start from, whatever is loaded later."""
@@ -153,28 +177,45 @@ class Material(nn.Module):
         """Of checkpoints without the mark, the viscosity is the inverse of a softplus."""
         name, mark = f"{prefix}raw.viscosity", f"{prefix}viscosity_is_a_logarithm"
         if "viscosity" in self.raw and name in state_dict and mark not in state_dict:
-            state_dict[name], state_dict[mark] = SOFTPLUS.physical(state_dict[name]).log(), torch.tensor(True)
+            state_dict[name], state_dict[mark] = (
+                SOFTPLUS.physical(state_dict[name]).log(),
+                torch.tensor(True),
+            )
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _check_names(self, law: str, parameters, frozen, modulated) -> None:
         known = law_named(law)
         if unknown := sorted(set(parameters) - set(FORMS)):
             own = [name for name in unknown if name in known.parameters]
-            hint = f" (law {law} takes {', '.join(own)}: give it a range with register_form)" if own else ""
-            raise ConfigError(f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}{hint}")
+            hint = (
+                f" (law {law} takes {', '.join(own)}: give it a range with register_form)"
+                if own
+                else ""
+            )
+            raise ConfigError(
+                f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}{hint}"
+            )
         for key, names in (("frozen", frozen), ("modulated", modulated or ())):
             if strange := sorted(set(names) - set(parameters)):
-                raise ConfigError(f"prior.{key}: expected names among {', '.join(parameters)}, found {', '.join(strange)}")
+                raise ConfigError(
+                    f"prior.{key}: expected names among {', '.join(parameters)}, found {', '.join(strange)}"
+                )
         if ("E" in parameters) != ("nu" in parameters):
-            raise ConfigError(f"prior.parameters: E and nu go together, found {', '.join(parameters)}")
+            raise ConfigError(
+                f"prior.parameters: E and nu go together, found {', '.join(parameters)}"
+            )
         if "E" not in parameters and "kappa" not in parameters:
-            raise ConfigError(f"prior.parameters: expected E with nu, or kappa with mu, found {', '.join(parameters)}")
+            raise ConfigError(
+                f"prior.parameters: expected E with nu, or kappa with mu, found {', '.join(parameters)}"
+            )
         takes = {name for name in known.parameters if name != known.reference}
         gives = {taken for name in parameters for taken in GIVES.get(name, (name,))}
         listed = [taken for name in parameters for taken in GIVES.get(name, (name,))]
         if twice := sorted({name for name in listed if listed.count(name) > 1}):
-            raise ConfigError(f"prior.parameters: expected each of {', '.join(sorted(takes))} once, found {', '.join(twice)} twice "
-                              f"by {', '.join(parameters)} (mu, lam come from E, nu)")
+            raise ConfigError(
+                f"prior.parameters: expected each of {', '.join(sorted(takes))} once, found {', '.join(twice)} twice "
+                f"by {', '.join(parameters)} (mu, lam come from E, nu)"
+            )
         if takes != gives:
             raise ConfigError(
                 f"prior.parameters: law {law} takes {', '.join(sorted(takes))}; {', '.join(parameters)} give "
@@ -203,7 +244,9 @@ class Material(nn.Module):
     def _add_direction(self, name: str, value: Sequence[float], learned: bool) -> None:
         numbers = list(value) if isinstance(value, (list, tuple)) else []
         if len(numbers) != 3 or not all(map(is_number, numbers)) or not any(numbers):
-            raise ConfigError(f"prior.parameters.{name}: expected a direction [x, y, z], found {value!r}")
+            raise ConfigError(
+                f"prior.parameters.{name}: expected a direction [x, y, z], found {value!r}"
+            )
         # where the angles begin is the configuration's, as `begins` of the numbers is: no part of what is learned
         self.register_buffer(f"frame_{name}", Direction.frame(numbers).float(), persistent=False)
         for coordinate in Direction.coordinates(name):
@@ -231,9 +274,13 @@ class Material(nn.Module):
         found: dict[str, Tensor] = {}
         for n in self.names:
             if n in self.directions:
-                found |= {f"{n}_{axis}": part for axis, part in zip(Direction.AXES, self.direction(n))}
+                found |= {
+                    f"{n}_{axis}": part for axis, part in zip(Direction.AXES, self.direction(n))
+                }
             else:
-                found[n] = getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n])
+                found[n] = (
+                    getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n])
+                )
         return found
 
     @staticmethod
@@ -287,6 +334,10 @@ def material_states(
 
     parameters: physical values by the law's own names (`Material.per_particle()`).
     """
-    simulator = Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, options=options)
-    values = {name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()}
+    simulator = Simulator(
+        law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, options=options
+    )
+    values = {
+        name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()
+    }
     return lambda F: simulator.material_state(F, torch.zeros_like(F), values)

@@ -39,18 +39,28 @@ class Ready:
     ) -> Rollout:  # fmt: skip
         """As `Body.simulate`, from here on; of a stack, the worlds at once."""
         simulator, stacked = self.simulator, self.state.x.ndim == 3
-        roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
+        roll = partial(
+            simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders)
+        )
         lift = self.lift[:, None] if stacked else self.lift
         if observed is None:
             timing = {} if self.timing is None else {"timing": self.timing}
             rollout = roll(self.state, frames=frames, progress=progress, **timing)
         else:
             if self.timing:
-                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
+                raise ConfigError(
+                    "simulation.adaptive: expected false where a criterion corrects the prediction frame by frame"
+                )
             seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
-            hidden = None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)
-            rollout = corrected_rollout(roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt, hidden)
-        fields = {name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")}
+            hidden = (
+                None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)
+            )
+            rollout = corrected_rollout(
+                roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt, hidden
+            )
+        fields = {
+            name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")
+        }
         return replace(rollout, **{**fields, "x": fields["x"] - lift})
 
     def motions(self, colliders: Sequence[Collider]) -> list:
@@ -67,9 +77,13 @@ class Ready:
         if adapter is None:
             return self
         if self.arguments["stride"] is not None:
-            raise ConfigError(f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}")
+            raise ConfigError(
+                f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}"
+            )
         state, parameters = self.state, self.arguments["parameters"]
-        held = AdapterOperator(*adapter(self.simulator.material_state(state.F, state.C_affine, parameters)))
+        held = AdapterOperator(
+            *adapter(self.simulator.material_state(state.F, state.C_affine, parameters))
+        )
         return replace(self, arguments={**self.arguments, "adapter": lambda _: held})
 
     @classmethod
@@ -79,7 +93,9 @@ class Ready:
         first, n = parts[0], len(parts[0].arguments["volume"])
         counts = sorted({part.simulator.substeps for part in parts})
         if len(counts) > 1 or any(part.timing for part in parts):
-            raise ConfigError(f"worlds: expected the same fixed substeps in all, found {counts}; give substeps")
+            raise ConfigError(
+                f"worlds: expected the same fixed substeps in all, found {counts}; give substeps"
+            )
         each = [part.arguments for part in parts]
         sizes = first.simulator.law.parameters
         parameters = {

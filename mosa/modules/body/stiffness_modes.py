@@ -18,7 +18,9 @@ class StiffnessModes(StiffnessField):
 
     few_numbers = True
 
-    def __init__(self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None) -> None:
+    def __init__(
+        self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None
+    ) -> None:
         super().__init__(low, high, settings)
         wavelength = self.settings.wavelength
         extent = (high - low).double().cpu()
@@ -34,7 +36,9 @@ class StiffnessModes(StiffnessField):
                         found.append((size, a, b, c))
         found = sorted(found)[: self.settings.most]
         if not found:
-            raise ConfigError(f"heterogeneity.wavelength: no wave of {wavelength} times the body fits; expected less than 2")
+            raise ConfigError(
+                f"heterogeneity.wavelength: no wave of {wavelength} times the body fits; expected less than 2"
+            )
         self.register_buffer("waves", torch.tensor([f[1:] for f in found], dtype=torch.float32))
         self.register_buffer("size", torch.tensor([f[0] for f in found], dtype=torch.float32))
         self.register_buffer("mean", torch.zeros(len(found)))

@@ -27,7 +27,9 @@ class KnownGradient(torch.autograd.Function):
     sequence's gradient is found when its loss is, and only the sums are kept."""
 
     @staticmethod
-    def forward(ctx, loss: Tensor, gradients: Sequence[Tensor | None], *parameters: Tensor) -> Tensor:
+    def forward(
+        ctx, loss: Tensor, gradients: Sequence[Tensor | None], *parameters: Tensor
+    ) -> Tensor:
         ctx.gradients = gradients
         return loss.clone()
 
@@ -43,8 +45,13 @@ class GradientSteps:
         """The optimiser of a stage and its schedule, as Lightning takes them. The rates follow `Stage.decay`, and are halved with
         every step that was taken back (`Retreat`)."""
         optimizer = torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95))
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: stage.decay(step) * self.retreat.share)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step", "name": "lr"}}
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: stage.decay(step) * self.retreat.share
+        )
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": schedule, "interval": "step", "name": "lr"},
+        }
 
     def groups(self, stage: Stage) -> list[dict]:
         """Parameter groups of a stage."""
@@ -53,9 +60,21 @@ class GradientSteps:
         learned = [] if replaced else [p for p in body.material.parameters() if p.requires_grad]
         groups = [{"params": learned, "lr": stage.lr, "name": "material"}]
         if body.contact.enabled:
-            groups.append({"params": list(body.contact.parameters()), "lr": stage.lr_contact, "name": "contact"})
+            groups.append(
+                {
+                    "params": list(body.contact.parameters()),
+                    "lr": stage.lr_contact,
+                    "name": "contact",
+                }
+            )
         if stage.learns_heterogeneity and body.heterogeneity is not None:
-            groups.append({"params": list(body.heterogeneity.parameters()), "lr": stage.lr_networks, "name": "heterogeneity"})
+            groups.append(
+                {
+                    "params": list(body.heterogeneity.parameters()),
+                    "lr": stage.lr_networks,
+                    "name": "heterogeneity",
+                }
+            )
         if stage.learns_adapter and body.adapter is not None:
             params = [p for p in body.adapter.parameters() if p.requires_grad]
             groups.append({"params": params, "lr": stage.lr_adapter, "name": "adapter"})
@@ -77,14 +96,20 @@ class GradientSteps:
         try:
             for own in batch.sequences:
                 weight = 1 / len(batch.sequences)
-                for name, value in self.descend(stage, iteration, own, weight, learned, total).items():
+                for name, value in self.descend(
+                    stage, iteration, own, weight, learned, total
+                ).items():
                     self.terms_of_step[name] = self.terms_of_step.get(name, 0.0) + weight * value
             self.check_finite(stage, iteration, total)
         except SimulationDiverged as error:
             if not self.retreat.back(self.running_optimizer, learned):
                 raise
-            log.warning("stage %s, iteration %d: the step before is taken back, and steps are half as long from here: %s",
-                        stage.name, iteration, error)
+            log.warning(
+                "stage %s, iteration %d: the step before is taken back, and steps are half as long from here: %s",
+                stage.name,
+                iteration,
+                error,
+            )
             self.taken_back = True
             return None
         return KnownGradient.apply(self.terms_of_step.pop("loss"), total, *learned)
@@ -101,17 +126,27 @@ class GradientSteps:
     def try_last_step(self, stage: Stage) -> None:
         """Take the last step of a stage back where the body cannot be simulated after it: no other one would find out."""
         try:
-            model = self.body.model().only(heterogeneity=stage.learns_heterogeneity, adapter=stage.learns_adapter)
+            model = self.body.model().only(
+                heterogeneity=stage.learns_heterogeneity, adapter=stage.learns_adapter
+            )
             with torch.no_grad():
                 for take in self.takes:
-                    self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
+                    self.body.simulate(
+                        take.start, self.world, len(take.cues.positions), take.frame_dt, model=model
+                    )
         except SimulationDiverged as error:
             if not self.retreat.back(self.running_optimizer, self.learned()):
                 raise
             log.warning("stage %s: its last step is taken back: %s", stage.name, error)
 
     def descend(
-        self, stage: Stage, iteration: int, own, weight: float, learned: Sequence[Tensor], total: list[Tensor | None]
+        self,
+        stage: Stage,
+        iteration: int,
+        own,
+        weight: float,
+        learned: Sequence[Tensor],
+        total: list[Tensor | None],
     ) -> dict[str, Tensor]:
         """Adds the gradient of one sequence's loss, times `weight`, to `total`; the loss, its terms and what else is logged, not
         weighted. own: its `SequenceBatch`.
@@ -127,12 +162,16 @@ class GradientSteps:
             loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items())
             if not torch.isfinite(loss):
                 bad = [name for name, value in terms.items() if not torch.isfinite(value)]
-                raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
-                                         "lower fit.*.lr or simulation.courant")
+                raise SimulationDiverged(
+                    f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
+                    "lower fit.*.lr or simulation.courant"
+                )
             found = torch.autograd.grad(weight / len(gains) * loss, learned, allow_unused=True)
             for i, (before, more) in enumerate(zip(total, found)):
                 total[i] = more if before is None else before if more is None else before + more
-            values = {name: value.detach() for name, value in terms.items()} | {"loss": loss.detach()}
+            values = {name: value.detach() for name, value in terms.items()} | {
+                "loss": loss.detach()
+            }
             values["inverted"] = loss.new_tensor(float(rollout.inverted))
             if "mean_abs_C" in self.last:
                 values["mean_abs_C"] = loss.new_tensor(self.last["mean_abs_C"])
@@ -154,30 +193,55 @@ class GradientSteps:
         adapted = stage.learns_adapter and body.adapter is not None
         collected: list = []
         rollout = body.simulate(
-            take.start, self.world, frames, take.frame_dt,
+            take.start,
+            self.world,
+            frames,
+            take.frame_dt,
             model=body.model().only(heterogeneity=stage.learns_heterogeneity, adapter=adapted),
-            collect=collected.append if adapted else None, observed=cues.positions if gain else None, gain=gain,
+            collect=collected.append if adapted else None,
+            observed=cues.positions if gain else None,
+            gain=gain,
         )
-        over_all = pool(collected) if collected else None  # a variance over time as well as over particles
+        over_all = (
+            pool(collected) if collected else None
+        )  # a variance over time as well as over particles
         targets = seen.select(range(len(seen.cameras)), frames)
         varies = stage.learns_heterogeneity and body.heterogeneity is not None
-        step = Step(body, take.start, rollout, targets, cues, frames, self.background, varies, over_all, self.misfit,
-                    with_flow=weights.get("flow", 0.0) != 0, extra=take.extra)
+        step = Step(
+            body,
+            take.start,
+            rollout,
+            targets,
+            cues,
+            frames,
+            self.background,
+            varies,
+            over_all,
+            self.misfit,
+            with_flow=weights.get("flow", 0.0) != 0,
+            extra=take.extra,
+        )
         terms = evaluate_terms(weights, step)
         if over_all is not None:
             self.last["mean_abs_C"] = float(over_all.mean_abs_C.detach())
         return terms, rollout
 
-    def check_finite(self, stage: Stage, iteration: int, gradients: Sequence[Tensor | None]) -> None:
+    def check_finite(
+        self, stage: Stage, iteration: int, gradients: Sequence[Tensor | None]
+    ) -> None:
         """A gradient that is not finite stops the run: it is never zeroed. Errors: SimulationDiverged naming the group."""
         left = iter(gradients)
         for group in self.running_optimizer.param_groups:
             own = [g for g in (next(left) for _ in group["params"]) if g is not None]
             if not all(bool(torch.isfinite(g).all()) for g in own):
-                raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: the gradient of {group['name']} is not "
-                                         "finite; lower simulation.courant or the learning rate of the stage")
+                raise SimulationDiverged(
+                    f"stage {stage.name}, iteration {iteration}: the gradient of {group['name']} is not "
+                    "finite; lower simulation.courant or the learning rate of the stage"
+                )
 
-    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None) -> None:
+    def configure_gradient_clipping(
+        self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None
+    ) -> None:
         """The networks' groups are clipped at fit.clip, then all of them as Trainer(gradient_clip_val) asks."""
         if self.stage is None or self.stage.newton:
             return
@@ -186,15 +250,30 @@ class GradientSteps:
 
     def clip_networks(self, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Norm of the gradient by parameter group, before the networks' are clipped at fit.clip."""
-        bounds = {group["name"]: self.clip if group["name"] in ("heterogeneity", "adapter") else float("inf")
-                  for group in optimizer.param_groups}
+        bounds = {
+            group["name"]: self.clip
+            if group["name"] in ("heterogeneity", "adapter")
+            else float("inf")
+            for group in optimizer.param_groups
+        }
         return {group["name"]: float(torch.nn.utils.clip_grad_norm_(group["params"], bounds[group["name"]]))
                 for group in optimizer.param_groups}  # fmt: skip
 
-    def report(self, stage: Stage, iteration: int, terms: dict[str, Tensor], loss: Tensor, norms: dict[str, float]) -> None:
+    def report(
+        self,
+        stage: Stage,
+        iteration: int,
+        terms: dict[str, Tensor],
+        loss: Tensor,
+        norms: dict[str, float],
+    ) -> None:
         """Scalars of one step, means over the takes: every term raw and weighted, parameters, mean |C|, gradient norms."""
-        values = {"loss/total": loss, "fit/frames": float(self.active_frames(stage, iteration, self.takes[-1])),
-                  "fit/stage": float(self.stage_index), "fit/inverted": terms.pop("inverted")}
+        values = {
+            "loss/total": loss,
+            "fit/frames": float(self.active_frames(stage, iteration, self.takes[-1])),
+            "fit/stage": float(self.stage_index),
+            "fit/inverted": terms.pop("inverted"),
+        }
         if "mean_abs_C" in terms:
             values["adapter/mean_abs_C"] = terms.pop("mean_abs_C")
         for name, value in terms.items():

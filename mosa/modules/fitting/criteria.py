@@ -61,8 +61,12 @@ def corrected_rollout(
         name: torch.cat([getattr(parts[0], name), *(getattr(part, name)[1:] for part in parts[1:])])
         for name in ("x", "v", "F", "F_tot")
     }
-    reactions = None if parts[0].reactions is None else torch.cat([part.reactions for part in parts])
-    times = frame_dt * torch.arange(len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device)
+    reactions = (
+        None if parts[0].reactions is None else torch.cat([part.reactions for part in parts])
+    )
+    times = frame_dt * torch.arange(
+        len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device
+    )
     return Rollout(
         **stacked, times=times, final=parts[-1].final, inverted=sum(part.inverted for part in parts), reactions=reactions,
         counts=tuple(count for part in parts for count in part.counts),

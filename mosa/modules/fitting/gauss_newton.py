@@ -90,8 +90,14 @@ class Posterior:
 
     def written(self) -> dict:
         """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
-        return {"names": list(self.names), "mean": self.mean, "covariance": self.covariance, "determined": self.determined,
-                "model_error": self.model_error, "rivals": dict(self.rivals)}
+        return {
+            "names": list(self.names),
+            "mean": self.mean,
+            "covariance": self.covariance,
+            "determined": self.determined,
+            "model_error": self.model_error,
+            "rivals": dict(self.rivals),
+        }
 
     @classmethod
     def read(cls, written: dict) -> Posterior:
@@ -104,7 +110,10 @@ class Posterior:
         counted("draws", (count, len(self.mean)), "take fewer", each=3 * 8)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
         L = torch.linalg.cholesky(self.covariance)
-        return self.mean + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T
+        return (
+            self.mean
+            + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T
+        )
 
 
 def _length(step: Tensor, matrix: Tensor) -> float:
@@ -129,7 +138,9 @@ class GaussNewton:
     """The last iteration's Jacobian (R, D), as its steps have put it right."""
 
     def _vector(self, get: Callable[[Block], Tensor | float]) -> Tensor:
-        return torch.cat([torch.as_tensor(get(b), dtype=torch.float64).expand(b.size) for b in self.blocks])
+        return torch.cat(
+            [torch.as_tensor(get(b), dtype=torch.float64).expand(b.size) for b in self.blocks]
+        )
 
     def mean(self) -> Tensor:
         """(D,) of the prior."""
@@ -141,11 +152,16 @@ class GaussNewton:
 
     def clamped(self, numbers: Tensor) -> Tensor:
         """Within the blocks' bounds."""
-        return torch.minimum(torch.maximum(numbers, self._vector(lambda b: b.bounds[0])), self._vector(lambda b: b.bounds[1]))
+        return torch.minimum(
+            torch.maximum(numbers, self._vector(lambda b: b.bounds[0])),
+            self._vector(lambda b: b.bounds[1]),
+        )
 
     def cost(self, numbers: Tensor, r: Tensor) -> float:
         """Minus the logarithm of the posterior, up to a constant."""
-        return 0.5 * float(r.square().sum()) + 0.5 * float((self.precision() * (numbers - self.mean()).square()).sum())
+        return 0.5 * float(r.square().sum()) + 0.5 * float(
+            (self.precision() * (numbers - self.mean()).square()).sum()
+        )
 
     def jacobian(self, numbers: Tensor, r: Tensor) -> Tensor:
         """(R, D) of the type and on the device of r (R,): one residual vector per column, the columns shared among the seats."""
@@ -189,7 +205,9 @@ class GaussNewton:
         return J.T
 
     @torch.no_grad()
-    def iterate(self, learn: bool = True, settled: bool = True, r: Tensor | None = None) -> dict[str, float]:
+    def iterate(
+        self, learn: bool = True, settled: bool = True, r: Tensor | None = None
+    ) -> dict[str, float]:
         """One iteration from where the first seat stands. learn: update the blocks' factors by the evidence first; settled: whether
         what is compared stays as it is, so that steps after the first that improves are worth their while; r: (R,) the residuals
         there, where they are known.
@@ -206,7 +224,9 @@ class GaussNewton:
         J = self.columns = self.jacobian(numbers, r)
         H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
         if not bool(torch.isfinite(H).all()):
-            raise SimulationDiverged("Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior")
+            raise SimulationDiverged(
+                "Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior"
+            )
         away = numbers - self.mean()
         if learn:
             self._evidence(away, H, g)
@@ -248,7 +268,8 @@ class GaussNewton:
         self.matrix, self.data = M, H
         share = _length(numbers - begun, first) / length if length > 0 else 0.0
         return {"before": before, "after": after, "share": share, "length": length} | {
-            f"sd/{b.name}": b.factor * float(b.sd.mean()) for b in self.blocks if b.learned}
+            f"sd/{b.name}": b.factor * float(b.sd.mean()) for b in self.blocks if b.learned
+        }
 
     @torch.no_grad()
     def transferred(self, steps: int) -> tuple[Tensor, float]:
@@ -304,12 +325,23 @@ class GaussNewton:
         it would have moved them is one more standard deviation along that way. Errors: ValueError before the first iteration."""
         if self.matrix is None or self.data is None or self.columns is None:
             raise ValueError("posterior: expected an iteration before it is asked for")
-        names = [f"{b.name}[{i}]" if b.size > 1 else b.name for b in self.blocks for i in range(b.size)]
+        names = [
+            f"{b.name}[{i}]" if b.size > 1 else b.name for b in self.blocks for i in range(b.size)
+        ]
         covariance = torch.linalg.inv(self.matrix - (1 - share) * self.data)
         covariance = 0.5 * (covariance + covariance.T)
         determined = (1 - covariance.diagonal() * self.precision()).clamp(0, 1)
         if wrong is not None:
             moved = covariance @ (share * (self.columns.T @ wrong.to(self.columns)).double().cpu())
             covariance = covariance + torch.outer(moved, moved)
-        kept = [i for i, nuisance in enumerate(self._vector(lambda b: float(b.nuisance)).tolist()) if not nuisance]
-        return Posterior([names[i] for i in kept], self.seats[0].read()[kept], covariance[kept][:, kept], determined[kept])
+        kept = [
+            i
+            for i, nuisance in enumerate(self._vector(lambda b: float(b.nuisance)).tolist())
+            if not nuisance
+        ]
+        return Posterior(
+            [names[i] for i in kept],
+            self.seats[0].read()[kept],
+            covariance[kept][:, kept],
+            determined[kept],
+        )

@@ -78,22 +78,45 @@ class Identification:
         self.gains = (0.0,) if self.calibrating else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
         if not any(self.kinds):
-            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are "
-                              "all 0; use fit=adam, which learns from images too")
+            raise ConfigError(
+                "losses: identification compares motion cues, and the weights of position, rotation and stretch are "
+                "all 0; use fit=adam, which learns from images too"
+            )
         self.chosen = residuals.sampled(len(body.rest), body.rest.device)
-        blocks = blocks_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings,
-                           calibrating=self.calibrating)
+        blocks = blocks_of(
+            body,
+            adapter=self.adapter,
+            heterogeneity=self.heterogeneity,
+            settings=settings,
+            calibrating=self.calibrating,
+        )
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
         bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
         self.iteration, self.noise, self.substeps = 0, None, None
-        self.grid: list[residuals.Fields] | None = None  # differences between the two grids, of every pair
+        self.grid: list[residuals.Fields] | None = (
+            None  # differences between the two grids, of every pair
+        )
         if self.knows_grid:
-            blocks.append(Block("grid", torch.zeros(1), torch.full((1,), float(settings.grid_error)), 0.2, nuisance=True))
-        self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress,
-                                  many=self._many if body.rest.is_cuda and not body.settings.adaptive else None)
+            blocks.append(
+                Block(
+                    "grid",
+                    torch.zeros(1),
+                    torch.full((1,), float(settings.grid_error)),
+                    0.2,
+                    nuisance=True,
+                )
+            )
+        self.newton = GaussNewton(
+            blocks,
+            [self._seat(each) for each in bodies],
+            progress=progress,
+            many=self._many if body.rest.is_cuda and not body.settings.adaptive else None,
+        )
         self.converged = False
         self.report: dict[str, float] = {}
-        self._residuals: Tensor | None = None  # at the numbers as they stand, between `prepare` and `iterate`
+        self._residuals: Tensor | None = (
+            None  # at the numbers as they stand, between `prepare` and `iterate`
+        )
 
     def threads(self, numbers: int) -> int:
         """Rollouts side by side, of as many numbers."""
@@ -108,7 +131,9 @@ class Identification:
         tensors = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
         if self.knows_grid:
             tensors.append(multiple)
-        return Seat(tensors, lambda: self._whitened(body, float(multiple)), lambda: self._possible(body))
+        return Seat(
+            tensors, lambda: self._whitened(body, float(multiple)), lambda: self._possible(body)
+        )
 
     def _possible(self, body: Body) -> None:
         """Errors: ConfigError where the numbers ask for more substeps than `max_substeps`. An iteration holds those of its
@@ -126,7 +151,11 @@ class Identification:
     def softly(self) -> tuple[float, ...]:
         """Shares of the data that the first iterations count, all of it afterwards. A calibration, one drop, and a stage too short
         for it count in full."""
-        return SOFTLY if len(self.takes) > 1 and not self.calibrating and self.iterations >= 2 * len(SOFTLY) else ()
+        return (
+            SOFTLY
+            if len(self.takes) > 1 and not self.calibrating and self.iterations >= 2 * len(SOFTLY)
+            else ()
+        )
 
     @property
     def pairs(self) -> list[tuple[int, float]]:
@@ -138,7 +167,14 @@ class Identification:
         """The body at the start of a take, with what is learned here."""
         take = self.takes[index]
         model = body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter)
-        return body.ready(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model, substeps=substeps)
+        return body.ready(
+            take.start,
+            self.world,
+            len(take.cues.positions),
+            take.frame_dt,
+            model=model,
+            substeps=substeps,
+        )
 
     @torch.no_grad()
     def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
@@ -171,17 +207,32 @@ class Identification:
                     seat.write(row)
                     parts.append(self.ready(self.body, i, self.substeps[i]).answered())
                 rollout = Ready.stack(parts).simulate(
-                    len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain,
-                    unseen=self.unseen(take))
+                    len(take.cues.positions),
+                    self.world.colliders,
+                    observed=take.cues.positions if gain else None,
+                    gain=gain,
+                    unseen=self.unseen(take),
+                )
                 for k, own in enumerate(rollout.worlds()):
-                    found[first + k].append(residuals.fields(own, take.cues, take.start.rotation, self.chosen, self.response(take)))
+                    found[first + k].append(
+                        residuals.fields(
+                            own, take.cues, take.start.rotation, self.chosen, self.response(take)
+                        )
+                    )
         multiples = rows[:, -1].tolist() if self.knows_grid else [0.0] * len(rows)
-        return torch.stack([self._compared(own, multiple) for own, multiple in zip(found, multiples)])
+        return torch.stack(
+            [self._compared(own, multiple) for own, multiple in zip(found, multiples)]
+        )
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
         return [
-            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation,
-                             self.chosen, self.response(self.takes[i]))
+            residuals.fields(
+                self.rollout(body, i, gain, self.substeps[i]),
+                self.takes[i].cues,
+                self.takes[i].start.rotation,
+                self.chosen,
+                self.response(self.takes[i]),
+            )
             for i, gain in self.pairs
         ]
 
@@ -191,11 +242,15 @@ class Identification:
             return self._compared(self._fields(body), multiple)
 
     def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
-        share = self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
+        share = (
+            self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
+        )
         if self.iteration < len(self.softly):
             share *= self.softly[self.iteration]
         counts = tuple(share * on for on in self.kinds)
-        return residuals.whitened(self._along(found, multiple), self.noise, [counts] * len(self.pairs))
+        return residuals.whitened(
+            self._along(found, multiple), self.noise, [counts] * len(self.pairs)
+        )
 
     def _along(self, found: list[residuals.Fields], multiple: float) -> list[residuals.Fields]:
         return found if self.grid is None else residuals.along(found, self.grid, multiple)
@@ -222,9 +277,17 @@ class Identification:
             coarser = self._coarser()
             if coarser is not None:
                 self.grid = residuals.difference(found, coarser)
-        least = residuals.floors(self.body.settings.dx, 0.0 if self.calibrating else self.settings.model_error)
-        wrong = None if self.grid is None else [
-            residuals.Fields(*(self.settings.grid_error * field for field in each)) for each in self.grid]
+        least = residuals.floors(
+            self.body.settings.dx, 0.0 if self.calibrating else self.settings.model_error
+        )
+        wrong = (
+            None
+            if self.grid is None
+            else [
+                residuals.Fields(*(self.settings.grid_error * field for field in each))
+                for each in self.grid
+            ]
+        )
         self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
 
     def search(self) -> float:
@@ -233,7 +296,9 @@ class Identification:
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues after frame 0."""
-        found = [self.rollout(self.body, i).x - take.cues.positions for i, take in enumerate(self.takes)]
+        found = [
+            self.rollout(self.body, i).x - take.cues.positions for i, take in enumerate(self.takes)
+        ]
         return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
 
     def _hold_substeps(self) -> None:
@@ -258,11 +323,17 @@ class Identification:
         if self._residuals is None:
             self.prepare()
         r, self._residuals = self._residuals, None
-        report = self.newton.iterate(learn=1 <= self.iteration < EVIDENCE_ITERATIONS, r=r,
-                                     settled=self.iteration >= NOISE_ITERATIONS and not self.calibrating)
+        report = self.newton.iterate(
+            learn=1 <= self.iteration < EVIDENCE_ITERATIONS,
+            r=r,
+            settled=self.iteration >= NOISE_ITERATIONS and not self.calibrating,
+        )
         self.report = report
         self.iteration += 1
-        small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance
+        small = (
+            self.iteration > NOISE_ITERATIONS
+            and report["length"] * report["share"] < self.settings.tolerance
+        )
         gained = report["before"] - report["after"]
         flat = self.iteration > EVIDENCE_ITERATIONS and not self.calibrating and gained < FLAT
         whole = not self.softly or self.iteration > len(self.softly) + 1
@@ -271,10 +342,15 @@ class Identification:
 
     def state(self) -> dict:
         """Plain containers and tensors: what going on from a checkpoint needs beside the body."""
-        return {"iteration": self.iteration, "factors": [b.factor for b in self.newton.blocks],
-                "noise": None if self.noise is None else [[t.cpu() for t in each] for each in self.noise],
-                "multiple": self.multiple(),
-                "grid": None if self.grid is None else [[t.cpu() for t in each] for each in self.grid]}
+        return {
+            "iteration": self.iteration,
+            "factors": [b.factor for b in self.newton.blocks],
+            "noise": None
+            if self.noise is None
+            else [[t.cpu() for t in each] for each in self.noise],
+            "multiple": self.multiple(),
+            "grid": None if self.grid is None else [[t.cpu() for t in each] for each in self.grid],
+        }
 
     def restore(self, state: dict) -> None:
         """As after the iterations that `state` was taken from, but for whether the last of them ended it."""
@@ -282,7 +358,11 @@ class Identification:
         for block, factor in zip(self.newton.blocks, state["factors"], strict=True):
             block.factor = float(factor)
         device = self.body.rest.device
-        self.noise = None if state["noise"] is None else [tuple(t.to(device) for t in each) for each in state["noise"]]
+        self.noise = (
+            None
+            if state["noise"] is None
+            else [tuple(t.to(device) for t in each) for each in state["noise"]]
+        )
         if state.get("grid") is not None:
             self.grid = [residuals.Fields(*(t.to(device) for t in each)) for each in state["grid"]]
         if self.knows_grid:
@@ -304,7 +384,9 @@ class Identification:
             there = self._fields(self.body)
             share, wrong = self.independent(there), self._grids_part(there)
         posterior = self.newton.posterior(share, wrong)
-        return replace(posterior, model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals())
+        return replace(
+            posterior, model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals()
+        )
 
     def _grids_part(self, there: list[residuals.Fields]) -> Tensor | None:
         """Of a calibration: `grid_error` times the difference of `there`, its residuals where it stands, from those on the coarser
@@ -321,7 +403,10 @@ class Identification:
         own, newton = self.body.material.law, self.newton
         if self.calibrating or own not in RIVALS:
             return {}
-        kept, found = len(newton.seats[0].read()) - self.knows_grid, {}  # the grid's multiple is last
+        kept, found = (
+            len(newton.seats[0].read()) - self.knows_grid,
+            {},
+        )  # the grid's multiple is last
         own_cost = self.cost()
         for law in RIVALS:
             if law == own:
@@ -348,7 +433,10 @@ class Identification:
 
         What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
         patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
-        each, cues = COUNTED_AT_FIRST * self.settings.count, 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
+        each, cues = (
+            COUNTED_AT_FIRST * self.settings.count,
+            3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2,
+        )
         counted, wrong, late = 0.0, 0.0, []
         for take, scales, found in zip(self.takes, self.noise, there or self._fields(self.body)):
             frames = slice(min(take.first_contact, len(scales[0])) - 1, None)

@@ -42,7 +42,9 @@ def flow_loss(simulated: Tensor, seen: Tensor, image_width: int) -> Tensor:
 def cofactors(F: Tensor) -> Tensor:
     """det(F) F^-T of (..., 3, 3)."""
     a, b, c = F.unbind(-2)
-    return torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
+    return torch.stack(
+        [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2
+    )
 
 
 class _Polar(torch.autograd.Function):
@@ -73,7 +75,9 @@ class _Polar(torch.autograd.Function):
         M = trace * torch.eye(3, dtype=F.dtype, device=F.device) - 0.5 * (W + W.mT)
         cofactor = cofactors(M)
         det = (M[..., 0, :] * cofactor[..., 0, :]).sum(-1)
-        omega = (cofactor @ axial(R.mT @ seed)[..., None])[..., 0] / det[..., None]  # M is symmetric
+        omega = (cofactor @ axial(R.mT @ seed)[..., None])[..., 0] / det[
+            ..., None
+        ]  # M is symmetric
         return R @ skew(omega)
 
 
@@ -93,9 +97,13 @@ def rotation_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, start: Tensor) -> 
     F_tot, cue: (T, N, 3, 3), frame 0 first; weight: (T, N); start: Q (3, 3), the rotation the sequence started with.
     Frame 0 and inverted particles have no weight.
     """
-    positive = ~(torch.linalg.det(F_tot.detach()) <= FLAT)  # a NaN stays in, so that the loss shows it
+    positive = ~(
+        torch.linalg.det(F_tot.detach()) <= FLAT
+    )  # a NaN stays in, so that the loss shows it
     eye = torch.eye(3, dtype=F_tot.dtype, device=F_tot.device)
-    R = polar_rotation(torch.where(positive[..., None, None], F_tot, eye))  # replaced before, or 0 x NaN would pass through
+    R = polar_rotation(
+        torch.where(positive[..., None, None], F_tot, eye)
+    )  # replaced before, or 0 x NaN would pass through
     squared = (cue - R @ start.mT.to(R)).square().sum((-1, -2))
     return weighted_mean(squared[1:], (weight * positive)[1:])
 
@@ -125,7 +133,10 @@ def shared_where_equal(seed: Tensor, values: Tensor, tolerance: float) -> Tensor
 
     Their axes are then arbitrary: the average is the one choice that does not depend on them (and the shortest subgradient).
     """
-    first, second = ((values[..., i] - values[..., i + 1]).abs() <= tolerance * values[..., 0].abs() for i in (0, 1))
+    first, second = (
+        (values[..., i] - values[..., i + 1]).abs() <= tolerance * values[..., 0].abs()
+        for i in (0, 1)
+    )
     a, b, c = seed.unbind(-1)
     all_three, ab, bc = first & second, (a + b) / 2, (b + c) / 2
     mean = (a + b + c) / 3
@@ -162,7 +173,9 @@ def stretch_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, floor: float = STRA
 
 def heterogeneity_loss(eta: Tensor, lambda_mu: float = 1.0, lambda_var: float = 1.0) -> Tensor:
     """L_het: lambda_mu (mean eta)^2 + lambda_var max(0, var eta - 0.25), eta: (N,)."""
-    return lambda_mu * eta.mean().square() + lambda_var * (eta.var(unbiased=False) - 0.25).clamp(min=0)
+    return lambda_mu * eta.mean().square() + lambda_var * (eta.var(unbiased=False) - 0.25).clamp(
+        min=0
+    )
 
 
 def position_loss(x: Tensor, seen: Tensor, size: float) -> Tensor:

@@ -17,7 +17,9 @@ class GaussNewtonOptimizer(torch.optim.Optimizer):
     iteration finds its Jacobian by differences. `lr` is 1: a whole step, which the iteration itself shortens where it must.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], identification: Callable[[], Identification]) -> None:
+    def __init__(
+        self, parameters: Iterable[Tensor], identification: Callable[[], Identification]
+    ) -> None:
         """identification: the running one, asked in every step: a stage makes it in its first closure."""
         super().__init__([{"params": list(parameters), "name": "numbers"}], {"lr": 1.0})
         self.identification = identification

@@ -50,7 +50,9 @@ class NewtonSteps:
             searched = True
         if self.body.material.candidates:
             searched = True
-            self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
+            self.compared = choose_law(
+                self.body, self.body.material.candidates, lambda: self.identifying(stage)
+            )
             self.settle_law()
         identification = self.identifying(stage)
         if saved is not None:
@@ -61,7 +63,9 @@ class NewtonSteps:
 
     def find_ground(self, stage: Stage) -> None:
         """How the body touches the ground, by a calibration on each that may be."""
-        ground, self.grounds = choose_ground(self.body, self.world.ground.height, lambda each: self.identifying(stage, each))
+        ground, self.grounds = choose_ground(
+            self.body, self.world.ground.height, lambda each: self.identifying(stage, each)
+        )
         self.settle_ground(ground)
 
     def better_ground(self, stage: Stage) -> Ground | None:
@@ -83,7 +87,9 @@ class NewtonSteps:
             ground = replace(found, mode=mode, friction=friction)
             cost, fit = self.fitted_on(ground, stage)
             better = own - cost
-            if better > max(gains.values(), default=-math.inf):  # of equals the first, as max() has it below
+            if better > max(
+                gains.values(), default=-math.inf
+            ):  # of equals the first, as max() has it below
                 fits.clear()
                 fits[ground] = fit  # one is kept, as each has a body
             gains[ground] = better
@@ -118,8 +124,15 @@ class NewtonSteps:
         """(cost, fit) of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same
         noise; infinite where the body cannot be simulated there. The fit itself stays where it stands."""
         own = self.identification
-        other = Identification(copy.deepcopy(self.body), self.takes, replace(self.world, ground=ground), stage, self.criterion,
-                               self.settings, own.kinds)
+        other = Identification(
+            copy.deepcopy(self.body),
+            self.takes,
+            replace(self.world, ground=ground),
+            stage,
+            self.criterion,
+            self.settings,
+            own.kinds,
+        )
         state = own.state()
         other.restore(state | {"iteration": max(state["iteration"], EVIDENCE_ITERATIONS)})
         try:
@@ -133,7 +146,9 @@ class NewtonSteps:
 
     def keep_posterior(self, stage: Stage) -> None:
         """Of the running identification, where it is the last one."""
-        alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
+        alone = (
+            self.body.adapter is None and self.body.heterogeneity is None
+        )  # then the calibration is all there is
         if stage.learns_adapter or (stage.calibrates and alone):
             self.posterior = self.identification.posterior()
 
@@ -155,8 +170,12 @@ class NewtonSteps:
     def identifying(self, stage: Stage, ground: Ground | None = None) -> Identification:
         """A stage's identification on the takes, from where the body stands. ground: another one than the world's."""
         world = self.world if ground is None else replace(self.world, ground=ground)
-        kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
-        return Identification(self.body, self.takes, world, stage, self.criterion, self.settings, kinds)
+        kinds = tuple(
+            self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch")
+        )
+        return Identification(
+            self.body, self.takes, world, stage, self.criterion, self.settings, kinds
+        )
 
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
         """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""
@@ -164,18 +183,30 @@ class NewtonSteps:
         samples = min(len(self.body.rest), SAMPLES)
         for name, size in (("noise", ()), ("grid", (samples, 3))):
             found = saved.get(name)
-            if found is not None and [[tuple(t.shape) for t in each] for each in found] != [[(T, *size)] * 3 for T in expected]:
-                raise DataError(f"ckpt_path: mosa.identification.{name}: expected tensors of {expected} frames after the "
-                                "first, found others: the checkpoint belongs to another configuration")
+            if found is not None and [[tuple(t.shape) for t in each] for each in found] != [
+                [(T, *size)] * 3 for T in expected
+            ]:
+                raise DataError(
+                    f"ckpt_path: mosa.identification.{name}: expected tensors of {expected} frames after the "
+                    "first, found others: the checkpoint belongs to another configuration"
+                )
         if len(saved["factors"]) != (count := len(identification.newton.blocks)):
-            raise DataError(f"ckpt_path: mosa.identification.factors: expected {count} numbers, found {len(saved['factors'])}: "
-                            "the checkpoint belongs to another configuration")
+            raise DataError(
+                f"ckpt_path: mosa.identification.factors: expected {count} numbers, found {len(saved['factors'])}: "
+                "the checkpoint belongs to another configuration"
+            )
         identification.restore(dict(saved))
 
     def report_newton(self, found: dict[str, float]) -> None:
         """Scalars of one iteration: cost, step, what the evidence found, parameters."""
-        values = {"loss/total": found["after"], "fit/stage": float(self.stage_index), "newton/share": found["share"],
-                  "newton/length": found["length"]}
-        values |= {f"newton/{name}": value for name, value in found.items() if name.startswith("sd/")}
+        values = {
+            "loss/total": found["after"],
+            "fit/stage": float(self.stage_index),
+            "newton/share": found["share"],
+            "newton/length": found["length"],
+        }
+        values |= {
+            f"newton/{name}": value for name, value in found.items() if name.startswith("sd/")
+        }
         values["fit/distance_m"] = self.identification.distance()
         self.log_values(values)

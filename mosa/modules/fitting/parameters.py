@@ -31,27 +31,62 @@ def few_numbers(module: torch.nn.Module | None) -> bool:
 def limits_of(name: str) -> tuple[float, float]:
     """Of a global parameter's unconstrained number, within which it is learned: beyond those of nu a rollout no longer tells
     another one."""
-    return (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX)) if name == "nu" else (-math.inf, math.inf)
+    return (
+        (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX))
+        if name == "nu"
+        else (-math.inf, math.inf)
+    )
 
 
-def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,
-              calibrating: bool = False) -> list[Block]:
+def blocks_of(
+    body: Body,
+    *,
+    adapter: bool,
+    heterogeneity: bool,
+    settings: IdentificationSettings,
+    calibrating: bool = False,
+) -> list[Block]:
     """The numbers that are learned, in the order of `tensors_of`."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER
     for name in body.material.learned:
         start = body.material.begins[name]
         wider = 2.5 if name == "nu" else 1.0
-        blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), wider * step, bounds=limits_of(name)))
+        blocks.append(
+            Block(
+                name,
+                torch.tensor([start]),
+                torch.tensor([1.5]),
+                wider * step,
+                bounds=limits_of(name),
+            )
+        )
     if body.contact.enabled:
         sd = 0.05 if calibrating else 0.03
-        blocks.append(Block("contact", torch.tensor([ContactOffset.START]), torch.tensor([sd]), step, bounds=ContactOffset.LIMITS))
+        blocks.append(
+            Block(
+                "contact",
+                torch.tensor([ContactOffset.START]),
+                torch.tensor([sd]),
+                step,
+                bounds=ContactOffset.LIMITS,
+            )
+        )
     if adapter:
         zero = torch.zeros(body.adapter.numbers.numel())
-        blocks.append(Block("operator", zero, zero + settings.operator_sd, step, learned=settings.evidence))
+        blocks.append(
+            Block("operator", zero, zero + settings.operator_sd, step, learned=settings.evidence)
+        )
     if heterogeneity:
         falls = (1 + (body.heterogeneity.size / 2) ** 2) ** (-settings.smoothness / 2)
-        blocks.append(Block("stiffness", 0 * falls, settings.stiffness_sd * falls, step / body.heterogeneity.settings.amplitude,
-                            learned=settings.evidence))
+        blocks.append(
+            Block(
+                "stiffness",
+                0 * falls,
+                settings.stiffness_sd * falls,
+                step / body.heterogeneity.settings.amplitude,
+                learned=settings.evidence,
+            )
+        )
     return blocks
 
 
@@ -65,13 +100,17 @@ def tensors_of(body: Body, *, adapter: bool, heterogeneity: bool) -> list[Tensor
 
 def write_numbers(body: Body, numbers: Tensor) -> None:
     """Set a learned body to numbers (D,) of its joint stage's posterior, a draw of it for instance."""
-    tensors = tensors_of(body, adapter=is_learned(body.adapter), heterogeneity=is_learned(body.heterogeneity))
+    tensors = tensors_of(
+        body, adapter=is_learned(body.adapter), heterogeneity=is_learned(body.heterogeneity)
+    )
     Seat(tensors, lambda: numbers).write(numbers)
 
 
 def read_numbers(body: Body) -> Tensor:
     """What `write_numbers` sets, (D,)."""
-    tensors = tensors_of(body, adapter=is_learned(body.adapter), heterogeneity=is_learned(body.heterogeneity))
+    tensors = tensors_of(
+        body, adapter=is_learned(body.adapter), heterogeneity=is_learned(body.heterogeneity)
+    )
     return Seat(tensors, torch.empty).read()
 
 

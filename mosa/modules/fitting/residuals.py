@@ -46,7 +46,11 @@ def sampled(particles: int, device: torch.device) -> Tensor:
 
 @torch.no_grad()
 def fields(
-    rollout: Rollout, cues: MotionCues, start_rotation: Tensor, chosen: Tensor, response: Response | None = None
+    rollout: Rollout,
+    cues: MotionCues,
+    start_rotation: Tensor,
+    chosen: Tensor,
+    response: Response | None = None,
 ) -> Fields:
     """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence;
     response: what the cues keep of the prediction that they were found about."""
@@ -55,18 +59,29 @@ def fields(
         x, F = response.seen(x, F, start_rotation)
     U, S, V = singular_value_decomposition(F[1:, chosen])
     relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
-    vector = 0.5 * torch.stack([relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0],
-                                relative[..., 1, 0] - relative[..., 0, 1]], -1)
+    vector = 0.5 * torch.stack(
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        -1,
+    )
     weight = cues.weight[1:frames, chosen, None]
-    return Fields(x[1:, chosen] - cues.positions[1:frames, chosen], vector * weight,
-                  (S - cues.stretch[1:frames, chosen]) * weight)
+    return Fields(
+        x[1:, chosen] - cues.positions[1:frames, chosen],
+        vector * weight,
+        (S - cues.stretch[1:frames, chosen]) * weight,
+    )
 
 
 def floors(dx: float, cells: float) -> tuple[float, float, float]:
     """Noise per component that no frame gets below: that of the cues, and what a simulation on a grid of dx [m] gets wrong whatever
     its law is, `cells` of it in positions."""
-    return tuple((cue**2 + (model * cells * (dx if i == 0 else 1.0)) ** 2) ** 0.5
-                 for i, (cue, model) in enumerate(zip(CUE_ERRORS, MODEL_ERRORS)))
+    return tuple(
+        (cue**2 + (model * cells * (dx if i == 0 else 1.0)) ** 2) ** 0.5
+        for i, (cue, model) in enumerate(zip(CUE_ERRORS, MODEL_ERRORS))
+    )
 
 
 def patterns(found: list[Fields]) -> float:
@@ -75,7 +90,9 @@ def patterns(found: list[Fields]) -> float:
     counts = []
     for each in found:
         field = each.position.flatten(1).double()
-        field = field / field.norm(dim=1, keepdim=True).clamp(min=1e-12)  # as the noise weighs the frames
+        field = field / field.norm(dim=1, keepdim=True).clamp(
+            min=1e-12
+        )  # as the noise weighs the frames
         gram = field @ field.T
         counts.append(float(gram.trace() ** 2 / gram.square().sum()))
     return sum(counts) / len(counts)
@@ -96,21 +113,32 @@ def spread(
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Root mean square (T - 1,) over particles of each frame's vectors: the noise of the three kinds, at least as `floors` says and
     no less than what the model gets wrong there, of which `model` is a sample."""
+
     def squares(field: Tensor) -> Tensor:
         return field.square().sum(-1).mean(-1)
 
     noise = []
     for i, each in enumerate(found):
         wrong = [squares(field) for field in model[i]] if model is not None else [0.0, 0.0, 0.0]
-        noise.append(tuple(torch.maximum(squares(field), 3 * floor**2 + m + 0 * squares(field)).sqrt()
-                           for field, floor, m in zip(each, least, wrong)))
+        noise.append(
+            tuple(
+                torch.maximum(squares(field), 3 * floor**2 + m + 0 * squares(field)).sqrt()
+                for field, floor, m in zip(each, least, wrong)
+            )
+        )
     return noise
 
 
-def whitened(found: list[Fields], noise: list[tuple[Tensor, Tensor, Tensor]], counts: list[tuple[float, float, float]]) -> Tensor:
+def whitened(
+    found: list[Fields],
+    noise: list[tuple[Tensor, Tensor, Tensor]],
+    counts: list[tuple[float, float, float]],
+) -> Tensor:
     """One vector whose squared length is minus twice the log likelihood, up to a constant."""
     parts = []
     for each, scales, numbers in zip(found, noise, counts):
         for field, scale, count in zip(each, scales, numbers):
-            parts.append((field * ((count / field.shape[1]) ** 0.5 / scale)[:, None, None]).flatten())
+            parts.append(
+                (field * ((count / field.shape[1]) ** 0.5 / scale)[:, None, None]).flatten()
+            )
     return torch.cat(parts)

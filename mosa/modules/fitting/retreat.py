@@ -48,14 +48,21 @@ class Retreat:
         return True
 
     def written(self) -> dict[str, Any]:
-        return {"halvings": self.halvings, "before": None if self.before is None else [t.cpu() for t in self.before]}
+        return {
+            "halvings": self.halvings,
+            "before": None if self.before is None else [t.cpu() for t in self.before],
+        }
 
     def read(self, saved: Mapping[str, Any] | None, parameters: Sequence[Tensor]) -> None:
         """As it was written, for these parameters. Errors: DataError where it is another stage's."""
         saved = saved or {"halvings": 0, "before": None}
         before = saved["before"]
-        if before is not None and [tuple(t.shape) for t in before] != [tuple(p.shape) for p in parameters]:
-            raise DataError(f"ckpt_path: mosa.retreat.before: expected tensors of shapes {[tuple(p.shape) for p in parameters]}, "
-                            f"found {[tuple(t.shape) for t in before]}: the checkpoint belongs to another configuration")
+        if before is not None and [tuple(t.shape) for t in before] != [
+            tuple(p.shape) for p in parameters
+        ]:
+            raise DataError(
+                f"ckpt_path: mosa.retreat.before: expected tensors of shapes {[tuple(p.shape) for p in parameters]}, "
+                f"found {[tuple(t.shape) for t in before]}: the checkpoint belongs to another configuration"
+            )
         self.halvings = int(saved["halvings"])
         self.before = None if before is None else [t.to(p) for t, p in zip(before, parameters)]

@@ -37,7 +37,9 @@ class Stage:
 
     def __post_init__(self) -> None:
         if self.name not in STAGES:
-            raise ConfigError(f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}")
+            raise ConfigError(
+                f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}"
+            )
         check_knobs(self, f"fit.{self.name}")
 
     @property
@@ -64,7 +66,9 @@ class Stage:
         be left out."""
         return {"prior": ("prior_eta", "prior"), "prior_eta": ("prior_eta",)}.get(self.name, ())
 
-    def learns(self, heterogeneity: object | None, adapter: object | None) -> tuple[object | None, ...]:
+    def learns(
+        self, heterogeneity: object | None, adapter: object | None
+    ) -> tuple[object | None, ...]:
         """Of these parts of a body those that the stage learns beside the global parameters; None for one that the body has not."""
         return (heterogeneity,) * self.learns_heterogeneity + (adapter,) * self.learns_adapter
 
@@ -78,10 +82,16 @@ class Stage:
 
         Errors: ConfigError where it is asked for and cannot."""
         if self.optimizer == "gauss_newton" and not few:
-            raise ConfigError(f"fit.{self.name}.optimizer: gauss_newton learns few numbers (adapter=operator or none, "
-                              "heterogeneity.kind=modes), not networks; expected adam or auto")
+            raise ConfigError(
+                f"fit.{self.name}.optimizer: gauss_newton learns few numbers (adapter=operator or none, "
+                "heterogeneity.kind=modes), not networks; expected adam or auto"
+            )
         chosen = "adam" if self.optimizer == "adam" or not few else "gauss_newton"
-        iterations = min(self.iterations, self.newton_iterations) if chosen == "gauss_newton" else self.iterations
+        iterations = (
+            min(self.iterations, self.newton_iterations)
+            if chosen == "gauss_newton"
+            else self.iterations
+        )
         return replace(self, optimizer=chosen, iterations=iterations)
 
     def decay(self, iteration: int) -> float:

@@ -33,10 +33,18 @@ class Stages(Checkpoint):
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         self.announce(trainer, pl_module)
 
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
-        if pl_module.stage_over and batch_idx == 0:  # of a checkpoint that was written before the stage was ended
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if (
+            pl_module.stage_over and batch_idx == 0
+        ):  # of a checkpoint that was written before the stage was ended
             self.advance(trainer, pl_module)
-        if pl_module.stage is not None and self.begun != pl_module.stage_index and not pl_module.stage_over:
+        if (
+            pl_module.stage is not None
+            and self.begun != pl_module.stage_index
+            and not pl_module.stage_over
+        ):
             self.begun = pl_module.stage_index
             if not pl_module.losses:
                 pl_module.begin(pl_module.stage)
@@ -52,7 +60,9 @@ class Stages(Checkpoint):
                 trainer.should_stop = False
                 for each in stoppers:
                     each.wait_count, each.stopped_epoch = 0, 0
-                    each.best_score = torch.tensor(torch.inf if each.monitor_op == torch.lt else -torch.inf)
+                    each.best_score = torch.tensor(
+                        torch.inf if each.monitor_op == torch.lt else -torch.inf
+                    )
             self.announce(trainer, pl_module)
 
     def advance(self, trainer: L.Trainer, pl_module: Any) -> None:
@@ -67,7 +77,15 @@ class Stages(Checkpoint):
     @staticmethod
     def announce(trainer: L.Trainer, pl_module: Any) -> None:
         """Tells the training data what the next epoch is."""
-        epochs, stage = getattr(getattr(trainer, "datamodule", None), "epochs", None), pl_module.stage
+        epochs, stage = (
+            getattr(getattr(trainer, "datamodule", None), "epochs", None),
+            pl_module.stage,
+        )
         if isinstance(epochs, Epochs) and stage is not None:
             done = len(pl_module.losses)
-            epochs.begin(whole=stage.newton, step=pl_module.steps_done, done=done, left=max(1, stage.iterations - done))
+            epochs.begin(
+                whole=stage.newton,
+                step=pl_module.steps_done,
+                done=done,
+                left=max(1, stage.iterations - done),
+            )

@@ -44,8 +44,15 @@ class Step:
     def seen(self) -> Views:
         """Images, mattes and flow of the rollout, from the cameras of `targets`; rendered once, for all terms that ask."""
         body, rollout = self.body, self.rollout
-        return observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
-                       self.targets.cameras, self.background, flow=self.with_flow)
+        return observe(
+            rollout.x,
+            deformed_covariances(rollout.F_tot, body.covariances),
+            body.opacities,
+            body.colors,
+            self.targets.cameras,
+            self.background,
+            flow=self.with_flow,
+        )
 
 
 Term = Callable[[Step], Tensor | None]
@@ -66,11 +73,15 @@ def flow(step: Step) -> Tensor:
 
 def rotation(step: Step) -> Tensor:
     cues, frames = step.cues, step.frames
-    return losses.rotation_loss(step.rollout.F_tot, cues.rotation[:frames], cues.weight[:frames], step.start.rotation)
+    return losses.rotation_loss(
+        step.rollout.F_tot, cues.rotation[:frames], cues.weight[:frames], step.start.rotation
+    )
 
 
 def stretch(step: Step) -> Tensor:
-    return losses.stretch_loss(step.rollout.F_tot, step.cues.stretch[: step.frames], step.cues.weight[: step.frames])
+    return losses.stretch_loss(
+        step.rollout.F_tot, step.cues.stretch[: step.frames], step.cues.weight[: step.frames]
+    )
 
 
 def position(step: Step) -> Tensor:
@@ -78,7 +89,11 @@ def position(step: Step) -> Tensor:
 
 
 def heterogeneity(step: Step) -> Tensor | None:
-    return losses.heterogeneity_loss(step.body.heterogeneity(step.body.rest)) if step.heterogeneous else None
+    return (
+        losses.heterogeneity_loss(step.body.heterogeneity(step.body.rest))
+        if step.heterogeneous
+        else None
+    )
 
 
 TERMS: dict[str, Term] = {
@@ -111,6 +126,9 @@ def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor
     """Every term that has a weight, raw, in the order in which they are known; then the penalties of an adapter that is learned."""
     found = {name: term(step) for name, term in TERMS.items() if weights.get(name, 0.0) != 0}
     if step.operator is not None:
-        found |= {name: penalty(step.operator, step.misfit) for name, penalty in step.body.adapter.penalties.items()
-                  if weights.get(name, 0.0) != 0}
+        found |= {
+            name: penalty(step.operator, step.misfit)
+            for name, penalty in step.body.adapter.penalties.items()
+            if weights.get(name, 0.0) != 0
+        }
     return {name: value for name, value in found.items() if value is not None}

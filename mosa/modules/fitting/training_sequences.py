@@ -51,38 +51,64 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
 
     @torch.no_grad()
     def predicted(gain: float = 0.0) -> Tensor:
-        return body.simulate(take.start, world, len(take.cues.positions), take.frame_dt, model=model,
-                             observed=take.cues.positions if gain else None, gain=gain).x
+        return body.simulate(
+            take.start,
+            world,
+            len(take.cues.positions),
+            take.frame_dt,
+            model=model,
+            observed=take.cues.positions if gain else None,
+            gain=gain,
+        ).x
 
     free, other, found = predicted(), None, None
-    if response and not body.settings.adaptive:  # substeps that vary cannot be corrected frame by frame
+    if (
+        response and not body.settings.adaptive
+    ):  # substeps that vary cannot be corrected frame by frame
         try:
             other = predicted(CORRECTING)
         except MosaError as error:
-            log.info("motion of %s: the corrected prediction cannot be simulated: %s", take.again.scene.sequence, error)
+            log.info(
+                "motion of %s: the corrected prediction cannot be simulated: %s",
+                take.again.scene.sequence,
+                error,
+            )
     if other is None:
         cues = take.again.about(free, take.cues.positions)
     else:
         cues, found = take.again.with_response(free, other, take.cues.positions, take.first_contact)
     moved = float((cues.positions - take.cues.positions).square().sum(-1).mean().sqrt())
-    log.info("motion of %s once more, about the calibrated backbone's: moved by %.2g mm (root mean square)",
-             take.again.scene.sequence, 1e3 * moved)
+    log.info(
+        "motion of %s once more, about the calibrated backbone's: moved by %.2g mm (root mean square)",
+        take.again.scene.sequence,
+        1e3 * moved,
+    )
     return replace(take, cues=cues, response=found)
 
 
 def with_positions(
-    takes: Sequence[Take], positions: Sequence[Tensor], responses: Sequence[dict[str, Tensor] | None] | None = None
+    takes: Sequence[Take],
+    positions: Sequence[Tensor],
+    responses: Sequence[dict[str, Tensor] | None] | None = None,
 ) -> list[Take]:
     """With the cues that `seen_again` found, of which a checkpoint keeps the positions (T, N, 3) [m] of each take, and the
     responses as they were written.
 
     Errors: ConfigError where they are of others."""
     expected = [tuple(take.cues.positions.shape) for take in takes]
-    if [tuple(each.shape) for each in positions] != expected or not all(take.again for take in takes):
-        raise ConfigError(f"ckpt_path: expected cues of shapes {expected}, found {[tuple(each.shape) for each in positions]}: "
-                          "the checkpoint belongs to other sequences, or reconstruction.informed was switched off since")
+    if [tuple(each.shape) for each in positions] != expected or not all(
+        take.again for take in takes
+    ):
+        raise ConfigError(
+            f"ckpt_path: expected cues of shapes {expected}, found {[tuple(each.shape) for each in positions]}: "
+            "the checkpoint belongs to other sequences, or reconstruction.informed was switched off since"
+        )
     responses = [None] * len(expected) if responses is None else responses
     if len(responses) != len(expected):
-        raise ConfigError(f"ckpt_path: expected mosa.responses of {len(expected)} sequences, found {len(responses)}")
-    return [replace(take, cues=take.again.cues(each), response=take.again.response(kept))
-            for take, each, kept in zip(takes, positions, responses)]
+        raise ConfigError(
+            f"ckpt_path: expected mosa.responses of {len(expected)} sequences, found {len(responses)}"
+        )
+    return [
+        replace(take, cues=take.again.cues(each), response=take.again.response(kept))
+        for take, each, kept in zip(takes, positions, responses)
+    ]

@@ -78,7 +78,13 @@ class Chain:
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int, worlds: int,
         lengths: Sequence[int], *, learned: Learned, plastic_adapted: bool, collects: bool, graphs: bool,
     ) -> None:  # fmt: skip
-        self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
+        self.numerics, self.adapter, self.ask, self.lengths, self.collects = (
+            numerics,
+            adapter,
+            ask,
+            tuple(lengths),
+            collects,
+        )
         self.substeps = sum(lengths)
         self.learned = learned
         self._shape = {
@@ -87,11 +93,15 @@ class Chain:
         }  # fmt: skip
         self.light: Workspace | None = None
         self.full: Workspace | None = None
-        self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
+        self.statistics: dict[
+            bool, tuple[Tensor, ...]
+        ] = {}  # in light and in full buffers: each graph has its own
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
         failing = f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured"
-        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0, MOST_GRAPHS)
+        self._graphs = Graphs(
+            TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0, MOST_GRAPHS
+        )
         self._held: tuple = ()  # what graphs have by value,
         self._read: Sequence[Tensor] = ()  # and by address
         self.again = "graphs" if graphs else "states"
@@ -107,7 +117,11 @@ class Chain:
 
     def named(self, statistics: Sequence[Tensor]) -> list:
         """One named tuple per evaluation, of tensors (K, ...)."""
-        return [self._kind(*parts) for parts in zip(*statistics, strict=True)] if self._kind is not None else []
+        return (
+            [self._kind(*parts) for parts in zip(*statistics, strict=True)]
+            if self._kind is not None
+            else []
+        )
 
     def _ask(
         self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
@@ -133,7 +147,12 @@ class Chain:
         work, slot = self.full, step % 2
         into = (work.adj_F[slot], work.adj_C_affine[slot], work.adj_held["parameters"])
         with torch.enable_grad(), at_hand():
-            inputs = (work.F[step], work.C_affine[step], work.held["parameters"], *self.learned.weights)
+            inputs = (
+                work.F[step],
+                work.C_affine[step],
+                work.held["parameters"],
+                *self.learned.weights,
+            )
             # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
             leaves = [t.detach().requires_grad_() for t in inputs]
             return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
@@ -142,15 +161,22 @@ class Chain:
     def _answer(self, work: Workspace, collects: bool, step: int) -> _Evaluation:
         """The same without a graph, in either workspace."""
         slot = step % len(work.x)
-        return _Evaluation([], *self._ask(work.F[slot], work.C_affine[slot], work.held["parameters"], collects))
+        return _Evaluation(
+            [], *self._ask(work.F[slot], work.C_affine[slot], work.held["parameters"], collects)
+        )
 
     @same_weights()
     def _forward(self, full: bool) -> None:
         work = self.workspace(full)
-        collected = [each.statistics for each in self._segments(work, partial(self._answer, work, self.collects))]
+        collected = [
+            each.statistics
+            for each in self._segments(work, partial(self._answer, work, self.collects))
+        ]
         self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
 
-    def _segments(self, work: Workspace, evaluate: Callable[[int], _Evaluation]) -> Iterator[_Evaluation]:
+    def _segments(
+        self, work: Workspace, evaluate: Callable[[int], _Evaluation]
+    ) -> Iterator[_Evaluation]:
         """Launches all segments, one after each answer of `evaluate` to the state at its start, and passes the answers on."""
         work.flags.fill_(NO_EVENT)
         step = 0
@@ -180,15 +206,23 @@ class Chain:
             work.point(answer)
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index], more=True)
-            pairs = [(answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None]
-            pairs += [(t, all_seeds[index]) for t, all_seeds in zip(statistics, self.statistics_seeds)]
+            pairs = [
+                (answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None
+            ]
+            pairs += [
+                (t, all_seeds[index]) for t, all_seeds in zip(statistics, self.statistics_seeds)
+            ]
             pairs = [(output, seed) for output, seed in pairs if output.requires_grad]
             if not pairs:
                 continue
             outputs, seeds = zip(*pairs)
             # the first three leaves get theirs in place, see `_evaluate`
             found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)[3:]
-            sums = [(total, part) for total, part in zip(self.adj_weights, found, strict=True) if part is not None]
+            sums = [
+                (total, part)
+                for total, part in zip(self.adj_weights, found, strict=True)
+                if part is not None
+            ]
             if sums:
                 torch._foreach_add_(*zip(*sums))
 
@@ -197,14 +231,21 @@ class Chain:
 
         learned: of the adapter as it is now."""
         for each in (self.light, self.full):
-            if each is not None:  # this pass uses one, the other may have had those of an earlier one
+            if (
+                each is not None
+            ):  # this pass uses one, the other may have had those of an earlier one
                 each.cutoff, each.steps = work.cutoff, work.steps
         self.learned = learned
         # not their sizes: buffers may come back to an earlier one
-        buffers = tuple(each.allocations if each is not None else 0 for each in (self.light, self.full))
+        buffers = tuple(
+            each.allocations if each is not None else 0 for each in (self.light, self.full)
+        )
         held, read = (buffers, work.cutoff), (*learned.tensors, *learned.weights)
         if held != self._held or not same_memory(self._read, read):
-            self._held, self._read = held, [t.detach() for t in read]  # aliases, which belong to no graph
+            self._held, self._read = (
+                held,
+                [t.detach() for t in read],
+            )  # aliases, which belong to no graph
             self._graphs.drop()
 
     def play(self, steps: Steps, name: str, *arguments) -> None:
@@ -248,7 +289,9 @@ class ChainOfSegments(Stretch):
     def full(self, differentiated: bool, kept: bool) -> bool:
         return differentiated  # a rollout with a backward pass has these buffers anyway
 
-    def buffers(self, solver: SegmentSolver, acting: Sequence[Tensor], full: bool) -> tuple[Workspace, dict]:
+    def buffers(
+        self, solver: SegmentSolver, acting: Sequence[Tensor], full: bool
+    ) -> tuple[Workspace, dict]:
         return self.chain.workspace(full), {"parameters": acting[0].detach()}
 
     def advance(self, work: Workspace, acting: Sequence[Tensor]) -> None:
@@ -265,9 +308,13 @@ class ChainOfSegments(Stretch):
             chain.statistics_seeds = tuple(torch.zeros_like(t) for t in chain.statistics[True])
         return chain.statistics_seeds
 
-    def adjoint(self, work: Workspace, acting: Sequence[Tensor], again: bool, penalised: bool) -> None:
+    def adjoint(
+        self, work: Workspace, acting: Sequence[Tensor], again: bool, penalised: bool
+    ) -> None:
         weights, tensors = tuple(acting[1:]), tensors_of(self.chain.adapter)
-        self.chain.follow(work, Learned(self.learned.names, weights, tensors))  # another rollout may have gone forward since
+        self.chain.follow(
+            work, Learned(self.learned.names, weights, tensors)
+        )  # another rollout may have gone forward since
         self.chain.play(work.steps, "adjoint", self.chain.again if again else "tape", penalised)
 
     def adjoint_of(self, work: Workspace, acting: Sequence[Tensor]) -> list[Tensor | None]:
@@ -280,7 +327,9 @@ def advance_chain(
 ) -> tuple[State, tuple[Tensor, ...], list]:  # fmt: skip
     """(the state after the chain, reactions, statistics of each evaluation), differentiable in state, parameters, poses and the
     adapter's weights. Arguments: as `ChainOfSegments` and `advance_segment`. Errors: SimulationDiverged; LeftWindow."""
-    stretch = ChainOfSegments(lanes, first, steps or Steps(lanes.numerics.dt, lanes.numerics.dt), chain, learned)
+    stretch = ChainOfSegments(
+        lanes, first, steps or Steps(lanes.numerics.dt, lanes.numerics.dt), chain, learned
+    )
     final, left = advance(stretch, state, (packed, *learned.weights, *poses))
     reactions = 2 if poses else 0
     return final, left[:reactions], chain.named(left[reactions:])

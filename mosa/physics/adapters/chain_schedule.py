@@ -40,9 +40,20 @@ class Chains:
     ask, collects: as `Chain`."""
 
     def __init__(
-        self, lanes: Lanes, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], packed: Tensor, collects: bool
+        self,
+        lanes: Lanes,
+        adapter: nn.Module,
+        ask: Callable[..., dict[str, Tensor | None]],
+        packed: Tensor,
+        collects: bool,
     ) -> None:
-        self.lanes, self.adapter, self.ask, self.packed, self.collects = lanes, adapter, ask, packed, collects
+        self.lanes, self.adapter, self.ask, self.packed, self.collects = (
+            lanes,
+            adapter,
+            ask,
+            packed,
+            collects,
+        )
         self.numerics = lanes.numerics
 
     def look(self) -> tuple[Tensor, ...]:
@@ -71,7 +82,12 @@ class Chains:
         return Plan(limit if graphs else chain_length(substeps, start, each)[0], graphs)
 
     def frame(
-        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
+        self,
+        state: State,
+        lengths: Sequence[int],
+        first: int,
+        poses: tuple[Tensor, ...],
+        steps: Steps | None,
     ) -> tuple[State, Tensor | None, list]:
         """(as `Prepared.frame`, statistics of the evaluations). A chain that fails is cut."""
         groups, done, forces, collected = grouped(lengths, self._plan.limit), 0, [], []
@@ -98,7 +114,15 @@ class Chains:
 
     def chain(self, lengths: tuple[int, ...], state: State) -> Chain:
         chains, n, worlds = self.lanes.buffers.chains, len(self.packed), self.lanes.worlds
-        key = (self.adapter, n, worlds, lengths, self.collects, self._plan.graphs, self.learned.names)
+        key = (
+            self.adapter,
+            n,
+            worlds,
+            lengths,
+            self.collects,
+            self._plan.graphs,
+            self.learned.names,
+        )
         chain = chains.pop(key, None)
         if chain is None:
             while len(chains) >= MAX_CHAINS:
@@ -118,9 +142,13 @@ class Chains:
             if len(probes) >= MAX_CHAINS:
                 probes.clear()
             with torch.enable_grad(), at_hand():
-                leaves = [t.detach().requires_grad_() for t in (state.F, state.C_affine, self.packed)]
+                leaves = [
+                    t.detach().requires_grad_() for t in (state.F, state.C_affine, self.packed)
+                ]
                 answer, held = self.ask(self.adapter, *leaves), 0
-                if device.type == "cuda":  # the second one's: an adapter may hold its last graph, and frees it with the next
+                if (
+                    device.type == "cuda"
+                ):  # the second one's: an adapter may hold its last graph, and frees it with the next
                     held = torch.cuda.memory_allocated(device)
                     second = self.ask(self.adapter, *leaves)
                     held = torch.cuda.memory_allocated(device) - held

@@ -41,16 +41,25 @@ class Several:
 
     Errors: ConfigError for another number of adapters than worlds."""
 
-    def __init__(self, adapters: Sequence[Callable[[MaterialState], AdapterOperator]], worlds: int) -> None:
+    def __init__(
+        self, adapters: Sequence[Callable[[MaterialState], AdapterOperator]], worlds: int
+    ) -> None:
         if len(adapters) != worlds:
-            raise ConfigError(f"adapter: expected one, or one for each of {worlds} worlds, found {len(adapters)}")
+            raise ConfigError(
+                f"adapter: expected one, or one for each of {worlds} worlds, found {len(adapters)}"
+            )
         self.adapters = tuple(adapters)
 
     def __call__(self, state: MaterialState) -> AdapterOperator:
         count = len(self.adapters)
         parts = zip(*((None,) * count if t is None else t.chunk(count) for t in state))
-        answers = [AdapterOperator(*adapter(MaterialState(*part))) for adapter, part in zip(self.adapters, parts)]
-        return AdapterOperator(*(None if own[0] is None else torch.cat(own) for own in zip(*answers)))
+        answers = [
+            AdapterOperator(*adapter(MaterialState(*part)))
+            for adapter, part in zip(self.adapters, parts)
+        ]
+        return AdapterOperator(
+            *(None if own[0] is None else torch.cat(own) for own in zip(*answers))
+        )
 
 
 def ask(
@@ -68,7 +77,9 @@ def ask(
         shape = (n, 6, 6) if name.endswith("G") else (n, 6)
         if value is None or tuple(value.shape) != shape or value.dtype != dtype:
             found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
-            raise ConfigError(f"adapter output {name}: expected shape {shape} of {dtype}, found {found}")
+            raise ConfigError(
+                f"adapter output {name}: expected shape {shape} of {dtype}, found {found}"
+            )
     if collect is not None:
         collect(adapter.statistics())
     return result

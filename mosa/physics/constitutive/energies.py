@@ -48,7 +48,9 @@ def herschel_bulkley_energy(F: Tensor, mu: Tensor, kappa: Tensor, **unused: Tens
     return 0.5 * kappa * (0.5 * (J**2 - 1) - torch.log(J)) + 0.5 * mu * (isochoric - 3)
 
 
-def herschel_bulkley_hencky_energy(F: Tensor, mu: Tensor, kappa: Tensor, **unused: Tensor) -> Tensor:
+def herschel_bulkley_hencky_energy(
+    F: Tensor, mu: Tensor, kappa: Tensor, **unused: Tensor
+) -> Tensor:
     """That of stvk with lam = kappa - 2 mu/3."""
     return stvk_energy(F, mu, kappa - 2 * mu / 3)
 

@@ -70,7 +70,9 @@ def isochoric_pair(kij: wp.float64, kji: wp.float64, gi: wp.float64, gj: wp.floa
 
 
 @wp.func_grad(isochoric_contract)
-def adj_isochoric_contract(F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, c: wp.float64, adj_ret: wp.mat33d):
+def adj_isochoric_contract(
+    F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, c: wp.float64, adj_ret: wp.mat33d
+):
     # from sum log q_i = 2 sum log S_i: da = (sum (2/S_i - 2 c S_i/q_i) dS_i - sum S_i^2/q_i dc)/sum 1/q_i
     K = wp.transpose(U) * adj_ret * V
     q = isochoric_squares(S, c)
@@ -86,7 +88,9 @@ def adj_isochoric_contract(F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d
     P = wp.mat33d(p00, p01, p02, p10, p11, p12, p20, p21, p22)
     wp.adjoint[F] += U * P * wp.transpose(V)
     squares = wp.vec3d(S[0] * S[0], S[1] * S[1], S[2] * S[2])
-    wp.adjoint[c] += wp.dot(k, squares) - shift * (squares[0] / q[0] + squares[1] / q[1] + squares[2] / q[2])
+    wp.adjoint[c] += wp.dot(k, squares) - shift * (
+        squares[0] / q[0] + squares[1] / q[1] + squares[2] / q[2]
+    )
 
 
 @wp.func

@@ -179,7 +179,9 @@ def polar_value(F: wp.mat33d):
                 x = wp.sqrt(wp.ddot(X, X))
                 y = wp.sqrt(wp.dot(bc, bc) + wp.dot(ca, ca) + wp.dot(ab, ab))
                 if y > wp.float64(1.0e-5) * x * x and d * x * x * x > -wp.float64(0.1) * y * y * y:
-                    e = _ONE / x  # all singular values are positive after the step: y/x is about the second one
+                    e = (
+                        _ONE / x
+                    )  # all singular values are positive after the step: y/x is about the second one
                     f = _ONE / y
                 else:
                     step = 20
@@ -191,7 +193,11 @@ def polar_value(F: wp.mat33d):
             dc = c1 - c
             X = wp.mat33d(a1[0], a1[1], a1[2], b1[0], b1[1], b1[2], c1[0], c1[1], c1[2])
             # quadratic convergence: a change of 1e-9 leaves an error of 1e-18
-            if e == _HALF and f > _ZERO and wp.dot(da, da) + wp.dot(db, db) + wp.dot(dc, dc) < wp.float64(1.0e-18):
+            if (
+                e == _HALF
+                and f > _ZERO
+                and wp.dot(da, da) + wp.dot(db, db) + wp.dot(dc, dc) < wp.float64(1.0e-18)
+            ):
                 converged = int(1)
             step = step + 1
     if converged == 0:
@@ -269,7 +275,12 @@ def log_quotient(a: wp.float64, b: wp.float64):
         z = d / (a + b)
         if wp.abs(z) < wp.float64(1.0e-2):
             z2 = z * z
-            series = _ONE + z2 / wp.float64(3.0) + z2 * z2 / wp.float64(5.0) + z2 * z2 * z2 / wp.float64(7.0)
+            series = (
+                _ONE
+                + z2 / wp.float64(3.0)
+                + z2 * z2 / wp.float64(5.0)
+                + z2 * z2 * z2 / wp.float64(7.0)
+            )
             q = _TWO * (series + z2 * z2 * z2 * z2 / wp.float64(9.0)) / (a + b)
         else:
             q = wp.log(a / b) / d
@@ -329,7 +340,13 @@ def growth(z: wp.float64):
     r = _ONE
     if wp.abs(z) < wp.float64(1.0e-2):
         z2 = z * z
-        r = _ONE + z / _TWO + z2 / wp.float64(6.0) + z2 * z / wp.float64(24.0) + z2 * z2 / wp.float64(120.0)
+        r = (
+            _ONE
+            + z / _TWO
+            + z2 / wp.float64(6.0)
+            + z2 * z / wp.float64(24.0)
+            + z2 * z2 / wp.float64(120.0)
+        )
         r = r + z2 * z2 * z / wp.float64(720.0) + z2 * z2 * z2 / wp.float64(5040.0)
     else:
         r = (wp.exp(z) - _ONE) / z
@@ -340,7 +357,9 @@ def growth(z: wp.float64):
 def contracted_stretch(S: wp.vec3d, c: wp.float64):
     e = hencky(S)
     m = (e[0] + e[1] + e[2]) / wp.float64(3.0)
-    return wp.vec3d(wp.exp(m + c * (e[0] - m)), wp.exp(m + c * (e[1] - m)), wp.exp(m + c * (e[2] - m)))
+    return wp.vec3d(
+        wp.exp(m + c * (e[0] - m)), wp.exp(m + c * (e[1] - m)), wp.exp(m + c * (e[2] - m))
+    )
 
 
 @wp.func
@@ -362,7 +381,9 @@ def contract_pair(kij: wp.float64, kji: wp.float64, gi: wp.float64, gj: wp.float
 
 
 @wp.func_grad(contract)
-def adj_contract(F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, c: wp.float64, adj_ret: wp.mat33d):
+def adj_contract(
+    F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, c: wp.float64, adj_ret: wp.mat33d
+):
     K = wp.transpose(U) * adj_ret * V
     g = contracted_stretch(S, c)
     e = hencky(S)

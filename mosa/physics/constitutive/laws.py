@@ -55,7 +55,9 @@ class Law:
             offsets[name] = total
             total += size
         if total > SLOTS:
-            raise ConfigError(f"law {self.name!r}: expected at most {SLOTS} numbers per particle, found {total}")
+            raise ConfigError(
+                f"law {self.name!r}: expected at most {SLOTS} numbers per particle, found {total}"
+            )
         object.__setattr__(self, "offsets", offsets)
 
     @property
@@ -93,7 +95,9 @@ def register_composition(sign: str, make: Callable[[str, list[Law]], Law]) -> No
     _COMPOSED[sign] = make
 
 
-def register_law(name: str, stress: Callable, parameters: dict[str, int] | tuple[str, ...], **options) -> Law:
+def register_law(
+    name: str, stress: Callable, parameters: dict[str, int] | tuple[str, ...], **options
+) -> Law:
     """Make a law known to `Simulator` by `name`; see `Law` for the arguments. Registering the same functions again is a no-op.
 
     Example: a fibre family a (rest direction), tau = mu (F F^T - I) + lam log(J) I + 2 kf (I4 - 1) (F a)(F a)^T, takes
@@ -105,20 +109,23 @@ def register_law(name: str, stress: Callable, parameters: dict[str, int] | tuple
     law = Law(name, stress, dict(parameters), **options)
     known = _LAWS.get(name)
     if known is not None and known != law:
-        raise ConfigError(f"law {name!r} is registered already with other functions or parameters; choose another name")
+        raise ConfigError(
+            f"law {name!r} is registered already with other functions or parameters; choose another name"
+        )
     _LAWS[name] = law
     return law
 
 
 def law_named(name: str) -> Law:
-    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`). Errors: ConfigError naming the known ones.
-    """
+    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`). Errors: ConfigError naming the known ones."""
     for sign, make in _COMPOSED.items():
         if sign in name and name not in _LAWS:
             make(name, [law_named(part) for part in name.split(sign)])
     if name not in _LAWS:
-        raise ConfigError(f"law: expected one of {', '.join(law_names())}, found {name!r}; one of another package is known once "
-                          "that is imported (extensions)")
+        raise ConfigError(
+            f"law: expected one of {', '.join(law_names())}, found {name!r}; one of another package is known once "
+            "that is imported (extensions)"
+        )
     return _LAWS[name]
 
 

@@ -11,10 +11,23 @@ from functools import cache
 
 import warp as wp
 
-from mosa.physics.constitutive.kinematics import contract, hencky_material, rotation, rotation_of, svd
+from mosa.physics.constitutive.kinematics import (
+    contract,
+    hencky_material,
+    rotation,
+    rotation_of,
+    svd,
+)
 from mosa.physics.constitutive.laws import SLOTS, Law
 from mosa.physics.constitutive.particle_access import particle_access
-from mosa.physics.constitutive.strain import FACTORISED, STRAINS, conjugate_stress, green_strain, green_stress, material_strain
+from mosa.physics.constitutive.strain import (
+    FACTORISED,
+    STRAINS,
+    conjugate_stress,
+    green_strain,
+    green_stress,
+    material_strain,
+)
 
 vec6 = wp.types.vector(length=6, dtype=wp.float64)
 
@@ -58,7 +71,9 @@ def field_types(scalar):
 
 
 @cache
-def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: str | None = None, shear: int = 0):
+def stress_kernel(
+    stress, uses_rotation: bool, scalar, adapted: bool, strain: str | None = None, shear: int = 0
+):
     """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame.
 
     strain: a name of `STRAINS`; the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is
@@ -67,7 +82,10 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
     """
     field33, field6, field66, fieldp = field_types(scalar)
     energetic = adapted and strain is not None
-    own, needs_rotation = particle_access(scalar, SLOTS), uses_rotation or (adapted and not energetic)
+    own, needs_rotation = (
+        particle_access(scalar, SLOTS),
+        uses_rotation or (adapted and not energetic),
+    )
     factorised, measure = strain in FACTORISED, STRAINS.index(strain) if energetic else 0
 
     @wp.kernel(module="unique")
@@ -89,12 +107,18 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
             if wp.static(factorised):
                 U, S, V = svd(Fi)
                 E = mandel(material_strain(wp.static(measure), Fi, S, V))
-                T = T + conjugate_stress(wp.static(measure), Fi, S, V, unmandel(modulus * own.times66(G, i, place, E)))
+                T = T + conjugate_stress(
+                    wp.static(measure), Fi, S, V, unmandel(modulus * own.times66(G, i, place, E))
+                )
             else:
-                T = T + green_stress(Fi, unmandel(modulus * own.times66(G, i, place, mandel(green_strain(Fi)))))
+                T = T + green_stress(
+                    Fi, unmandel(modulus * own.times66(G, i, place, mandel(green_strain(Fi))))
+                )
         elif wp.static(adapted):
             s = vech(wp.transpose(R) * T * R)
-            T = T + R * unvech(own.times66(G, i, place, s) + own.vector6(h, i, place)) * wp.transpose(R)
+            T = T + R * unvech(
+                own.times66(G, i, place, s) + own.vector6(h, i, place)
+            ) * wp.transpose(R)
         tau[i] = field33(T)
 
     return stress_of_particles
@@ -164,5 +188,7 @@ def state_kernel(stress, uses_rotation: bool, scalar, plastic: bool):
 def kernels_of(law: Law, scalar, adapted: bool, plastic_adapted: bool, strain: str | None = None):
     """(stress kernel, return-mapping kernel or None) of a law. strain: of an operator that is a stiffness, see `stress_kernel`."""
     shear = law.offsets["mu"] if adapted and strain is not None else 0
-    stress = stress_kernel(law.stress, law.uses_rotation, scalar, adapted, strain if adapted else None, shear)
+    stress = stress_kernel(
+        law.stress, law.uses_rotation, scalar, adapted, strain if adapted else None, shear
+    )
     return stress, return_kernel(law.return_map, scalar, plastic_adapted) if law.plastic else None

@@ -15,7 +15,13 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.constitutive.laws import SLOTS, Law, LawParameters, register_composition, register_law
+from mosa.physics.constitutive.laws import (
+    SLOTS,
+    Law,
+    LawParameters,
+    register_composition,
+    register_law,
+)
 
 INDEX = "law"
 """Name of the parameter that says which law a particle follows."""
@@ -27,12 +33,16 @@ def register_mixture(name: str, laws: Sequence[Law]) -> Law:
     for law in laws:
         for key, size in law.parameters.items():
             if parameters.setdefault(key, size) != size:
-                raise ConfigError(f"law {name!r}: parameter {key} has {parameters[key]} numbers in one law and {size} in another")
+                raise ConfigError(
+                    f"law {name!r}: parameter {key} has {parameters[key]} numbers in one law and {size} in another"
+                )
     parameters[INDEX] = 1
     slot = sum(parameters.values()) - 1
     references = {law.reference for law in laws} - {None}
     if len(references) > 1:
-        raise ConfigError(f"law {name!r}: expected one name for the start's rotation, found {', '.join(sorted(references))}")
+        raise ConfigError(
+            f"law {name!r}: expected one name for the start's rotation, found {', '.join(sorted(references))}"
+        )
     gathers = [_gather(law, parameters) for law in laws]
     stress, mapping = _stress(laws[-1].stress, gathers[-1]), None
     for i in reversed(range(len(laws) - 1)):
@@ -40,7 +50,9 @@ def register_mixture(name: str, laws: Sequence[Law]) -> Law:
     if any(law.plastic for law in laws):
         mapping = _mapping(laws[-1].return_map or _unmapped, gathers[-1])
         for i in reversed(range(len(laws) - 1)):
-            mapping = _chosen_mapping(_mapping(laws[i].return_map or _unmapped, gathers[i]), mapping, slot, i)
+            mapping = _chosen_mapping(
+                _mapping(laws[i].return_map or _unmapped, gathers[i]), mapping, slot, i
+            )
     return register_law(
         name, stress, parameters, return_map=mapping, uses_rotation=any(law.uses_rotation for law in laws),
         reference=next(iter(references), None), needs_positive_J=any(law.needs_positive_J for law in laws),
@@ -53,8 +65,13 @@ def _by_law(laws: Sequence[Law], quantity: Callable) -> Callable:
 
     def chosen(**parameters: Tensor) -> Tensor:
         index = torch.as_tensor(parameters[INDEX])
-        parts = [quantity(law, {k: parameters[k] for k in law.parameters if k in parameters}) for law in laws]
-        result = torch.zeros(torch.broadcast_shapes(index.shape, *(p.shape for p in parts)), dtype=parts[0].dtype)
+        parts = [
+            quantity(law, {k: parameters[k] for k in law.parameters if k in parameters})
+            for law in laws
+        ]
+        result = torch.zeros(
+            torch.broadcast_shapes(index.shape, *(p.shape for p in parts)), dtype=parts[0].dtype
+        )
         result = result.to(parts[0].device)
         for i, part in enumerate(parts):
             result = torch.where(index == i, part, result)

@@ -172,4 +172,6 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     @wp.func_native(*snippets(slots, f"wp::vec_t<{slots}, double>"))
     def parameters(field: fields, i: int) -> vector: ...
 
-    return SimpleNamespace(matrix33=matrix33, vector6=vector6, times66=times66, parameters=parameters)
+    return SimpleNamespace(
+        matrix33=matrix33, vector6=vector6, times66=times66, parameters=parameters
+    )

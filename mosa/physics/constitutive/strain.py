@@ -47,7 +47,10 @@ def log_ratio(z: wp.float64):
     r = _ONE
     if wp.abs(z) < _CLOSE:
         y = z * z
-        r = _ONE + y * (_ONE / wp.float64(3.0) + y * (_ONE / wp.float64(5.0) + y * (_ONE / wp.float64(7.0) + y / wp.float64(9.0))))
+        r = _ONE + y * (
+            _ONE / wp.float64(3.0)
+            + y * (_ONE / wp.float64(5.0) + y * (_ONE / wp.float64(7.0) + y / wp.float64(9.0)))
+        )
     else:
         r = _HALF * wp.log((_ONE + z) / (_ONE - z)) / z
     return r
@@ -81,7 +84,9 @@ def second_difference(measure: int, s: wp.float64, t: wp.float64, u: wp.float64)
     c = wp.abs(u)
     r = _ZERO
     if measure == _BIOT:
-        r = -_ONE / (wp.max(a + b, STRAIN_CLAMP) * wp.max(b + c, STRAIN_CLAMP) * wp.max(c + a, STRAIN_CLAMP))
+        r = -_ONE / (
+            wp.max(a + b, STRAIN_CLAMP) * wp.max(b + c, STRAIN_CLAMP) * wp.max(c + a, STRAIN_CLAMP)
+        )
     else:
         low = wp.min(a, wp.min(b, c))
         high = wp.max(a, wp.max(b, c))
@@ -96,13 +101,21 @@ def second_difference(measure: int, s: wp.float64, t: wp.float64, u: wp.float64)
                 # at the mean, and h_k = h_(k-2) p + h_(k-3) q with p = -(xy + yz + zx), q = xyz
                 p = -(x * y + y * z + z * x)
                 q = x * y * z
-                series = -_HALF - p / wp.float64(4.0) + q / wp.float64(5.0) - p * p / wp.float64(6.0)
-                series = series + _TWO * p * q / wp.float64(7.0) - (p * p * p + q * q) / wp.float64(8.0)
+                series = (
+                    -_HALF - p / wp.float64(4.0) + q / wp.float64(5.0) - p * p / wp.float64(6.0)
+                )
+                series = (
+                    series + _TWO * p * q / wp.float64(7.0) - (p * p * p + q * q) / wp.float64(8.0)
+                )
                 r = _HALF * series / (m * m)
             else:
-                r = (first_difference(measure, low, middle) - first_difference(measure, middle, high)) / (low * low - high * high)
+                r = (
+                    first_difference(measure, low, middle) - first_difference(measure, middle, high)
+                ) / (low * low - high * high)
         elif high > STRAIN_CLAMP and high * high - low * low > wp.float64(1.0e-12):
-            r = (first_difference(measure, low, middle) - first_difference(measure, middle, high)) / (low * low - high * high)
+            r = (
+                first_difference(measure, low, middle) - first_difference(measure, middle, high)
+            ) / (low * low - high * high)
     return r
 
 
@@ -136,7 +149,9 @@ def second_entry(measure: int, K: wp.mat33d, B: wp.mat33d, S: wp.vec3d, i: int, 
     """Entry of D^2 E(C)[T, B] in the frame of V: sum over j of e[i, j, k] (K_ij B_jk + B_ij K_jk)."""
     r = _ZERO
     for j in range(3):
-        r = r + second_difference(measure, S[i], S[j], S[k]) * (K[i, j] * B[j, k] + B[i, j] * K[j, k])
+        r = r + second_difference(measure, S[i], S[j], S[k]) * (
+            K[i, j] * B[j, k] + B[i, j] * K[j, k]
+        )
     return r
 
 

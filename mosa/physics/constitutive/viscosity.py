@@ -13,9 +13,19 @@ import warp as wp
 from torch import Tensor
 
 from mosa.physics.constitutive.elasticity import eye
-from mosa.physics.constitutive.energies import herschel_bulkley_energy, herschel_bulkley_hencky_energy, newtonian_energy
+from mosa.physics.constitutive.energies import (
+    herschel_bulkley_energy,
+    herschel_bulkley_hencky_energy,
+    newtonian_energy,
+)
 from mosa.physics.constitutive.isochoric import clamped_squares, isochoric_contract
-from mosa.physics.constitutive.kinematics import contract, hencky_spatial, rotation, rotation_of, svd
+from mosa.physics.constitutive.kinematics import (
+    contract,
+    hencky_spatial,
+    rotation,
+    rotation_of,
+    svd,
+)
 from mosa.physics.constitutive.laws import LawParameters, register_law
 from mosa.physics.constitutive.material_kernels import deviator
 
@@ -37,7 +47,13 @@ def root(x: wp.float64):
 
 
 @wp.func
-def flow_fraction(n: wp.float64, yield_stress: wp.float64, viscosity: wp.float64, modulus: wp.float64, dt: wp.float64):
+def flow_fraction(
+    n: wp.float64,
+    yield_stress: wp.float64,
+    viscosity: wp.float64,
+    modulus: wp.float64,
+    dt: wp.float64,
+):
     """|s|/|s_trial| after a step of flow: |s| = n - y/(1 + viscosity/(2 modulus dt)), y = n - sqrt(2/3) yield_stress > 0."""
     y = n - _SQRT23 * yield_stress
     return _ONE - y / (n * (_ONE + viscosity / (_TWO * modulus * dt)))
@@ -70,7 +86,9 @@ def herschel_bulkley_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d
     if J > _ZERO:
         D = deviator(wp.pow(J, -_TWO * _THIRD) * (F * wp.transpose(F)))
         E = deviator(H)
-        measure = p[0] * wp.max(root(wp.ddot(D, D)) + _TWO * (root(n2) - root(wp.ddot(E, E))), _ZERO)
+        measure = p[0] * wp.max(
+            root(wp.ddot(D, D)) + _TWO * (root(n2) - root(wp.ddot(E, E))), _ZERO
+        )
         q = measure * measure + norm_eps
         n = wp.sqrt(wp.where(q > _ZERO, q, _ONE))
         if q > _ZERO and n > _SQRT23 * p[2]:

@@ -20,7 +20,9 @@ class ColliderBuffers:
     world axes.
     """
 
-    def __init__(self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool) -> None:
+    def __init__(
+        self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool
+    ) -> None:
         self.count = len(packed)
         self.kernels = collider_kernels(scalar, work.exact)
         self._scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
@@ -83,7 +85,10 @@ class ColliderBuffers:
             return
         settle = sum_functions(self._scalar).settle
         for target, (added, _) in zip(tensors, sums, strict=True):
-            flat = [wp.from_torch(added.view(-1, COLUMNS)), wp.from_torch(target.view(-1), dtype=self._scalar)]
+            flat = [
+                wp.from_torch(added.view(-1, COLUMNS)),
+                wp.from_torch(target.view(-1), dtype=self._scalar),
+            ]
             self._work.run(settle, target.numel(), flat)
 
     def _arguments(self, met: list, step: int, time: float) -> list:

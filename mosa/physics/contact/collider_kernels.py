@@ -71,7 +71,13 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         out = v
         if phi < r:
             V = linear[substep, c] + wp.cross(angular[substep, c], R)
-            out = v + pushed(v - V, Q * wp.normalize(g), kick * shapes[k, 8] * (r - phi), shapes[k, 3], shapes[k, 9])
+            out = v + pushed(
+                v - V,
+                Q * wp.normalize(g),
+                kick * shapes[k, 8] * (r - phi),
+                shapes[k, 3],
+                shapes[k, 9],
+            )
         return out
 
     @wp.kernel(module=module, enable_backward=False)
@@ -89,7 +95,22 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         u = v[p]
         for k in range(count):
             c = (p / size) * count + k
-            after = struck(u, x[p], r, kick, k, c, substep, shapes, codes, fields, position, rotation, linear, angular)
+            after = struck(
+                u,
+                x[p],
+                r,
+                kick,
+                k,
+                c,
+                substep,
+                shapes,
+                codes,
+                fields,
+                position,
+                rotation,
+                linear,
+                angular,
+            )
             f = (mass[p] / dt) * (u - after)
             if force and wp.dot(f, f) > scalar(0.0):
                 add_vector(force, substep, c, f)
@@ -125,7 +146,22 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
             if phi < r:
                 u = v[p]
                 for j in range(k):
-                    u = struck(u, x[p], r, kick, j, c - k + j, substep, shapes, codes, fields, position, rotation, linear, angular)
+                    u = struck(
+                        u,
+                        x[p],
+                        r,
+                        kick,
+                        j,
+                        c - k + j,
+                        substep,
+                        shapes,
+                        codes,
+                        fields,
+                        position,
+                        rotation,
+                        linear,
+                        angular,
+                    )
                 omega = angular[substep, c]
                 local = wp.normalize(g)
                 n = Q * local

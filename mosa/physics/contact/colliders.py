@@ -98,7 +98,9 @@ class PackedColliders(NamedTuple):
         return len(self.codes)
 
 
-def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device) -> PackedColliders:
+def pack_colliders(
+    colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device
+) -> PackedColliders:
     """Errors: ConfigError naming the collider and the field."""
     shapes = torch.zeros(len(colliders), packing.SHAPE_COLUMNS, dtype=torch.float64)
     codes = torch.zeros(len(colliders), packing.CODE_COLUMNS, dtype=torch.int32)
@@ -106,30 +108,48 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
     for i, collider in enumerate(colliders):
         where, shape = f"collider {collider.name or i}", collider.shape
         if type(shape) not in KINDS:
-            raise ConfigError(f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}")
+            raise ConfigError(
+                f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}"
+            )
         if collider.mode not in MODES:
-            raise ConfigError(f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}")
+            raise ConfigError(
+                f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}"
+            )
         if isinstance(collider.friction, bool) or not 0 <= collider.friction < math.inf:
-            raise ConfigError(f"{where}: friction: expected a finite number >= 0, found {collider.friction}")
+            raise ConfigError(
+                f"{where}: friction: expected a finite number >= 0, found {collider.friction}"
+            )
         if collider.friction > 0 and collider.mode not in RUBBING:
-            raise ConfigError(f"{where}: friction acts on modes {' and '.join(RUBBING)} only, found mode {collider.mode!r}")
+            raise ConfigError(
+                f"{where}: friction acts on modes {' and '.join(RUBBING)} only, found mode {collider.mode!r}"
+            )
         for j, value in enumerate(_sizes(shape)):
             if not 0 < value < math.inf:
-                raise ConfigError(f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}")
+                raise ConfigError(
+                    f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}"
+                )
             shapes[i, packing.SIZE + j] = value
         sticks = collider.mode == "sticky"
-        shapes[i, packing.FRICTION], shapes[i, packing.HOLD] = (math.inf, HOLD) if sticks else (collider.friction, GRIP)
+        shapes[i, packing.FRICTION], shapes[i, packing.HOLD] = (
+            (math.inf, HOLD) if sticks else (collider.friction, GRIP)
+        )
         shapes[i, packing.STIFFNESS] = 1.0 if collider.mode == "touch" else STIFFER
         codes[i, packing.KIND] = KINDS[type(shape)]
         if isinstance(shape, SignedDistanceField):
-            shapes[i, packing.ORIGIN : packing.ORIGIN + 3] = torch.as_tensor(shape.origin, dtype=torch.float64)
+            shapes[i, packing.ORIGIN : packing.ORIGIN + 3] = torch.as_tensor(
+                shape.origin, dtype=torch.float64
+            )
             shapes[i, packing.SPACING] = shape.spacing
             codes[i, packing.DIMS : packing.DIMS + 3] = torch.tensor(shape.values.shape)
             codes[i, packing.OFFSET] = offset
             fields.append(shape.values.double().cpu().reshape(-1))
             offset += shape.values.numel()
     values = torch.cat(fields)
-    return PackedColliders(shapes.to(dtype=dtype, device=device), codes.to(device), values.to(dtype=dtype, device=device))
+    return PackedColliders(
+        shapes.to(dtype=dtype, device=device),
+        codes.to(device),
+        values.to(dtype=dtype, device=device),
+    )
 
 
 def _sizes(shape: Shape) -> tuple[float, ...]:
@@ -158,7 +178,11 @@ def reach(shape: Shape) -> float:
         far = origin + shape.spacing * (torch.tensor(shape.values.shape) - 1)
         return float(torch.maximum(origin.abs(), far.abs()).norm())
     sizes = _sizes(shape)
-    return sum(sizes) if isinstance(shape, Capsule) else float(torch.tensor(sizes, dtype=torch.float64).norm())
+    return (
+        sum(sizes)
+        if isinstance(shape, Capsule)
+        else float(torch.tensor(sizes, dtype=torch.float64).norm())
+    )
 
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
@@ -166,9 +190,13 @@ def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> 
     if not isinstance(mode, str) or mode not in MODES:
         raise ConfigError(f"world.walls.mode: expected one of {', '.join(MODES)}, found {mode!r}")
     if not is_number(friction) or friction < 0:
-        raise ConfigError(f"world.walls.friction: expected a finite number >= 0, found {friction!r}")
+        raise ConfigError(
+            f"world.walls.friction: expected a finite number >= 0, found {friction!r}"
+        )
     if friction > 0 and mode not in RUBBING:
-        raise ConfigError(f"world.walls.friction: acts with modes {' and '.join(RUBBING)} only, found mode {mode!r}")
+        raise ConfigError(
+            f"world.walls.friction: acts with modes {' and '.join(RUBBING)} only, found mode {mode!r}"
+        )
     low, high = torch.as_tensor(box).double().tolist()
     planes = []
     for axis in range(3):
@@ -197,7 +225,8 @@ def colliders_from_config(
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
         raise ConfigError(f"{field_name}: expected a list of colliders, found {items!r}")
     return tuple(
-        item if isinstance(item, Collider) else _collider(item, f"{field_name}[{i}]") for i, item in enumerate(items)
+        item if isinstance(item, Collider) else _collider(item, f"{field_name}[{i}]")
+        for i, item in enumerate(items)
     )
 
 
@@ -210,20 +239,26 @@ def _collider(item: Mapping, where: str) -> Collider:
     make, needed = _FIELDS[kind]
     extra = {"plane": ("normal",), "mesh": ("spacing", "scale", "margin")}.get(kind, ())
     if unknown := [key for key in item if key not in (*_COMMON, *needed, *extra)]:
-        raise ConfigError(f"{where}: unknown: {', '.join(unknown)}; a {kind} takes {', '.join((*needed, *extra, *_COMMON[1:]))}")
+        raise ConfigError(
+            f"{where}: unknown: {', '.join(unknown)}; a {kind} takes {', '.join((*needed, *extra, *_COMMON[1:]))}"
+        )
     if missing := [key for key in needed if item.get(key) is None]:
         raise ConfigError(f"{where}: a {kind} needs {', '.join(missing)}")
     check_keys(item, where)
     item = {key: value for key, value in item.items() if value is not None}
     mode = item.get("mode", "sticky")
     if item.get("friction", 0) > 0 and mode not in RUBBING:
-        raise ConfigError(f"{where}.friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}")
+        raise ConfigError(
+            f"{where}.friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}"
+        )
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
             shape = field_of_mesh(Path(item["path"]), **options)
         else:
-            shape = make(*(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed))
+            shape = make(
+                *(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed)
+            )
         motion = _motion(item)
         friction = float(item.get("friction", 0.0))
     except ConfigError as error:
@@ -243,13 +278,22 @@ def _motion(item: dict) -> Motion:
     if "waypoints" in motion:
         points = motion.pop("waypoints")
         if motion or item.get("position") is not None:
-            raise ConfigError("motion: waypoints stand alone, without position, velocity or angular_velocity")
+            raise ConfigError(
+                "motion: waypoints stand alone, without position, velocity or angular_velocity"
+            )
         if len(points) < 2:
             raise ConfigError(f"motion.waypoints: expected at least two poses, found {len(points)}")
-        turns = [_axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation for p in points]
-        return Motion.waypoints([p["time"] for p in points], [p["position"] for p in points], torch.stack(turns))
+        turns = [
+            _axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation
+            for p in points
+        ]
+        return Motion.waypoints(
+            [p["time"] for p in points], [p["position"] for p in points], torch.stack(turns)
+        )
     if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:
-        raise ConfigError(f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints")
+        raise ConfigError(
+            f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints"
+        )
     position = torch.as_tensor(item.get("position", (0.0, 0.0, 0.0)), dtype=torch.float64)
     if position.shape != (3,):
         raise ConfigError(f"position: expected three numbers, found {item['position']!r}")
@@ -262,7 +306,9 @@ def _axis_degrees(value: Sequence[float] | None) -> Tensor:
         return torch.zeros(3, dtype=torch.float64)
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.shape != (4,) or not float(value[:3].norm()) > 0:
-        raise ConfigError(f"rotation: expected (ax, ay, az, degrees) with a non-zero axis, found {value.tolist()}")
+        raise ConfigError(
+            f"rotation: expected (ax, ay, az, degrees) with a non-zero axis, found {value.tolist()}"
+        )
     return value[:3] / value[:3].norm() * torch.deg2rad(value[3])
 
 

@@ -21,7 +21,13 @@ def update_kernels(scalar) -> SimpleNamespace:
     collide, adj_collide = make_plane_functions(scalar)
     fade, slowness = make_fade(scalar), make_slowness(scalar)
     memory, nodes = node_access(scalar), node_functions(scalar)
-    load3, load4, store3, store4, clear = memory.load3, memory.load4, memory.store3, memory.store4, memory.clear
+    load3, load4, store3, store4, clear = (
+        memory.load3,
+        memory.load4,
+        memory.store3,
+        memory.store4,
+        memory.clear,
+    )
     node_position, nodes_of = nodes.node_position, nodes.nodes_of
     module = f"mosa.physics.grid_update_{scalar.__name__}"
 
@@ -51,7 +57,9 @@ def update_kernels(scalar) -> SimpleNamespace:
         for i in range(count):
             w, _change = touch(r, y, planes, i)
             if w > scalar(0.0):
-                hit = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
+                hit = collide(
+                    r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4]
+                )
                 if w < scalar(1.0):
                     r = r + w * (hit - r)
                 else:
@@ -60,7 +68,12 @@ def update_kernels(scalar) -> SimpleNamespace:
 
     @wp.func
     def adj_contact(
-        u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, seed: vec3
+        u: vec3,
+        y: vec3,
+        planes: wp.array2d(dtype=scalar),
+        modes: wp.array(dtype=int),
+        count: int,
+        seed: vec3,
     ):
         a = seed
         for reverse in range(count):
@@ -71,7 +84,11 @@ def update_kernels(scalar) -> SimpleNamespace:
                 normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
                 hit = collide(before, normal, modes[i], planes[i, 4])
                 along = (change * wp.dot(hit - before, a)) * normal
-                a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a) + along
+                a = (
+                    (scalar(1.0) - w) * a
+                    + adj_collide(before, normal, modes[i], planes[i, 4], w * a)
+                    + along
+                )
         return a
 
     @wp.kernel(module=module, enable_backward=False)
@@ -91,7 +108,9 @@ def update_kernels(scalar) -> SimpleNamespace:
             if g[3] > cutoff:
                 u = free_velocity(g, impulse)
                 if count > 0:
-                    u = contact(u, node_position(node - first, origin, dims, dx), planes, modes, count)
+                    u = contact(
+                        u, node_position(node - first, origin, dims, dx), planes, modes, count
+                    )
             store3(velocity, node, u)
             if cleared:
                 clear(cleared, node)
@@ -113,13 +132,21 @@ def update_kernels(scalar) -> SimpleNamespace:
                 u = free_velocity(g, impulse)
                 a = load3(adj_velocity, node)
                 if count > 0:
-                    a = adj_contact(u, node_position(node - first, origin, dims, dx), planes, modes, count, a)
+                    a = adj_contact(
+                        u, node_position(node - first, origin, dims, dx), planes, modes, count, a
+                    )
                 a = a / g[3]
                 # v = p/m: dL/dm = -a.(p/m)/m
-                store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
+                store4(
+                    adj_grid,
+                    node,
+                    vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]),
+                )
             else:
                 clear(adj_grid, node)
             if cleared:
                 clear(cleared, node)
 
-    return SimpleNamespace(grid_update=grid_update, adj_grid=adj_grid, free_velocity=free_velocity, contact=contact)
+    return SimpleNamespace(
+        grid_update=grid_update, adj_grid=adj_grid, free_velocity=free_velocity, contact=contact
+    )

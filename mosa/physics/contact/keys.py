@@ -20,8 +20,15 @@ def listed(value: Any) -> Any:
 
 
 def numbers(described: str, count: int, further: Callable[[list], bool] = lambda v: True) -> Kind:
-    return Kind(described, lambda v: isinstance(listed(v), list) and len(listed(v)) == count and
-                all(is_number(x) and abs(x) <= FARTHEST for x in listed(v)) and further(listed(v)))
+    return Kind(
+        described,
+        lambda v: (
+            isinstance(listed(v), list)
+            and len(listed(v)) == count
+            and all(is_number(x) and abs(x) <= FARTHEST for x in listed(v))
+            and further(listed(v))
+        ),
+    )
 
 
 def either(described: str, *kinds: Kind) -> Kind:
@@ -29,14 +36,27 @@ def either(described: str, *kinds: Kind) -> Kind:
 
 
 def rows(kind: Kind, described: str, least: int = 1) -> Kind:
-    return Kind(described, lambda v: isinstance(listed(v), list) and len(listed(v)) >= least and all(map(kind.fits, listed(v))))
+    return Kind(
+        described,
+        lambda v: (
+            isinstance(listed(v), list)
+            and len(listed(v)) >= least
+            and all(map(kind.fits, listed(v)))
+        ),
+    )
 
 
 TEXT = Kind("a text", lambda v: isinstance(v, str))
 LENGTH = number(0, FARTHEST, above=True)
 THREE = numbers(f"three finite numbers within {FARTHEST:g}", 3)
-TURN = numbers("(ax, ay, az, degrees), four finite numbers with a non-zero axis", 4, lambda v: any(v[:3]))
-VELOCITY = either(f"three finite numbers within {FARTHEST:g}, or such a triple for each piece", THREE, rows(THREE, ""))
+TURN = numbers(
+    "(ax, ay, az, degrees), four finite numbers with a non-zero axis", 4, lambda v: any(v[:3])
+)
+VELOCITY = either(
+    f"three finite numbers within {FARTHEST:g}, or such a triple for each piece",
+    THREE,
+    rows(THREE, ""),
+)
 RISING = rows(Kind("", is_number), "")
 KEYS = {
     "radius": LENGTH, "length": LENGTH, "size": numbers("three lengths above 0 [m]", 3, lambda v: min(v) > 0),
@@ -61,9 +81,13 @@ def check_keys(item: Mapping, where: str) -> None:
     for i, point in enumerate(motion.get("waypoints") or ()):
         at = f"{where}.motion.waypoints[{i}]"
         if missing := [key for key in ("time", "position") if point.get(key) is None]:
-            raise ConfigError(f"{at}: expected time and position in each, found one without {missing[0]!r}")
+            raise ConfigError(
+                f"{at}: expected time and position in each, found one without {missing[0]!r}"
+            )
         if unknown := [key for key in point if key not in WAYPOINT]:
-            raise ConfigError(f"{at}.{unknown[0]}: unknown key; expected one of {', '.join(WAYPOINT)}")
+            raise ConfigError(
+                f"{at}.{unknown[0]}: unknown key; expected one of {', '.join(WAYPOINT)}"
+            )
         fits(point, WAYPOINT, at)
 
 
@@ -71,4 +95,6 @@ def fits(values: Mapping, kinds: Mapping[str, Kind], where: str) -> None:
     """Errors: ConfigError naming the first value that is not of its kind."""
     for key, kind in kinds.items():
         if values.get(key) is not None and not kind.fits(values[key]):
-            raise ConfigError(f"{where}.{key}: expected {kind.described}, found {str(values[key])[:120]!r}")
+            raise ConfigError(
+                f"{where}.{key}: expected {kind.described}, found {str(values[key])[:120]!r}"
+            )

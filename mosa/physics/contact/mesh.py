@@ -33,7 +33,11 @@ class SignedDistanceField:
 
 @wp.kernel(module="mosa.physics.contact.mesh", enable_backward=False)
 def _nearest(
-    mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: wp.float32, face: wp.array(dtype=int), sign: wp.array(dtype=wp.float32)
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    reach: wp.float32,
+    face: wp.array(dtype=int),
+    sign: wp.array(dtype=wp.float32),
 ):
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
@@ -60,7 +64,10 @@ def triangle_distance(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def field_of_triangles(
-    vertices: Tensor | np.ndarray, triangles: Tensor | np.ndarray, spacing: float | None = None, margin: float | None = None
+    vertices: Tensor | np.ndarray,
+    triangles: Tensor | np.ndarray,
+    spacing: float | None = None,
+    margin: float | None = None,
 ) -> SignedDistanceField:
     """Signed distances to a closed, consistently oriented mesh. vertices: (P, 3) [m]; triangles: (T, 3) indices.
 
@@ -69,13 +76,23 @@ def field_of_triangles(
     Errors: ConfigError: shapes, indices, no area, not closed, lattice too large.
     """
     points, index = np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
-    if points.ndim != 2 or points.shape[1] != 3 or index.ndim != 2 or index.shape[1] != 3 or not len(index):
-        raise ConfigError(f"mesh: expected vertices (P, 3) and triangles (T, 3), found {points.shape} and {index.shape}")
+    if (
+        points.ndim != 2
+        or points.shape[1] != 3
+        or index.ndim != 2
+        or index.shape[1] != 3
+        or not len(index)
+    ):
+        raise ConfigError(
+            f"mesh: expected vertices (P, 3) and triangles (T, 3), found {points.shape} and {index.shape}"
+        )
     if not np.isfinite(points).all() or index.min() < 0 or index.max() >= len(points):
         raise ConfigError(f"mesh: expected finite vertices and indices from 0 to {len(points) - 1}")
     if float(np.abs(points).max()) > FARTHEST:
         far = float(np.abs(points).max())
-        raise ConfigError(f"mesh: expected vertices within {FARTHEST:g} m, found one at {far:.3g} m: check scale")
+        raise ConfigError(
+            f"mesh: expected vertices within {FARTHEST:g} m, found one at {far:.3g} m: check scale"
+        )
     points, index = _welded(points, index)
     directed = np.concatenate([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
     keys, counts = np.unique(directed, axis=0, return_counts=True)
@@ -85,13 +102,22 @@ def field_of_triangles(
             f"among {len(index)} triangles: fill its holes"
         )
     corners = points[index]
-    if (np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) <= 0).any():
+    if (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        <= 0
+    ).any():
         raise ConfigError("mesh: expected triangles with an area, found a degenerate one")
     if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:
-        raise ConfigError("mesh: its triangles face inwards (negative volume): turn their orientation around")
+        raise ConfigError(
+            "mesh: its triangles face inwards (negative volume): turn their orientation around"
+        )
     extent = float((points.max(0) - points.min(0)).max())
     if extent < SMALLEST:
-        raise ConfigError(f"mesh: expected an extent of at least {SMALLEST:g} m, found {extent:.3g} m: check scale")
+        raise ConfigError(
+            f"mesh: expected an extent of at least {SMALLEST:g} m, found {extent:.3g} m: check scale"
+        )
     spacing = extent / 48 if spacing is None else spacing
     if not spacing > 0:
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
@@ -124,7 +150,9 @@ def _welded(points: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return unique, inverse.reshape(-1)[index]
 
 
-def field_of_mesh(path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0) -> SignedDistanceField:
+def field_of_mesh(
+    path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0
+) -> SignedDistanceField:
     """Signed distances to the mesh of an OBJ or PLY file (faces with more corners are cut into fans), times `scale` to metres.
 
     Errors: ConfigError naming the file.
@@ -137,11 +165,15 @@ def field_of_mesh(path: Path, spacing: float | None = None, margin: float | None
         raise ConfigError(f"mesh: {path}: expected a file .obj or .ply")
     try:
         vertices, faces = readers[path.suffix.lower()](path)
-        triangles = np.array([(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)], dtype=np.int64).reshape(-1, 3)
+        triangles = np.array(
+            [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)], dtype=np.int64
+        ).reshape(-1, 3)
     except DataError as error:
         raise ConfigError(f"mesh: {error}") from error
     except Exception as error:  # whatever a parser finds: the file is not what its name says
-        raise ConfigError(f"mesh: {path} cannot be read ({type(error).__name__}: {error})") from error
+        raise ConfigError(
+            f"mesh: {path} cannot be read ({type(error).__name__}: {error})"
+        ) from error
     try:
         return field_of_triangles(scale * vertices, triangles, spacing, margin)
     except ConfigError as error:

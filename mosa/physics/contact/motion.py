@@ -31,7 +31,9 @@ def exponential(vectors: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable."""
     zero = torch.zeros_like(vectors[..., 0])
     x, y, z = vectors.unbind(-1)
-    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
+    return torch.matrix_exp(
+        torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    )
 
 
 def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
@@ -44,16 +46,29 @@ def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
         return exponential(value)
     if value.ndim != leading + 2 or value.shape[-2:] != (3, 3):
         expected = "(K, 3) or (K, 3, 3)" if leading else "(3,) or (3, 3)"
-        raise ConfigError(f"rotation: expected rotation vectors or matrices {expected}, found shape {tuple(value.shape)}")
-    defect = (value.detach() @ value.detach().mT - torch.eye(3, dtype=torch.float64, device=value.device)).abs().max()
+        raise ConfigError(
+            f"rotation: expected rotation vectors or matrices {expected}, found shape {tuple(value.shape)}"
+        )
+    defect = (
+        (
+            value.detach() @ value.detach().mT
+            - torch.eye(3, dtype=torch.float64, device=value.device)
+        )
+        .abs()
+        .max()
+    )
     if not (float(defect) < 1e-4 and bool((torch.linalg.det(value.detach()) > 0).all())):
-        raise ConfigError(f"rotation: expected rotation matrices (R R^T = I, det R = 1), found a defect of {float(defect):.3g}")
+        raise ConfigError(
+            f"rotation: expected rotation matrices (R R^T = I, det R = 1), found a defect of {float(defect):.3g}"
+        )
     return value
 
 
 def rotation_vector(R: Tensor) -> Tensor:
     """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) by at most pi, differentiable."""
-    sine = 0.5 * torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    sine = 0.5 * torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
     cosine = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
     square = (sine**2).sum(-1)
     small = square < 1e-8
@@ -63,7 +78,12 @@ def rotation_vector(R: Tensor) -> Tensor:
     # near pi the sine has no direction, but R + R^T - 2 cos = 2 (1 - cos) n n^T has
     about = R + R.mT - 2 * cosine[..., None, None] * torch.eye(3).to(R)
     about = torch.where((cosine < -0.9)[..., None, None], about, torch.ones_like(about))
-    longest = about.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*R.shape[:-1], 1)
+    longest = (
+        about.detach()
+        .diagonal(dim1=-2, dim2=-1)
+        .argmax(-1)[..., None, None]
+        .expand(*R.shape[:-1], 1)
+    )
     axis = torch.nn.functional.normalize(about.gather(-1, longest)[..., 0], dim=-1)
     along = (sine * axis).sum(-1, keepdim=True)
     turn = torch.atan2(along.abs(), cosine[..., None]) * torch.where(along < 0, -axis, axis)
@@ -82,16 +102,22 @@ def turning(start: Tensor, end: Tensor) -> Tensor:
 def _vectors(name: str, value: Tensor | Sequence) -> Tensor:
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.shape[-1:] != (3,) or value.ndim > 2 or not bool(torch.isfinite(value.detach()).all()):
-        raise ConfigError(f"motion: {name}: expected (3,) or (K, 3) finite numbers, found shape {tuple(value.shape)}")
+        raise ConfigError(
+            f"motion: {name}: expected (3,) or (K, 3) finite numbers, found shape {tuple(value.shape)}"
+        )
     return value.reshape(-1, 3)
 
 
 def _mean(times: Tensor, pieces: Tensor, ends: Tensor, middle: Tensor) -> Tensor:
     """(S, 3) means of velocities `pieces` (K, 3) from `times` (K,) on between `ends` (S + 1,): those in the `middle`, but where a
     piece begins or ends between them, however short it is."""
-    passed = torch.cat([torch.zeros(1, 3).to(pieces), (pieces[:-1] * times.diff()[:, None]).cumsum(0)])
+    passed = torch.cat(
+        [torch.zeros(1, 3).to(pieces), (pieces[:-1] * times.diff()[:, None]).cumsum(0)]
+    )
     at = (torch.searchsorted(times, ends, right=True) - 1).clamp_min(0)
-    mean = (passed[at] + (ends - times[at]).clamp_min(0)[:, None] * pieces[at]).diff(dim=0) / ends.diff()[:, None]
+    mean = (passed[at] + (ends - times[at]).clamp_min(0)[:, None] * pieces[at]).diff(
+        dim=0
+    ) / ends.diff()[:, None]
     return torch.where(torch.isclose(mean, middle, rtol=1e-6, atol=1e-9), middle, mean)
 
 
@@ -112,7 +138,12 @@ class Motion:
     times: Sequence[float] | Tensor | None = None
 
     @classmethod
-    def waypoints(cls, times: Sequence[float] | Tensor, positions: Tensor | Sequence, rotations: Tensor | Sequence | None = None):
+    def waypoints(
+        cls,
+        times: Sequence[float] | Tensor,
+        positions: Tensor | Sequence,
+        rotations: Tensor | Sequence | None = None,
+    ):
         """Through poses at `times` (K,) [s], K >= 2, at constant twist between; at rest before the first and after the last.
 
         positions: (K, 3) [m]; rotations: (K, 3) or (K, 3, 3), turned by less than half a turn from one to the next, or by more
@@ -123,8 +154,12 @@ class Motion:
         positions = _vectors("waypoints: positions", positions)
         count = len(times)
         if times.ndim != 1 or count < 2 or not bool((times.diff() > 0).all()):
-            raise ConfigError(f"motion: waypoints: times: expected at least two ascending numbers, found {times.tolist()}")
-        rotations = torch.as_tensor(torch.zeros(count, 3) if rotations is None else rotations, dtype=torch.float64)
+            raise ConfigError(
+                f"motion: waypoints: times: expected at least two ascending numbers, found {times.tolist()}"
+            )
+        rotations = torch.as_tensor(
+            torch.zeros(count, 3) if rotations is None else rotations, dtype=torch.float64
+        )
         R = rotation_matrices(rotations, 1)
         if len(positions) != count or len(R) != count:
             raise ConfigError(
@@ -132,9 +167,13 @@ class Motion:
                 f"{len(R)}"
             )
         told = rotations.ndim == 2
-        turns = turning(rotations[:-1], rotations[1:]) if told else rotation_vector(R[1:] @ R[:-1].mT)
+        turns = (
+            turning(rotations[:-1], rotations[1:]) if told else rotation_vector(R[1:] @ R[:-1].mT)
+        )
         if not told and bool((turns.detach().norm(dim=-1) > 3.04).any()):
-            raise ConfigError("motion: waypoints: rotations: expected less than half a turn between two, put one in between")
+            raise ConfigError(
+                "motion: waypoints: rotations: expected less than half a turn between two, put one in between"
+            )
         interval, rest = times.diff()[:, None], torch.zeros(1, 3, dtype=torch.float64)
         velocity = torch.cat([(positions[1:] - positions[:-1]) / interval, rest])
         angular = torch.cat([turns / interval, rest])
@@ -142,22 +181,36 @@ class Motion:
 
     def shifted(self, offset: Tensor) -> "Motion":
         """The same motion moved by offset (3,) [m]."""
-        return replace(self, position=torch.as_tensor(self.position, dtype=torch.float64).cpu() + offset.double().cpu())
+        return replace(
+            self,
+            position=torch.as_tensor(self.position, dtype=torch.float64).cpu()
+            + offset.double().cpu(),
+        )
 
     def sample(
         self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
         from the `first` one after time `start`. Errors: ConfigError naming the field."""
-        start_position, R0 = _vectors("position", self.position).cpu(), rotation_matrices(self.rotation).cpu()
+        start_position, R0 = (
+            _vectors("position", self.position).cpu(),
+            rotation_matrices(self.rotation).cpu(),
+        )
         if len(start_position) != 1:
-            raise ConfigError(f"motion: position: expected (3,), found {len(start_position)} vectors: see Motion.waypoints")
+            raise ConfigError(
+                f"motion: position: expected (3,), found {len(start_position)} vectors: see Motion.waypoints"
+            )
         position = start_position[0]
-        linear, angular = _vectors("velocity", self.velocity).cpu(), _vectors("angular_velocity", self.angular_velocity).cpu()
+        linear, angular = (
+            _vectors("velocity", self.velocity).cpu(),
+            _vectors("angular_velocity", self.angular_velocity).cpu(),
+        )
         times, count = self._pieces(frames, substeps, dt, max(len(linear), len(angular)))
         for name, value in (("velocity", linear), ("angular_velocity", angular)):
             if len(value) not in (1, count):
-                raise ConfigError(f"motion: {name}: expected 1 or {count} vectors, found {len(value)}")
+                raise ConfigError(
+                    f"motion: {name}: expected 1 or {count} vectors, found {len(value)}"
+                )
         linear, angular = linear.expand(count, 3), angular.expand(count, 3)
         interval = times.diff()[:, None]
         knots = torch.cat([position[None], position + ((linear[:-1] * interval).cumsum(0))])
@@ -175,14 +228,25 @@ class Motion:
         since = torch.where(resting, torch.zeros(()), (t - times[piece])[:, None])
         x = knots[piece] + since * linear[piece]
         R = exponential(since * angular[piece]) @ attitudes[piece]
-        return x, R, *(_mean(times, value, ends, value[piece] * ~resting) for value in (linear, angular))
+        return (
+            x,
+            R,
+            *(_mean(times, value, ends, value[piece] * ~resting) for value in (linear, angular)),
+        )
 
     def _pieces(self, frames: int, substeps: int, dt: float, count: int) -> tuple[Tensor, int]:
         """(start times (K,), K)."""
         if self.times is not None:
             times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
-            if times.ndim != 1 or not len(times) or not bool((times.diff() > 0).all()) or not bool(torch.isfinite(times).all()):
-                raise ConfigError(f"motion: times: expected ascending numbers, found {times.tolist()}")
+            if (
+                times.ndim != 1
+                or not len(times)
+                or not bool((times.diff() > 0).all())
+                or not bool(torch.isfinite(times).all())
+            ):
+                raise ConfigError(
+                    f"motion: times: expected ascending numbers, found {times.tolist()}"
+                )
             return times, len(times)
         length = {1: 0.0, frames: substeps * dt, frames * substeps: dt}
         if count not in length:
@@ -200,7 +264,9 @@ class Motion:
         """
         if self.times is not None:
             return self
-        count = max(len(_vectors(name, getattr(self, name))) for name in ("velocity", "angular_velocity"))
+        count = max(
+            len(_vectors(name, getattr(self, name))) for name in ("velocity", "angular_velocity")
+        )
         if frames is not None and count not in (1, frames):
             raise ConfigError(
                 f"motion: velocity and angular_velocity: expected 1 or {frames} (per frame interval) vectors where no times are "
@@ -210,7 +276,10 @@ class Motion:
 
     def max_speed(self, reach: float) -> float:
         """Bound of the speed [m/s] of a point within `reach` [m] of the origin."""
-        linear, angular = (_vectors("", v).detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity))
+        linear, angular = (
+            _vectors("", v).detach().norm(dim=1).max()
+            for v in (self.velocity, self.angular_velocity)
+        )
         return float(linear + reach * angular)
 
 
@@ -233,8 +302,15 @@ class Trajectory:
         """As `Motion.sample`; `start` must be a whole number of substeps into the trajectory."""
         begin, count = round(start / dt), frames * substeps
         first += begin
-        values = (self.position, rotation_matrices(self.rotation, 1), self.velocity, self.angular_velocity)
-        if any(len(v) < first + count for v in values) or not math.isclose(begin * dt, start, abs_tol=1e-6 * dt):
+        values = (
+            self.position,
+            rotation_matrices(self.rotation, 1),
+            self.velocity,
+            self.angular_velocity,
+        )
+        if any(len(v) < first + count for v in values) or not math.isclose(
+            begin * dt, start, abs_tol=1e-6 * dt
+        ):
             raise ConfigError(
                 f"trajectory: expected poses and velocities of substeps {first} to {first + count}, found "
                 f"{[len(v) for v in values]}"
@@ -242,7 +318,9 @@ class Trajectory:
         return tuple(v[first : first + count].double().cpu() for v in values)
 
     def max_speed(self, reach: float) -> float:
-        linear, angular = (v.detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity))
+        linear, angular = (
+            v.detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity)
+        )
         return float(linear + reach * angular)
 
 
@@ -258,7 +336,9 @@ def sample_frame(
     dt, sampled = frame_dt / count, []
     for motion in motions:
         if isinstance(motion, Motion):
-            sampled.append(motion.timed(frames, frame_dt).sample(1, count, dt, start + frame * frame_dt))
+            sampled.append(
+                motion.timed(frames, frame_dt).sample(1, count, dt, start + frame * frame_dt)
+            )
         elif replayed and start == 0:
             sampled.append(motion.sample(1, count, dt, first=first))
         else:
@@ -270,13 +350,23 @@ def sample_frame(
 
 
 def sample_poses(
-    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, first: int = 0
+    motions: Sequence[Motion | Trajectory],
+    frames: int,
+    substeps: int,
+    dt: float,
+    start: float,
+    first: int = 0,
 ) -> Poses:
     """Poses (float64, CPU) of all colliders at every substep of `frames` frame intervals, from the `first` one after time `start`.
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
-    counted("substeps of all frames and colliders", (frames, substeps, len(motions)), "take fewer", each=3 * 8 * (3 + 9 + 3 + 3))
+    counted(
+        "substeps of all frames and colliders",
+        (frames, substeps, len(motions)),
+        "take fewer",
+        each=3 * 8 * (3 + 9 + 3 + 3),
+    )
     return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions])
 
 
@@ -284,7 +374,9 @@ def _poses(sampled: Sequence[Sequence[Tensor]]) -> Poses:
     for i, parts in enumerate(sampled):
         for name, part in zip(Poses._fields, parts):
             if not bool(torch.isfinite(part.detach()).all()):
-                bad = int((~torch.isfinite(part.detach())).reshape(len(part), -1).any(1).nonzero()[0])
+                bad = int(
+                    (~torch.isfinite(part.detach())).reshape(len(part), -1).any(1).nonzero()[0]
+                )
                 raise ConfigError(
                     f"motion of collider {i}: {name}: expected finite numbers, found {part[bad].tolist()} at substep {bad}"
                 )

@@ -25,15 +25,27 @@ def check_clear(
     (K, 3) [m] and rotation (K, 3, 3) of the colliders now, () for theirs at t = 0. Errors: ConfigError naming the colliders."""
     deep, places = [], []
     for k, collider in enumerate(colliders):
-        motion = collider.motion.timed(None, 1.0) if isinstance(collider.motion, Motion) else collider.motion
-        position, rotation = [part[k].detach() for part in poses] or [part[0] for part in motion.sample(1, 1, 1e-9)[:2]]
-        distance = signed_distance(collider.shape, (x.detach().cpu().double() - position) @ rotation)
+        motion = (
+            collider.motion.timed(None, 1.0)
+            if isinstance(collider.motion, Motion)
+            else collider.motion
+        )
+        position, rotation = [part[k].detach() for part in poses] or [
+            part[0] for part in motion.sample(1, 1, 1e-9)[:2]
+        ]
+        distance = signed_distance(
+            collider.shape, (x.detach().cpu().double() - position) @ rotation
+        )
         deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
         places.append(str([round(p, 4) for p in position.tolist()]))
     share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:
         inside = [i for i, each in enumerate(deep) if bool(each.any())]
-        named = " and ".join(f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside)
-        raise ConfigError(f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside "
-                          f"of {'them' if inside[1:] else 'it'} {'now' if poses else 'at t = 0'}, where its position is "
-                          f"{' and '.join(places[i] for i in inside)} m")
+        named = " and ".join(
+            f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside
+        )
+        raise ConfigError(
+            f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside "
+            f"of {'them' if inside[1:] else 'it'} {'now' if poses else 'at t = 0'}, where its position is "
+            f"{' and '.join(places[i] for i in inside)} m"
+        )

@@ -59,36 +59,55 @@ def ground_plane(ground: Ground, up: Tensor) -> Plane:
     """The plane of a ground; up: (3,) unit vector."""
     up = torch.as_tensor(up, dtype=torch.float64).cpu()
     up = up / up.norm()
-    return Plane(tuple((ground.height * up).tolist()), tuple(up.tolist()), ground.mode, ground.friction)
+    return Plane(
+        tuple((ground.height * up).tolist()), tuple(up.tolist()), ground.mode, ground.friction
+    )
 
 
-def pack_planes(planes: list[Plane], dtype: torch.dtype, device: torch.device, dx: float) -> tuple[Tensor, Tensor]:
+def pack_planes(
+    planes: list[Plane], dtype: torch.dtype, device: torch.device, dx: float
+) -> tuple[Tensor, Tensor]:
     """(values (P, 6): normal, offset normal.point, friction, thickness; modes (P,) int32) for the kernels. dx [m]: of the grid.
 
     Errors: ConfigError naming the plane and the field.
     """
-    values, modes = torch.zeros(max(len(planes), 1), 6, dtype=torch.float64), torch.zeros(max(len(planes), 1)).int()
+    values, modes = (
+        torch.zeros(max(len(planes), 1), 6, dtype=torch.float64),
+        torch.zeros(max(len(planes), 1)).int(),
+    )
     for i, plane in enumerate(planes):
         if plane.mode not in MODES:
-            raise ConfigError(f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}")
+            raise ConfigError(
+                f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}"
+            )
         if isinstance(plane.friction, bool) or not 0 <= plane.friction < math.inf:
-            raise ConfigError(f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}")
+            raise ConfigError(
+                f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}"
+            )
         if plane.friction > 0 and plane.mode not in RUBBING:
-            raise ConfigError(f"plane {i}: friction acts on modes {' and '.join(RUBBING)} only, found mode {plane.mode!r}")
+            raise ConfigError(
+                f"plane {i}: friction acts on modes {' and '.join(RUBBING)} only, found mode {plane.mode!r}"
+            )
         thickness = plane.thickness
         if thickness is None:
             thickness = THICKNESS * dx if plane.friction > 0 and plane.mode != "touch" else 0.0
         if isinstance(thickness, bool) or not 0 <= thickness < math.inf:
-            raise ConfigError(f"plane {i}: thickness: expected a finite number >= 0 [m], found {thickness}")
+            raise ConfigError(
+                f"plane {i}: thickness: expected a finite number >= 0 [m], found {thickness}"
+            )
         normal = torch.tensor(plane.normal, dtype=torch.float64)
         if not normal.norm() > 0:
-            raise ConfigError(f"plane {i}: normal: expected a non-zero vector, found {plane.normal}")
+            raise ConfigError(
+                f"plane {i}: normal: expected a non-zero vector, found {plane.normal}"
+            )
         normal = normal / normal.norm()
         values[i, :3] = normal
         values[i, 3] = normal @ torch.tensor(plane.point, dtype=torch.float64)
         values[i, 4], values[i, 5] = plane.friction, thickness
         if not bool(torch.isfinite(values[i]).all()):
-            raise ConfigError(f"plane {i}: expected a finite point and normal, found {plane.point} and {plane.normal}")
+            raise ConfigError(
+                f"plane {i}: expected a finite point and normal, found {plane.point} and {plane.normal}"
+            )
         modes[i] = MODES[plane.mode]
     return values.to(dtype=dtype, device=device), modes.to(device)
 

@@ -3,7 +3,16 @@
 import torch
 from torch import Tensor
 
-from mosa.physics.contact.colliders import HOLD, STIFFER, Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
+from mosa.physics.contact.colliders import (
+    HOLD,
+    STIFFER,
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+)
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.touch import GRIP
 
@@ -61,7 +70,9 @@ def collide(
         (gradient,) = torch.autograd.grad(phi.sum(), q, create_graph=True)
         n = (gradient / gradient.norm(dim=1, keepdim=True)) @ Q.mT
         u = v[near] - linear - torch.linalg.cross(angular.expand_as(r), r)
-        push = dt * spring[near] * (1 if collider.mode == "touch" else STIFFER) * (radius[near] - phi)
+        push = (
+            dt * spring[near] * (1 if collider.mode == "touch" else STIFFER) * (radius[near] - phi)
+        )
         tangential = u - (u * n).sum(1, keepdim=True) * n
         lost = torch.full_like(push, HOLD)
         if collider.mode != "sticky":

@@ -91,7 +91,11 @@ def shape_functions(scalar) -> SimpleNamespace:
         z = scalar(0.0)
         n = int(-1)
         if i >= z and j >= z and l >= z:
-            if i < scalar(codes[k, 1] - 1) and j < scalar(codes[k, 2] - 1) and l < scalar(codes[k, 3] - 1):
+            if (
+                i < scalar(codes[k, 1] - 1)
+                and j < scalar(codes[k, 2] - 1)
+                and l < scalar(codes[k, 3] - 1)
+            ):
                 n = codes[k, 4] + (int(i) * codes[k, 2] + int(j)) * codes[k, 3] + int(l)
         return n, vec3(t[0] - i, t[1] - j, t[2] - l)
 
@@ -144,7 +148,9 @@ def shape_functions(scalar) -> SimpleNamespace:
                         xy = sx * sy * wz
                         yz = wx * sy * sz
                         zx = sx * wy * sz
-                        r = r + value * vec3(xy * b[1] + zx * b[2], xy * b[0] + yz * b[2], zx * b[0] + yz * b[1])
+                        r = r + value * vec3(
+                            xy * b[1] + zx * b[2], xy * b[0] + yz * b[2], zx * b[0] + yz * b[1]
+                        )
             r = r / (shapes[k, 7] * shapes[k, 7])
         return r
 
@@ -247,4 +253,6 @@ def shape_functions(scalar) -> SimpleNamespace:
             r = trilinear_curvature(q, k, shapes, codes, fields, b)
         return r
 
-    return SimpleNamespace(signed_distance=signed_distance, curvature=curvature, vec3=vec3, mat33=mat33)
+    return SimpleNamespace(
+        signed_distance=signed_distance, curvature=curvature, vec3=vec3, mat33=mat33
+    )

@@ -30,7 +30,9 @@ GRIP = 3.0
 def springs(modulus: Tensor, mass: Tensor, volume: Tensor, dx: float) -> Tensor:
     """k (N,) [1/s^2] of particles with these moduli [Pa], masses [kg] and volumes [m^3] (N,). dx [m]: of the grid."""
     # in float64: in float32 a power has other last digits in another place of a tensor
-    return (STIFFNESS * modulus.double() * volume.double().pow(2 / 3) / (mass.double() * dx)).to(mass)
+    return (STIFFNESS * modulus.double() * volume.double().pow(2 / 3) / (mass.double() * dx)).to(
+        mass
+    )
 
 
 @cache
@@ -88,7 +90,15 @@ def touch_kernels(scalar) -> SimpleNamespace:
     module, grip = f"mosa.physics.touch_{scalar.__name__}", scalar(GRIP)
 
     @wp.func
-    def met(v: vec3, x: vec3, r: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, kick: scalar):
+    def met(
+        v: vec3,
+        x: vec3,
+        r: scalar,
+        planes: wp.array2d(dtype=scalar),
+        modes: wp.array(dtype=int),
+        count: int,
+        kick: scalar,
+    ):
         """Velocity after the first `count` planes."""
         u = v
         for i in range(count):
@@ -136,7 +146,11 @@ def touch_kernels(scalar) -> SimpleNamespace:
         adj_springs[p] = adj_springs[p] + spring
 
     @wp.kernel(module=module, enable_backward=False)
-    def loosen(adj_springs: wp.array(dtype=scalar), slopes: wp.array2d(dtype=scalar), adj_parameters: wp.array2d(dtype=scalar)):
+    def loosen(
+        adj_springs: wp.array(dtype=scalar),
+        slopes: wp.array2d(dtype=scalar),
+        adj_parameters: wp.array2d(dtype=scalar),
+    ):
         """Adds what springs (N,) with `slopes` (N, S) in packed parameters add to the adjoint of these."""
         p = wp.tid()
         for i in range(slopes.shape[1]):

@@ -33,15 +33,29 @@ class Axes:
     def world(self) -> "Axes":
         """The way back."""
         turn = None if self.turn is None else self.turn.mT
-        return Axes(turn, self.shift and tuple((-Axes(turn).vectors(torch.tensor(self.shift, dtype=torch.float64))).tolist()))
+        return Axes(
+            turn,
+            self.shift
+            and tuple(
+                (-Axes(turn).vectors(torch.tensor(self.shift, dtype=torch.float64))).tolist()
+            ),
+        )
 
     def vectors(self, v: Tensor | None) -> Tensor | None:
         """(..., 3), or forces and torques (..., 6)."""
-        return v if v is None or self.turn is None else (v.unflatten(-1, (-1, 3)) @ self.turn.mT.to(v)).flatten(-2)
+        return (
+            v
+            if v is None or self.turn is None
+            else (v.unflatten(-1, (-1, 3)) @ self.turn.mT.to(v)).flatten(-2)
+        )
 
     def points(self, x: Tensor) -> Tensor:
         """(..., 3) [m]: float64 where the origin moves."""
-        return self.vectors(x) if self.shift is None else self.vectors(x.double()) - x.double().new_tensor(self.shift)
+        return (
+            self.vectors(x)
+            if self.shift is None
+            else self.vectors(x.double()) - x.double().new_tensor(self.shift)
+        )
 
     def gradients(self, F: Tensor) -> Tensor:
         """Deformation gradients (..., 3, 3), or rotations of bodies."""
@@ -49,16 +63,24 @@ class Axes:
 
     def state(self, state: ParticleState, dtype: torch.dtype | None = None) -> ParticleState:
         """dtype: of positions, None for what `points` gives."""
-        x, F, C = self.points(state.x), self.gradients(state.F), self.vectors(self.gradients(state.C_affine))
+        x, F, C = (
+            self.points(state.x),
+            self.gradients(state.F),
+            self.vectors(self.gradients(state.C_affine)),
+        )
         F_tot = F if state.F_tot is state.F else self.gradients(state.F_tot)
-        return ParticleState(x if dtype is None else x.to(dtype), self.vectors(state.v), C, F, F_tot)
+        return ParticleState(
+            x if dtype is None else x.to(dtype), self.vectors(state.v), C, F, F_tot
+        )
 
 
 def entered(state: ParticleState, axes: Axes, dtype: torch.dtype, dx: float) -> ParticleState:
     """A state of the world in axes that are chosen already, on a grid of dx [m]. Errors: ConfigError where it is too far away."""
     found, most = axes.state(state), 0.5 * (SPREAD + 1) * PERIOD * dx
     if (far := float(found.x.detach().abs().max())) > most:
-        raise ConfigError(f"x: expected particles within {most:.3g} m of the place of the reset, found {far:.3g} m: reset there")
+        raise ConfigError(
+            f"x: expected particles within {most:.3g} m of the place of the reset, found {far:.3g} m: reset there"
+        )
     return replace(found, x=found.x.to(dtype))
 
 
@@ -66,7 +88,11 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
     """(3, 3) float64: turns the normals of all planes that nodes meet, one after the other, onto the nearest grid axes; None where
     they are there. Errors: ConfigError where they are not at right angles."""
     turn, eye = None, torch.eye(3, dtype=torch.float64)
-    met = {i: torch.tensor(p.normal, dtype=torch.float64) for i, p in enumerate(planes) if p.mode in NODE_MODES and any(p.normal)}
+    met = {
+        i: torch.tensor(p.normal, dtype=torch.float64)
+        for i, p in enumerate(planes)
+        if p.mode in NODE_MODES and any(p.normal)
+    }
     met = {i: n / n.norm() for i, n in met.items()}
     for n in met.values():
         m = Axes(turn).vectors(n)
@@ -76,8 +102,10 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
             turn = Axes(eye + S + S @ S / (1 + m @ along)).gradients(eye if turn is None else turn)
     for i, n in met.items():
         if float(Axes(turn).vectors(n).abs().sort().values[1]) > ASKEW:
-            raise ConfigError(f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and "
-                              "walls at right angles, along which a grid can be, or mode touch (scene.ground.mode=touch) at others")
+            raise ConfigError(
+                f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and "
+                "walls at right angles, along which a grid can be, or mode touch (scene.ground.mode=touch) at others"
+            )
     return turn
 
 
@@ -89,10 +117,14 @@ def shift_to(x: Tensor, turn: Tensor | None, dx: float) -> tuple[float, ...] | N
     if not far < float("inf"):
         return None  # the first substep names the particle
     if far * torch.finfo(x.dtype).eps > COARSE * dx:
-        raise ConfigError(f"x: particles are {far:.3g} m from the origin, where {x.dtype} has no digits for a grid of {dx:.3g} m: "
-                          "give x in float64, or place body, ground and solids nearer to the origin")
+        raise ConfigError(
+            f"x: particles are {far:.3g} m from the origin, where {x.dtype} has no digits for a grid of {dx:.3g} m: "
+            "give x in float64, or place body, ground and solids nearer to the origin"
+        )
     if x.ndim == 3 and wide > SPREAD * PERIOD * dx:
-        raise ConfigError(f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
-                          "meet, and may be in one place")
+        raise ConfigError(
+            f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
+            "meet, and may be in one place"
+        )
     shift = PERIOD * dx * torch.round(Axes(turn).vectors(0.5 * (low + high)) / (PERIOD * dx))
     return tuple(shift.tolist()) if bool(shift.any()) else None

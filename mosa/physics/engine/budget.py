@@ -49,6 +49,8 @@ def room(device: torch.device, wanted: int, worlds: int = 1) -> float:
     """Bytes that a rollout which could use `wanted` may keep between the passes: on a GPU all or nothing, so that a long rollout of
     many particles stays small; on a CPU as much for each of its worlds as a rollout of one, within a share of the memory."""
     if device.type != "cuda":
-        return KEPT_ON_CPU if worlds == 1 else min(worlds * KEPT_ON_CPU, KEPT_SHARE * machine_memory())
+        return (
+            KEPT_ON_CPU if worlds == 1 else min(worlds * KEPT_ON_CPU, KEPT_SHARE * machine_memory())
+        )
     available = KEPT_SHARE * free_memory(device)
     return available if wanted < available else 0

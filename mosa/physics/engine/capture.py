@@ -98,7 +98,9 @@ class Graphs:
     failing: what the warning says, before the last error, when too many captures in a row have failed; attempts: so many, 0 for
     none at all; most: graphs, and passes that wait to become one."""
 
-    def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS, most: int = MAX_GRAPHS) -> None:
+    def __init__(
+        self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS, most: int = MAX_GRAPHS
+    ) -> None:
         self.strategy, self.failing, self.attempts, self.most = strategy, failing, attempts, most
         self._replays: dict[Hashable, Body] = {}
         self._warm: dict[Hashable, None] = {}  # in the order in which they ran

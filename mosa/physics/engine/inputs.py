@@ -27,9 +27,13 @@ def pack_parameters(
     *worlds, particles = shape
     expected = [name for name in law.parameters if name != law.reference]
     if missing := [name for name in expected if name not in parameters]:
-        raise ConfigError(f"law {law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}")
+        raise ConfigError(
+            f"law {law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}"
+        )
     if unknown := [name for name in parameters if name not in expected]:
-        raise ConfigError(f"law {law.name!r} takes {', '.join(expected)}; unknown: {', '.join(unknown)}")
+        raise ConfigError(
+            f"law {law.name!r} takes {', '.join(expected)}; unknown: {', '.join(unknown)}"
+        )
     columns = []
     for name, size in law.parameters.items():
         if name == law.reference:
@@ -37,7 +41,9 @@ def pack_parameters(
             continue
         value = parameters[name]
         if isinstance(value, int | float):
-            value = torch.full((), value, dtype=like.dtype, device=like.device)  # a copy from the host would wait for CUDA
+            value = torch.full(
+                (), value, dtype=like.dtype, device=like.device
+            )  # a copy from the host would wait for CUDA
         value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
         if name == "yield_stress" and "von_mises" in law.name.split("+"):
             value = value * yield_factor  # the other laws that yield have their radius fixed
@@ -57,8 +63,13 @@ def pack_parameters(
 def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> None:
     """Errors: ConfigError naming what has another shape, type or device; x may be float64 in any case."""
     *worlds, n = state.x.shape[:-1]
-    shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in State._fields}
-    values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
+    shapes = {
+        name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3)
+        for name in State._fields
+    }
+    values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {
+        "volume": (volume, (n,))
+    }
     for name, (value, shape) in values.items():
         known = value.dtype == numerics.dtype or (name == "x" and value.dtype == torch.float64)
         if tuple(value.shape) != shape or not known or value.device.type != numerics.device.type:
@@ -79,7 +90,9 @@ def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Te
         valid = torch.ones((), dtype=torch.bool, device=volume.device)
     else:
         if density.shape != volume.shape:
-            raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
+            raise ConfigError(
+                f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}"
+            )
         density = density.detach().to(volume)
         valid = (torch.isfinite(density) & (density > 0)).all()
     numbers = [(volume > 0).all(), valid, (density * volume).mean()]
@@ -109,9 +122,13 @@ def gravity_of_worlds(
         return (common,) * worlds
     gravity = torch.as_tensor(gravity, dtype=torch.float64)
     if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
-        raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
+        raise ConfigError(
+            f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}"
+        )
     if gravity.requires_grad and torch.is_grad_enabled():
-        raise ConfigError("gravity: expected numbers without gradients, found a tensor that requires them: pass its detach()")
+        raise ConfigError(
+            "gravity: expected numbers without gradients, found a tensor that requires them: pass its detach()"
+        )
     return tuple(map(tuple, gravity.tolist()))
 
 
@@ -123,10 +140,14 @@ def motions_of_worlds(
     if worlds is None or not any(isinstance(own, Sequence) for own in motions):
         motions = [motions] * (worlds or 1)
     elif len(motions) != worlds:
-        raise ConfigError(f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}")
+        raise ConfigError(
+            f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}"
+        )
     for own in motions:
         if len(own) != len(colliders):
-            raise ConfigError(f"motions: expected one for each of {len(colliders)} colliders, found {len(own)}")
+            raise ConfigError(
+                f"motions: expected one for each of {len(colliders)} colliders, found {len(own)}"
+            )
     return list(motions)
 
 

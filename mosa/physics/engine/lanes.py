@@ -42,7 +42,10 @@ class Lanes:
     def piece(self, state: State, left: int, most: int, dt: float) -> int:
         """As `SegmentSolver.piece`, the fewest of any."""
         parts = self.split(state)
-        return min(solver.piece(part, left, most, dt) for solver, part in zip(self.solvers, parts, strict=True))
+        return min(
+            solver.piece(part, left, most, dt)
+            for solver, part in zip(self.solvers, parts, strict=True)
+        )
 
     def split(self, tensors: Iterable[Tensor | None], dim: int = 0) -> list[tuple]:
         """The solvers' parts of tensors of all particles, or of all worlds' colliders."""
@@ -56,7 +59,9 @@ class Lanes:
         """The tensors of all from the solvers' parts."""
         if len(parts) == 1:
             return list(parts[0])
-        return [None if each[0] is None else torch.cat(each, dim) for each in zip(*parts, strict=True)]
+        return [
+            None if each[0] is None else torch.cat(each, dim) for each in zip(*parts, strict=True)
+        ]
 
     def each(self, kind: tuple, function: Callable, *arguments: Sequence) -> list:
         """function(solver, its arguments) of every solver, in their order."""
@@ -71,7 +76,9 @@ class Lanes:
                 self.buffers.give_back(solver.workspaces)
 
         count = len(self.solvers)
-        if count == 1 or self.solvers[0].volume.is_cuda:  # in turns: while one captures a graph no other may touch the stream
+        if (
+            count == 1 or self.solvers[0].volume.is_cuda
+        ):  # in turns: while one captures a graph no other may touch the stream
             return [run(index) for index in range(count)]
         if kind in self.buffers.ran:
             return list(threaded(run, range(count)))

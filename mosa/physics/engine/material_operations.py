@@ -8,14 +8,20 @@ import warp as wp
 from torch import Tensor
 
 from mosa.physics.constitutive.laws import Law
-from mosa.physics.constitutive.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
+from mosa.physics.constitutive.material_kernels import (
+    field_types,
+    return_kernel,
+    state_kernel,
+    stress_kernel,
+)
 from mosa.physics.engine.numerics import Numerics
 from mosa.physics.launching import SCALARS, aligned, launch, warp_stream, zeros_in_one
 
 
 def _arrays(tensors: list[Tensor | None], kinds: list) -> list:
     return [
-        None if t is None else wp.from_torch(aligned(t.detach()), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)
+        None if t is None else wp.from_torch(aligned(t.detach()), dtype=kind)
+        for t, kind in zip(tensors, kinds, strict=True)
     ]
 
 
@@ -23,7 +29,9 @@ def _targets(tensors: Sequence[Tensor], kinds: list) -> list:
     """What adjoints add to: never a copy, which nobody would read. Matrices of 3 x 3 are moved one number at a time and may begin
     anywhere; the others begin at a multiple of 16 bytes where they are made."""
     if not all(t.is_contiguous() for t in tensors):
-        raise ValueError(f"gradients: expected contiguous tensors, found strides {[t.stride() for t in tensors]}")
+        raise ValueError(
+            f"gradients: expected contiguous tensors, found strides {[t.stride() for t in tensors]}"
+        )
     return [wp.from_torch(t.detach(), dtype=kind) for t, kind in zip(tensors, kinds)]
 
 
@@ -40,7 +48,10 @@ def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) 
     kernel = stress_kernel(law.stress, law.uses_rotation, scalar, False)
     blank, tau = F.new_zeros(1, 6, 6), torch.empty_like(F, memory_format=torch.contiguous_format)
     with warp_stream(F.device):
-        arrays = _arrays([F, C_affine, parameters, blank, blank[0, :1], tau], [mat33, mat33, vecp, mat66, vec6, mat33])
+        arrays = _arrays(
+            [F, C_affine, parameters, blank, blank[0, :1], tau],
+            [mat33, mat33, vecp, mat66, vec6, mat33],
+        )
         launch(kernel, len(F), arrays, arrays[0].device)
     return tau
 
@@ -67,7 +78,10 @@ class _MaterialState(torch.autograd.Function):
     def backward(ctx, *seeds):
         # the adjoint leaves the outputs alone and only reads the seeds: Warp clears only those that are the grad of an array
         inputs, seeds = list(ctx.saved_tensors), [*seeds] + [None] * (not ctx.plastic)
-        gradients, blank = _zeros(inputs) if ctx.into is None else ctx.into, inputs[0].new_empty(1, 6)
+        gradients, blank = (
+            _zeros(inputs) if ctx.into is None else ctx.into,
+            inputs[0].new_empty(1, 6),
+        )
         with warp_stream(blank.device):
             arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
             adjoints = [*_targets(gradients, ctx.kinds), *_arrays(seeds, ctx.kinds[3:])]
@@ -76,7 +90,11 @@ class _MaterialState(torch.autograd.Function):
 
 
 def material_state(
-    law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor, into: tuple[Tensor, Tensor, Tensor] | None = None
+    law: Law,
+    F: Tensor,
+    C_affine: Tensor,
+    parameters: Tensor,
+    into: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """(w, s, e) that an adapter reads, differentiable.
 
@@ -103,7 +121,12 @@ class _Return(torch.autograd.Function):
         mapped = torch.empty_like(F, memory_format=torch.contiguous_format)
         with warp_stream(F.device):
             arrays = _arrays([F, C, parameters, G, h], ctx.kinds)
-            launch(ctx.kernel, len(F), [*arrays, *ctx.constants, *_arrays([mapped], [mat33])], arrays[0].device)
+            launch(
+                ctx.kernel,
+                len(F),
+                [*arrays, *ctx.constants, *_arrays([mapped], [mat33])],
+                arrays[0].device,
+            )
         return mapped
 
     @staticmethod
@@ -115,7 +138,9 @@ class _Return(torch.autograd.Function):
             arrays = _arrays(inputs, ctx.kinds)
             blank, seeds = _arrays([seed.new_empty(1, 3, 3), seed], ctx.kinds[:1] * 2)
             adjoints = [*_targets(gradients, ctx.kinds), 0.0, 0.0, 0, seeds]
-            launch(ctx.kernel, len(seed), [*arrays, *ctx.constants, blank], arrays[0].device, adjoints)
+            launch(
+                ctx.kernel, len(seed), [*arrays, *ctx.constants, blank], arrays[0].device, adjoints
+            )
         return None, *gradients[:3], *(gradients[3:] if ctx.adapted else (None, None))
 
 

@@ -59,7 +59,9 @@ class Stretch(ABC):
     """Whether the window has room for what gravity adds to the speeds."""
 
     @abstractmethod
-    def buffers(self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool) -> tuple[Workspace, dict]:
+    def buffers(
+        self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool
+    ) -> tuple[Workspace, dict]:
         """(the workspace, what is copied into it by name). full: with buffers for the adjoint."""
 
     @abstractmethod
@@ -67,7 +69,9 @@ class Stretch(ABC):
         """All substeps, in a workspace that is loaded."""
 
     @abstractmethod
-    def adjoint(self, work: Workspace, acting: Sequence[Tensor | None], again: bool, penalised: bool) -> None:
+    def adjoint(
+        self, work: Workspace, acting: Sequence[Tensor | None], again: bool, penalised: bool
+    ) -> None:
         """Of all substeps, in a workspace that is loaded and seeded. again: the states are not there; penalised: `statistics_seeds`
         are not all zero."""
 
@@ -92,9 +96,16 @@ class Stretch(ABC):
 
     def _parts(self, state: State, others: Sequence[Tensor | None]) -> tuple[list, list, list]:
         """(states, what acts, poses) of each solver."""
-        split, posed = self.lanes.split, len(Poses._fields) if self.lanes.numerics.colliders is not None else 0
+        split, posed = (
+            self.lanes.split,
+            len(Poses._fields) if self.lanes.numerics.colliders is not None else 0,
+        )
         acting = len(others) - posed
-        return [State(*part) for part in split(state)], split(others[:acting]), split(others[acting:], 1)
+        return (
+            [State(*part) for part in split(state)],
+            split(others[:acting]),
+            split(others[acting:], 1),
+        )
 
     def _kind(self, name: str, others: Sequence[Tensor | None]) -> tuple:
         """Of a pass: those of one kind run the same kernels."""
@@ -106,7 +117,16 @@ class Stretch(ABC):
     ) -> Workspace:  # fmt: skip
         work, held = self.buffers(solver, acting, full)
         work.set_window(*windows)
-        work.load(state, held, solver.volume, solver.mass, solver.cutoff, poses, self.steps, solver.gravities)
+        work.load(
+            state,
+            held,
+            solver.volume,
+            solver.mass,
+            solver.cutoff,
+            poses,
+            self.steps,
+            solver.gravities,
+        )
         return work
 
     def forward(
@@ -126,11 +146,22 @@ class Stretch(ABC):
                 return work
 
             margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
-            work, final, windows = solver.within(launched, state, time, margins, self.foresees, self.first, dt)
-            left = [*([] if work.colliders is None else work.colliders.reaction), *self.statistics(work)]
-            return final, copies(left), Kept(windows, solver.budget.keep(work.tape()) if kept else [])
+            work, final, windows = solver.within(
+                launched, state, time, margins, self.foresees, self.first, dt
+            )
+            left = [
+                *([] if work.colliders is None else work.colliders.reaction),
+                *self.statistics(work),
+            ]
+            return (
+                final,
+                copies(left),
+                Kept(windows, solver.budget.keep(work.tape()) if kept else []),
+            )
 
-        finals, left, kept = zip(*self.lanes.each(self._kind("advance", others), run, *self._parts(state, others)))
+        finals, left, kept = zip(
+            *self.lanes.each(self._kind("advance", others), run, *self._parts(state, others))
+        )
         states = [final if self.plastic else final[:-1] for final in finals]
         return State.whole(self.lanes.join(states)), self.lanes.join(left, 1), kept
 
@@ -140,14 +171,30 @@ class Stretch(ABC):
     ) -> tuple[list[Tensor], list[Tensor | None]]:  # fmt: skip
         """Gradients of (state, others), of as many states as there are seeds: without F_tot where the law does not yield."""
 
-        def run(solver: SegmentSolver, kept: Kept, state: State, acting: tuple, poses: tuple, seeds: tuple, other_seeds: tuple):
+        def run(
+            solver: SegmentSolver,
+            kept: Kept,
+            state: State,
+            acting: tuple,
+            poses: tuple,
+            seeds: tuple,
+            other_seeds: tuple,
+        ):
             work = self._loaded(solver, state, acting, poses, kept.windows, True)
             tape = kept.take()
             solver.budget.used(tape)
             if tape:
                 work.rewind(tape)
-            slot, slots, statistics = self.substeps % 2, work.adjoint_slots(), self.statistics_seeds()
-            reaction, of_poses = ([], []) if work.colliders is None else (work.colliders.adj_reaction, work.colliders.adj_poses)
+            slot, slots, statistics = (
+                self.substeps % 2,
+                work.adjoint_slots(),
+                self.statistics_seeds(),
+            )
+            reaction, of_poses = (
+                ([], [])
+                if work.colliders is None
+                else (work.colliders.adj_reaction, work.colliders.adj_poses)
+            )
             targets = [*(target[slot] for target in slots), *reaction, *statistics]
             seeded = list(zip(targets, (*seeds, *other_seeds), strict=True))
             if unseeded := [target for target, seed in seeded if seed is None]:
@@ -157,11 +204,30 @@ class Stretch(ABC):
             penalised = any(seed is not None for seed in other_seeds[len(reaction) :])
             self.adjoint(work, acting, not tape, penalised)
             of_acting = self.adjoint_of(work, acting)
-            found = iter(copies([*(target[0] for target in slots), *(t for t in of_acting if t is not None), *of_poses]))
-            return [next(found) for _ in slots], [None if t is None else next(found) for t in of_acting], list(found)
+            found = iter(
+                copies(
+                    [
+                        *(target[0] for target in slots),
+                        *(t for t in of_acting if t is not None),
+                        *of_poses,
+                    ]
+                )
+            )
+            return (
+                [next(found) for _ in slots],
+                [None if t is None else next(found) for t in of_acting],
+                list(found),
+            )
 
         parts, lanes = self._parts(state, others), self.lanes
-        found = lanes.each(self._kind("adjoint", others), run, kept, *parts, lanes.split(seeds), lanes.split(other_seeds, 1))
+        found = lanes.each(
+            self._kind("adjoint", others),
+            run,
+            kept,
+            *parts,
+            lanes.split(seeds),
+            lanes.split(other_seeds, 1),
+        )
         of_state, of_acting, of_poses = zip(*found)
         return lanes.join(of_state), [*lanes.join(of_acting), *lanes.join(of_poses, 1)]
 
@@ -173,14 +239,18 @@ class _Advance(torch.autograd.Function):
         state, others = _detached(inputs[:STATES]), inputs[STATES:]
         final, more, ctx.kept = stretch.forward(state, others, True)
         ctx.stretch, ctx.own = stretch, STATES if stretch.plastic else STATES - 1
-        ctx.save_for_backward(*state, *others)  # weights too: autograd tells if one is changed before the backward pass
+        ctx.save_for_backward(
+            *state, *others
+        )  # weights too: autograd tells if one is changed before the backward pass
         return *final[: ctx.own], *more
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
         state, others = State(*ctx.saved_tensors[:STATES]), ctx.saved_tensors[STATES:]
-        found, of_others = ctx.stretch.backward(state, others, ctx.kept, seeds[: ctx.own], seeds[ctx.own :])
+        found, of_others = ctx.stretch.backward(
+            state, others, ctx.kept, seeds[: ctx.own], seeds[ctx.own :]
+        )
         return None, *found, *[None] * (STATES - ctx.own), *of_others
 
 
@@ -193,7 +263,9 @@ def wants_gradient(tensors: Iterable[Tensor | None]) -> bool:
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
-def advance(stretch: Stretch, state: State, others: Sequence[Tensor | None]) -> tuple[State, tuple[Tensor, ...]]:
+def advance(
+    stretch: Stretch, state: State, others: Sequence[Tensor | None]
+) -> tuple[State, tuple[Tensor, ...]]:
     """(the state after the stretch, what else it leaves), differentiable in state and others. Errors: as `Stretch.forward`."""
     if not wants_gradient((*state, *others)):
         final, more, _ = stretch.forward(_detached(state), others, False)

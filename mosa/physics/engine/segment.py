@@ -35,27 +35,41 @@ class HeldSegment(Stretch):
         # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
         return self.cut
 
-    def buffers(self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool) -> tuple[Workspace, dict]:
+    def buffers(
+        self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool
+    ) -> tuple[Workspace, dict]:
         held = dict(zip(HELD, acting, strict=True))
         operator = [held[name] for name in ("G", "h") if held[name] is not None]
         # views of one row, as `expand` makes them, are read from there by all particles
         shared = bool(operator) and all(part.stride(0) == 0 for part in operator)
-        return solver.workspace(self.substeps, bool(operator), held["plastic_G"] is not None, full, shared), held
+        return solver.workspace(
+            self.substeps, bool(operator), held["plastic_G"] is not None, full, shared
+        ), held
 
     def advance(self, work: Workspace, acting: Sequence[Tensor | None]) -> None:
         work.advance()
 
-    def adjoint(self, work: Workspace, acting: Sequence[Tensor | None], again: bool, penalised: bool) -> None:
+    def adjoint(
+        self, work: Workspace, acting: Sequence[Tensor | None], again: bool, penalised: bool
+    ) -> None:
         if again:
             work.advance()
         work.adjoint()
 
     def adjoint_of(self, work: Workspace, acting: Sequence[Tensor | None]) -> list[Tensor | None]:
-        return [None if value is None else work.adj_held[name] for name, value in zip(HELD, acting, strict=True)]
+        return [
+            None if value is None else work.adj_held[name]
+            for name, value in zip(HELD, acting, strict=True)
+        ]
 
 
 def advance_segment(
-    lanes: Lanes, state: State, held: dict, substeps: int, first: int, poses: tuple[Tensor, ...] = (),
+    lanes: Lanes,
+    state: State,
+    held: dict,
+    substeps: int,
+    first: int,
+    poses: tuple[Tensor, ...] = (),
     steps: Steps | None = None,
 ) -> tuple[State, tuple[Tensor, ...]]:
     """(state after `substeps`, reactions), differentiable in state, everything in `held`, and poses.
@@ -75,4 +89,6 @@ def advance_segment(
             continue
         reactions.append(reaction)
         done, steps = done + piece, Steps(steps.dt, steps.dt)
-    return state, reactions[0] if len(reactions) == 1 else tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
+    return state, reactions[0] if len(reactions) == 1 else tuple(
+        torch.cat(parts) for parts in zip(*reactions, strict=True)
+    )

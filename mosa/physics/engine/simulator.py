@@ -79,16 +79,32 @@ class Simulator:
         options: LawOptions = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
-        for name, value, most in (("dx", dx, 1e300), ("frame_dt", frame_dt, 1e300), ("substeps", substeps, MOST_SUBSTEPS)):
+        for name, value, most in (
+            ("dx", dx, 1e300),
+            ("frame_dt", frame_dt, 1e300),
+            ("substeps", substeps, MOST_SUBSTEPS),
+        ):
             if not 0 < value <= most:
-                raise ConfigError(f"{name}: expected a positive number of at most {most:g}, found {value}")
-        if strain is not None and (strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None):
+                raise ConfigError(
+                    f"{name}: expected a positive number of at most {most:g}, found {value}"
+                )
+        if strain is not None and (
+            strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None
+        ):
             if strain not in STRAINS:
-                raise ConfigError(f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}")
-            raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu")
+                raise ConfigError(
+                    f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}"
+                )
+            raise ConfigError(
+                f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
+            )
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
-        self.substeps, self.frame_dt, self.dt = int(substeps), float(frame_dt), float(frame_dt) / int(substeps)
+        self.substeps, self.frame_dt, self.dt = (
+            int(substeps),
+            float(frame_dt),
+            float(frame_dt) / int(substeps),
+        )
         self.dtype, self.device = dtype, torch.device(device)
         self.options = options
         gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
@@ -98,11 +114,15 @@ class Simulator:
         axes = self._axes = Axes(turn_along(all_planes))
         values, modes = pack_planes(all_planes, torch.float64, self.device, float(dx))
         self.colliders = tuple(colliders)
-        packed_colliders = pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
+        packed_colliders = (
+            pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
+        )
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
         box = corners(box, float(dx) if touching else 0.0)
-        low, high = box if axes.turn is None else corners(None)  # one askew is looked at by `Stepper.through`
+        low, high = (
+            box if axes.turn is None else corners(None)
+        )  # one askew is looked at by `Stepper.through`
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt,
             gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes, plane_count=len(all_planes),
@@ -119,7 +139,11 @@ class Simulator:
         self._ask = partial(ask, self.law, dtype)
 
     def pack(
-        self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None, worlds: int | None = None
+        self,
+        parameters: dict[str, Tensor],
+        particles: int,
+        rotation: Tensor | None = None,
+        worlds: int | None = None,
     ) -> Tensor:
         """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
 
@@ -128,8 +152,13 @@ class Simulator:
         one.
         """
         shape = (particles,) if worlds is None else (worlds, particles)
-        like, factor = self.numerics.planes, YIELD_CONVENTIONS[self.options.yield_convention]  # of its type and on its device
-        return pack_parameters(self.law, parameters, shape, like, rotation=rotation, yield_factor=factor)
+        like, factor = (
+            self.numerics.planes,
+            YIELD_CONVENTIONS[self.options.yield_convention],
+        )  # of its type and on its device
+        return pack_parameters(
+            self.law, parameters, shape, like, rotation=rotation, yield_factor=factor
+        )
 
     def rollout(
         self,
@@ -185,7 +214,9 @@ class Simulator:
             if number > 1:
                 current, frame = stepper.enter(moment, False)
             alike = 0 if varies or self.colliders else frames - 1 - number
-            moment, forces, count = stepper.through(moment, current, frame, poses(number - 1, frame), alike)
+            moment, forces, count = stepper.through(
+                moment, current, frame, poses(number - 1, frame), alike
+            )
             counts.append(count)
             if forces is not None:
                 reactions.append(forces)
@@ -193,12 +224,20 @@ class Simulator:
             if progress is not None:
                 progress(number)
         names = ("x", "v", "F", "F_tot") if self.law.plastic else ("x", "v", "F")
-        columns = stepper.apart((torch.stack([getattr(each, name) for each in recorded]) for name in names), 1)
+        columns = stepper.apart(
+            (torch.stack([getattr(each, name) for each in recorded]) for name in names), 1
+        )
         inverted = int((_determinant(columns[2].detach()) <= 0).sum())
         world = stepper.axes.world
-        columns = [world.points(columns[0]), world.vectors(columns[1]), *map(world.gradients, columns[2:])]
+        columns = [
+            world.points(columns[0]),
+            world.vectors(columns[1]),
+            *map(world.gradients, columns[2:]),
+        ]
         if inverted and self.options.on_inversion == "warn":
-            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
+            warnings.warn(
+                f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2
+            )
         (forces,) = stepper.apart([torch.stack(reactions) if reactions else None], 2)
         return Rollout(
             *columns[:3], columns[-1], times=self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device),
@@ -239,31 +278,63 @@ class Simulator:
         """frames: None where there may be any number of them. Errors: ConfigError."""
         worlds = None if state.x.ndim == 2 else count_of_worlds(state, together)
         if worlds is not None and timing is not None:
-            raise ConfigError("timing: expected None with many worlds, which take the same substeps")
+            raise ConfigError(
+                "timing: expected None with many worlds, which take the same substeps"
+            )
         if worlds is None and (gravity is not None or together is not None):
-            raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
+            raise ConfigError(
+                "gravity and together: expected None without worlds; gravity is the simulator's"
+            )
         check_state(self.numerics, state, volume)
         if (shift := shift_to(state.x, self._axes.turn, self.numerics.dx)) != self._axes.shift:
             self._move(shift)
         axes = self._axes
         state = axes.state(state, self.dtype)
-        gravities = None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
+        gravities = (
+            None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
+        )
         if gravity is not None:
-            gravities = tuple(map(tuple, axes.vectors(torch.tensor(gravities, dtype=torch.float64)).tolist()))
-        prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames, worlds, gravities, together)
+            gravities = tuple(
+                map(tuple, axes.vectors(torch.tensor(gravities, dtype=torch.float64)).tolist())
+            )
+        prepared = self._prepare(
+            state,
+            parameters,
+            volume,
+            density,
+            adapter,
+            stride,
+            collect,
+            frames,
+            worlds,
+            gravities,
+            together,
+        )
         each = motions_of_worlds(motions, self.colliders, worlds)
         choose = None
         if isinstance(timing, Replay):
             counts = check_counts(timing.counts, frames)
             choose = lambda frame, *_: counts[frame - 1]  # noqa: E731
         elif timing is not None:
-            solids = max((m.max_speed(reach(c.shape)) for m, c in zip(each[0], self.colliders)), default=0.0)
+            solids = max(
+                (m.max_speed(reach(c.shape)) for m, c in zip(each[0], self.colliders)), default=0.0
+            )
             density = density if isinstance(density, Tensor) and density.ndim else float(density)
-            chooser = StepChooser(timing.control, self.numerics, parameters, prepared.packed, density, self.frame_dt, solids)
+            chooser = StepChooser(
+                timing.control,
+                self.numerics,
+                parameters,
+                prepared.packed,
+                density,
+                self.frame_dt,
+                solids,
+            )
             choose = chooser.choose
         clock = Clock(self.frame_dt, self.substeps, None if frames == 1 else choose)
         lag = 0.0 if timing is None else timing.lag
-        return Stepper(prepared, worlds, clock, each, axes, self.colliders), Moment(self._begun(state, started), lag=lag)
+        return Stepper(prepared, worlds, clock, each, axes, self.colliders), Moment(
+            self._begun(state, started), lag=lag
+        )
 
     def _move(self, shift: tuple[float, ...] | None) -> None:
         """The origin of its axes. A stepper that was made before goes on with its own numerics and buffers."""
@@ -282,12 +353,27 @@ class Simulator:
         if not self.colliders:
             return lambda *_: (), ()
         if stepper.clock.varies:
-            return lambda number, frame: stepper.taken(sample_frame(
-                each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, replayed
-            ), frame.dt), ()
+            return lambda number, frame: stepper.taken(
+                sample_frame(
+                    each[0],
+                    number,
+                    frames - 1,
+                    frame.first,
+                    frame.count,
+                    self.frame_dt,
+                    start_time,
+                    replayed,
+                ),
+                frame.dt,
+            ), ()
         found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time) for own in each]
-        found = stepper.taken(tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)), self.dt)
-        return lambda _, frame: tuple(part[frame.first : frame.first + frame.count] for part in found), found
+        found = stepper.taken(
+            tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)),
+            self.dt,
+        )
+        return lambda _, frame: tuple(
+            part[frame.first : frame.first + frame.count] for part in found
+        ), found
 
     def _prepare(
         self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
@@ -295,12 +381,21 @@ class Simulator:
     ) -> Prepared:  # fmt: skip
         """What a rollout needs besides its state. Errors: ConfigError."""
         if (frames is not None and frames < 1) or (stride is not None and stride < 1):
-            raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
-        counted("particles of all frames", (frames or 1, *state.x.shape[:-1]), "take fewer", each=4 * (3 + 3 + 9 + 9))
+            raise ConfigError(
+                f"frames and stride: expected at least 1, found {frames} and {stride}"
+            )
+        counted(
+            "particles of all frames",
+            (frames or 1, *state.x.shape[:-1]),
+            "take fewer",
+            each=4 * (3 + 3 + 9 + 9),
+        )
         volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
         density, mean_mass = checked_density(density, volume)
         F = state.F if worlds is None else state.F.flatten(0, 1)
-        packed = self.pack(parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds)
+        packed = self.pack(
+            parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds
+        )
         cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
@@ -308,14 +403,19 @@ class Simulator:
             solvers = [SegmentSolver(self.numerics, volume, density, cutoff)]
         else:
             size = together or (worlds if self.device.type == "cuda" else 1)
-            volume, density = (t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density))
+            volume, density = (
+                t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density)
+            )
             solvers = [
-                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i) for i in range(0, worlds, size)
+                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i)
+                for i in range(0, worlds, size)
             ]
         if isinstance(adapter, Sequence):
             adapter = Several(adapter, count)
         lanes = Lanes(solvers, self.buffers)
-        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers)
+        return Prepared(
+            self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers
+        )
 
     def _begun(self, state: ParticleState, started: bool) -> ParticleState:
         """The state that is advanced: F_tot is F itself where the law does not yield."""
@@ -323,10 +423,14 @@ class Simulator:
         C_affine = state.C_affine if spins else torch.zeros_like(state.C_affine)
         return replace(state, C_affine=C_affine, F_tot=state.F_tot if self.law.plastic else state.F)
 
-    def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
+    def material_state(
+        self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]
+    ) -> MaterialState:
         """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
-        return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
+        return MaterialState(
+            *material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation))
+        )
 
 
 def _determinant(F: Tensor) -> Tensor:

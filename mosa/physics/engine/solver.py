@@ -66,9 +66,22 @@ class SegmentSolver:
         return len(self.gravities)
 
     def workspace(
-        self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool, shared: bool = False
+        self,
+        substeps: int,
+        adapted: bool,
+        plastic_adapted: bool,
+        with_adjoint: bool,
+        shared: bool = False,
     ) -> Workspace:
-        key = (len(self.volume), substeps, adapted, plastic_adapted, with_adjoint, self.worlds, shared)
+        key = (
+            len(self.volume),
+            substeps,
+            adapted,
+            plastic_adapted,
+            with_adjoint,
+            self.worlds,
+            shared,
+        )
         if key not in self.workspaces:
             self.workspaces[key] = Workspace(
                 self.numerics, len(self.volume), substeps, adapted=adapted, plastic_adapted=plastic_adapted,
@@ -109,7 +122,10 @@ class SegmentSolver:
         try:
             yield
             with torch.no_grad():
-                fine = min(self.look(torch.stack(self._shared.flags).amin(0), self._shared.final)) == NO_EVENT
+                fine = (
+                    min(self.look(torch.stack(self._shared.flags).amin(0), self._shared.final))
+                    == NO_EVENT
+                )
         finally:
             self._shared = None
         if not fine:
@@ -124,7 +140,9 @@ class SegmentSolver:
         bounds, pieces = self.bounds(state), -(-left // most)
         if not np.isfinite(bounds).all():
             return min(left, WIDENED)
-        while (count := -(-left // pieces)) > WIDENED and not self._serves(bounds, count * dt, WIDENED * dt, 2):
+        while (count := -(-left // pieces)) > WIDENED and not self._serves(
+            bounds, count * dt, WIDENED * dt, 2
+        ):
             pieces *= 2
         return count
 
@@ -134,14 +152,18 @@ class SegmentSolver:
         bounds = self.bounds(state)
         if not np.isfinite(bounds).all():
             return 1
-        while frames > 1 and not self._serves(bounds, frames * frame_dt, min(frame_dt, WIDENED * dt), margin):
+        while frames > 1 and not self._serves(
+            bounds, frames * frame_dt, min(frame_dt, WIDENED * dt), margin
+        ):
             frames //= 2
         return frames
 
     def _serves(self, bounds: np.ndarray, time: float, least: float, margin: int) -> bool:
         """Whether the windows for `time` [s] are about as small as those for the time `least`."""
         reach = fallen(bounds, self._pull, time)
-        long, short = window_of(reach, self.numerics.dx, np.array([time, least])[:, None, None], margin)[1].prod(-1)
+        long, short = window_of(
+            reach, self.numerics.dx, np.array([time, least])[:, None, None], margin
+        )[1].prod(-1)
         return bool(long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES)
 
     def windows(self, state: State, time: float, margin: int, falls: bool) -> Windows:
@@ -158,7 +180,9 @@ class SegmentSolver:
     def look(self, flags: Tensor, final: State) -> list[int]:
         """The events of a segment; the same transfer tells the host where the next one starts."""
         bounds = extent(*(self._apart(t) for t in final[:2]))
-        numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(force=True)  # float64 holds the flags exactly
+        numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(
+            force=True
+        )  # float64 holds the flags exactly
         self._know(final, numbers[4:].reshape(-1, 12))
         return [int(n) for n in numbers[:4]]
 
@@ -173,7 +197,9 @@ class SegmentSolver:
     def bounds(self, state: State) -> np.ndarray:
         """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""
         if self._known is None or not same_memory(self._known[0], state[:2]):
-            self._know(state, extent(*(self._apart(t) for t in state[:2])).double().numpy(force=True))
+            self._know(
+                state, extent(*(self._apart(t) for t in state[:2])).double().numpy(force=True)
+            )
         return self._known[1]
 
     def _know(self, state: State, bounds: np.ndarray) -> None:
@@ -200,12 +226,18 @@ class SegmentSolver:
             NONFINITE: "position, velocity or deformation is no longer finite",
             OUTSIDE: f"position is outside the box {list(numerics.box[0])} to {list(numerics.box[1])} m",
             INVERTED: "det F <= 0, which "
-            + (f"law {law.name} has no value for" if law.needs_positive_J else "on_inversion=error forbids"),
+            + (
+                f"law {law.name} has no value for"
+                if law.needs_positive_J
+                else "on_inversion=error forbids"
+            ),
         }[event]
         remedy = "use more substeps, or parameters nearer to the calibrated ones"
         if event == OUTSIDE:
-            remedy = ("use a larger box (scene.box of a run, box= of a twin), or another start: a velocity that is not given is "
-                      "the training's")
+            remedy = (
+                "use a larger box (scene.box of a run, box= of a twin), or another start: a velocity that is not given is "
+                "the training's"
+            )
         return SimulationDiverged(
             f"{self._named(world)}substep {substep}, particle {particle}: {what} (dt {dt:.3g} s, dx {numerics.dx:.3g} m); {remedy}"
         )

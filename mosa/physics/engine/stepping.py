@@ -60,9 +60,15 @@ class Prepared:
 
     def __post_init__(self) -> None:
         self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
-        alone = len(self.lanes.solvers) == 1 and self.stride is not None and getattr(self.adapter, "flow", None) is None
+        alone = (
+            len(self.lanes.solvers) == 1
+            and self.stride is not None
+            and getattr(self.adapter, "flow", None) is None
+        )
         if self.gathers and alone and isinstance(self.adapter, nn.Module):
-            self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, self.collect is not None)
+            self.chains = Chains(
+                self.lanes, self.adapter, self.ask, self.packed, self.collect is not None
+            )
 
     def first_advance(self, state: State, dt: float) -> State:
         """The advance of F by dt [s] with which a motion begins."""
@@ -71,14 +77,22 @@ class Prepared:
         if not numerics.law.plastic:
             F = first_advance(numerics, F, C, self.packed)
             return state._replace(F=F, F_tot=F)
-        operator = self.ask(self.adapter, F, C, self.packed, self.collect) if self.adapter is not None else self.held
-        mapped = first_advance(numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"])
+        operator = (
+            self.ask(self.adapter, F, C, self.packed, self.collect)
+            if self.adapter is not None
+            else self.held
+        )
+        mapped = first_advance(
+            numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"]
+        )
         return state._replace(F=mapped, F_tot=F_tot + dt * (C @ F_tot))
 
     def settle(self, state: State) -> None:
         """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts segments then."""
         if self.adapter is not None and self.stride is None:
-            self.held.update(self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect))
+            self.held.update(
+                self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect)
+            )
             self.adapter = None
 
     def give_memory(self, substeps: int, wanted: bool) -> None:
@@ -87,7 +101,14 @@ class Prepared:
             each = substep_bytes(self.numerics, len(self.packed))
             self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds))
 
-    def begin(self, state: State, poses: tuple[Tensor, ...], substeps: int, variable: bool, gives: bool = False) -> None:
+    def begin(
+        self,
+        state: State,
+        poses: tuple[Tensor, ...],
+        substeps: int,
+        variable: bool,
+        gives: bool = False,
+    ) -> None:
         """Before a motion of `substeps` substeps: how long stretches may be that nothing cuts. gives: also memory, as above."""
         self.settle(state)
         weights = () if self.chains is None else self.chains.look()
@@ -106,9 +127,15 @@ class Prepared:
         """Of the segments of a frame; where counts vary, sizes that many of them share."""
         if self.adapter is not None:
             return segments(frame.count, self.stride)
-        return segments(frame.count, None, self.most_alone) if frame.steps is None else segments(frame.count, SEGMENT)
+        return (
+            segments(frame.count, None, self.most_alone)
+            if frame.steps is None
+            else segments(frame.count, SEGMENT)
+        )
 
-    def frame(self, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> tuple[State, Tensor | None]:
+    def frame(
+        self, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0
+    ) -> tuple[State, Tensor | None]:
         """(state after a frame, reactions (substeps, W K, 6) or None). poses: of W worlds with K colliders at its substeps, ()
         where there are none; alike: frames that follow and are known to have as many substeps and no poses, of which some may be
         done now. The state is then the one of the frame before."""
@@ -120,9 +147,13 @@ class Prepared:
                 return state, forces
             done, collected = [state], []
             try:
-                with self.lanes.solvers[0].one_look(state, count * frame.count * frame.dt, self._margin):
+                with self.lanes.solvers[0].one_look(
+                    state, count * frame.count * frame.dt, self._margin
+                ):
                     for k in range(count):
-                        after, _, more = self._one(done[-1], frame._replace(first=frame.first + k * frame.count), poses)
+                        after, _, more = self._one(
+                            done[-1], frame._replace(first=frame.first + k * frame.count), poses
+                        )
                         done.append(after)
                         collected += more
             except (LeftWindow, SimulationDiverged) as error:
@@ -140,15 +171,24 @@ class Prepared:
     def _together(self, state: State, frame: Frame, frames: int) -> int:
         """How many of `frames` frames alike are launched before the host looks at them."""
         frames = min(frames, self._most_ahead // frame.count)
-        if frames < 2 or not self.gathers or len(self.lanes.solvers) > 1 or (self.adapter is not None and self.chains is None):
+        if (
+            frames < 2
+            or not self.gathers
+            or len(self.lanes.solvers) > 1
+            or (self.adapter is not None and self.chains is None)
+        ):
             return 1
-        return self.lanes.solvers[0].together(state, frames, frame.count * frame.dt, frame.dt, self._margin)
+        return self.lanes.solvers[0].together(
+            state, frames, frame.count * frame.dt, frame.dt, self._margin
+        )
 
     def _collect(self, statistics: list) -> None:
         for each in statistics:
             self.collect(each)
 
-    def _one(self, state: State, frame: Frame, poses: tuple[Tensor, ...]) -> tuple[State, Tensor | None, list]:
+    def _one(
+        self, state: State, frame: Frame, poses: tuple[Tensor, ...]
+    ) -> tuple[State, Tensor | None, list]:
         """(as `frame`, of this frame alone, statistics of a chain's evaluations)."""
         lengths, first, steps = self.lengths(frame), frame.first, frame.steps
         if self.chains is not None:
@@ -159,9 +199,13 @@ class Prepared:
             if flow is not None:
                 state = state._replace(F=flow(state.F, length * frame.dt))
             if self.adapter is not None:
-                self.held.update(self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect))
+                self.held.update(
+                    self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect)
+                )
             along = tuple(part[done : done + length] for part in poses)
-            state, reaction = advance_segment(self.lanes, state, self.held, length, first + done, along, steps)
+            state, reaction = advance_segment(
+                self.lanes, state, self.held, length, first + done, along, steps
+            )
             forces += [torch.cat(reaction, -1)] if reaction else []
             steps = None if steps is None else Steps(steps.dt, steps.dt)
             done += length
@@ -207,7 +251,10 @@ class Stepper:
         self.axes, self.solids = axes, solids
 
     def step(
-        self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
+        self,
+        moment: Moment,
+        poses: Poses | Callable[[int, float], Poses] | None = None,
+        speed: float | None = None,
     ) -> Step:
         """One step on from `moment`, which is left as it is; differentiable in it, in poses, and in what `Simulator.stepper` got.
 
@@ -222,7 +269,9 @@ class Stepper:
         (forces,) = self.apart([self.axes.world.vectors(forces)], 1)
         return Step(after._replace(state=ParticleState(*self.apart(after.state))), forces, count)
 
-    def enter(self, moment: Moment, begins: bool, speed: float | None = None) -> tuple[State, Frame]:
+    def enter(
+        self, moment: Moment, begins: bool, speed: float | None = None
+    ) -> tuple[State, Frame]:
         """(all particles before the next frame, the frame). begins: whether a motion does, whose F is not advanced yet."""
         state = flat(moment.state)
         if not self.prepared.numerics.law.plastic:
@@ -230,14 +279,20 @@ class Stepper:
         frame = self.clock.frame(moment, state, speed)
         return self.prepared.first_advance(state, frame.dt) if begins else state, frame
 
-    def through(self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> Step:
+    def through(
+        self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0
+    ) -> Step:
         """The frame that `enter` found, of all particles one world's after the other's. poses, alike: as `Prepared.frame`."""
         state, forces = self.prepared.frame(state, frame, poses, alike)
         if self.axes.turn is not None:
             self._check_box(self.axes.world.points(state.x.detach()), frame)
         if forces is not None and frame.steps is not None:
             forces = mean_force(forces, frame.steps)
-        return Step(Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt), forces, frame.count)
+        return Step(
+            Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt),
+            forces,
+            frame.count,
+        )
 
     def _check_box(self, x: Tensor, frame: Frame) -> None:
         low, high = x.new_tensor(self.prepared.numerics.box)
@@ -248,9 +303,14 @@ class Stepper:
 
     def apart(self, tensors: Iterable[Tensor | None], dim: int = 0) -> list[Tensor | None]:
         """With a dimension for the worlds in place of `dim`."""
-        return [t if self.worlds is None or t is None else t.unflatten(dim, (self.worlds, -1)) for t in tensors]
+        return [
+            t if self.worlds is None or t is None else t.unflatten(dim, (self.worlds, -1))
+            for t in tensors
+        ]
 
-    def _poses(self, moment: Moment, frame: Frame, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
+    def _poses(
+        self, moment: Moment, frame: Frame, poses: Poses | Callable | None
+    ) -> tuple[Tensor, ...]:
         """(S, W K, ...) each, in the simulator's type."""
         colliders, count = len(self.motions[0]), frame.count
         if not colliders:
@@ -262,7 +322,9 @@ class Stepper:
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
-                raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
+                raise ConfigError(
+                    f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}"
+                )
         poses = self.taken(poses, frame.dt)
         return poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
 
@@ -271,17 +333,34 @@ class Stepper:
         pass the body without being felt."""
         most, K = 0.5 * self.prepared.numerics.dx / dt, len(self.solids)
         worlds = poses[0].shape[1:-1].numel() // K
-        x, R, v, w = (part.detach().reshape(len(part), worlds, K, size) for part, size in zip(poses, (3, 9, 3, 3)))
+        x, R, v, w = (
+            part.detach().reshape(len(part), worlds, K, size)
+            for part, size in zip(poses, (3, 9, 3, 3))
+        )
         far = v.new_tensor([reach(solid.shape) for solid in self.solids])
         moved = (x.diff(dim=0).norm(dim=-1), far * R.diff(dim=0).norm(dim=-1) / math.sqrt(2))
-        fastest = torch.cat([v.norm(dim=-1) + w.norm(dim=-1) * far, *(part / dt for part in moved)]).flatten(0, 1)
+        fastest = torch.cat(
+            [v.norm(dim=-1) + w.norm(dim=-1) * far, *(part / dt for part in moved)]
+        ).flatten(0, 1)
         if not bool((fastest <= (1 + 1e-6) * most).all()):
             fastest = fastest.amax(0)
             k = int(fastest.argmax())
-            raise ConfigError(f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
-                              f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))")
+            raise ConfigError(
+                f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
+                f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))"
+            )
         x, R, v, w = poses
-        return tuple(map(self._moved, (self.axes.points(x), self.axes.gradients(R), self.axes.vectors(v), self.axes.vectors(w))))
+        return tuple(
+            map(
+                self._moved,
+                (
+                    self.axes.points(x),
+                    self.axes.gradients(R),
+                    self.axes.vectors(v),
+                    self.axes.vectors(w),
+                ),
+            )
+        )
 
     def _moved(self, part: Tensor) -> Tensor:
         """In the simulator's type and on its device: one row where it is the same in all."""
@@ -289,10 +368,22 @@ class Stepper:
         moved = (part[:1] if same else part).to(dtype=numerics.dtype, device=numerics.device)
         return moved.expand_as(part) if same else moved
 
-    def sample(self, moment: Moment, count: int, dt: float, motions: Sequence[Motion | Trajectory], after: int = 0) -> Poses:
+    def sample(
+        self,
+        moment: Moment,
+        count: int,
+        dt: float,
+        motions: Sequence[Motion | Trajectory],
+        after: int = 0,
+    ) -> Poses:
         """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
         `moment`, at the times at which a rollout takes them."""
         frame_dt = self.clock.frame_dt
-        motions = [motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion for motion in motions]
-        first, start = (0, moment.frames * frame_dt) if self.clock.varies else (moment.substeps, 0.0)
+        motions = [
+            motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion
+            for motion in motions
+        ]
+        first, start = (
+            (0, moment.frames * frame_dt) if self.clock.varies else (moment.substeps, 0.0)
+        )
         return sample_poses(motions, 1, count, dt, start, first + after)

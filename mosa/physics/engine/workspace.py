@@ -52,11 +52,21 @@ class Workspace:
         pointed: bool = False, worlds: int = 1, shared: bool = False,
     ) -> None:  # fmt: skip
         self.worlds, self.size = worlds, particles // worlds
-        self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
+        self.numerics, self.particles, self.substeps, self.with_adjoint = (
+            numerics,
+            particles,
+            substeps,
+            with_adjoint,
+        )
         self.scalar = SCALARS[numerics.dtype]
         self.exact = needed(numerics.device)
-        self.kernels, self.update = transfer_kernels(self.scalar, self.exact), update_kernels(self.scalar)
-        self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
+        self.kernels, self.update = (
+            transfer_kernels(self.scalar, self.exact),
+            update_kernels(self.scalar),
+        )
+        self.stress, self.mapping = kernels_of(
+            numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain
+        )
         self.plastic = numerics.law.plastic
         n = particles
         states = substeps + 1 if with_adjoint else 2
@@ -66,8 +76,14 @@ class Workspace:
         self.C_affine, self.C_affine_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
         self.F, self.F_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
         # the deformation gradient that is never mapped: F itself where the law does not yield
-        self.F_tot, self.F_tot_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33) if self.plastic else (self.F, self.F_wp)
-        self.tau, self.tau_wp = self._per_slot(substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33)
+        self.F_tot, self.F_tot_wp = (
+            self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+            if self.plastic
+            else (self.F, self.F_wp)
+        )
+        self.tau, self.tau_wp = self._per_slot(
+            substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33
+        )
         self.mass, self.mass_wp = self.array((n,), self.scalar)
         self.volume, self.volume_wp = self.array((n,), self.scalar)
         vec6, mat66 = wp.types.vector(6, self.scalar), wp.types.matrix((6, 6), self.scalar)
@@ -79,23 +95,34 @@ class Workspace:
         self.held, self.held_wp = {}, {}
         for name, (shape, kind) in shapes.items():
             one = name != "parameters" and (pointed or (shared and name in ("G", "h")))
-            self.held[name], self.held_wp[name] = self.array((1, *shape[1:]) if one else shape, kind)
+            self.held[name], self.held_wp[name] = self.array(
+                (1, *shape[1:]) if one else shape, kind
+            )
         self._rows = {name: self.held[name][0] for name in ("G", "h")} if shared else {}
         if with_adjoint:
             self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
             self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
-            self.adj_C_affine, self.adj_C_affine_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_C_affine, self.adj_C_affine_wp = self._per_slot(
+                2, (n, 3, 3), self.kernels.mat33
+            )
             self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_F_tot, self.adj_F_tot_wp = self.adj_F, self.adj_F_wp
             if self.plastic:
                 self.adj_F_tot, self.adj_F_tot_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
-            buffer, parts = zeros_in_one([shape for shape, _ in shapes.values()], numerics.dtype, numerics.device)
+            buffer, parts = zeros_in_one(
+                [shape for shape, _ in shapes.values()], numerics.dtype, numerics.device
+            )
             self.adj_held = dict(zip(shapes, parts))
-            self.adj_held_wp = {name: wp.from_torch(part, dtype=shapes[name][1]) for name, part in self.adj_held.items()}
+            self.adj_held_wp = {
+                name: wp.from_torch(part, dtype=shapes[name][1])
+                for name, part in self.adj_held.items()
+            }
             # to clear in one launch: all of it, and all but the parameters' part, which comes first
             self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
-            self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
+            self.adj_operator_wp = wp.from_torch(
+                buffer[parts[1].storage_offset() :], dtype=self.scalar
+            )
         self.flags, self.flags_wp = self.array((4,), wp.int64, torch.int64)
         self.window, self.window_wp = self.array((3 * worlds, 3), wp.vec3i, torch.int32)
         # what gravity adds to node velocities in the first substep of a segment and in the others
@@ -113,23 +140,33 @@ class Workspace:
                 self.slopes, self.slopes_wp = self.array((n, SLOTS), self.scalar)
                 self.adj_slots_wp = wp.from_torch(self.adj_held["parameters"], dtype=self.scalar)
         if numerics.colliders is not None:
-            self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
+            self.colliders = ColliderBuffers(
+                numerics.colliders, self.scalar, substeps, self, with_adjoint
+            )
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
         self._placed: np.ndarray | None = None
-        self._given: tuple[np.ndarray, np.ndarray] | None = None  # the windows that are placed; nobody changes them
+        self._given: tuple[np.ndarray, np.ndarray] | None = (
+            None  # the windows that are placed; nobody changes them
+        )
         self._pulled: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         strategy = WarpCapture(numerics.device, self.flags_wp.device)
-        self._graphs = Graphs(strategy, "substeps cannot be captured as a graph and are launched one by one")
+        self._graphs = Graphs(
+            strategy, "substeps cannot be captured as a graph and are launched one by one"
+        )
 
-    def array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None) -> tuple[Tensor, wp.array]:
+    def array(
+        self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None
+    ) -> tuple[Tensor, wp.array]:
         """Zeros of `shape`, and the same memory as Warp's array of `kind`."""
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
         return tensor, wp.from_torch(tensor, dtype=kind)
 
     def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
-        tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
+        tensor = torch.zeros(
+            (slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device
+        )
         return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
 
     def tape(self) -> list[Tensor]:
@@ -149,7 +186,9 @@ class Workspace:
         self.grid_slots().copy_(tape[-1])
 
     def _particle_slots(self) -> list[Tensor]:
-        parts = [self.x, self.v, self.C_affine, self.F, self.tau] + ([self.F_tot] if self.plastic else [])
+        parts = [self.x, self.v, self.C_affine, self.F, self.tau] + (
+            [self.F_tot] if self.plastic else []
+        )
         return [part[0]._base for part in parts]
 
     def grid_slots(self) -> Tensor:
@@ -168,7 +207,9 @@ class Workspace:
         if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
             self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL)))
         if self._placed is None or not np.array_equal(rows, self._placed):
-            self.window.copy_(torch.from_numpy(rows).flatten(0, 1), non_blocking=True)  # CUDA stages it before it returns
+            self.window.copy_(
+                torch.from_numpy(rows).flatten(0, 1), non_blocking=True
+            )  # CUDA stages it before it returns
             self._placed, self.nodes = rows, nodes
         self._given = origins, dims
 
@@ -182,9 +223,19 @@ class Workspace:
         # where only the last one is wanted a second one, which is cleared while the first is read
         grids, vec4 = self.substeps if self.with_adjoint else 2, self.kernels.vec4
         each = 8 * self.numerics.dtype.itemsize
-        counted("kept grid nodes", (grids, count), "use more substeps, or a box", each=each, error=SimulationDiverged)
-        self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
-        self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
+        counted(
+            "kept grid nodes",
+            (grids, count),
+            "use more substeps, or a box",
+            each=each,
+            error=SimulationDiverged,
+        )
+        self.fields = torch.zeros(
+            (2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device
+        )
+        self.grid_wp, self.velocity_wp = (
+            [wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields
+        )
         if self.exact:
             self.sums, self.sums_wp = self.array((4 * count, COLUMNS), wp.int64, torch.int64)
         if self.with_adjoint:
@@ -222,7 +273,10 @@ class Workspace:
         given = {name: value for name, value in held.items() if value is not None}
         targets = self.held
         if self._rows:  # a view of one row with a leading dimension has other strides than its target: each is then copied alone
-            targets, given = self.held | self._rows, given | {name: given[name][0] for name in self._rows}
+            targets, given = (
+                self.held | self._rows,
+                given | {name: given[name][0] for name in self._rows},
+            )
         torch._foreach_copy_([targets[name] for name in given], list(given.values()))
         self._tighten(given.get("parameters"))
 
@@ -230,7 +284,9 @@ class Workspace:
         """As `hold`, without a copy or a graph: the next launches read these tensors. The caller keeps them."""
         for name, value in held.items():
             if value is not None:
-                self.held_wp[name] = wp.from_torch(aligned(value.detach()), dtype=self.held_wp[name].dtype)
+                self.held_wp[name] = wp.from_torch(
+                    aligned(value.detach()), dtype=self.held_wp[name].dtype
+                )
         self._tighten(held.get("parameters"))
 
     def _tighten(self, parameters: Tensor | None) -> None:
@@ -253,13 +309,30 @@ class Workspace:
 
     def adjoint_slots(self) -> list[list[Tensor]]:
         """Both slots of the adjoints of (x, v, C_affine, F), where the law yields of F_tot too."""
-        return [self.adj_x, self.adj_v, self.adj_C_affine, self.adj_F, *([self.adj_F_tot] if self.plastic else [])]
+        return [
+            self.adj_x,
+            self.adj_v,
+            self.adj_C_affine,
+            self.adj_F,
+            *([self.adj_F_tot] if self.plastic else []),
+        ]
 
     def state(self, step: int) -> list[Tensor]:
         """Copies of (x, v, C_affine, F), where the law yields of F_tot too, after `step` substeps: the last ones, or any of those
         whose states are kept."""
         slot = step % len(self.x)
-        return copies([part[slot] for part in (self.x, self.v, self.C_affine, self.F, *((self.F_tot,) if self.plastic else ()))])
+        return copies(
+            [
+                part[slot]
+                for part in (
+                    self.x,
+                    self.v,
+                    self.C_affine,
+                    self.F,
+                    *((self.F_tot,) if self.plastic else ()),
+                )
+            ]
+        )
 
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
@@ -318,7 +391,11 @@ class Workspace:
         again: in the adjoint, where reactions are known."""
         v = self.v_wp[state]
         if self.numerics.touching:
-            self.run(self.touch.meet, self.particles, [*self._touch_arguments(state, step), self.v_met_wp])
+            self.run(
+                self.touch.meet,
+                self.particles,
+                [*self._touch_arguments(state, step), self.v_met_wp],
+            )
             v = self.v_met_wp
         if self.colliders is not None:
             v = self.colliders.strike(step, self._struck(state), self._kick(step), again)
@@ -331,7 +408,14 @@ class Workspace:
 
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
-        return [self.F_wp[state], self.C_affine_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
+        return [
+            self.F_wp[state],
+            self.C_affine_wp[state],
+            held["parameters"],
+            held["G"],
+            held["h"],
+            self.tau_wp[slot],
+        ]
 
     def _mapping_arguments(self, state: int, new: int) -> list:
         held, numerics = self.held_wp, self.numerics
@@ -352,14 +436,21 @@ class Workspace:
             a, b, g, s = step % states, (step + 1) % states, step % grids, step % len(self.tau)
             if step == 0 and not self.exact:
                 self.over_nodes(kernels.clear, [self.grid_wp[g]])
-            cleared = self.grid_wp[(step + 1) % grids] if step + 1 < self.substeps and not self.exact else None
+            cleared = (
+                self.grid_wp[(step + 1) % grids]
+                if step + 1 < self.substeps and not self.exact
+                else None
+            )
             self.run(self.stress, n, self._stress_arguments(a, s))
             self.run(kernels.p2g, n, [
                 self.x_wp[a], self._met(a, step), self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
-            self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g], cleared])
+            self.over_nodes(
+                self.update.grid_update,
+                [*self._grid_arguments(g, step), self.velocity_wp[g], cleared],
+            )
             self.run(kernels.g2p, n, [
                 self.x_wp[a], self.F_tot_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
                 self.x_wp[b], self.v_wp[b], self.C_affine_wp[b], self.F_tot_wp[b],
@@ -398,7 +489,10 @@ class Workspace:
                 self.adj_x_wp[a], self.adj_F_tot_wp[a], self._added_to(adj_velocity),
             ])  # fmt: skip
             self._settle(adj_velocity)
-            self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared])
+            self.over_nodes(
+                self.update.adj_grid,
+                [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared],
+            )
             self.run(kernels.adj_p2g, n, [
                 self.x_wp[step], self._met(step, step, True), self.C_affine_wp[step], self.tau_wp[step], self.mass_wp,
                 self.volume_wp, *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a],

@@ -90,18 +90,23 @@ def node_access(scalar) -> SimpleNamespace:
 
     def add_row(names: str) -> str:
         fourth = "values[n].c[3]" if len(names) == 4 else "decltype(x)(0)"
-        cuda = SHARED.replace("FOURTH", fourth).replace("ADD", added(scalar, names, filler=None if len(names) == 4 else "w"))
+        cuda = SHARED.replace("FOURTH", fourth).replace(
+            "ADD", added(scalar, names, filler=None if len(names) == 4 else "w")
+        )
         return _either(cuda, PLAIN).replace("NUMBERS", str(len(names)))
 
     @wp.func_native(_either(PAIR, "return {0, 1};"))
     def pair(x: int) -> wp.vec2i: ...
 
-    @wp.func_native(_either(f"{LOAD[scalar]} return {{q.x, q.y, q.z, q.w}};", "return field.data[i];"))
+    @wp.func_native(
+        _either(f"{LOAD[scalar]} return {{q.x, q.y, q.z, q.w}};", "return field.data[i];")
+    )
     def load4(field: field4, i: int) -> vec4: ...
 
     @wp.func_native(
         _either(
-            f"{LOAD[scalar]} return {{q.x, q.y, q.z}};", "const auto& q = field.data[i].c; return {q[0], q[1], q[2]};"
+            f"{LOAD[scalar]} return {{q.x, q.y, q.z}};",
+            "const auto& q = field.data[i].c; return {q[0], q[1], q[2]};",
         )
     )
     def load3(field: field4, i: int) -> vec3: ...
@@ -124,7 +129,14 @@ def node_access(scalar) -> SimpleNamespace:
         store4(field, i, vec4(z, z, z, z))
 
     return SimpleNamespace(
-        load4=load4, load3=load3, store4=store4, store3=store3, pair=pair, add4=add4, add3=add3, clear=clear
+        load4=load4,
+        load3=load3,
+        store4=store4,
+        store3=store3,
+        pair=pair,
+        add4=add4,
+        add3=add3,
+        clear=clear,
     )
 
 
@@ -142,7 +154,9 @@ def exact_node_access(scalar) -> SimpleNamespace:
         return wp.vec2i(0, 1)
 
     @wp.func
-    def add4(sums: wp.array2d(dtype=wp.int64), node: int, a: vec4, b: vec4, c: vec4, together: wp.vec2i):
+    def add4(
+        sums: wp.array2d(dtype=wp.int64), node: int, a: vec4, b: vec4, c: vec4, together: wp.vec2i
+    ):
         for k in range(4):
             add_exactly(sums, 4 * node + k, a[k])
         for k in range(4):
@@ -151,7 +165,9 @@ def exact_node_access(scalar) -> SimpleNamespace:
             add_exactly(sums, 4 * node + 8 + k, c[k])
 
     @wp.func
-    def add3(sums: wp.array2d(dtype=wp.int64), node: int, a: vec3, b: vec3, c: vec3, together: wp.vec2i):
+    def add3(
+        sums: wp.array2d(dtype=wp.int64), node: int, a: vec3, b: vec3, c: vec3, together: wp.vec2i
+    ):
         for k in range(3):
             add_exactly(sums, 4 * node + k, a[k])
         for k in range(3):
@@ -162,7 +178,16 @@ def exact_node_access(scalar) -> SimpleNamespace:
     @wp.func
     def settle_node(sums: wp.array2d(dtype=wp.int64), field: wp.array(dtype=vec4), node: int):
         first = 4 * node
-        store4(field, node, vec4(total(sums, first), total(sums, first + 1), total(sums, first + 2), total(sums, first + 3)))
+        store4(
+            field,
+            node,
+            vec4(
+                total(sums, first),
+                total(sums, first + 1),
+                total(sums, first + 2),
+                total(sums, first + 3),
+            ),
+        )
         for k in range(4):
             clear(sums, first + k)
 

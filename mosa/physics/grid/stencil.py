@@ -31,7 +31,9 @@ def stencil_functions(scalar) -> SimpleNamespace:
     def cell(x: vec3, inv_dx: scalar):
         """Lowest node of the stencil."""
         h = scalar(0.5)
-        return vec3(wp.floor(x[0] * inv_dx - h), wp.floor(x[1] * inv_dx - h), wp.floor(x[2] * inv_dx - h))
+        return vec3(
+            wp.floor(x[0] * inv_dx - h), wp.floor(x[1] * inv_dx - h), wp.floor(x[2] * inv_dx - h)
+        )
 
     @wp.func
     def window_row(p: int, size: int):
@@ -57,7 +59,13 @@ def stencil_functions(scalar) -> SimpleNamespace:
                 r = window[row + 2][0] + (int(i) * dims[1] + int(j)) * dims[2] + int(k)
         return r
 
-    return SimpleNamespace(spline=spline, spline_slope=spline_slope, cell=cell, window_row=window_row, local_cell=local_cell)
+    return SimpleNamespace(
+        spline=spline,
+        spline_slope=spline_slope,
+        cell=cell,
+        window_row=window_row,
+        local_cell=local_cell,
+    )
 
 
 @cache

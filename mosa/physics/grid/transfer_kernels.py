@@ -35,12 +35,26 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
-    memory, stencil, nodes_of = node_access(scalar), stencil_functions(scalar), node_functions(scalar).nodes_of
+    memory, stencil, nodes_of = (
+        node_access(scalar),
+        stencil_functions(scalar),
+        node_functions(scalar).nodes_of,
+    )
     load3, load4, clear_node = memory.load3, memory.load4, memory.clear
     adding = exact_node_access(scalar) if exact else memory
-    pair, add3, add4, settle_node = adding.pair, adding.add3, adding.add4, exact_node_access(scalar).settle_node
+    pair, add3, add4, settle_node = (
+        adding.pair,
+        adding.add3,
+        adding.add4,
+        exact_node_access(scalar).settle_node,
+    )
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
-    spline, spline_slope, cell, local_cell = stencil.spline, stencil.spline_slope, stencil.cell, stencil.local_cell
+    spline, spline_slope, cell, local_cell = (
+        stencil.spline,
+        stencil.spline_slope,
+        stencil.cell,
+        stencil.local_cell,
+    )
     window_row = stencil.window_row
     module = f"mosa.physics.{'exact_' if exact else ''}transfers_{scalar.__name__}"
 
@@ -55,7 +69,10 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(
-        window: wp.array(dtype=wp.vec3i), threads: int, sums: wp.array2d(dtype=wp.int64), grid: wp.array(dtype=vec4)
+        window: wp.array(dtype=wp.vec3i),
+        threads: int,
+        sums: wp.array2d(dtype=wp.int64),
+        grid: wp.array(dtype=vec4),
     ):
         world = wp.tid() / threads
         first, end = nodes_of(window, world)
@@ -85,7 +102,9 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
             return
         if check_J == 1:
             if wp.determinant(F[p]) <= scalar(0.0):
-                wp.atomic_min(flags, _FLIPPED, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p))
+                wp.atomic_min(
+                    flags, _FLIPPED, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p)
+                )
         together = pair(n)
         f = xp * inv_dx - base
         wx = spline(f[0])
@@ -170,7 +189,12 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         if not wp.isfinite(total):
             wp.atomic_min(flags, _BAD, key)
         elif (
-            y[0] < low[0] or y[1] < low[1] or y[2] < low[2] or y[0] > high[0] or y[1] > high[1] or y[2] > high[2]
+            y[0] < low[0]
+            or y[1] < low[1]
+            or y[2] < low[2]
+            or y[0] > high[0]
+            or y[1] > high[1]
+            or y[2] > high[2]
         ):
             wp.atomic_min(flags, _OUT, key)
 
@@ -314,5 +338,13 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         adj_x[p] = adj_x[p] + inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
 
     return SimpleNamespace(
-        clear=clear, settle=settle, p2g=p2g, g2p=g2p, adj_g2p=adj_g2p, adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33
+        clear=clear,
+        settle=settle,
+        p2g=p2g,
+        g2p=g2p,
+        adj_g2p=adj_g2p,
+        adj_p2g=adj_p2g,
+        vec3=vec3,
+        vec4=vec4,
+        mat33=mat33,
     )

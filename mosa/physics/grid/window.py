@@ -31,7 +31,10 @@ def extent(x: Tensor, v: Tensor) -> Tensor:
 
 def fallen(bounds: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
     """`extent` (..., 12) with the velocities of bodies that gravity (..., 3) [m/s^2] pulls on for `time` seconds."""
-    bounds, gained = np.array(bounds, dtype=np.float64), np.asarray(gravity, dtype=np.float64) * time
+    bounds, gained = (
+        np.array(bounds, dtype=np.float64),
+        np.asarray(gravity, dtype=np.float64) * time,
+    )
     bounds[..., 6:9] += np.minimum(gained, 0.0)
     bounds[..., 9:] += np.maximum(gained, 0.0)
     return bounds
@@ -47,13 +50,17 @@ def grid_window(
     x, v: (..., N, 3); bounds: their extent, where the host has it already; name: of a world, for messages. Errors:
     SimulationDiverged for non-finite input or particles of a world spread over more than 2^23 nodes.
     """
-    bounds = extent(x, v).numpy(force=True) if bounds is None else bounds  # the only transfer to the host
+    bounds = (
+        extent(x, v).numpy(force=True) if bounds is None else bounds
+    )  # the only transfer to the host
     rows = np.reshape(bounds, (-1, 12))
     if not np.isfinite(rows).all():
         world = int((~np.isfinite(rows)).any(1).nonzero()[0][0])
         x, v = (t.reshape(len(rows), -1, 3)[world] for t in (x, v))
         bad = int((~(torch.isfinite(x).all(1) & torch.isfinite(v).all(1))).nonzero()[0])
-        raise SimulationDiverged(f"{name(world)}particle {bad} has a non-finite position or velocity before the substep")
+        raise SimulationDiverged(
+            f"{name(world)}particle {bad} has a non-finite position or velocity before the substep"
+        )
     low, dims = window_of(bounds, dx, time, margin)
     # as shares of the most; NaN, of infinite ends, is too much as well
     most = np.maximum(dims.prod(-1) / MAX_NODES, (np.abs(low).max(-1) + dims.max(-1)) / FARTHEST)
@@ -68,11 +75,15 @@ def grid_window(
     return low.astype(np.int64), dims.astype(np.int64)
 
 
-def window_of(bounds: np.ndarray, dx: float, time: float | np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def window_of(
+    bounds: np.ndarray, dx: float, time: float | np.ndarray, margin: int
+) -> tuple[np.ndarray, np.ndarray]:
     """As `grid_window`, of extents (..., 12) and of any size, in float64; time: one, or some that broadcast with (..., 1)."""
     bounds = np.asarray(bounds, dtype=np.float64)
     speeds = _OUTWARDS * bounds[..., 6:]
-    turned = TURNED * np.abs(speeds).max(-1, keepdims=True)  # by the largest component of a velocity
+    turned = TURNED * np.abs(speeds).max(
+        -1, keepdims=True
+    )  # by the largest component of a velocity
     ahead = np.ceil(np.maximum(GAINED * speeds, turned) * time / dx) + margin
     cells = np.floor(bounds[..., :6] / dx - 0.5)
     low, high = cells[..., :3] - ahead[..., :3], cells[..., 3:] + 2 + ahead[..., 3:]

@@ -39,12 +39,19 @@ class StepControl:
         for name in ("courant", "factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"adaptive steps: {name}: expected a positive number, found {value}")
+                raise ConfigError(
+                    f"adaptive steps: {name}: expected a positive number, found {value}"
+                )
         for name in ("minimum", "maximum", "multiple"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                field = {"minimum": "simulation.min_substeps", "maximum": "simulation.max_substeps"}.get(name, name)
-                raise ConfigError(f"adaptive steps: {field}: expected a whole number of at least 1, found {value!r}")
+                field = {
+                    "minimum": "simulation.min_substeps",
+                    "maximum": "simulation.max_substeps",
+                }.get(name, name)
+                raise ConfigError(
+                    f"adaptive steps: {field}: expected a whole number of at least 1, found {value!r}"
+                )
         if self.minimum > self.maximum:
             raise ConfigError(
                 f"simulation.min_substeps: expected at most simulation.max_substeps ({self.maximum}), found {self.minimum}"
@@ -65,9 +72,13 @@ def current_modulus(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -
     for i in range(3):
         n = axes[:, :, i]
         stretch = STRETCH * torch.einsum("pi,pj,pjk->pik", n, n, F)
-        after, before = (kirchhoff_stress(law, F + s * stretch, C_affine, parameters) for s in (1.0, -1.0))
+        after, before = (
+            kirchhoff_stress(law, F + s * stretch, C_affine, parameters) for s in (1.0, -1.0)
+        )
         slope = torch.einsum("pi,pij,pj->p", n, after - before, n) / (2 * STRETCH)
-        result = torch.maximum(result, slope + (-torch.einsum("pi,pij,pj->p", n, tau, n)).clamp_min(0))
+        result = torch.maximum(
+            result, slope + (-torch.einsum("pi,pij,pj->p", n, tau, n)).clamp_min(0)
+        )
     return result
 
 
@@ -89,7 +100,10 @@ class StepChooser:
         self.rest_modulus = law.wave_modulus(values).expand(n)
         self.viscosity = law.explicit_viscosity(values).expand(n)
         # what the frame itself can add to the speeds at its start
-        self.fall, self.collider_speed = math.hypot(*numerics.gravity) * self.frame_dt, collider_speed
+        self.fall, self.collider_speed = (
+            math.hypot(*numerics.gravity) * self.frame_dt,
+            collider_speed,
+        )
 
     @torch.no_grad()
     def choose(self, frame: int, state: State, collider_speed: float | None = None) -> int:
@@ -99,24 +113,47 @@ class StepChooser:
         Errors: SimulationDiverged for a state that is not finite; ConfigError where more than the maximum would be needed.
         """
         control, dx, (_, v, C_affine, F, _) = self.control, self.numerics.dx, state
-        finite = torch.isfinite(F).all(-1).all(-1) & torch.isfinite(C_affine).all(-1).all(-1) & torch.isfinite(v).all(-1)
+        finite = (
+            torch.isfinite(F).all(-1).all(-1)
+            & torch.isfinite(C_affine).all(-1).all(-1)
+            & torch.isfinite(v).all(-1)
+        )
         if not bool(finite.all()):
             bad = int((~finite).nonzero()[0])
-            raise SimulationDiverged(f"frame {frame}: particle {bad} has a non-finite velocity or deformation at its start")
+            raise SimulationDiverged(
+                f"frame {frame}: particle {bad} has a non-finite velocity or deformation at its start"
+            )
         J = torch.linalg.det(F)
-        modulus = torch.maximum(current_modulus(self.numerics.law, F, C_affine, self.packed), self.rest_modulus)
+        modulus = torch.maximum(
+            current_modulus(self.numerics.law, F, C_affine, self.packed), self.rest_modulus
+        )
         # an inverted element has no modulus where the law has no value: the first substep names it
-        modulus = torch.where(J > 0, modulus, self.rest_modulus) if self.numerics.law.needs_positive_J else modulus
+        modulus = (
+            torch.where(J > 0, modulus, self.rest_modulus)
+            if self.numerics.law.needs_positive_J
+            else modulus
+        )
         speed = (control.factor * modulus / self.density).sqrt()
         viscosity = self.viscosity * J.clamp_min(0)  # per current volume, as the mass is
-        rate = speed / (control.courant * dx) + viscosity / (VISCOUS_NUMBER * self.density * dx * dx)
+        rate = speed / (control.courant * dx) + viscosity / (
+            VISCOUS_NUMBER * self.density * dx * dx
+        )
         stiffest, fastest = int(rate.argmax()), float(v.norm(dim=1).max())
         fastest += self.fall + (self.collider_speed if collider_speed is None else collider_speed)
         c, mu = float(speed[stiffest]), float(viscosity[stiffest])
-        density = float(self.density[stiffest] if isinstance(self.density, Tensor) else self.density)
+        density = float(
+            self.density[stiffest] if isinstance(self.density, Tensor) else self.density
+        )
         if not math.isfinite(c):
-            raise SimulationDiverged(f"frame {frame}: the stress of particle {stiffest} is not finite at its start")
-        needed = max(1, math.ceil(min(1e9, self.frame_dt * step_rate(c, mu, density, dx, fastest, control.courant))))
+            raise SimulationDiverged(
+                f"frame {frame}: the stress of particle {stiffest} is not finite at its start"
+            )
+        needed = max(
+            1,
+            math.ceil(
+                min(1e9, self.frame_dt * step_rate(c, mu, density, dx, fastest, control.courant))
+            ),
+        )
         if needed > control.maximum:
             raise ConfigError(
                 f"simulation.max_substeps: expected at least {needed} for frame {frame}, found {control.maximum}: particle "
@@ -132,7 +169,9 @@ class StepChooser:
 def check_counts(counts, frames: int) -> list[int]:
     """Given counts of the frames - 1 intervals, as integers. Errors: ConfigError."""
     values = list(counts)
-    if len(values) != frames - 1 or any(isinstance(c, bool) or not 1 <= c <= MOST_SUBSTEPS or int(c) != c for c in values):
+    if len(values) != frames - 1 or any(
+        isinstance(c, bool) or not 1 <= c <= MOST_SUBSTEPS or int(c) != c for c in values
+    ):
         raise ConfigError(
             f"counts: expected {frames - 1} positive whole numbers, one for each frame interval (Rollout.counts of an earlier "
             f"rollout), found {values}"

@@ -20,13 +20,18 @@ def wave_speed(modulus_max: float, density: float, factor: float = 1.0) -> float
     return math.sqrt(factor * modulus_max / density)
 
 
-def step_rate(speed: float, viscosity: float, density: float, dx: float, v_max: float, courant: float) -> float:
+def step_rate(
+    speed: float, viscosity: float, density: float, dx: float, v_max: float, courant: float
+) -> float:
     """1/dt [1/s] of the largest stable step. speed: wave speed c [m/s]; viscosity [Pa s] of a stress mu sym(C_affine).
 
     max(c/(courant dx) + viscosity/(VISCOUS_NUMBER rho dx^2), v_max/(dx/2)). The first two add up: with the damping of the last
     substep the limit of an oscillator is (2/omega)(sqrt(1 + zeta^2) - zeta) >= (2/omega)/(1 + 2 zeta).
     """
-    return max(speed / (courant * dx) + viscosity / (VISCOUS_NUMBER * density * dx) / dx, v_max / (0.5 * dx))
+    return max(
+        speed / (courant * dx) + viscosity / (VISCOUS_NUMBER * density * dx) / dx,
+        v_max / (0.5 * dx),
+    )
 
 
 def required_substeps(
@@ -47,7 +52,9 @@ def required_substeps(
         if not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"time step: {name}: expected a number >= 0, found {value}")
     speed = wave_speed(modulus_max, density, factor)
-    count = max(1, math.ceil(min(1e9, frame_dt * step_rate(speed, viscosity, density, dx, v_max, courant))))
+    count = max(
+        1, math.ceil(min(1e9, frame_dt * step_rate(speed, viscosity, density, dx, v_max, courant)))
+    )
     if count > limit:
         viscous = f", viscosity {viscosity:.3g} Pa s" if viscosity else ""
         raise ConfigError(

@@ -20,7 +20,13 @@ from mosa.reconstruction.gaussians.static import SMALLEST, FitSettings
 from mosa.reconstruction.motion.observed import Windows
 from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_basis
-from mosa.rendering.appearance.spherical_harmonics import Y0, camera_centers, colors_in, constant_coefficients, mean_colors
+from mosa.rendering.appearance.spherical_harmonics import (
+    Y0,
+    camera_centers,
+    colors_in,
+    constant_coefficients,
+    mean_colors,
+)
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
 from mosa.schema import COUNT, FLAG, WEIGHT, check_knobs, knob, one_of, whole
@@ -59,7 +65,10 @@ class RestGaussians:
         self.log_scale, self.quaternion = splats.scales.log(), splats.rotations.clone()
         self.logit = torch.logit(splats.opacities.clamp(0.01, 0.99))
         self.first = constant_coefficients(splats.colors)
-        self.constant, self.higher = self.first.clone(), splats.means.new_zeros(len(splats.means), extra, 3)
+        self.constant, self.higher = (
+            self.first.clone(),
+            splats.means.new_zeros(len(splats.means), extra, 3),
+        )
         self.light = splats.means.new_zeros(LIGHT)
         rates = {"shift": settings.lr_positions * unit, "log_scale": settings.lr_scales, "logit": settings.lr_opacities,
                  "constant": settings.lr_colors, "higher": settings.lr_harmonics}  # fmt: skip
@@ -67,7 +76,10 @@ class RestGaussians:
             rates["quaternion"] = settings.lr_rotations
         if settings.light:
             rates["light"] = settings.lr_light
-        groups = [{"params": [getattr(self, name).requires_grad_(True)], "start": rate} for name, rate in rates.items()]
+        groups = [
+            {"params": [getattr(self, name).requires_grad_(True)], "start": rate}
+            for name, rate in rates.items()
+        ]
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
         scale = splats.scales.mean(1, keepdim=True)
         self.lower, self.upper = (SMALLEST * scale).log(), (settings.largest * scale).log()
@@ -83,7 +95,10 @@ class RestGaussians:
     def change(self) -> Tensor:
         """Sum over the splats of the squares by which their colours, in the mean over directions and channels, left the first ones,
         each weighted by what it counts for."""
-        constant, higher = ((Y0 * moved).square().mean(2).sum() for moved in (self.constant - self.first, self.higher))
+        constant, higher = (
+            (Y0 * moved).square().mean(2).sum()
+            for moved in (self.constant - self.first, self.higher)
+        )
         return self.settings.keep * constant + self.settings.keep_harmonics * higher
 
     def step(self, loss: Tensor, factor: float) -> None:
@@ -96,7 +111,9 @@ class RestGaussians:
         with torch.no_grad():
             if self.settings.shape == "isotropic":
                 self.log_scale.copy_(self.log_scale.mean(1, keepdim=True).expand(-1, 3))
-            self.log_scale.copy_(torch.minimum(torch.maximum(self.log_scale, self.lower), self.upper))
+            self.log_scale.copy_(
+                torch.minimum(torch.maximum(self.log_scale, self.lower), self.upper)
+            )
             least = self.log_scale.amax(1, keepdim=True) - math.log(self.settings.axis_ratio)
             self.log_scale.copy_(torch.maximum(self.log_scale, least))
 
@@ -104,8 +121,13 @@ class RestGaussians:
     def appearance(self) -> Appearance:
         """The splats as they are."""
         harmonics = self.harmonics.detach()
-        splats = Splats(self.start.means + self.shift.detach(), self.log_scale.detach().exp(),
-                        normalize(self.quaternion.detach(), dim=-1), torch.sigmoid(self.logit.detach()), mean_colors(harmonics))
+        splats = Splats(
+            self.start.means + self.shift.detach(),
+            self.log_scale.detach().exp(),
+            normalize(self.quaternion.detach(), dim=-1),
+            torch.sigmoid(self.logit.detach()),
+            mean_colors(harmonics),
+        )
         return Appearance(splats, harmonics, self.normals, self.light.detach())
 
 
@@ -138,15 +160,24 @@ def fit_carried(
         batch = windows.select(chosen.to(windows.frame.device))
         A, turn = carried.gradients[batch.frame], carried.rotations[batch.frame]
         means = carried.means[batch.frame] + (A @ gaussians.shift[..., None])[..., 0]
-        directions = (means.detach() - eyes[chosen][:, None])[..., None, :] @ turn  # seen from the body: R^T d
-        colors = colors_in(gaussians.harmonics, directions[..., 0, :]) * (turns[batch.frame] @ gaussians.light).exp()[..., None]
+        directions = (means.detach() - eyes[chosen][:, None])[
+            ..., None, :
+        ] @ turn  # seen from the body: R^T d
+        colors = (
+            colors_in(gaussians.harmonics, directions[..., 0, :])
+            * (turns[batch.frame] @ gaussians.light).exp()[..., None]
+        )
         image, alpha = rasterize(
             means, A @ gaussians.covariances @ A.mT, torch.sigmoid(gaussians.logit), colors, batch.cameras,
             torch.arange(len(batch), device=means.device), background,
         )  # fmt: skip
-        loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
+        loss = image_loss(
+            image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
+        )
         loss = loss + gaussians.change() / alpha.numel()
-        gaussians.step(loss, 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * step / settings.iterations)))
+        gaussians.step(
+            loss, 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * step / settings.iterations))
+        )
         if progress is not None:
             progress(1)
     return gaussians.appearance()

@@ -34,7 +34,9 @@ class Relocation:
         """How much finer than at the start the Gaussians may become because there will be more of them."""
         return 1.0
 
-    def after_step(self, gaussians: FreeGaussians, step: int, steps: int, generator: torch.Generator) -> None:
+    def after_step(
+        self, gaussians: FreeGaussians, step: int, steps: int, generator: torch.Generator
+    ) -> None:
         if self.every and step % self.every == 0 and step < UNTIL * steps:
             relocate(gaussians, generator)
 
@@ -57,7 +59,9 @@ class MarkovChain:
         """As for `Relocation`: by the mean distance on a surface."""
         return math.sqrt(min(1.0, count / self.most))
 
-    def after_step(self, gaussians: FreeGaussians, step: int, steps: int, generator: torch.Generator) -> None:
+    def after_step(
+        self, gaussians: FreeGaussians, step: int, steps: int, generator: torch.Generator
+    ) -> None:
         if self.noise > 0:
             perturb(gaussians, generator, amount=self.noise * gaussians.annealed)
         if step % self.every == 0 and step < UNTIL * steps:
@@ -78,7 +82,9 @@ def shared_opacity(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     o, n = opacity.double(), copies.double()
     each = -torch.expm1(torch.log1p(-o) / n)
     x = torch.linspace(-8, 8, 65, dtype=torch.float64, device=o.device)
-    covered = -torch.expm1(n[:, None] * torch.log1p(-each[:, None] * torch.exp(-0.5 * x**2))).sum(1) * (x[1] - x[0])
+    covered = -torch.expm1(n[:, None] * torch.log1p(-each[:, None] * torch.exp(-0.5 * x**2))).sum(
+        1
+    ) * (x[1] - x[0])
     return each.to(opacity), (math.sqrt(2 * math.pi) * o / covered).to(opacity)
 
 
@@ -90,9 +96,13 @@ def relocate(gaussians: FreeGaussians, generator: torch.Generator) -> None:
     if len(dead) == 0 or len(dead) == len(opacity):
         return
     # seen area: of the two larger axes
-    area = scale.square()[:, 0] if not gaussians.anisotropic else scale.sort(1).values[:, 1:].prod(1)
+    area = (
+        scale.square()[:, 0] if not gaussians.anisotropic else scale.sort(1).values[:, 1:].prod(1)
+    )
     chance = torch.where(vanished, torch.zeros_like(opacity), opacity * area)
-    target = torch.multinomial(chance.cpu(), len(dead), replacement=True, generator=generator).to(dead.device)
+    target = torch.multinomial(chance.cpu(), len(dead), replacement=True, generator=generator).to(
+        dead.device
+    )
     source = torch.arange(len(opacity), device=dead.device)
     source[dead] = target
     gaussians.take(source, vanished)
@@ -100,7 +110,9 @@ def relocate(gaussians: FreeGaussians, generator: torch.Generator) -> None:
     gaussians.shift(dead, (noise * SPREAD * gaussians.scales.detach()[dead])[..., None])
 
 
-def refine(gaussians: FreeGaussians, generator: torch.Generator, *, growth: float, most: int) -> None:
+def refine(
+    gaussians: FreeGaussians, generator: torch.Generator, *, growth: float, most: int
+) -> None:
     """Moves the vanished onto others and adds `growth` of their number, to `most` at most, all as copies of Gaussians drawn by
     opacity; those and their copies share the opacity (`shared_opacity`) and forget their momentum.
 
@@ -115,7 +127,9 @@ def refine(gaussians: FreeGaussians, generator: torch.Generator, *, growth: floa
     if len(dead) == count or len(dead) + added == 0:
         return
     chance = torch.where(vanished, torch.zeros_like(opacity), opacity)
-    target = torch.multinomial(chance.cpu(), len(dead) + added, replacement=True, generator=generator).to(dead.device)
+    target = torch.multinomial(
+        chance.cpu(), len(dead) + added, replacement=True, generator=generator
+    ).to(dead.device)
     copies = 1 + torch.bincount(target, minlength=count)
     source = torch.cat([torch.arange(count, device=dead.device), target[len(dead) :]])
     source[dead] = target[: len(dead)]
@@ -131,7 +145,10 @@ def _root(gaussians: FreeGaussians) -> Tensor:
     """A square root of each covariance, (N, 3, 3) [m]."""
     if not gaussians.anisotropic:
         return torch.diag_embed(gaussians.scales.detach())
-    return quaternion_to_matrix(gaussians.parameters["rotation"].detach()) * gaussians.scales.detach()[:, None]
+    return (
+        quaternion_to_matrix(gaussians.parameters["rotation"].detach())
+        * gaussians.scales.detach()[:, None]
+    )
 
 
 def perturb(gaussians: FreeGaussians, generator: torch.Generator, *, amount: float) -> None:
@@ -139,7 +156,9 @@ def perturb(gaussians: FreeGaussians, generator: torch.Generator, *, amount: flo
     opacity of 0.1 on: those about to vanish look for a place where they are of use."""
     gate = torch.sigmoid(-100 * (gaussians.opacities.detach() - VANISHED))
     noise = torch.randn(len(gaussians), 3, generator=generator).to(gate.device)
-    gaussians.shift(slice(None), (amount * gate)[:, None, None] * _root(gaussians) @ noise[..., None])
+    gaussians.shift(
+        slice(None), (amount * gate)[:, None, None] * _root(gaussians) @ noise[..., None]
+    )
 
 
 def prune(gaussians: FreeGaussians) -> None:

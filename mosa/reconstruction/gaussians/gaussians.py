@@ -36,7 +36,15 @@ class FreeGaussians:
     """
 
     def __init__(
-        self, splats: Splats, rates: Rates, *, move: bool, anisotropic: bool, smallest: float, largest: float, axis_ratio: float
+        self,
+        splats: Splats,
+        rates: Rates,
+        *,
+        move: bool,
+        anisotropic: bool,
+        smallest: float,
+        largest: float,
+        axis_ratio: float,
     ) -> None:
         scale = splats.scales.mean(1)
         self.parameters = {
@@ -51,8 +59,15 @@ class FreeGaussians:
         self.fixed = {"lower": (scale * smallest).log(), "upper": (scale * largest).log(), "rotations": splats.rotations,
                       "first_colors": splats.colors}  # fmt: skip
         self.anisotropic, self.axis_ratio, self.annealed = anisotropic, axis_ratio, 1.0
-        learned = {name: p.requires_grad_(True) for name, p in self.parameters.items() if move or name != "means"}
-        groups = [{"params": [p], "start": getattr(rates, name), "name": name} for name, p in learned.items()]
+        learned = {
+            name: p.requires_grad_(True)
+            for name, p in self.parameters.items()
+            if move or name != "means"
+        }
+        groups = [
+            {"params": [p], "start": getattr(rates, name), "name": name}
+            for name, p in learned.items()
+        ]
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
 
     def __len__(self) -> int:
@@ -75,7 +90,11 @@ class FreeGaussians:
     def covariances(self) -> Tensor:
         """(N, 3, 3) [m^2]."""
         scale = self.parameters["log_scale"].exp()
-        return covariance_from(scale, self.parameters["rotation"]) if self.anisotropic else isotropic_covariances(scale)
+        return (
+            covariance_from(scale, self.parameters["rotation"])
+            if self.anisotropic
+            else isotropic_covariances(scale)
+        )
 
     def anneal(self, factor: float) -> None:
         """Steps at `factor` of their start."""
@@ -108,7 +127,9 @@ class FreeGaussians:
                 self.optimizer.state[new] = state
             group["params"], self.parameters[group["name"]] = [new], new
         learned = {group["name"] for group in self.optimizer.param_groups}
-        self.parameters |= {name: p[source] for name, p in self.parameters.items() if name not in learned}
+        self.parameters |= {
+            name: p[source] for name, p in self.parameters.items() if name not in learned
+        }
         self.fixed = {name: value[source] for name, value in self.fixed.items()}
 
     @torch.no_grad()
@@ -120,7 +141,9 @@ class FreeGaussians:
     def dim(self, rows: Tensor, opacity: Tensor, factor: Tensor) -> None:
         """Gives the Gaussians `rows` (N,) bool other opacities (M,) and `factor` (M,) times their scales, within the bounds."""
         self.parameters["opacity"][rows] = torch.logit(opacity.clamp(1e-6, 1 - 1e-6))
-        self.parameters["log_scale"][rows] += factor.log()[:, None] if self.anisotropic else factor.log()
+        self.parameters["log_scale"][rows] += (
+            factor.log()[:, None] if self.anisotropic else factor.log()
+        )
         self.bound()
 
     @torch.no_grad()
@@ -129,4 +152,6 @@ class FreeGaussians:
         rotations = self.fixed["rotations"]
         if self.anisotropic:
             rotations = torch.nn.functional.normalize(self.parameters["rotation"].detach(), dim=-1)
-        return Splats(self.parameters["means"].detach(), self.scales, rotations, self.opacities, self.colors)
+        return Splats(
+            self.parameters["means"].detach(), self.scales, rotations, self.opacities, self.colors
+        )

@@ -39,7 +39,9 @@ def sampled_windows(points: Tensor, windows: Windows) -> Tensor:
     seen = points @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, None, :3, 3]
     pixel = seen @ cameras.K.transpose(1, 2)
     pixel = pixel[..., :2] / pixel[..., 2:].clamp(min=1e-6)
-    stacked = torch.cat([windows.images * windows.mattes[..., None], windows.mattes[..., None]], -1).permute(0, 3, 1, 2)
+    stacked = torch.cat(
+        [windows.images * windows.mattes[..., None], windows.mattes[..., None]], -1
+    ).permute(0, 3, 1, 2)
     return sample_images(stacked, pixel).transpose(1, 2)
 
 
@@ -89,7 +91,9 @@ def random_splats(volume: Volume, windows: Windows, *, count: int, seed: int) ->
     """Isotropic Gaussians at uniformly random points of the volume's box, of its values nothing is read; as wide as the root mean
     square distance to the three nearest, coloured by what the mattes show there, grey where they show nothing."""
     size = volume.pitch * (torch.tensor(volume.values.shape) - 1)
-    points = volume.origin.cpu() + size * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    points = volume.origin.cpu() + size * torch.rand(
+        count, 3, generator=torch.Generator().manual_seed(seed)
+    )
     distance = cKDTree(points.numpy()).query(points.numpy(), k=min(4, count))[0][:, 1:]
     scale = torch.as_tensor(np.sqrt((distance**2).mean(1)), dtype=torch.float32)
     device = windows.images.device
@@ -99,5 +103,13 @@ def random_splats(volume: Volume, windows: Windows, *, count: int, seed: int) ->
     sampled = sampled_windows(points, windows)
     seen = sampled[..., 3].sum(0)
     colors = sampled[..., :3].sum(0) / seen.clamp(min=1e-9)[:, None]
-    colors = torch.where(seen[:, None] > 0.1, colors, torch.full_like(colors, 0.5)).clamp(0.02, 0.98)
-    return Splats(points, scale[:, None].repeat(1, 3), rotations, torch.full((count,), 0.3, device=device), colors)
+    colors = torch.where(seen[:, None] > 0.1, colors, torch.full_like(colors, 0.5)).clamp(
+        0.02, 0.98
+    )
+    return Splats(
+        points,
+        scale[:, None].repeat(1, 3),
+        rotations,
+        torch.full((count,), 0.3, device=device),
+        colors,
+    )

@@ -20,10 +20,14 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     mx, my, xx, yy, xy = moments
     vx, vy, vxy = xx - mx * mx, yy - my * my, xy - mx * my
     c1, c2 = 0.01**2, 0.03**2
-    return (((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean()
+    return (
+        ((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    ).mean()
 
 
-def image_loss(image: Tensor, alpha: Tensor, windows: Windows, *, ssim_weight: float, matte_weight: float) -> Tensor:
+def image_loss(
+    image: Tensor, alpha: Tensor, windows: Windows, *, ssim_weight: float, matte_weight: float
+) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM) of colours, plus L1 of alpha against the mattes."""
     loss = (1 - ssim_weight) * (image - windows.images).abs().mean()
     if ssim_weight > 0:

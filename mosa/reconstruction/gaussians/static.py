@@ -79,10 +79,14 @@ class StaticSettings(FitSettings):
         """What moves and adds Gaussians, of which there are `count` at the start."""
         if self.densify == "relocate":
             return Relocation(self.relocate_every)
-        return MarkovChain(self.max_points or count, self.refine_every, self.growth, self.fade, self.noise)
+        return MarkovChain(
+            self.max_points or count, self.refine_every, self.growth, self.fade, self.noise
+        )
 
 
-def start_splats(volume: Volume, windows: Windows, settings: StaticSettings, *, count: int, seed: int) -> Splats:
+def start_splats(
+    volume: Volume, windows: Windows, settings: StaticSettings, *, count: int, seed: int
+) -> Splats:
     """`count` Gaussians, less where the hull's surface has fewer voxels, from which the static stage starts."""
     return STARTS[settings.start](volume, windows, count=count, seed=seed)
 
@@ -103,17 +107,26 @@ def fit_splats(
     their number changes, never beyond `max_points`. The same bits for the same seed on a CPU.
     """
     generator = torch.Generator().manual_seed(seed)
-    densifier = settings.densifier(len(splats.means)) if move and isinstance(settings, StaticSettings) else None
+    densifier = (
+        settings.densifier(len(splats.means))
+        if move and isinstance(settings, StaticSettings)
+        else None
+    )
     unit = float(splats.scales.mean(1).mean())
     rates = Rates(
-        settings.lr_positions * unit, settings.lr_scales, settings.lr_opacities, settings.lr_colors * 4, settings.lr_rotations
+        settings.lr_positions * unit,
+        settings.lr_scales,
+        settings.lr_opacities,
+        settings.lr_colors * 4,
+        settings.lr_rotations,
     )
     gaussians = FreeGaussians(
         splats,
         rates,
         move=move,
         anisotropic=settings.shape == "anisotropic",
-        smallest=SMALLEST * (densifier.shrinkage(len(splats.means)) if densifier is not None else 1.0),
+        smallest=SMALLEST
+        * (densifier.shrinkage(len(splats.means)) if densifier is not None else 1.0),
         largest=settings.largest,
         axis_ratio=settings.axis_ratio,
     )
@@ -132,7 +145,9 @@ def fit_splats(
             torch.zeros(len(batch), dtype=torch.long, device=background.device),
             background,
         )
-        loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
+        loss = image_loss(
+            image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
+        )
         if settings.keep > 0:
             # Adam moves a Gaussian of a hundredth of a pixel as fast as one of ten: hardly seen ones drift to any colour, which
             # shows when the object turns

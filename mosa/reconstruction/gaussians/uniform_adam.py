@@ -30,11 +30,19 @@ class UniformAdam(torch.optim.Optimizer):
         axes = tuple(range(1, p.dim()))
         if not state:
             state["step"], state["mean"] = 0, torch.zeros_like(p)
-            state["square"] = torch.zeros([len(p)] + [1] * len(axes), dtype=p.dtype, device=p.device)
+            state["square"] = torch.zeros(
+                [len(p)] + [1] * len(axes), dtype=p.dtype, device=p.device
+            )
         state["step"] += 1
         state["mean"].lerp_(p.grad, 1 - first)
-        state["square"].lerp_((p.grad**2).sum(axes, keepdim=True) if axes else p.grad**2, 1 - second)
+        state["square"].lerp_(
+            (p.grad**2).sum(axes, keepdim=True) if axes else p.grad**2, 1 - second
+        )
         scale = (state["square"] / (1 - second ** state["step"])).sqrt()
         # a frame without any gradient (all its views look away) stays where it is
-        move = torch.where(scale > 0, state["mean"] / scale.clamp(min=torch.finfo(p.dtype).tiny), torch.zeros_like(p))
+        move = torch.where(
+            scale > 0,
+            state["mean"] / scale.clamp(min=torch.finfo(p.dtype).tiny),
+            torch.zeros_like(p),
+        )
         p.add_(move, alpha=-lr / (1 - first ** state["step"]))

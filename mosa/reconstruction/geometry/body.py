@@ -2,7 +2,7 @@
 matter.
 
 Where the images say nothing the hull stays, smoothed between its outlines, and `Geometry.figures` say how much of the surface
-that is. """
+that is."""
 
 from __future__ import annotations
 
@@ -71,7 +71,9 @@ class Geometry:
         }  # fmt: skip
         if self.deviation.numel():
             on_surface = self.deviation[surface_of(self.body)]
-            figures["geometry/uncertain_share"] = float((2 * on_surface > 0.7 * spacing).double().mean())
+            figures["geometry/uncertain_share"] = float(
+                (2 * on_surface > 0.7 * spacing).double().mean()
+            )
             figures["geometry/deviation_m"] = float(on_surface.median())
         return figures
 
@@ -85,8 +87,12 @@ class Geometry:
     @classmethod
     def read(cls, stored: dict) -> Geometry:
         """The inverse of `stored`."""
-        return cls(Volume(stored["values"], stored["origin"], stored["pitch"]), stored["hull_volume"], stored["deviation"],
-                   stored["free_frames"])
+        return cls(
+            Volume(stored["values"], stored["origin"], stored["pitch"]),
+            stored["hull_volume"],
+            stored["deviation"],
+            stored["free_frames"],
+        )
 
 
 def surface_of(body: Volume) -> Tensor:
@@ -121,25 +127,39 @@ def nothing_left(scene: Scene, hull: Geometry) -> Geometry:
     return hull
 
 
-def find_geometry(scene: Scene, hull: Volume, settings: GeometrySettings, *, ridge_passes: int, sigma: float, margin: int,
-                  device: torch.device | str) -> Geometry:
+def find_geometry(
+    scene: Scene,
+    hull: Volume,
+    settings: GeometrySettings,
+    *,
+    ridge_passes: int,
+    sigma: float,
+    margin: int,
+    device: torch.device | str,
+) -> Geometry:
     """The body of `scene` inside its visual hull (occupancy of frame 0, training cameras only), read from training frames alone;
     the hull's where they leave nothing of it. Errors: DataError where the hull has no inside.
 
     ridge_passes, sigma: of `shave_ridges`, which gives the body where source is hull, and else a start; margin: px around the
-    mattes. """
+    mattes."""
     whole = replace(hull, values=(hull.values > 0.5).float())
     volume = whole.occupied_volume()
     cameras = scene.cameras.select(scene.training_cameras)
 
     def of_hull() -> Geometry:
-        body = shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma) if ridge_passes else whole
+        body = (
+            shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma)
+            if ridge_passes
+            else whole
+        )
         return Geometry(body, volume, torch.empty(0), 1)
 
     if not holds_matter(signed_distance(whole)):
-        raise DataError(f"scene {scene.name}: expected a visual hull with an inside, found {int(whole.values.sum())} voxels of "
-                        f"{1e3 * hull.pitch:.3g} mm: take more voxels (reconstruction.resolution) or more pixels (scene.scale), "
-                        "and look at the mattes of frame 0 and at scene.box")
+        raise DataError(
+            f"scene {scene.name}: expected a visual hull with an inside, found {int(whole.values.sum())} voxels of "
+            f"{1e3 * hull.pitch:.3g} mm: take more voxels (reconstruction.resolution) or more pixels (scene.scale), "
+            "and look at the mattes of frame 0 and at scene.box"
+        )
     if settings.source == "hull":
         return of_hull()
     frames = free_frames_at_most(scene, max(1, settings.frames))

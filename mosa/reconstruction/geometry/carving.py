@@ -46,7 +46,9 @@ class CarvingSettings:
 
 def _at_pixels(image: Tensor, pixel: Tensor) -> Tensor:
     """Bilinear values (C, ...) of an image (C, H, W) at pixels (..., 2); 0 outside."""
-    return sample_images(image[None], pixel.reshape(1, -1, 2)).reshape(len(image), *pixel.shape[:-1])
+    return sample_images(image[None], pixel.reshape(1, -1, 2)).reshape(
+        len(image), *pixel.shape[:-1]
+    )
 
 
 def _window_mean(values: Tensor) -> Tensor:
@@ -60,7 +62,13 @@ def _pixels(points: Tensor, K: Tensor, w2c: Tensor) -> Tensor:
 
 
 def _disagreement(
-    body: Volume, views: Windows, v: int, others: list[int], points: Tensor, met: Tensor, settings: CarvingSettings
+    body: Volume,
+    views: Windows,
+    v: int,
+    others: list[int],
+    points: Tensor,
+    met: Tensor,
+    settings: CarvingSettings,
 ) -> Tensor:
     """Mean squared difference of colours (K, H, W) between view v and the others that agree best, at points (K, H, W, 3) along its
     rays, the first where they meet the body. met: (H, W) rays that do."""
@@ -69,7 +77,9 @@ def _disagreement(
     own = views.images[v].permute(2, 0, 1)[:, None]
     costs = []
     for u in others:
-        seen = torch.cat([views.images[u] * views.mattes[u][..., None], views.mattes[u][..., None]], -1).permute(2, 0, 1)
+        seen = torch.cat(
+            [views.images[u] * views.mattes[u][..., None], views.mattes[u][..., None]], -1
+        ).permute(2, 0, 1)
         found = _at_pixels(seen, _pixels(points, views.cameras.K[u], views.cameras.w2c[u]))
         difference = (found[:3] / found[3:].clamp(min=0.05) - own).square().mean(0).clamp(max=0.09)
         weight = ((found[3] > 0.9) & inside & (views.mattes[v] > 0.95)).to(own)
@@ -86,7 +96,9 @@ def _partners(centres: Tensor, middle: Tensor, settings: CarvingSettings) -> lis
     cosine = (towards @ towards.T).fill_diagonal_(-2.0)
     value, index = cosine.topk(min(settings.neighbours, len(cosine) - 1), 1)
     near = value > math.cos(math.radians(settings.degrees))
-    return [[u for u, ok in zip(row, good) if ok] for row, good in zip(index.tolist(), near.tolist())]
+    return [
+        [u for u, ok in zip(row, good) if ok] for row, good in zip(index.tolist(), near.tolist())
+    ]
 
 
 def votes(body: Volume, views: Windows, settings: CarvingSettings) -> Tensor:
@@ -116,8 +128,13 @@ def votes(body: Volume, views: Windows, settings: CarvingSettings) -> Tensor:
         pixel = _pixels(points, views.cameras.K[v], views.cameras.w2c[v]).long()
         column, row = pixel[:, 0].clamp(0, width - 1), pixel[:, 1].clamp(0, height - 1)
         way, margin = (points - centres[v]).norm(dim=-1), 0.5 * body.pitch
-        surface, end = (begin + steps[first])[row, column] - margin, (begin + steps[best])[row, column] + 1.5 * body.pitch
-        tally += (sure[row, column] & (way < surface)).to(tally) - (sure[row, column] & (way >= surface) & (way < end)).to(tally)
+        surface, end = (
+            (begin + steps[first])[row, column] - margin,
+            (begin + steps[best])[row, column] + 1.5 * body.pitch,
+        )
+        tally += (sure[row, column] & (way < surface)).to(tally) - (
+            sure[row, column] & (way >= surface) & (way < end)
+        ).to(tally)
     grid = torch.zeros_like(body.values)
     grid[inside] = tally
     return grid
@@ -133,7 +150,9 @@ def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
     missing = torch.zeros_like(held)
     for K, w2c, matte in zip(views.cameras.K, views.cameras.w2c, views.mattes):
         # bins as wide as a voxel and a half is seen: a column of voxels leaves no hole
-        size = max(1.0, 1.5 * body.pitch * float(K[0, 0]) / float((points @ w2c[2, :3] + w2c[2, 3]).mean()))
+        size = max(
+            1.0, 1.5 * body.pitch * float(K[0, 0]) / float((points @ w2c[2, :3] + w2c[2, 3]).mean())
+        )
         columns, rows = int(views.cameras.width / size) + 1, int(views.cameras.height / size) + 1
         pixel = _pixels(points, K, w2c)
         seen = _at_pixels(matte[None], pixel)[0] > 0.5
@@ -141,7 +160,9 @@ def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
         ray = row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)
         covered = torch.zeros(rows * columns, device=kept.device)
         covered[ray[held]] = 1.0
-        covered = dilation(covered.reshape(1, 1, rows, columns), covered.new_ones(3, 3)).reshape(-1) > 0.5
+        covered = (
+            dilation(covered.reshape(1, 1, rows, columns), covered.new_ones(3, 3)).reshape(-1) > 0.5
+        )
         missing |= seen & ~covered[ray]
     result = kept.clone()
     result[inside] = held | missing

@@ -31,7 +31,9 @@ def at(volume: Volume, points: Tensor) -> Tensor:
 def bell(sigma: float, like: Tensor) -> Tensor:
     """Weights of a Gaussian of `sigma` cells to three of them either side, with sum 1."""
     reach = max(1, round(3 * sigma))
-    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=like.device, dtype=like.dtype) / sigma) ** 2)
+    weights = torch.exp(
+        -0.5 * (torch.arange(-reach, reach + 1, device=like.device, dtype=like.dtype) / sigma) ** 2
+    )
     return weights / weights.sum()
 
 
@@ -56,11 +58,15 @@ def scatter(shape: tuple[int, ...], index: Tensor, values: Tensor) -> Tensor:
     part, low = index - low, low.long()
     limit = torch.tensor(shape, device=index.device)
     fixed = (values.double() * FIXED_POINT).round()
-    total = torch.zeros(values.shape[1], shape[0] * shape[1] * shape[2], dtype=torch.long, device=index.device)
+    total = torch.zeros(
+        values.shape[1], shape[0] * shape[1] * shape[2], dtype=torch.long, device=index.device
+    )
     for corner in range(8):
         offset = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=index.device)
         cell = low + offset
-        weight = torch.where(offset.bool(), part, 1 - part).prod(1) * ((cell >= 0) & (cell < limit)).all(1)
+        weight = torch.where(offset.bool(), part, 1 - part).prod(1) * (
+            (cell >= 0) & (cell < limit)
+        ).all(1)
         cell = torch.minimum(cell.clamp(min=0), limit - 1)
         flat = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
         total.index_add_(1, flat, (fixed * weight[:, None].double()).round().long().T.contiguous())
@@ -76,8 +82,12 @@ def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Centres (V, 3) [m] and unit directions (V, H, W, 3) through the middles of the pixels."""
     y = torch.arange(cameras.height, device=cameras.K.device) + 0.5
     x = torch.arange(cameras.width, device=cameras.K.device) + 0.5
-    pixel = torch.stack((*torch.meshgrid(x, y, indexing="xy"), torch.ones(len(y), len(x), device=x.device)), -1)
-    directions = pixel @ torch.linalg.inv(cameras.K).transpose(1, 2)[:, None] @ cameras.w2c[:, None, :3, :3]
+    pixel = torch.stack(
+        (*torch.meshgrid(x, y, indexing="xy"), torch.ones(len(y), len(x), device=x.device)), -1
+    )
+    directions = (
+        pixel @ torch.linalg.inv(cameras.K).transpose(1, 2)[:, None] @ cameras.w2c[:, None, :3, :3]
+    )
     centres = -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
     return centres, F.normalize(directions, dim=-1)
 
@@ -88,7 +98,9 @@ def span(volume: Volume) -> tuple[Tensor, float]:
     return volume.origin + size / 2, float(size.norm()) / 2
 
 
-def first_crossing(distance: Volume, origin: Tensor, direction: Tensor, start: Tensor | None = None) -> Tensor:
+def first_crossing(
+    distance: Volume, origin: Tensor, direction: Tensor, start: Tensor | None = None
+) -> Tensor:
     """Way (M,) [m] along rays (M, 3) to where a distance (negative inside) first falls below 0; infinite where it never does.
 
     start: (M,) ways before which nothing is looked for; nan: from the grid's border.
@@ -104,7 +116,11 @@ def first_crossing(distance: Volume, origin: Tensor, direction: Tensor, start: T
     for _ in range(int(2 * radius / step) + 2):
         now = at(distance, origin[left] + way[left, None] * direction[left])
         inside = now < 0
-        share = torch.where(before[left].isinf(), torch.ones_like(now), before[left] / (before[left] - now).clamp(min=1e-9))
+        share = torch.where(
+            before[left].isinf(),
+            torch.ones_like(now),
+            before[left] / (before[left] - now).clamp(min=1e-9),
+        )
         hit[left[inside]] = (way[left] + (share - 1) * step)[inside]
         before[left] = now
         left = left[~inside]

@@ -43,7 +43,12 @@ def body_volume(volume: Volume, *, threshold: float = 0.5) -> float:
 
 
 def _keep_thin_features(
-    kept: np.ndarray, count: np.ndarray, cell: np.ndarray, voxels: np.ndarray, centres: np.ndarray, reach: float
+    kept: np.ndarray,
+    count: np.ndarray,
+    cell: np.ndarray,
+    voxels: np.ndarray,
+    centres: np.ndarray,
+    reach: float,
 ) -> None:
     """Keeps further cells, the fullest first, until no voxel is farther than `reach` from a kept cell's centre.
 
@@ -57,7 +62,9 @@ def _keep_thin_features(
         far = far[np.linalg.norm(voxels[far] - centres[best], axis=1) > reach]
 
 
-def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.25) -> Particles:
+def fill(
+    volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.25
+) -> Particles:
     """Particles on a lattice of `spacing` [m] inside the 0.5 level of an occupancy volume (pitch well below the spacing).
 
     The fullest cells hold a particle each, as many as volume / spacing^3, but none filled by less than `smallest_part`.
@@ -78,9 +85,14 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     # the fullest cells, as many as the volume holds: so a particle's mean volume is spacing^3 for thin bodies too
     wanted = max(1, round(len(voxels) * (volume.pitch / spacing) ** 3))
     full = (spacing / volume.pitch) ** 3
-    smallest = max(np.partition(count, -min(wanted, len(count)))[-min(wanted, len(count))], smallest_part * full)
+    smallest = max(
+        np.partition(count, -min(wanted, len(count)))[-min(wanted, len(count))],
+        smallest_part * full,
+    )
     kept = count >= smallest
-    centres = (np.stack(np.unravel_index(np.arange(len(count)), shape), -1) + low + 0.5) * spacing + centre
+    centres = (
+        np.stack(np.unravel_index(np.arange(len(count)), shape), -1) + low + 0.5
+    ) * spacing + centre
     _keep_thin_features(kept, count, flat, voxels, centres, 1.5 * spacing)
     names = np.flatnonzero(kept)
     owner = np.full(len(count), -1)
@@ -90,7 +102,10 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     if stray.any():
         owner[stray] = cKDTree(centres[names]).query(voxels[stray])[1]
     held = np.bincount(owner, minlength=len(names))
-    positions = np.stack([np.bincount(owner, voxels[:, a], len(names)) for a in range(3)], -1) / held[:, None]
+    positions = (
+        np.stack([np.bincount(owner, voxels[:, a], len(names)) for a in range(3)], -1)
+        / held[:, None]
+    )
     solid = np.zeros(shape + 2, bool)
     solid[1:-1, 1:-1, 1:-1] = kept.reshape(shape)
     inner = ndimage.binary_erosion(solid, np.ones((3, 3, 3), bool))[1:-1, 1:-1, 1:-1].ravel()

@@ -66,7 +66,9 @@ def signed_distance(inside: Volume) -> Volume:
     """Distance [m] to the surface of voxels (values 0 or 1), negative inside, on a grid wider by BORDER cells."""
     solid = F.pad(inside.values > 0.5, (BORDER,) * 6).cpu().numpy()
     cells = ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)
-    values = smooth(torch.as_tensor(cells, dtype=torch.float32, device=inside.values.device) * inside.pitch, 0.7)
+    values = smooth(
+        torch.as_tensor(cells, dtype=torch.float32, device=inside.values.device) * inside.pitch, 0.7
+    )
     return Volume(values, inside.origin - BORDER * inside.pitch, inside.pitch)
 
 
@@ -78,7 +80,9 @@ def voxels(distance: Volume, like: Volume) -> Volume:
 
 def blurred(views: Windows, sigma: float) -> Tensor:
     """Colour, its slopes along columns and rows [1/px] and matte, (B, 10, h, w); colours are means inside of the matte alone."""
-    stacked = torch.cat([views.images * views.mattes[..., None], views.mattes[..., None]], -1).permute(0, 3, 1, 2)
+    stacked = torch.cat(
+        [views.images * views.mattes[..., None], views.mattes[..., None]], -1
+    ).permute(0, 3, 1, 2)
     stacked = smooth(stacked, sigma, (-2, -1))
     color = stacked[:, :3] / stacked[:, 3:].clamp(min=0.05)
     rows, columns = torch.gradient(color, dim=(2, 3))
@@ -99,7 +103,9 @@ class _Group:
 def _group(views: Windows) -> _Group:
     around, box = views.mattes[:, None], views.mattes.new_ones(3, 3)
     edge = (dilation(around, box) > 0.02) & (erosion(around, box) < 0.98)
-    return _Group(views, *camera_rays(views.cameras), edge[:, 0], torch.full_like(views.mattes, float("nan")))
+    return _Group(
+        views, *camera_rays(views.cameras), edge[:, 0], torch.full_like(views.mattes, float("nan"))
+    )
 
 
 def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:
@@ -107,9 +113,13 @@ def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:
     seen = group.views.mattes > 0.5
     window = seen.nonzero()[:, 0]
     way = torch.full_like(group.views.mattes, float("inf"))
-    way[seen] = first_crossing(distance, group.centres[window], group.directions[seen], group.start[seen])
+    way[seen] = first_crossing(
+        distance, group.centres[window], group.directions[seen], group.start[seen]
+    )
     # the next round looks from a little before this one's surface: it moves by less than a voxel
-    group.start = torch.where(way.isfinite(), way - 3 * distance.pitch, torch.full_like(way, float("nan")))
+    group.start = torch.where(
+        way.isfinite(), way - 3 * distance.pitch, torch.full_like(way, float("nan"))
+    )
     met = way.isfinite()
     return way, group.centres[met.nonzero()[:, 0]] + way[met][:, None] * group.directions[met]
 
@@ -126,7 +136,9 @@ def color_information(
     slopes = gradient(distance.values, distance.pitch)
     normal = F.normalize(sample(slopes, (points - distance.origin) / distance.pitch), dim=-1)
     height, width = ways.shape[1:]
-    reach = F.max_pool2d(torch.where(ways.isfinite(), ways, torch.zeros_like(ways))[:, None], 3, 1, 1)[:, 0]
+    reach = F.max_pool2d(
+        torch.where(ways.isfinite(), ways, torch.zeros_like(ways))[:, None], 3, 1, 1
+    )[:, 0]
     weights, colors, changes, variances = [], [], [], []
     for u in range(len(cameras)):
         R, focal = cameras.w2c[u, :3, :3], cameras.K[u].diagonal()[:2]
@@ -136,14 +148,21 @@ def color_information(
         turned = normal @ R.T
         moved = focal * (turned[:, :2] - flat * turned[:, 2:]) / seen[:, 2:]
         found = sample_images(images[u][None], pixel[None])[0].T
-        column, row = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
+        column, row = (
+            pixel[:, 0].long().clamp(0, width - 1),
+            pixel[:, 1].long().clamp(0, height - 1),
+        )
         arm = points - group.centres[u]
         facing = -(normal * F.normalize(arm, dim=-1)).sum(-1)
-        visible = (arm.norm(dim=-1) <= reach[u, row, column] + 0.5 * distance.pitch) & (facing > settings.facing)
+        visible = (arm.norm(dim=-1) <= reach[u, row, column] + 0.5 * distance.pitch) & (
+            facing > settings.facing
+        )
         weights.append((visible & (found[:, 9] > 0.9)) * facing.clamp(min=0).square())
         colors.append(found[:, :3])
         changes.append(found[:, 3:6] * moved[:, :1] + found[:, 6:9] * moved[:, 1:])
-        variances.append(settings.noise**2 + settings.misplaced**2 * (found[:, 3:9].square().sum(1) / 3))
+        variances.append(
+            settings.noise**2 + settings.misplaced**2 * (found[:, 3:9].square().sum(1) / 3)
+        )
     weight, color, change = torch.stack(weights), torch.stack(colors), torch.stack(changes)
     robust = weight
     for _ in range(2):
@@ -156,7 +175,9 @@ def color_information(
     each = (robust / torch.stack(variances) / (weight > 0).sum(0).clamp(min=1))[..., None]
     if doubt:
         mean = (weight[..., None] * color).sum(0) / weight.sum(0).clamp(min=1e-6)[:, None]
-        squares = (weight * (color - mean).square().mean(-1) / torch.stack(variances)).sum(0) / weight.sum(0).clamp(min=1e-6)
+        squares = (weight * (color - mean).square().mean(-1) / torch.stack(variances)).sum(
+            0
+        ) / weight.sum(0).clamp(min=1e-6)
         each = each / squares.clamp(min=1).square()[:, None]
     return (each * change.square()).sum((0, 2)), -(each * change * residual).sum((0, 2))
 
@@ -169,10 +190,18 @@ def outline_information(
     width: of a pixel at the body [m].
     """
     window = group.outline.nonzero()[:, 0]
-    origin, direction, matte = group.centres[window], group.directions[group.outline], group.views.mattes[group.outline]
+    origin, direction, matte = (
+        group.centres[window],
+        group.directions[group.outline],
+        group.views.mattes[group.outline],
+    )
     best, way = nearest_passing(distance, origin, direction)
     share = (0.5 - best / width).clamp(0, 1)
-    told = ((share > 0) | (matte > 0.02)) & ((share < 1) | (matte < 0.98)) & (best < 4 * distance.pitch)
+    told = (
+        ((share > 0) | (matte > 0.02))
+        & ((share < 1) | (matte < 0.98))
+        & (best < 4 * distance.pitch)
+    )
     information = told / (settings.outline * width) ** 2
     return origin + way[:, None] * direction, information, information * (matte - share) * width
 
@@ -185,7 +214,11 @@ def pixel_width(distance: Volume, views: Windows) -> float:
 
 
 def refine(
-    distance: Volume, hull: Volume, frames: list[Windows], settings: RefinementSettings, schedule: list[tuple[int, float]]
+    distance: Volume,
+    hull: Volume,
+    frames: list[Windows],
+    settings: RefinementSettings,
+    schedule: list[tuple[int, float]],
 ) -> Volume:
     """The refined distance [m].
 
@@ -202,10 +235,16 @@ def refine(
         for _ in range(rounds):
             which = turn % len(groups)
             ways, points = _surface(distance, groups[which])
-            about, pull = color_information(distance, groups[which], images[which], points, ways, settings)
-            edges, edge_about, edge_pull = outline_information(distance, groups[which], width, settings)
+            about, pull = color_information(
+                distance, groups[which], images[which], points, ways, settings
+            )
+            edges, edge_about, edge_pull = outline_information(
+                distance, groups[which], width, settings
+            )
             # in units of voxels
-            values = torch.stack([torch.cat([about, edge_about]) * pitch**2, torch.cat([pull, edge_pull]) * pitch], 1)
+            values = torch.stack(
+                [torch.cat([about, edge_about]) * pitch**2, torch.cat([pull, edge_pull]) * pitch], 1
+            )
             index = (torch.cat([points, edges]) - distance.origin) / pitch
             known, pulled = area * smooth(scatter(shape, index, values), settings.patch)
             step = pulled / (known + (pitch / (1e-3 * settings.step)) ** 2)
@@ -222,23 +261,32 @@ def refine(
     return distance
 
 
-def surface_information(distance: Volume, frames: list[Windows], settings: RefinementSettings, blur: float) -> Tensor:
+def surface_information(
+    distance: Volume, frames: list[Windows], settings: RefinementSettings, blur: float
+) -> Tensor:
     """Information [1/m^2] on the place of the surface, (X, Y, Z), of all frames together: what is not told is 0.
 
     Colours that do not agree at the surface tell little, by the square of their chi^2. A ray of an outline tells where the
     surface is only where it touches it in one place: along a flat side, or over a hollow that it spans, it tells how high and not
-    where. """
+    where."""
     width, total = pixel_width(distance, frames[0]), torch.zeros_like(distance.values)
     _, radius = span(distance)
-    patch, shape = 0.5 * settings.patch, tuple(distance.values.shape)  # half: nothing is said of what lies far from a rim
+    patch, shape = (
+        0.5 * settings.patch,
+        tuple(distance.values.shape),
+    )  # half: nothing is said of what lies far from a rim
     area = 2 * math.pi * patch**2
     for views in frames:
         group = _group(views)
         ways, points = _surface(distance, group)
-        about, _ = color_information(distance, group, blurred(views, blur), points, ways, settings, doubt=True)
+        about, _ = color_information(
+            distance, group, blurred(views, blur), points, ways, settings, doubt=True
+        )
         edges, edge_about, _ = outline_information(distance, group, width, settings)
         window = group.outline.nonzero()[:, 0]
-        touching = _touching(distance, group.centres[window], group.directions[group.outline], edges, 0.5 * width)
+        touching = _touching(
+            distance, group.centres[window], group.directions[group.outline], edges, 0.5 * width
+        )
         edge_about = edge_about * (touching < LOCAL * radius)
         index = (torch.cat([points, edges]) - distance.origin) / distance.pitch
         values = torch.cat([about, edge_about])[:, None] * distance.pitch**2
@@ -246,12 +294,17 @@ def surface_information(distance: Volume, frames: list[Windows], settings: Refin
     return total / distance.pitch**2
 
 
-def _touching(distance: Volume, origin: Tensor, direction: Tensor, nearest: Tensor, within: float) -> Tensor:
+def _touching(
+    distance: Volume, origin: Tensor, direction: Tensor, nearest: Tensor, within: float
+) -> Tensor:
     """Length [m] of rays (M, 3) on which the distance is less than `within` [m] above the one at their nearest points (M, 3)."""
     centre, radius = span(distance)
     limit = at(distance, nearest) + within
     middle = ((centre - origin) * direction).sum(-1)
     count = torch.zeros_like(limit)
     for k in range(int(2 * radius / distance.pitch) + 1):
-        count += at(distance, origin + (middle - radius + k * distance.pitch)[:, None] * direction) < limit
+        count += (
+            at(distance, origin + (middle - radius + k * distance.pitch)[:, None] * direction)
+            < limit
+        )
     return count * distance.pitch

@@ -39,9 +39,13 @@ HALF = 1.13
 """Standard deviations at which a Gaussian of opacity 0.95 has fallen to one half: that far out is the surface that it shows."""
 
 
-def opacity_field(splats: Splats, origin: Tensor, shape: tuple[int, int, int], pitch: float, wider: float) -> np.ndarray:
+def opacity_field(
+    splats: Splats, origin: Tensor, shape: tuple[int, int, int], pitch: float, wider: float
+) -> np.ndarray:
     """1 - prod_i (1 - o_i exp(-q_i / 2)) on a grid of voxels, of Gaussians whose variances are larger by wider^2 [m^2]."""
-    covariances = covariance_from(splats.scales, splats.rotations).double() + wider**2 * torch.eye(3).double()
+    covariances = (
+        covariance_from(splats.scales, splats.rotations).double() + wider**2 * torch.eye(3).double()
+    )
     places = (splats.means.double() - origin.double()) / pitch
     widest = REACH * covariances.diagonal(dim1=1, dim2=2).amax(1).sqrt() / pitch
     inverse, reach = torch.linalg.inv(covariances / pitch**2), widest.ceil()
@@ -76,7 +80,9 @@ def blocked(shell: np.ndarray, direction: tuple[int, int, int]) -> np.ndarray:
     return np.moveaxis(moved, 0, axis)
 
 
-def solid_of(splats: Splats, *, resolution: int = 80, share: float = 0.9, up: Tensor | None = None) -> Volume:
+def solid_of(
+    splats: Splats, *, resolution: int = 80, share: float = 0.9, up: Tensor | None = None
+) -> Volume:
     """The solid that Gaussians (CPU) enclose, occupancy in [0, 1].
 
     resolution: voxels along the longest side; share: of 26 directions that have to end at the shell; up: (3,), given where the
@@ -85,7 +91,9 @@ def solid_of(splats: Splats, *, resolution: int = 80, share: float = 0.9, up: Te
     low, high = splats.means.amin(0), splats.means.amax(0)
     extent = float((high - low).max())
     if not 0 < extent < np.inf:
-        raise DataError(f"solid: expected Gaussians that fill a space, found an extent of {extent:.3g}")
+        raise DataError(
+            f"solid: expected Gaussians that fill a space, found an extent of {extent:.3g}"
+        )
     pitch = extent / resolution
     gap = float(np.median(cKDTree(splats.means.numpy()).query(splats.means.numpy(), k=5)[0][:, 4]))
     wider = WIDER * max(gap, pitch)
@@ -98,17 +106,29 @@ def solid_of(splats: Splats, *, resolution: int = 80, share: float = 0.9, up: Te
         if not any(direction):
             continue
         count += 1
-        falls = up is not None and float(torch.tensor(direction, dtype=torch.float32) @ up.float().cpu()) < -0.3
+        falls = (
+            up is not None
+            and float(torch.tensor(direction, dtype=torch.float32) @ up.float().cpu()) < -0.3
+        )
         closed += 1 if falls else blocked(shell, direction)
     inside = ndimage.binary_fill_holes(shell | (closed >= share * count))
     if up is not None:  # what lies below the lowest of the shell is the ground, not the object
-        height = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) @ up.cpu().double().numpy()
+        height = (
+            np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+            @ up.cpu().double().numpy()
+        )
         inside &= height >= height[shell].min() if shell.any() else False
     if not inside.any():
-        raise DataError("solid: expected Gaussians that enclose something, found none opaque enough; is the object cut out of its "
-                        "surroundings, and what is its opacity?")
-    depth = (ndimage.distance_transform_edt(inside) - 0.5) * pitch  # the surface lies half a voxel outside of the outermost centres
-    centres = ndimage.map_coordinates(depth, ((splats.means - origin) / pitch).T.double().numpy(), order=1)
+        raise DataError(
+            "solid: expected Gaussians that enclose something, found none opaque enough; is the object cut out of its "
+            "surroundings, and what is its opacity?"
+        )
+    depth = (
+        ndimage.distance_transform_edt(inside) - 0.5
+    ) * pitch  # the surface lies half a voxel outside of the outermost centres
+    centres = ndimage.map_coordinates(
+        depth, ((splats.means - origin) / pitch).T.double().numpy(), order=1
+    )
     beneath = float(np.quantile(centres, OUTERMOST)) - HALF * float(splats.scales.amin(1).median())
     values = np.clip(0.5 + (depth - max(beneath, 0.0)) / pitch, 0, 1).astype(np.float32)
     return Volume(torch.from_numpy(values), origin, pitch)

@@ -41,10 +41,14 @@ class Neighbourhood:
         return torch.einsum("...nki,nkj->...nij", difference, self.gradient)
 
     def to(self, device: torch.device | str) -> Neighbourhood:
-        return Neighbourhood(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return Neighbourhood(
+            *(getattr(self, name).to(device) for name in self.__dataclass_fields__)
+        )
 
 
-def neighbourhood(rest: Tensor, *, neighbours: int = 20, condition_limit: float = CONDITION_LIMIT) -> Neighbourhood:
+def neighbourhood(
+    rest: Tensor, *, neighbours: int = 20, condition_limit: float = CONDITION_LIMIT
+) -> Neighbourhood:
     """Weighted least squares over the `neighbours` nearest rest particles. rest: (N, 3) [m].
 
     Minimises sum_k w_k |d_k - F D_k|^2, D rest vector, d deformed vector, w = (1 - r^2/r_max^2)^2 with r_max 1.2 times the
@@ -54,7 +58,9 @@ def neighbourhood(rest: Tensor, *, neighbours: int = 20, condition_limit: float 
     """
     points = rest.detach().cpu().double().numpy()
     if len(points) < 5:
-        raise DataError(f"neighbourhood: expected at least 5 particles, found {len(points)}; choose a smaller spacing")
+        raise DataError(
+            f"neighbourhood: expected at least 5 particles, found {len(points)}; choose a smaller spacing"
+        )
     count = min(neighbours, len(points) - 1)
     distance, index = cKDTree(points).query(points, k=count + 1)
     # a particle is its own nearest neighbour unless two coincide: then drop whichever comes first
@@ -99,10 +105,14 @@ def neighbourhood_cues(positions: Tensor, covariances: Tensor, around: Neighbour
     known = weight > 0
     rotation = torch.where(known[..., None, None], rotation, identity)
     stretch = torch.where(known[..., None], stretch, torch.ones_like(stretch))
-    return MotionCues(positions.contiguous(), rotation, stretch, weight.contiguous(), covariances.contiguous())
+    return MotionCues(
+        positions.contiguous(), rotation, stretch, weight.contiguous(), covariances.contiguous()
+    )
 
 
-def gaussian_cues(positions: Tensor, covariances: Tensor, splats: Splats, scales: Tensor, rotations: Tensor) -> MotionCues:
+def gaussian_cues(
+    positions: Tensor, covariances: Tensor, splats: Splats, scales: Tensor, rotations: Tensor
+) -> MotionCues:
     """The paper's cues: change of each Gaussian's own scale and rotation since frame 0.
 
     scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1.
@@ -111,4 +121,6 @@ def gaussian_cues(positions: Tensor, covariances: Tensor, splats: Splats, scales
     rotation = quaternion_to_matrix(rotations) @ rest.transpose(-1, -2)
     stretch = (scales / splats.scales).sort(-1, descending=True).values
     weight = torch.ones(positions.shape[:2], dtype=positions.dtype, device=positions.device)
-    return MotionCues(positions.contiguous(), rotation.contiguous(), stretch, weight, covariances.contiguous())
+    return MotionCues(
+        positions.contiguous(), rotation.contiguous(), stretch, weight, covariances.contiguous()
+    )

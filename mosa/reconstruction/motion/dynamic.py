@@ -95,7 +95,9 @@ def elastic_energy(deformation: Tensor, poisson: float) -> Tensor:
     return (strain**2).sum((-1, -2)).mean() + poisson / (1 - 2 * poisson) * (trace**2).mean()
 
 
-def _round_robin(windows: Windows, frames: list[int], generator: torch.Generator) -> Callable[[int], Tensor]:
+def _round_robin(
+    windows: Windows, frames: list[int], generator: torch.Generator
+) -> Callable[[int], Tensor]:
     """draw(n): indices of n windows of every frame in `frames`; all views of a frame are seen before one repeats."""
     by_frame = {t: (windows.frame == t).nonzero()[:, 0].cpu() for t in frames}
     queue = {t: torch.empty(0, dtype=torch.long) for t in frames}
@@ -104,7 +106,9 @@ def _round_robin(windows: Windows, frames: list[int], generator: torch.Generator
         chosen = []
         for t in frames:
             while len(queue[t]) < count:
-                queue[t] = torch.cat([queue[t], by_frame[t][torch.randperm(len(by_frame[t]), generator=generator)]])
+                queue[t] = torch.cat(
+                    [queue[t], by_frame[t][torch.randperm(len(by_frame[t]), generator=generator)]]
+                )
             chosen.append(queue[t][:count])
             queue[t] = queue[t][count:]
         return torch.cat(chosen)
@@ -126,8 +130,15 @@ class Objective:
 
     predicted: a motion in which neither energy is stored; None: the body at rest."""
 
-    def __init__(self, motion: Motion, carried: Scaffold, scaffold: Scaffold, background: Tensor, settings: DynamicSettings,
-                 predicted: Predicted | None = None):
+    def __init__(
+        self,
+        motion: Motion,
+        carried: Scaffold,
+        scaffold: Scaffold,
+        background: Tensor,
+        settings: DynamicSettings,
+        predicted: Predicted | None = None,
+    ):
         self.motion, self.carried, self.scaffold = motion, carried, scaffold
         self.background, self.settings, self.predicted = background, settings, predicted
         self.refining = False
@@ -135,7 +146,10 @@ class Objective:
     def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
         """frames: (S,) long; state: (B,) which of them each window shows."""
         carried, settings = self.carried, self.settings
-        sample, colors = self.motion(frames, carried.splats, carried.modes, carried.around), carried.colors(frames)
+        sample, colors = (
+            self.motion(frames, carried.splats, carried.modes, carried.around),
+            carried.colors(frames),
+        )
         image, alpha = rasterize(
             sample.positions,
             sample.covariances,
@@ -145,14 +159,22 @@ class Objective:
             state,
             self.background,
         )
-        loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
+        loss = image_loss(
+            image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
+        )
         if settings.elastic > 0:
-            loss = loss + settings.elastic * elastic_energy(self._deformation(frames, sample), settings.poisson)
+            loss = loss + settings.elastic * elastic_energy(
+                self._deformation(frames, sample), settings.poisson
+            )
         if settings.bending > 0 and isinstance(self.motion, ModalMotion):
             c = self.motion.coefficients(frames)
-            c = (c if self.predicted is None else c - self.predicted.coefficients[frames]) / self.motion.reach
+            c = (
+                c if self.predicted is None else c - self.predicted.coefficients[frames]
+            ) / self.motion.reach
             curvature = (self.scaffold.modes.energy[:, None] * c**2).sum((-2, -1))
-            if self.refining and settings.bending_scale > 0:  # what a frame shows sets its own weight
+            if (
+                self.refining and settings.bending_scale > 0
+            ):  # what a frame shows sets its own weight
                 curvature = settings.bending_scale * torch.log1p(curvature / settings.bending_scale)
             loss = loss + settings.bending * curvature.mean()
         return loss
@@ -162,7 +184,11 @@ class Objective:
             return sample.deformation
         if isinstance(self.motion, ModalMotion):
             deformation = self.motion.displacement(frames, self.scaffold.modes)[1]
-            return deformation if self.predicted is None else deformation @ self.predicted.inverse[frames]
+            return (
+                deformation
+                if self.predicted is None
+                else deformation @ self.predicted.inverse[frames]
+            )
         return self.motion(frames, self.scaffold.splats, None, self.scaffold.around).deformation
 
 
@@ -213,7 +239,9 @@ def fit_motion(
     generator = torch.Generator().manual_seed(seed)
     moving = list(range(1, len(offsets)))
     if settings.model == "modes":
-        motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach, free_shape=settings.free_shape)
+        motion = ModalMotion(
+            offsets, scaffold.modes.energy, reach=reach, free_shape=settings.free_shape
+        )
         objective = Objective(motion, carried, scaffold, background, settings)
         for t in moving:
             with torch.no_grad():
@@ -248,5 +276,15 @@ def fit_motion(
         rate = settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    minimise(objective, optimizer, moving, windows, settings.iterations, settings.views, rate, generator, progress)
+    minimise(
+        objective,
+        optimizer,
+        moving,
+        windows,
+        settings.iterations,
+        settings.views,
+        rate,
+        generator,
+        progress,
+    )
     return motion

@@ -18,7 +18,13 @@ from torch import Tensor
 
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
 from mosa.reconstruction.motion.cues import polar
-from mosa.reconstruction.motion.dynamic import DynamicSettings, Objective, Predicted, Scaffold, minimise
+from mosa.reconstruction.motion.dynamic import (
+    DynamicSettings,
+    Objective,
+    Predicted,
+    Scaffold,
+    minimise,
+)
 from mosa.reconstruction.motion.modes import coefficients_of
 from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.motion.observed import Windows
@@ -103,7 +109,10 @@ def informed_motion(
         """(T,) of images, 0 for the first frame, with the particles near `positions`."""
         project(motion, scaffold, positions)
         objective = Objective(motion, carried, scaffold, background, alone)
-        found = [objective(t[None], each := compared.of_frame(int(t)), torch.zeros_like(each.frame)) for t in every[1:]]
+        found = [
+            objective(t[None], each := compared.of_frame(int(t)), torch.zeros_like(each.frame))
+            for t in every[1:]
+        ]
         return torch.stack([torch.zeros_like(found[0]), *found])
 
     laid = laid_onto(predicted, seen)
@@ -113,17 +122,32 @@ def informed_motion(
     with torch.no_grad():
         deformation = motion.displacement(every, scaffold.modes)[1]
         about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
-    weights = replace(dynamic, elastic=settings.elastic, bending=settings.bending, bending_scale=0.0)
+    weights = replace(
+        dynamic, elastic=settings.elastic, bending=settings.bending, bending_scale=0.0
+    )
     objective = Objective(motion, carried, scaffold, background, weights, about)
     optimizer = UniformAdam(motion.parameters(), lr=settings.lr)
     generator = torch.Generator().manual_seed(seed)
-    minimise(objective, optimizer, every[1:].tolist(), windows, settings.iterations, settings.views, settings.lr, generator,
-             progress)
+    minimise(
+        objective,
+        optimizer,
+        every[1:].tolist(),
+        windows,
+        settings.iterations,
+        settings.views,
+        settings.lr,
+        generator,
+        progress,
+    )
     first = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
     project(first, scaffold, seen)
 
     @torch.no_grad()
     def loss(of: ModalMotion) -> float:
-        return float(Objective(of, judging or carried, scaffold, background, alone)(every, compared, compared.frame))
+        return float(
+            Objective(of, judging or carried, scaffold, background, alone)(
+                every, compared, compared.frame
+            )
+        )
 
     return (motion, begun) if loss(motion) < WORSE * loss(first) + SLACK else None

@@ -38,7 +38,9 @@ class Modes:
         N = len(self.values)
         columns = coefficients.permute(1, 0, 2).reshape(K, S * 3)
         shift = (self.values @ columns).reshape(N, S, 3).transpose(0, 1)
-        gradient = (self.gradient.reshape(N * 3, K) @ columns).reshape(N, 3, S, 3).permute(2, 0, 3, 1)
+        gradient = (
+            (self.gradient.reshape(N * 3, K) @ columns).reshape(N, 3, S, 3).permute(2, 0, 3, 1)
+        )
         return shift, gradient
 
     def at(self, points: Tensor, rest: Tensor, *, neighbours: int = 8) -> Modes:
@@ -46,9 +48,13 @@ class Modes:
 
         rest: (N, 3) [m] the particles' rest positions. Affine motions stay exact.
         """
-        distance, index = cKDTree(rest.cpu().numpy()).query(points.detach().cpu().numpy(), k=min(neighbours, len(rest)))
+        distance, index = cKDTree(rest.cpu().numpy()).query(
+            points.detach().cpu().numpy(), k=min(neighbours, len(rest))
+        )
         weight = 1 / (distance**2 + (0.3 * distance.max(1, keepdims=True)) ** 2 + 1e-12)
-        weight = torch.as_tensor(weight / weight.sum(1, keepdims=True), dtype=rest.dtype, device=rest.device)
+        weight = torch.as_tensor(
+            weight / weight.sum(1, keepdims=True), dtype=rest.dtype, device=rest.device
+        )
         index = torch.as_tensor(index, device=rest.device)
         values = points.new_zeros(len(points), self.values.shape[1])
         gradient = points.new_zeros(len(points), 3, self.values.shape[1])
@@ -79,20 +85,28 @@ def bending_matrix(around: Neighbourhood) -> sparse.csr_matrix:
     root = np.sqrt(kernel / kernel.sum(1, keepdims=True))
     rows = np.arange(particles * count).reshape(particles, count)
     entries = sparse.coo_matrix(
-        ((root[..., None] * coupling).ravel(), (np.repeat(rows.ravel(), count), np.repeat(index, count, 0).ravel())),
+        (
+            (root[..., None] * coupling).ravel(),
+            (np.repeat(rows.ravel(), count), np.repeat(index, count, 0).ravel()),
+        ),
         shape=(particles * count, particles),
     )
     diagonal = sparse.coo_matrix(
-        ((root * own).ravel(), (rows.ravel(), np.repeat(np.arange(particles), count))), shape=entries.shape
+        ((root * own).ravel(), (rows.ravel(), np.repeat(np.arange(particles), count))),
+        shape=entries.shape,
     )
     residual = (entries + diagonal).tocsr()
     return (residual.T @ residual).tocsr()
 
 
-def _bending_modes(matrix: sparse.csr_matrix, rest: Tensor, affine: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _bending_modes(
+    matrix: sparse.csr_matrix, rest: Tensor, affine: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Energies (count,) and orthonormal patterns (N, count) of the softest modes that are not affine, the softest first."""
     if len(affine) >= FILTERED_FROM:
-        found = softest_vectors(matrix, rest.detach(), torch.as_tensor(affine, device=rest.device), count)
+        found = softest_vectors(
+            matrix, rest.detach(), torch.as_tensor(affine, device=rest.device), count
+        )
         if found is not None:
             return tuple(part.cpu().numpy() for part in found)
     shift = 1e-7 * matrix.diagonal().mean()
@@ -128,7 +142,16 @@ def deformation_modes(rest: Tensor, around: Neighbourhood, *, count: int) -> Mod
     modes = modes * np.sqrt(particles)
     index, operator = around.index.cpu().numpy(), around.gradient.double().cpu().numpy()
     starts = np.arange(particles + 1) * index.shape[1]
-    slopes = [sparse.csr_matrix((operator[..., a].ravel(), index.ravel(), starts), (particles, particles)) for a in range(3)]
-    gradient = np.stack([slope @ modes - operator[..., a].sum(1)[:, None] * modes for a, slope in enumerate(slopes)], 1)
+    slopes = [
+        sparse.csr_matrix((operator[..., a].ravel(), index.ravel(), starts), (particles, particles))
+        for a in range(3)
+    ]
+    gradient = np.stack(
+        [
+            slope @ modes - operator[..., a].sum(1)[:, None] * modes
+            for a, slope in enumerate(slopes)
+        ],
+        1,
+    )
     as_tensor = lambda a: torch.as_tensor(a, dtype=rest.dtype, device=rest.device)  # noqa: E731
     return Modes(as_tensor(modes), as_tensor(gradient), as_tensor(energy))

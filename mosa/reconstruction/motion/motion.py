@@ -37,7 +37,13 @@ class ModalMotion(nn.Module):
     """
 
     def __init__(
-        self, offsets: Tensor, energies: Tensor, *, reach: float, softness: float = 10.0, free_shape: bool = False
+        self,
+        offsets: Tensor,
+        energies: Tensor,
+        *,
+        reach: float,
+        softness: float = 10.0,
+        free_shape: bool = False,
     ) -> None:
         super().__init__()
         frames, count = len(offsets), len(energies)
@@ -47,7 +53,11 @@ class ModalMotion(nn.Module):
         self.register_buffer("unit", reach / (1 + order / softness))
         self.register_buffer("turn", 1 / (1 + order / softness))
         self.amplitude = nn.Parameter(torch.zeros(frames, count, 3, device=offsets.device))
-        self.shape_amplitude = nn.Parameter(torch.zeros(frames, count, 6, device=offsets.device)) if free_shape else None
+        self.shape_amplitude = (
+            nn.Parameter(torch.zeros(frames, count, 6, device=offsets.device))
+            if free_shape
+            else None
+        )
 
     def coefficients(self, frames: Tensor) -> Tensor:
         """Mode coefficients (S, K, 3) [m] of the given frames; zero at frame 0."""
@@ -58,30 +68,45 @@ class ModalMotion(nn.Module):
         """Displacement (S, N, 3) [m] and deformation gradient (S, N, 3, 3)."""
         return self.displaced(self.coefficients(frames), frames, modes)
 
-    def displaced(self, coefficients: Tensor, frames: Tensor, modes: Modes) -> tuple[Tensor, Tensor]:
+    def displaced(
+        self, coefficients: Tensor, frames: Tensor, modes: Modes
+    ) -> tuple[Tensor, Tensor]:
         """The same under other coefficients (S, K, 3) [m], of frames (S,), or (1,) for all of them."""
         shift, gradient = modes.displacement(coefficients)
-        return shift + self.offsets[frames][:, None], gradient + torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        return shift + self.offsets[frames][:, None], gradient + torch.eye(
+            3, dtype=gradient.dtype, device=gradient.device
+        )
 
-    def forward(self, frames: Tensor, splats: Splats, modes: Modes, around: Neighbourhood | None = None) -> MotionSample:
+    def forward(
+        self, frames: Tensor, splats: Splats, modes: Modes, around: Neighbourhood | None = None
+    ) -> MotionSample:
         shift, deformation = self.displacement(frames, modes)
         positions = splats.means + shift
         if self.shape_amplitude is None:
-            return MotionSample(positions, carried_covariance(deformation, splats.scales, splats.rotations), deformation)
+            return MotionSample(
+                positions,
+                carried_covariance(deformation, splats.scales, splats.rotations),
+                deformation,
+            )
         moving = (frames > 0).to(self.turn)[:, None, None]
         shape = modes.values @ (moving * self.shape_amplitude[frames] * self.turn[:, None])
         scales = splats.scales * shape[..., :3].exp()
         half = 0.5 * shape[..., 3:]
         rotations = quaternion_multiply(
-            torch.cat([torch.ones_like(half[..., :1]), half], -1), splats.rotations.expand(len(frames), -1, -1)
+            torch.cat([torch.ones_like(half[..., :1]), half], -1),
+            splats.rotations.expand(len(frames), -1, -1),
         )
         rotations = nn.functional.normalize(rotations, dim=-1)
-        return MotionSample(positions, covariance_from(scales, rotations), deformation, scales, rotations)
+        return MotionSample(
+            positions, covariance_from(scales, rotations), deformation, scales, rotations
+        )
 
 
 def _encoded(x: Tensor, frequencies: int) -> Tensor:
     """x, sin(2^l pi x), cos(2^l pi x), l < frequencies."""
-    angles = torch.pi * x[..., None] * 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
+    angles = (
+        torch.pi * x[..., None] * 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
+    )
     return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
 
 
@@ -132,14 +157,24 @@ class MotionBasisNetwork(nn.Module):
         clock = _encoded(time, self.time_frequencies)[:, None].expand(-1, len(points), -1)
         return self.coefficient(torch.cat([encoded, clock], -1)) @ basis / self.bases
 
-    def forward(self, frames: Tensor, splats: Splats, modes: Modes | None, around: Neighbourhood | None = None) -> MotionSample:
+    def forward(
+        self,
+        frames: Tensor,
+        splats: Splats,
+        modes: Modes | None,
+        around: Neighbourhood | None = None,
+    ) -> MotionSample:
         time = frames[:, None].to(self.centre) / max(1, len(self.offsets) - 1)
         points = (splats.means - self.centre) / self.reach
         raw = self._raw(torch.cat([torch.zeros_like(time[:1]), time]), points)
         raw = raw[1:] - raw[:1]
         positions = splats.means + self.reach * raw[..., :3] + self.offsets[frames][:, None]
         change = raw[..., 3:7] + raw.new_tensor([1.0, 0.0, 0.0, 0.0])
-        rotations = quaternion_multiply(nn.functional.normalize(change, dim=-1), splats.rotations.expand(len(frames), -1, -1))
+        rotations = quaternion_multiply(
+            nn.functional.normalize(change, dim=-1), splats.rotations.expand(len(frames), -1, -1)
+        )
         scales = splats.scales * raw[..., 7:].exp()
         deformation = around.deformation(positions) if around is not None else None
-        return MotionSample(positions, covariance_from(scales, rotations), deformation, scales, rotations)
+        return MotionSample(
+            positions, covariance_from(scales, rotations), deformation, scales, rotations
+        )

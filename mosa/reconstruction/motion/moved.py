@@ -19,7 +19,13 @@ from mosa.reconstruction.motion.informed import informed_motion
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import MotionSample
 from mosa.reconstruction.motion.observed import Windows, object_windows
-from mosa.reconstruction.motion.response import MODES, UNEXPLAINED, Response, image_matrices, response_of
+from mosa.reconstruction.motion.response import (
+    MODES,
+    UNEXPLAINED,
+    Response,
+    image_matrices,
+    response_of,
+)
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import turned_basis
@@ -38,7 +44,9 @@ class MovingParts:
     splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both fits.
     """
 
-    def __init__(self, scene: Scene, splats: Splats, static: Splats, settings: ReconstructionSettings) -> None:
+    def __init__(
+        self, scene: Scene, splats: Splats, static: Splats, settings: ReconstructionSettings
+    ) -> None:
         self.scene, self.splats, self.static, self.settings = scene, splats, static, settings
 
     @cached_property
@@ -47,14 +55,20 @@ class MovingParts:
         scene = self.scene
         views, frames = scene.training_cameras, scene.training_frames
         cameras = scene.cameras.select(views)
-        found = list(threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames))
+        found = list(
+            threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames)
+        )
         return torch.stack(found).to(self.splats.means)
 
     @cached_property
     def scaffold(self) -> Scaffold:
         """The particles, with the modes at them."""
         around = neighbourhood(self.splats.means, neighbours=self.settings.neighbours)
-        return Scaffold(self.splats, deformation_modes(self.splats.means, around, count=self.settings.dynamic.modes), around)
+        return Scaffold(
+            self.splats,
+            deformation_modes(self.splats.means, around, count=self.settings.dynamic.modes),
+            around,
+        )
 
     @cached_property
     def carried(self) -> Scaffold:
@@ -76,7 +90,12 @@ class MovingParts:
 
 
 def first_motion(
-    parts: MovingParts, windows: Windows, background: Tensor, seed: int, bar: Callable[[str, int], tqdm], cache: StageCache
+    parts: MovingParts,
+    windows: Windows,
+    background: Tensor,
+    seed: int,
+    bar: Callable[[str, int], tqdm],
+    cache: StageCache,
 ) -> dict[str, Tensor]:
     """Positions, covariances and, where free, shapes of the particles in every training frame."""
     dynamic, splats = parts.settings.dynamic, parts.splats
@@ -97,10 +116,18 @@ def first_motion(
     return {name: value.cpu() for name, value in result.items()}
 
 
-def cues_of(motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings) -> MotionCues:
+def cues_of(
+    motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings
+) -> MotionCues:
     """Cues of a reconstructed motion, relative to `splats`, where it starts."""
     if settings.cue == "gaussian":
-        return gaussian_cues(motion["positions"], motion["covariances"], splats, motion["scales"], motion["rotations"])
+        return gaussian_cues(
+            motion["positions"],
+            motion["covariances"],
+            splats,
+            motion["scales"],
+            motion["rotations"],
+        )
     around = neighbourhood(splats.means, neighbours=settings.neighbours)
     return neighbourhood_cues(motion["positions"], motion["covariances"], around)
 
@@ -136,23 +163,52 @@ class SecondLook:
         is no guide to the images, or where what they keep cannot be told.
 
         first_contact: index of the first frame after it: until then predictions do not differ."""
-        seen, scene, parts, settings = self._seen(seen), self.scene, self.reconstruction.moving, self.settings.informed
+        seen, scene, parts, settings = (
+            self._seen(seen),
+            self.scene,
+            self.reconstruction.moving,
+            self.settings.informed,
+        )
         windows = self._windows()
         found = self._found(predicted, seen, windows)
         if found is None:
             return self.cues(seen), None
         positions, about = found
-        second = self._found(other, seen, windows) if settings.response and first_contact < len(positions) else None
+        second = (
+            self._found(other, seen, windows)
+            if settings.response and first_contact < len(positions)
+            else None
+        )
         if second is None:
             return self.cues(positions), None
         frames = len(positions) - 1
-        with tqdm(total=frames, desc=f"what images of {scene.sequence} tell", disable=not self.progress, leave=False) as steps:
-            matrices = image_matrices(parts.scaffold, self._carried, windows, parts.centres, self._background(), positions,
-                                      reach=parts.reach, views=settings.response, progress=steps.update)
-        response, strength, left = response_of(parts.scaffold.modes, matrices, about, positions, second[1], second[0],
-                                               first_contact)
-        log.info("motion of %s: what holds it where images tell little is %.3g of what they tell in the median direction; that "
-                 "explains %.0f%% of what another prediction changed", scene.sequence, strength, 100 * (1 - left))
+        with tqdm(
+            total=frames,
+            desc=f"what images of {scene.sequence} tell",
+            disable=not self.progress,
+            leave=False,
+        ) as steps:
+            matrices = image_matrices(
+                parts.scaffold,
+                self._carried,
+                windows,
+                parts.centres,
+                self._background(),
+                positions,
+                reach=parts.reach,
+                views=settings.response,
+                progress=steps.update,
+            )
+        response, strength, left = response_of(
+            parts.scaffold.modes, matrices, about, positions, second[1], second[0], first_contact
+        )
+        log.info(
+            "motion of %s: what holds it where images tell little is %.3g of what they tell in the median direction; that "
+            "explains %.0f%% of what another prediction changed",
+            scene.sequence,
+            strength,
+            100 * (1 - left),
+        )
         return self.cues(positions), response if left < UNEXPLAINED else None
 
     def response(self, written: dict[str, Tensor] | None) -> Response | None:
@@ -164,8 +220,10 @@ class SecondLook:
         found = {name: tuple(written[name].shape) for name in ("about", "share")}
         expected = {"about": (T, N, 3), "share": (T, 3 * K, 3 * K)}
         if found != expected:
-            raise ConfigError(f"ckpt_path: expected mosa.responses of shapes {expected}, found {found}: the checkpoint belongs to "
-                              "another sequence")
+            raise ConfigError(
+                f"ckpt_path: expected mosa.responses of shapes {expected}, found {found}: the checkpoint belongs to "
+                "another sequence"
+            )
         about, share = (written[name].to(modes.values) for name in ("about", "share"))
         return Response(about, share, modes.values[:, :K], modes.gradient[..., :K])
 
@@ -179,30 +237,47 @@ class SecondLook:
             return parts.carried
         appearance = appearance.to(self.device)
         splats, seen = appearance.splats, self._seen(None)
-        turns = turned_basis(appearance.normals, bind(splats.means, parts.splats.means).carry(seen).rotations)
-        return Scaffold(splats, parts.scaffold.modes.at(splats.means, parts.splats.means), shades=(turns @ appearance.light).exp())
+        turns = turned_basis(
+            appearance.normals, bind(splats.means, parts.splats.means).carry(seen).rotations
+        )
+        return Scaffold(
+            splats,
+            parts.scaffold.modes.at(splats.means, parts.splats.means),
+            shades=(turns @ appearance.light).exp(),
+        )
 
     def _seen(self, seen: Tensor | None) -> Tensor:
-        return (self.reconstruction.cues.positions if seen is None else seen).to(self.reconstruction.moving.centres)
+        return (self.reconstruction.cues.positions if seen is None else seen).to(
+            self.reconstruction.moving.centres
+        )
 
     def _windows(self) -> Windows:
         scene = self.scene
-        return object_windows(scene, scene.training_cameras, scene.training_frames, margin=self.settings.margin).to(self.device)
+        return object_windows(
+            scene, scene.training_cameras, scene.training_frames, margin=self.settings.margin
+        ).to(self.device)
 
     def _background(self) -> Tensor:
         return self.scene.background.to(self.reconstruction.moving.centres)
 
-    def _found(self, predicted: Tensor, seen: Tensor, windows: Windows) -> tuple[Tensor, Tensor] | None:
+    def _found(
+        self, predicted: Tensor, seen: Tensor, windows: Windows
+    ) -> tuple[Tensor, Tensor] | None:
         """(positions, the shapes that they were sought from), (T, N, 3) [m] each; None where the prediction is no guide."""
         parts, settings, sequence = self.reconstruction.moving, self.settings, self.scene.sequence
         title = f"motion of {sequence} about the prediction"
-        with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
+        with tqdm(
+            total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False
+        ) as steps:
             found = informed_motion(parts.scaffold, self._carried, windows, parts.centres, self._background(),
                                     predicted.to(seen), seen, settings.informed, settings.dynamic, reach=parts.reach,
                                     seed=self.seed, judging=parts.carried, progress=steps.update)  # fmt: skip
         if found is None:
-            log.warning("reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
-                        "motion stays", sequence)
+            log.warning(
+                "reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
+                "motion stays",
+                sequence,
+            )
             return None
         with torch.no_grad():
             return parts.sample(found[0]).positions, found[1]
@@ -210,6 +285,11 @@ class SecondLook:
     def cues(self, positions: Tensor) -> MotionCues:
         """Of positions (T, N, 3) [m] that `about` found, for instance those in a checkpoint."""
         splats = self.reconstruction.splats.to(self.device)
-        around, positions = neighbourhood(splats.means, neighbours=self.settings.neighbours), positions.to(splats.means)
-        covariances = carried_covariance(around.deformation(positions), splats.scales, splats.rotations)
+        around, positions = (
+            neighbourhood(splats.means, neighbours=self.settings.neighbours),
+            positions.to(splats.means),
+        )
+        covariances = carried_covariance(
+            around.deformation(positions), splats.scales, splats.rotations
+        )
         return neighbourhood_cues(positions, covariances, around)

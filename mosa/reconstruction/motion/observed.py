@@ -39,7 +39,11 @@ class Windows:
 
     def to(self, device: torch.device | str) -> Windows:
         return Windows(
-            self.images.to(device), self.mattes.to(device), self.cameras.to(device), self.view.to(device), self.frame.to(device)
+            self.images.to(device),
+            self.mattes.to(device),
+            self.cameras.to(device),
+            self.view.to(device),
+            self.frame.to(device),
         )
 
 
@@ -55,7 +59,9 @@ def _overlap(start: int, size: int, limit: int) -> tuple[slice, slice]:
     return slice(low, high), slice(low - start, high - start)
 
 
-def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin: int = 6, multiple: int = 8) -> Windows:
+def object_windows(
+    scene: Scene, views: list[int], frames: list[int], *, margin: int = 6, multiple: int = 8
+) -> Windows:
     """Windows around the mattes of the given views and frames, `margin` px wider on each side, sides a multiple of `multiple`.
 
     A window may reach beyond the image: there it shows the background and an empty matte.
@@ -88,5 +94,11 @@ def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin:
     K = scene.cameras.K[view].clone()
     K[:, 0, 2] -= x0
     K[:, 1, 2] -= y0
-    cameras = Cameras(K, scene.cameras.w2c[view], width, height, tuple(scene.cameras.names[v] for v in view.tolist()))
+    cameras = Cameras(
+        K,
+        scene.cameras.w2c[view],
+        width,
+        height,
+        tuple(scene.cameras.names[v] for v in view.tolist()),
+    )
     return Windows(images, cut, cameras, view, frame)

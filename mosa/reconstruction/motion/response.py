@@ -71,7 +71,9 @@ class Response:
         c = self.coefficients(positions.to(self.values), frame)
         return torch.einsum("nk,...kd->...nd", self.values, c).to(positions)
 
-    def seen(self, positions: Tensor, deformation: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    def seen(
+        self, positions: Tensor, deformation: Tensor, rotation: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) of a motion as it would have been found.
 
         rotation: (3, 3) that the sequence started with: the modes' gradients are relative to the pose of its frame 0."""
@@ -122,7 +124,9 @@ def image_matrices(
 
     def some_of(colour: Tensor, alpha: Tensor) -> Tensor:
         values = torch.cat([colour, alpha[..., None]], -1).flatten(1)
-        return values[:, :: 2 * (values.shape[1] // (2 * VALUES)) + 1]  # an odd step meets all four channels
+        return values[
+            :, :: 2 * (values.shape[1] // (2 * VALUES)) + 1
+        ]  # an odd step meets all four channels
 
     for frame in range(1, len(offsets)):
         at = torch.tensor([frame], device=device)
@@ -135,7 +139,12 @@ def image_matrices(
             window = own.select(torch.tensor([view], device=device))
             base = images(here, at, window)
             weight = ((base - some_of(window.images, window.mattes)).abs() + ABSOLUTE).rsqrt()
-            J = torch.cat([(images(here + STEP * some, at, window) - base) / STEP for some in directions.split(TOGETHER)])
+            J = torch.cat(
+                [
+                    (images(here + STEP * some, at, window) - base) / STEP
+                    for some in directions.split(TOGETHER)
+                ]
+            )
             J = J * weight
             H += (J @ J.T).double() / J.shape[1] / len(chosen)
         matrices.append(H)
@@ -160,23 +169,35 @@ def responses(matrices: Tensor, energies: Tensor) -> tuple[Callable[[float], Ten
     return share, unit
 
 
-def measured(share: Callable[[float], Tensor], unit: float, moved: Tensor, followed: Tensor) -> tuple[float, float]:
+def measured(
+    share: Callable[[float], Tensor], unit: float, moved: Tensor, followed: Tensor
+) -> tuple[float, float]:
     """(a, share of the squares that it leaves unexplained) under which U explains how what was found moved when its prediction did.
 
     moved, followed: (T, D) [m] changes of the predictions' and of the found motions' coefficients, of frames with contact."""
 
     def left(a: float) -> float:
         explained = torch.einsum("tij,tj->ti", share(a)[-len(moved) :], moved)
-        return float((followed - explained).square().sum() / followed.square().sum().clamp(min=1e-30))
+        return float(
+            (followed - explained).square().sum() / followed.square().sum().clamp(min=1e-30)
+        )
 
-    tried = (unit * torch.logspace(*(torch.tensor(SHARES).log10().tolist()), 51, dtype=torch.float64)).tolist()
+    tried = (
+        unit * torch.logspace(*(torch.tensor(SHARES).log10().tolist()), 51, dtype=torch.float64)
+    ).tolist()
     costs = [left(a) for a in tried]
     best = min(range(len(tried)), key=costs.__getitem__)
     return tried[best], costs[best]
 
 
 def response_of(
-    modes: Modes, matrices: Tensor, about: Tensor, found: Tensor, other_about: Tensor, other_found: Tensor, first_contact: int
+    modes: Modes,
+    matrices: Tensor,
+    about: Tensor,
+    found: Tensor,
+    other_about: Tensor,
+    other_found: Tensor,
+    first_contact: int,
 ) -> tuple[Response, float, float]:
     """(the response, a over its unit, what it leaves unexplained) of a motion `found` about a prediction, from the one that was
     found about another; all (T, N, 3) [m]. matrices: `image_matrices`. Until first contact predictions do not differ."""

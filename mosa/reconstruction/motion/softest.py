@@ -32,12 +32,18 @@ def cosines(points: Tensor, count: int) -> Tensor:
     side = min(side, count + 1)
     number = torch.cartesian_prod(*[torch.arange(side, device=points.device)] * 3)
     number = number[((number / size) ** 2).sum(1).argsort(stable=True)[1 : count + 1]]
-    waves = [torch.cos(torch.pi * number[:, a] * ((points[:, a] - low[a]) / size[a])[:, None]) for a in range(3)]
+    waves = [
+        torch.cos(torch.pi * number[:, a] * ((points[:, a] - low[a]) / size[a])[:, None])
+        for a in range(3)
+    ]
     return waves[0] * waves[1] * waves[2]
 
 
 def _on(matrix: sparse.csr_matrix, like: Tensor, dtype: torch.dtype) -> Tensor:
-    parts = (torch.as_tensor(a.astype(np.int64), device=like.device) for a in (matrix.indptr, matrix.indices))
+    parts = (
+        torch.as_tensor(a.astype(np.int64), device=like.device)
+        for a in (matrix.indptr, matrix.indices)
+    )
     values = torch.as_tensor(matrix.data, dtype=dtype, device=like.device)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
@@ -55,7 +61,13 @@ def largest_eigenvalue(matrix: Tensor, *, steps: int = 15, block: int = 8) -> fl
 
 
 def chebyshev_filter(
-    matrix: sparse.csr_matrix, X: Tensor, low: float, high: float, softest: float, amplification: float, dtype: torch.dtype
+    matrix: sparse.csr_matrix,
+    X: Tensor,
+    low: float,
+    high: float,
+    softest: float,
+    amplification: float,
+    dtype: torch.dtype,
 ) -> Tensor:
     """Vectors (N, k) times a polynomial of the matrix that is small from eigenvalue `low` to `high` and 1 at `softest`, of the
     degree that brings the amplification. Computed in dtype, returned as X is."""
@@ -72,7 +84,9 @@ def chebyshev_filter(
     return now.to(X)
 
 
-def softest_vectors(matrix: sparse.csr_matrix, points: Tensor, known: Tensor, count: int) -> tuple[Tensor, Tensor] | None:
+def softest_vectors(
+    matrix: sparse.csr_matrix, points: Tensor, known: Tensor, count: int
+) -> tuple[Tensor, Tensor] | None:
     """Eigenvalues (count,) in ascending order and orthonormal eigenvectors (N, count), float64, that are orthogonal to `known`.
 
     matrix: (N, N) symmetric, no eigenvalue below 0; points: (N, 3), over which the vectors are smooth; known: (N, k) orthonormal
@@ -85,7 +99,9 @@ def softest_vectors(matrix: sparse.csr_matrix, points: Tensor, known: Tensor, co
         return None
     A = _on(matrix, known, torch.float64)
     high = 1.1 * largest_eigenvalue(A)
-    limit = count + 2 * (last - count) // 3  # the very last ones converge slowest: what lies above is suppressed
+    limit = (
+        count + 2 * (last - count) // 3
+    )  # the very last ones converge slowest: what lies above is suppressed
     X = cosines(points.double(), last)
     for _ in range(MOST_FILTERS):
         X, _ = torch.linalg.qr(X - known @ (known.T @ X))

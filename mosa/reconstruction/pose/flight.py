@@ -45,7 +45,9 @@ class Motion:
         return replace(views, cameras=replace(views.cameras, w2c=w2c))
 
 
-def _sampled(image: Tensor, points: Tensor, K: Tensor, w2c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sampled(
+    image: Tensor, points: Tensor, K: Tensor, w2c: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Values (N, C) of an image at projected points, the points in the camera's frame (N, 3), and x/z, y/z (N, 2)."""
     seen = points @ w2c[:3, :3].T + w2c[:3, 3]
     flat = seen[:, :2] / seen[:, 2:]
@@ -76,14 +78,21 @@ def _channels(views: Windows, sigma: float) -> Tensor:
     return torch.cat([found[:, :3], found[:, 9:], found[:, 3:6], columns, found[:, 6:9], rows], 1)
 
 
-def follow_rigidly(first: Windows, other: Windows, points: list[Tensor], start: Motion) -> tuple[Motion, float]:
+def follow_rigidly(
+    first: Windows, other: Windows, points: list[Tensor], start: Motion
+) -> tuple[Motion, float]:
     """Motion from the first windows to others of the same cameras, and the root mean square difference of colour and matte that
     is left; points: of each window, as seen in `first`. Gauss-Newton on six numbers, coarse to fine, with robust weights."""
     motion, left = start, float("inf")
     radius = float(torch.cat(points).sub(start.centre).norm(dim=1).mean())
     for sigma in BLURS:
         before, after = _channels(first, sigma), _channels(other, sigma)
-        matrix, vector, total, count = torch.zeros(6, 6).to(start.centre), torch.zeros(6).to(start.centre), 0.0, 0.0
+        matrix, vector, total, count = (
+            torch.zeros(6, 6).to(start.centre),
+            torch.zeros(6).to(start.centre),
+            0.0,
+            0.0,
+        )
         for b, own in enumerate(points):
             wanted = _sampled(before[b], own, first.cameras.K[b], first.cameras.w2c[b])[0][:, :4]
             moved = motion.points(own)
@@ -92,14 +101,19 @@ def follow_rigidly(first: Windows, other: Windows, points: list[Tensor], start: 
             residual = found[:, :4] - wanted
             slope = torch.stack([found[:, 4:8] * K[0, 0], found[:, 8:12] * K[1, 1]], -1)
             depth = -(slope * flat[:, None]).sum(-1, keepdim=True)
-            pull = torch.cat([slope, depth], -1) / seen[:, 2:, None] @ w2c[:3, :3]  # (N, 4, 3) by a shift of the point
+            pull = (
+                torch.cat([slope, depth], -1) / seen[:, 2:, None] @ w2c[:3, :3]
+            )  # (N, 4, 3) by a shift of the point
             arm = moved - motion.centre - motion.shift
             turned = torch.linalg.cross(arm[:, None].expand_as(pull), pull) / radius
             J = torch.cat([pull, turned], -1)
             weight = 1 / (1 + residual.square().sum(1) / 0.03)
             matrix += torch.einsum("n,nci,ncj->ij", weight, J, J)
             vector += torch.einsum("n,nci,nc->i", weight, J, residual)
-            total, count = total + float((weight * residual.square().mean(1)).sum()), count + float(weight.sum())
+            total, count = (
+                total + float((weight * residual.square().mean(1)).sum()),
+                count + float(weight.sum()),
+            )
         damping = 1e-4 * matrix.diagonal().mean() * torch.eye(6).to(matrix)
         step = -torch.linalg.solve((matrix + damping).double(), vector.double()).to(vector)
         turn = rotation_exp(step[3:] / radius)
@@ -113,7 +127,7 @@ def free_motions(scene: Scene, distance: Volume, frames: list[Windows]) -> list[
     any device; distance: of the body in frame 0, negative inside [m].
 
     A frame is free where the scene says so; else where the moved body ends above the ground, falls as the frames before it say,
-    to a pixel, and looks as rigid as it did in frame 1. Of two frames or less nothing is known but the ground. """
+    to a pixel, and looks as rigid as it did in frame 1. Of two frames or less nothing is known but the ground."""
     device = distance.values.device
     up, gravity = scene.up.to(device), scene.gravity.to(device)
     points = visible_points(distance, frames[0])
@@ -121,7 +135,9 @@ def free_motions(scene: Scene, distance: Volume, frames: list[Windows]) -> list[
     centre, width = everywhere.mean(0), pixel_width(distance, frames[0])
     times = (scene.times - scene.times[0]).tolist()
     views = scene.training_cameras
-    centres = matte_centres(scene.mattes[views][:, : len(frames)], scene.cameras.select(views)).to(device)
+    centres = matte_centres(scene.mattes[views][:, : len(frames)], scene.cameras.select(views)).to(
+        device
+    )
     motions, first_left = [], float("inf")
     velocity = None
     for t in range(1, len(frames)):
@@ -129,7 +145,9 @@ def free_motions(scene: Scene, distance: Volume, frames: list[Windows]) -> list[
             break
         start = Motion(torch.eye(3, device=device), centres[t] - centres[0], centre)
         if velocity is not None:
-            start = Motion(motions[-1].rotation, velocity * times[t] + 0.5 * gravity * times[t] ** 2, centre)
+            start = Motion(
+                motions[-1].rotation, velocity * times[t] + 0.5 * gravity * times[t] ** 2, centre
+            )
         ground = scene.ground.height if scene.ground is not None else -float("inf")
         if float((start.points(everywhere) @ up).min()) < ground:
             break

@@ -39,7 +39,9 @@ def spread_rotations(count: int) -> Tensor:
     t = s / count
     alpha, beta = 2 * torch.pi * s / 2**0.5, 2 * torch.pi * s / 1.533751168755204288118041
     r, q = t.sqrt(), (1 - t).sqrt()
-    return quaternion_to_matrix(torch.stack((r * alpha.sin(), r * alpha.cos(), q * beta.sin(), q * beta.cos()), -1)).float()
+    return quaternion_to_matrix(
+        torch.stack((r * alpha.sin(), r * alpha.cos(), q * beta.sin(), q * beta.cos()), -1)
+    ).float()
 
 
 def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
@@ -54,7 +56,12 @@ def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
     u = (mattes.sum(2) @ x) / area.clamp(min=1e-6)
     v = (mattes.sum(3) @ y) / area.clamp(min=1e-6)
     border = torch.stack(
-        (mattes[:, :, 0].amax(-1), mattes[:, :, -1].amax(-1), mattes[..., 0].amax(-1), mattes[..., -1].amax(-1))
+        (
+            mattes[:, :, 0].amax(-1),
+            mattes[:, :, -1].amax(-1),
+            mattes[..., 0].amax(-1),
+            mattes[..., -1].amax(-1),
+        )
     )
     seen = area > 0
     whole = seen & (border.amax(0) < 0.5)
@@ -65,10 +72,17 @@ def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
                 f"frame {t}: {int(number)} of {len(cameras)} views have a matte of the object, at least 2 are needed"
             )
     K, R = cameras.K.to(mattes), cameras.w2c[:, :3, :3].to(mattes)
-    directions = torch.linalg.solve(K[:, None], torch.stack((u, v, torch.ones_like(u)), -1)[..., None])[..., 0] @ R
+    directions = (
+        torch.linalg.solve(K[:, None], torch.stack((u, v, torch.ones_like(u)), -1)[..., None])[
+            ..., 0
+        ]
+        @ R
+    )
     directions = directions / directions.norm(dim=-1, keepdim=True)
     origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:].to(mattes))[..., 0]
-    P = use[..., None, None] * (torch.eye(3).to(mattes) - directions[..., None] * directions[..., None, :])
+    P = use[..., None, None] * (
+        torch.eye(3).to(mattes) - directions[..., None] * directions[..., None, :]
+    )
     return torch.linalg.solve(P.sum(0), (P @ origins[:, None, :, None]).sum(0))[..., 0]
 
 
@@ -78,7 +92,13 @@ def choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 def refine(
-    body: RigidBody, level: Level, poses: Poses, background: Tensor, *, iterations: int, central: bool = False
+    body: RigidBody,
+    level: Level,
+    poses: Poses,
+    background: Tensor,
+    *,
+    iterations: int,
+    central: bool = False,
 ) -> tuple[Poses, Tensor]:
     """Each of K poses after a few Levenberg-Marquardt steps, with its cost (K,)."""
     frame = torch.zeros(len(poses.center), dtype=torch.long, device=poses.center.device)
@@ -91,17 +111,24 @@ def refine(
         else:
             better = found[0] < state[0]
             damping = torch.where(better, damping / 3, damping * 6)
-            best = Poses(choose(better, trial.rotation, best.rotation), choose(better, trial.center, best.center))
+            best = Poses(
+                choose(better, trial.rotation, best.rotation),
+                choose(better, trial.center, best.center),
+            )
             state = tuple(choose(better, new, old) for new, old in zip(found, state))
         step = damped(state[1], state[2], damping)
-        step = step * (0.6 * body.radius / step.norm(dim=-1, keepdim=True).clamp(min=1e-12)).clamp(max=1)
+        step = step * (0.6 * body.radius / step.norm(dim=-1, keepdim=True).clamp(min=1e-12)).clamp(
+            max=1
+        )
         trial = best.moved(step[:, :3], step[:, 3:] / body.radius)
         if float(step.norm(dim=-1).max()) < 2e-3 * level.pixel:
             break
     return best, state[0]
 
 
-def coarse_poses(body: RigidBody, level: Level, center: Tensor, background: Tensor, rotations: int, keep: int) -> Poses:
+def coarse_poses(
+    body: RigidBody, level: Level, center: Tensor, background: Tensor, rotations: int, keep: int
+) -> Poses:
     """The `keep` best of many rotations, each placed so that its rendered mattes' centre meets that of the real
     ones."""
     R = spread_rotations(rotations).to(center)
@@ -109,7 +136,9 @@ def coarse_poses(body: RigidBody, level: Level, center: Tensor, background: Tens
     seen = body.render(poses, level.cameras, background)
     centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras)
     poses = Poses(R, center + center - centres)
-    cost = huber(body.render(poses, level.cameras, background) - level.target)[0].flatten(1).mean(-1)
+    cost = (
+        huber(body.render(poses, level.cameras, background) - level.target)[0].flatten(1).mean(-1)
+    )
     return poses.take(cost.argsort()[:keep])
 
 
@@ -126,11 +155,23 @@ RELIT = (0, 2)
 
 
 def refine_lit(
-    body: RigidBody, level: Level, pose: Poses, before: Tensor, background: Tensor, *, iterations: int = 8, moves: bool = True
+    body: RigidBody,
+    level: Level,
+    pose: Poses,
+    before: Tensor,
+    background: Tensor,
+    *,
+    iterations: int = 8,
+    moves: bool = True,
 ) -> tuple[Poses, Tensor]:
     """One pose and its light (8,), fitted together by Levenberg-Marquardt steps from the light `before`; moves: whether the pose is
     fitted too, or known. body: with normals."""
-    best, trial, state, damping = (pose, before), (pose, before), None, torch.full((1,), 1e-3).to(before)
+    best, trial, state, damping = (
+        (pose, before),
+        (pose, before),
+        None,
+        torch.full((1,), 1e-3).to(before),
+    )
     for i in range(iterations):
         if i in RELIT:
             columns = light_columns(body, level, *trial, background)
@@ -155,11 +196,17 @@ def light_of(
     """The light (8,) under which a body in a known pose (Q, x_c) looks as one frame shows it, from its colours at rest. normals:
     (N, 3) at rest; before: (8,) what is known of the light; the rest as of `register_pose`."""
     body = RigidBody.of(splats, rest_center, normals)
-    images, mattes, cameras = images[:, None].to(body.arm), mattes[:, None].to(body.arm), cameras.to(body.arm.device)
+    images, mattes, cameras = (
+        images[:, None].to(body.arm),
+        mattes[:, None].to(body.arm),
+        cameras.to(body.arm.device),
+    )
     Q, center = (x.to(body.arm) for x in pose)
     level = make_level(images, mattes, cameras, center, None)
     before = torch.zeros(LIGHT).to(body.arm) if before is None else before.to(body.arm)
-    return refine_lit(body, level, Poses(Q[None], center[None]), before, background.to(body.arm), moves=False)[1]
+    return refine_lit(
+        body, level, Poses(Q[None], center[None]), before, background.to(body.arm), moves=False
+    )[1]
 
 
 def register_pose(
@@ -185,13 +232,17 @@ def register_pose(
     at about 56 px, the best at full resolution with all views. Errors: DataError where fewer than two views see the
     object.
     """
-    middle = splats.means.detach().mean(0)  # about which the body turns while searching, wherever X_c is
+    middle = splats.means.detach().mean(
+        0
+    )  # about which the body turns while searching, wherever X_c is
     body = RigidBody.of(splats, middle, normals)
     background = background.to(body.arm)
     images, mattes = images[:, None].to(body.arm), mattes[:, None].to(body.arm)
     cameras = cameras.to(body.arm.device)
     center = matte_centres(mattes, cameras)[0]
-    some = torch.linspace(0, len(cameras) - 1, min(coarse_views, len(cameras))).round().long().tolist()
+    some = (
+        torch.linspace(0, len(cameras) - 1, min(coarse_views, len(cameras))).round().long().tolist()
+    )
     thin = body.thinned(400, seed)
     level = make_level(images[some], mattes[some], cameras.select(some), center, 28)
     poses = coarse_poses(thin, level, center, background, rotations, starts)
@@ -208,7 +259,9 @@ def register_pose(
         before = torch.zeros(LIGHT).to(body.arm) if light is None else light.to(body.arm)
         best, found = refine_lit(body, level, best, before, background)
     Q = best.rotation[0]
-    return Registered(Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm)), found)
+    return Registered(
+        Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm)), found
+    )
 
 
 def distinct(poses: Poses, cost: Tensor, count: int, *, degrees: float = 5.0) -> Tensor:
@@ -229,7 +282,9 @@ def flight(pose: Poses, motion: Tensor, times: Tensor, gravity: Tensor) -> Poses
     shift, angle, velocity, spin = motion.view(4, 3)
     start = pose.moved(shift[None], angle[None])
     t = times[:, None]
-    return Poses(rotation_exp(spin * t) @ start.rotation, start.center + velocity * t + 0.5 * gravity * t**2)
+    return Poses(
+        rotation_exp(spin * t) @ start.rotation, start.center + velocity * t + 0.5 * gravity * t**2
+    )
 
 
 def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
@@ -266,7 +321,9 @@ def initial_velocity(
     Errors: DataError for fewer than two frames or views.
     """
     if images.shape[1] < 2:
-        raise DataError(f"initial velocity: {images.shape[1]} frame of free flight, at least 2 are needed")
+        raise DataError(
+            f"initial velocity: {images.shape[1]} frame of free flight, at least 2 are needed"
+        )
     body = RigidBody.of(splats, rest_center)
     background, gravity = background.to(body.arm), gravity.to(body.arm)
     times = (times - times[0]).to(body.arm)
@@ -279,7 +336,17 @@ def initial_velocity(
     for target_px, iterations in ((40, 8), (None, 6))[: 2 if exact else 1]:
         level = make_level(images, mattes, cameras, start.center[0], target_px)
         last = target_px is None
-        motion = fit_flight(body, level, start, motion, times, gravity, background, iterations=iterations, central=last)
+        motion = fit_flight(
+            body,
+            level,
+            start,
+            motion,
+            times,
+            gravity,
+            background,
+            iterations=iterations,
+            central=last,
+        )
     return motion[6:9], motion[9:]
 
 
@@ -301,7 +368,9 @@ def fit_flight(
     best, trial, state = motion, motion, None
     for _ in range(iterations):
         poses = flight(start, trial, times, gravity)
-        cost, gradient, matrix = normal_equations(body, level, poses, background, frame, central=central)
+        cost, gradient, matrix = normal_equations(
+            body, level, poses, background, frame, central=central
+        )
         J = flight_jacobian(trial, times, body.radius)
         new = (
             cost.sum(),
@@ -314,7 +383,13 @@ def fit_flight(
             damping = damping * 6
         step = damped(state[1][None], state[2][None], damping)[0]
         trial = best + step
-        moved = torch.stack((step[:3].norm(), step[6:9].norm() * times[-1], step[9:].norm() * times[-1] * body.radius)).max()
+        moved = torch.stack(
+            (
+                step[:3].norm(),
+                step[6:9].norm() * times[-1],
+                step[9:].norm() * times[-1] * body.radius,
+            )
+        ).max()
         if float(moved) < 2e-3 * level.pixel:
             break
     return best

@@ -73,7 +73,9 @@ class RigidBody:
     @staticmethod
     def of(splats: Splats, rest_center: Tensor, normals: Tensor | None = None) -> RigidBody:
         arm = splats.means.detach().float() - rest_center.to(splats.means).float()
-        covariances = covariance_from(splats.scales.detach().float(), splats.rotations.detach().float())
+        covariances = covariance_from(
+            splats.scales.detach().float(), splats.rotations.detach().float()
+        )
         radius = float(arm.square().sum(-1).mean().sqrt())
         return RigidBody(arm, covariances, splats.opacities.detach().float(), splats.colors.detach().float(), radius,
                          None if normals is None else normals.to(arm))  # fmt: skip
@@ -87,7 +89,9 @@ class RigidBody:
         total = len(self.arm)
         if total <= count:
             return self
-        index = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:count].to(self.arm.device)
+        index = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:count].to(
+            self.arm.device
+        )
         swell = (total / count) ** (2 / 3)
         return RigidBody(
             self.arm[index], swell * self.covariances[index], self.opacities[index], self.colors[index], self.radius,
@@ -104,9 +108,13 @@ class RigidBody:
             R, c = poses.rotation[k : k + chunk], poses.center[k : k + chunk]
             means = self.arm @ R.transpose(1, 2) + c[:, None]
             covariances = R[:, None] @ self.covariances @ R[:, None].transpose(-1, -2)
-            batch = replace(cameras, K=cameras.K.repeat(len(R), 1, 1), w2c=cameras.w2c.repeat(len(R), 1, 1))
+            batch = replace(
+                cameras, K=cameras.K.repeat(len(R), 1, 1), w2c=cameras.w2c.repeat(len(R), 1, 1)
+            )
             index = torch.arange(len(R), device=c.device).repeat_interleave(views)
-            image, alpha = rasterize(means, covariances, self.opacities, self.colors[None], batch, index, background)
+            image, alpha = rasterize(
+                means, covariances, self.opacities, self.colors[None], batch, index, background
+            )
             parts.append(torch.cat((image, alpha[..., None]), -1).unflatten(0, (len(R), views)))
         return torch.cat(parts)
 
@@ -128,7 +136,9 @@ def left_jacobian(v: Tensor) -> Tensor:
     return torch.eye(3).to(S) + a * S + b * (S @ S)
 
 
-def make_level(images: Tensor, mattes: Tensor, cameras: Cameras, center: Tensor, target_px: float | None) -> Level:
+def make_level(
+    images: Tensor, mattes: Tensor, cameras: Cameras, center: Tensor, target_px: float | None
+) -> Level:
     """Images (V, T, H, W, 3) and mattes (V, T, H, W) cut to the object, its window reduced to about `target_px`
     (None: kept)."""
     margin = round(0.12 * max(crop_boxes(mattes, margin=0)[2:])) + 2
@@ -154,10 +164,14 @@ def make_level(images: Tensor, mattes: Tensor, cameras: Cameras, center: Tensor,
 def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
     """Cost and weight of residuals."""
     size = residual.abs()
-    return torch.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)), HUBER / size.clamp(min=HUBER)
+    return torch.where(
+        size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)
+    ), HUBER / size.clamp(min=HUBER)
 
 
-def pose_columns(body: RigidBody, level: Level, poses: Poses, background: Tensor, *, central: bool) -> tuple[Tensor, Tensor]:
+def pose_columns(
+    body: RigidBody, level: Level, poses: Poses, background: Tensor, *, central: bool
+) -> tuple[Tensor, Tensor]:
     """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle times the body's radius [m].
 
     One-sided differences (`central` false) cost half and move the optimum a little: good enough on the way, not at the end."""
@@ -165,9 +179,16 @@ def pose_columns(body: RigidBody, level: Level, poses: Poses, background: Tensor
     sides = (torch.zeros(1, 6), torch.eye(6), -torch.eye(6))[: 3 if central else 2]
     steps = h * torch.cat(sides).to(poses.center)
     shift, angle = steps[:, :3].repeat(count, 1), steps[:, 3:].repeat(count, 1) / body.radius
-    around = Poses(poses.rotation.repeat_interleave(len(steps), 0), poses.center.repeat_interleave(len(steps), 0))
-    seen = body.render(around.moved(shift, angle), level.cameras, background).view(count, len(steps), -1)
-    return seen[:, 0], (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (seen[:, 1:] - seen[:, :1]) / h
+    around = Poses(
+        poses.rotation.repeat_interleave(len(steps), 0),
+        poses.center.repeat_interleave(len(steps), 0),
+    )
+    seen = body.render(around.moved(shift, angle), level.cameras, background).view(
+        count, len(steps), -1
+    )
+    return seen[:, 0], (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (
+        seen[:, 1:] - seen[:, :1]
+    ) / h
 
 
 def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -175,11 +196,21 @@ def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor
     weighted by Huber's rule."""
     cost, weight = huber(residual)
     weighted = columns * weight[:, None]
-    return cost.sum(-1), (weighted @ residual[..., None])[..., 0], weighted @ columns.transpose(1, 2)
+    return (
+        cost.sum(-1),
+        (weighted @ residual[..., None])[..., 0],
+        weighted @ columns.transpose(1, 2),
+    )
 
 
 def normal_equations(
-    body: RigidBody, level: Level, poses: Poses, background: Tensor, frame: Tensor, *, central: bool = True
+    body: RigidBody,
+    level: Level,
+    poses: Poses,
+    background: Tensor,
+    frame: Tensor,
+    *,
+    central: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`equations` of K poses against the frames (K,) of the level, in the numbers of `pose_columns`."""
     seen, columns = pose_columns(body, level, poses, background, central=central)
@@ -201,7 +232,9 @@ LIGHT_RIDGE = 1e-3
 numbers, and what they are then does not show."""
 
 
-def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor, background: Tensor) -> Tensor:
+def light_columns(
+    body: RigidBody, level: Level, pose: Poses, light: Tensor, background: Tensor
+) -> Tensor:
     """(8, P) derivative of the level's first frame in the numbers of the light, at one pose."""
     frames = [body.shaded(pose.rotation[0], each).render(pose, level.cameras, background).flatten()
               for each in (light, *(light + LIGHT_STEP * torch.eye(LIGHT).to(light)))]  # fmt: skip
@@ -209,14 +242,24 @@ def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor, bac
 
 
 def lit_equations(
-    body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, columns: Tensor, background: Tensor
+    body: RigidBody,
+    level: Level,
+    pose: Poses,
+    light: Tensor,
+    before: Tensor,
+    columns: Tensor,
+    background: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
     pose's numbers as of `pose_columns`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
     # the colours turn with the light's own columns alone: a pose's columns know its geometry
-    seen, moved = pose_columns(body.shaded(pose.rotation[0], light), level, pose, background, central=True)
+    seen, moved = pose_columns(
+        body.shaded(pose.rotation[0], light), level, pose, background, central=True
+    )
     every = torch.cat((moved, columns[None]), 1)
-    cost, gradient, matrix = (found[0] for found in equations(seen - level.target[:1].flatten(1), every))
+    cost, gradient, matrix = (
+        found[0] for found in equations(seen - level.target[:1].flatten(1), every)
+    )
     ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
     matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
     gradient[6:] += ridge * (light - before)

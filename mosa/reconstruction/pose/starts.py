@@ -30,8 +30,16 @@ def splats_of(body: RestShape) -> Splats:
     """The body's particles as (isotropic or not) splats with axes from their covariances."""
     values, vectors = torch.linalg.eigh(body.covariances.double())
     vectors = vectors * torch.linalg.det(vectors)[:, None, None]
-    quaternions = torch.as_tensor(Rotation.from_matrix(vectors.cpu().numpy()).as_quat(scalar_first=True))
-    return Splats(body.rest, values.clamp(min=0).sqrt().to(body.rest), quaternions.to(body.rest), body.opacities, body.colors)
+    quaternions = torch.as_tensor(
+        Rotation.from_matrix(vectors.cpu().numpy()).as_quat(scalar_first=True)
+    )
+    return Splats(
+        body.rest,
+        values.clamp(min=0).sqrt().to(body.rest),
+        quaternions.to(body.rest),
+        body.opacities,
+        body.colors,
+    )
 
 
 def lowest(body: RestShape, start: Start, scene: Scene, time: float) -> float:
@@ -41,14 +49,18 @@ def lowest(body: RestShape, start: Start, scene: Scene, time: float) -> float:
     R = torch.as_tensor(spin).to(body.rest) @ start.rotation.to(body.rest)
     arm = (body.rest - body.center) @ R.T
     center = start.center + start.velocity * time + 0.5 * gravity * time**2
-    return float(((arm + center) @ up).min()) - (scene.ground.height if scene.ground is not None else -torch.inf)
+    return float(((arm + center) @ up).min()) - (
+        scene.ground.height if scene.ground is not None else -torch.inf
+    )
 
 
 def first_contact(body: RestShape, start: Start, scene: Scene) -> int:
     """Index of the first frame after first contact: given by the scene, or where free flight would have touched the ground."""
     if scene.last_free_frame is not None:
         return min(scene.last_free_frame + 1, scene.frames - 1)
-    surface = 0.5 * float(body.volume.mean()) ** (1 / 3)  # particles lie half a spacing below the surface
+    surface = 0.5 * float(body.volume.mean()) ** (
+        1 / 3
+    )  # particles lie half a spacing below the surface
     for t, time in enumerate((scene.times - scene.times[0]).tolist()):
         if t > 0 and lowest(body, start, scene, time) < surface:
             return t
@@ -64,11 +76,17 @@ def appearance_of(body: RestShape) -> Appearance:
         splats = splats_of(body)
         found = Appearance(splats, constant_coefficients(splats.colors))
     if found.light is None or not bool(found.light.any()):
-        found = replace(found, normals=surface_normals(found.splats.means, body.rest), light=found.splats.means.new_zeros(LIGHT))
+        found = replace(
+            found,
+            normals=surface_normals(found.splats.means, body.rest),
+            light=found.splats.means.new_zeros(LIGHT),
+        )
     return found
 
 
-def sequence_start(body: RestShape, appearance: Appearance, scene: Scene, *, register: bool) -> Start:
+def sequence_start(
+    body: RestShape, appearance: Appearance, scene: Scene, *, register: bool
+) -> Start:
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
     rest shape's own. appearance: at rest, of `appearance_of`.
 
@@ -87,17 +105,33 @@ def sequence_start(body: RestShape, appearance: Appearance, scene: Scene, *, reg
         )  # fmt: skip
         lit = shading(light, appearance.normals.to(light), rotation)
         splats = replace(splats, colors=splats.colors * lit.to(splats.colors)[:, None])
-    start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
+    start = Start(
+        rotation.to(body.rest),
+        center.to(body.rest),
+        torch.zeros(3).to(body.rest),
+        torch.zeros(3).to(body.rest),
+    )
     count, most, exact = 2, MOST_FRAMES, False
     while True:
-        velocity, spin = initial_velocity(splats, (rotation, center), images[:, :count], mattes[:, :count], views,
-                                          times=scene.times[:count], gravity=scene.gravity, background=scene.background,
-                                          rest_center=body.center, exact=exact)
+        velocity, spin = initial_velocity(
+            splats,
+            (rotation, center),
+            images[:, :count],
+            mattes[:, :count],
+            views,
+            times=scene.times[:count],
+            gravity=scene.gravity,
+            background=scene.background,
+            rest_center=body.center,
+            exact=exact,
+        )
         start = Start(start.rotation, start.center, velocity.to(body.rest), spin.to(body.rest))
         free = first_contact(body, start, scene)
         if free < 2 and exact:
-            raise DataError(f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
-                            "frames of free flight are needed (scene.frames, scene.last_free_frame)")
+            raise DataError(
+                f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
+                "frames of free flight are needed (scene.frames, scene.last_free_frame)"
+            )
         if not exact:
             count, exact = max(2, min(free, most)), True
             continue

@@ -11,7 +11,12 @@ from torch import Tensor, nn
 
 from mosa.rendering.appearance.carrying import Binding, Carried, bind
 from mosa.rendering.appearance.lighting import LIGHT, shading
-from mosa.rendering.appearance.spherical_harmonics import camera_centers, colors_in, constant_coefficients, mean_colors
+from mosa.rendering.appearance.spherical_harmonics import (
+    camera_centers,
+    colors_in,
+    constant_coefficients,
+    mean_colors,
+)
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.observer import deformed_covariances, repeat_cameras
 from mosa.rendering.rasterizer import rasterize
@@ -28,13 +33,29 @@ class CarriedSplats(nn.Module):
         """particles: (N, 3) [m]. Errors: DataError for fewer than 8 particles."""
         super().__init__()
         splats = appearance.splats
-        self._keep({f.name: getattr(splats, f.name) for f in fields(Splats)} | {"harmonics": appearance.harmonics}, particles)
+        self._keep(
+            {f.name: getattr(splats, f.name) for f in fields(Splats)}
+            | {"harmonics": appearance.harmonics},
+            particles,
+        )
         lit = appearance.light is not None and appearance.normals is not None
         upright = torch.tensor([0.0, 0, 1]).expand_as(splats.means)
-        self._keep({"normals": appearance.normals if lit else upright, "light": appearance.light if lit else torch.zeros(LIGHT)},
-                   particles)
+        self._keep(
+            {
+                "normals": appearance.normals if lit else upright,
+                "light": appearance.light if lit else torch.zeros(LIGHT),
+            },
+            particles,
+        )
         bound = bind(splats.means, particles)
-        self._keep({f"bound_{f.name}": getattr(bound, f.name) for f in fields(Binding) if f.name != "index"}, particles)
+        self._keep(
+            {
+                f"bound_{f.name}": getattr(bound, f.name)
+                for f in fields(Binding)
+                if f.name != "index"
+            },
+            particles,
+        )
         self.register_buffer("bound_index", bound.index.to(particles.device), persistent=False)
 
     def _keep(self, tensors: Mapping[str, Tensor], like: Tensor) -> None:
@@ -46,7 +67,12 @@ class CarriedSplats(nn.Module):
 
     @property
     def appearance(self) -> Appearance:
-        return Appearance(Splats(*(getattr(self, f.name) for f in fields(Splats))), self.harmonics, self.normals, self.light)
+        return Appearance(
+            Splats(*(getattr(self, f.name) for f in fields(Splats))),
+            self.harmonics,
+            self.normals,
+            self.light,
+        )
 
     @property
     def binding(self) -> Binding:
@@ -91,11 +117,22 @@ class Seen:
                 colors = colors_in(self.harmonics, torch.ones_like(self.means[:1]))
             else:
                 lines = self.means - camera_centers(camera).to(self.means)
-                colors = colors_in(self.harmonics, (lines[..., None, :] @ self.rotations)[..., 0, :])  # R^T d
+                colors = colors_in(
+                    self.harmonics, (lines[..., None, :] @ self.rotations)[..., 0, :]
+                )  # R^T d
             if self.shades is not None:
                 colors = colors * self.shades[..., None]
-            found.append(rasterize(self.means, self.covariances, self.opacities, colors, repeat_cameras(camera, frames), index,
-                                   background)[0])
+            found.append(
+                rasterize(
+                    self.means,
+                    self.covariances,
+                    self.opacities,
+                    colors,
+                    repeat_cameras(camera, frames),
+                    index,
+                    background,
+                )[0]
+            )
         return torch.stack(found)
 
     def colors(self) -> Tensor:
@@ -122,9 +159,18 @@ def seen(body: HasAppearance, positions: Tensor, F_tot: Tensor | None) -> Seen:
     if splats is None:
         if F_tot is None:
             raise ValueError("seen: a body without splats needs F_tot")
-        return Seen(positions, deformed_covariances(F_tot, body.covariances), body.opacities, constant_coefficients(body.colors))
+        return Seen(
+            positions,
+            deformed_covariances(F_tot, body.covariances),
+            body.opacities,
+            constant_coefficients(body.colors),
+        )
     carried = splats.carry(positions)
     shapes = carried.covariances(covariance_from(splats.scales, splats.rotations))
     turns = carried.rotations if splats.harmonics.shape[1] > 1 else None
-    shades = shading(splats.light, splats.normals, carried.rotations) if bool(splats.light.any()) else None
+    shades = (
+        shading(splats.light, splats.normals, carried.rotations)
+        if bool(splats.light.any())
+        else None
+    )
     return Seen(carried.means, shapes, splats.opacities, splats.harmonics, turns, shades)

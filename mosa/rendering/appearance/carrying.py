@@ -57,7 +57,10 @@ class Binding:
 
     def to(self, like: Tensor) -> Binding:
         """On the device and of the type of a tensor."""
-        moved = {name: getattr(self, name).to(like) for name in ("value", "gradient", "rest", "body", "affine")}
+        moved = {
+            name: getattr(self, name).to(like)
+            for name in ("value", "gradient", "rest", "body", "affine")
+        }
         return Binding(index=self.index.to(like.device), **moved)
 
     def states(self, positions: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -77,7 +80,9 @@ class Binding:
         means, gradients = map(torch.stack, zip(*bound.states(positions)))
         with torch.no_grad():
             U, s, Vh = torch.linalg.svd(gradients)
-            proper = torch.linalg.det(U @ Vh).sign()  # the smallest axis is the one that an inverted neighbourhood turned over
+            proper = torch.linalg.det(
+                U @ Vh
+            ).sign()  # the smallest axis is the one that an inverted neighbourhood turned over
             rotations = torch.cat((U[..., :2], U[..., 2:] * proper[..., None, None]), -1) @ Vh
             far = s[..., 0] > STRETCH_LIMIT
         if bool(far.any()):
@@ -95,7 +100,9 @@ def bind(splats: Tensor, particles: Tensor, *, neighbours: int = NEIGHBOURS) -> 
     centre goes.
     """
     if len(particles) < 8:
-        raise DataError(f"bind: expected at least 8 particles to carry splats, found {len(particles)}")
+        raise DataError(
+            f"bind: expected at least 8 particles to carry splats, found {len(particles)}"
+        )
     X, P = splats.detach().cpu().double(), particles.detach().cpu().double()
     count = min(neighbours, len(P))
     index = cKDTree(P.numpy()).query(X.numpy(), k=np.arange(1, count + 1))[1]
@@ -109,9 +116,14 @@ def bind(splats: Tensor, particles: Tensor, *, neighbours: int = NEIGHBOURS) -> 
         moment = torch.einsum("mk,mki,mkj->mij", weight, basis, basis)
         ridge = RIDGE * weight.sum(1)[:, None] * torch.tensor([0.0, 1, 1, 1], dtype=torch.float64)
         first = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(at), 4)
-        return weight * torch.einsum("mki,mi->mk", basis, torch.linalg.solve(moment + torch.diag_embed(ridge), first))
+        return weight * torch.einsum(
+            "mki,mi->mk", basis, torch.linalg.solve(moment + torch.diag_embed(ridge), first)
+        )
 
-    slopes = [torch.func.jvp(coefficients, (X,), (axis.expand_as(X),))[1] for axis in torch.eye(3, dtype=torch.float64)]
+    slopes = [
+        torch.func.jvp(coefficients, (X,), (axis.expand_as(X),))[1]
+        for axis in torch.eye(3, dtype=torch.float64)
+    ]
     middle = P.mean(0)
     body = P - middle
     return Binding(

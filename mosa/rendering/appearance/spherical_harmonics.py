@@ -39,7 +39,13 @@ def basis(directions: Tensor, degree: int) -> Tensor:
         values += [-a * y, a * z, -a * x]
     if degree >= 2:
         a, b = math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi))
-        values += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, 0.5 * a * (x * x - y * y)]
+        values += [
+            a * x * y,
+            -a * y * z,
+            b * (3 * z * z - 1),
+            -a * x * z,
+            0.5 * a * (x * x - y * y),
+        ]
     if degree >= 3:
         a, b = math.sqrt(35 / (32 * math.pi)), math.sqrt(105 / (4 * math.pi))
         c, d = math.sqrt(21 / (32 * math.pi)), math.sqrt(7 / (16 * math.pi))
@@ -66,7 +72,9 @@ def camera_centers(cameras: Cameras) -> Tensor:
     return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
 
 
-def view_colors(coefficients: Tensor, means: Tensor, cameras: Cameras, state_index: Tensor) -> Tensor:
+def view_colors(
+    coefficients: Tensor, means: Tensor, cameras: Cameras, state_index: Tensor
+) -> Tensor:
     """Features (B, N, 3) for `rasterize`: the colour of every Gaussian as each camera sees it.
 
     coefficients: (N, K, 3), K = 1, 4, 9 or 16; means: (S, N, 3) [m]; state_index: (B,). Gradients to coefficients,
@@ -85,7 +93,11 @@ def rotated(coefficients: Tensor, rotation: Tensor) -> Tensor:
     and without Euler angles or recursion. Gradients to both. Errors: ConfigError for another K.
     """
     degree = degree_of(coefficients)
-    parts = [coefficients[..., :1, :].expand(*torch.broadcast_shapes(coefficients.shape[:-2], rotation.shape[:-2]), 1, 3)]
+    parts = [
+        coefficients[..., :1, :].expand(
+            *torch.broadcast_shapes(coefficients.shape[:-2], rotation.shape[:-2]), 1, 3
+        )
+    ]
     if degree:
         spread, inverses = _projections()
         turned = spread.to(rotation) @ rotation  # rows are R^T d

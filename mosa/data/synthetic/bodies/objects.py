@@ -65,7 +65,9 @@ class BuiltinObject:
     reach: float | None = field(default=None, repr=False)
 
 
-RABBIT = HiddenMaterial(E=2e5, nu=0.3, ratio=1.6, fibre=(1.0, 0.3, 0.0), amplitude=0.2, period=0.125)
+RABBIT = HiddenMaterial(
+    E=2e5, nu=0.3, ratio=1.6, fibre=(1.0, 0.3, 0.0), amplitude=0.2, period=0.125
+)
 # stiffer and slower to squash, fibres lean across the axis, and the stiffness varies along the body
 PEANUT = HiddenMaterial(
     E=3e5, nu=0.35, ratio=1.9, fibre=(0.2, 0.5, 1.0), amplitude=0.25, period=0.16, axis=(0.3, 0.9, 0.3)
@@ -79,19 +81,53 @@ CLAY = HiddenYield(
     E=2e5, nu=0.3, yield_stress=1.5e4, coefficients=(0.6, 1.5, 2.0, 0.7, 1.8, 0.6), turn=(0.4, 0.3, 0.2), amplitude=0.2,
     period=0.125,
 )  # fmt: skip
-CHICK = HiddenMaterial(E=2.2e5, nu=0.28, ratio=1.8, fibre=(0.3, -0.2, 1.0), amplitude=0.15, period=0.13, axis=(0.0, 1.0, 0.3))
+CHICK = HiddenMaterial(
+    E=2.2e5,
+    nu=0.28,
+    ratio=1.8,
+    fibre=(0.3, -0.2, 1.0),
+    amplitude=0.15,
+    period=0.13,
+    axis=(0.0, 1.0, 0.3),
+)
 # the second five: shapes, materials and drops were fixed together, before anything was fitted on them
-GORILLA = HiddenMaterial(E=3e5, nu=0.3, ratio=1.75, fibre=(0.3, 1.0, 0.4), amplitude=0.2, period=0.15, axis=(0.6, 0.7, 0.3))
-CHICK2 = HiddenMaterial(E=2.4e5, nu=0.27, ratio=2.0, fibre=(0.5, 0.6, -0.7), amplitude=0.25, period=0.12, axis=(0.3, -0.4, 0.9))
+GORILLA = HiddenMaterial(
+    E=3e5,
+    nu=0.3,
+    ratio=1.75,
+    fibre=(0.3, 1.0, 0.4),
+    amplitude=0.2,
+    period=0.15,
+    axis=(0.6, 0.7, 0.3),
+)
+CHICK2 = HiddenMaterial(
+    E=2.4e5,
+    nu=0.27,
+    ratio=2.0,
+    fibre=(0.5, 0.6, -0.7),
+    amplitude=0.25,
+    period=0.12,
+    axis=(0.3, -0.4, 0.9),
+)
 RAINBOWBALL = HiddenMaterial(
     E=1.8e5, nu=0.36, ratio=1.5, fibre=(-0.6, 0.5, 0.6), amplitude=0.18, period=0.11, axis=(0.6, 0.2, -0.7)
 )  # fmt: skip
-CALF = HiddenMaterial(E=3.5e5, nu=0.33, ratio=1.65, fibre=(1.0, 0.2, 0.35), amplitude=0.22, period=0.17, axis=(0.9, 0.2, 0.4))
+CALF = HiddenMaterial(
+    E=3.5e5,
+    nu=0.33,
+    ratio=1.65,
+    fibre=(1.0, 0.2, 0.35),
+    amplitude=0.22,
+    period=0.17,
+    axis=(0.9, 0.2, 0.4),
+)
 # no directions, one stiffness: what is learned of it has to be nothing
 RING = HiddenMaterial(E=2.5e5, nu=0.34, ratio=1.0, fibre=(1.0, 0.0, 0.0), amplitude=0.0, period=0.1)
 
 # strong fibres in the plane of x and the vertical, no other variation: what a compression test of a specimen measures
-CYLINDER = HiddenMaterial(E=2e5, nu=0.3, ratio=1.8, fibre=(1.0, 0.4, 0.0), amplitude=0.0, period=0.1)
+CYLINDER = HiddenMaterial(
+    E=2e5, nu=0.3, ratio=1.8, fibre=(1.0, 0.4, 0.0), amplitude=0.0, period=0.1
+)
 
 DROPS = {
     "train": Drop(speed=2.5),
@@ -168,9 +204,23 @@ def stand_in(shape: str, height: float, law: str, *, spacing: float = 0.0125, re
              held: tuple[str, ...] = (), convention: str = "paper", **values: float) -> BuiltinObject:  # fmt: skip
     """An object that stands in for a scene of PAC-NeRF, with its published law and parameters, filmed as there: 11 cameras, 24
     frames a second."""
-    material = PublishedMaterial(law=law, values=tuple(values.items()), held=held, convention=convention)
-    film = Footage(cameras=11, frames=frames, size=400, fps=24.0, field=0.52, target=0.38, distance=3.0)
-    return BuiltinObject(shape, height, material, PACNERF, film, spacing=spacing, pitch=0.006, remesh=remesh, reach=1.6)
+    material = PublishedMaterial(
+        law=law, values=tuple(values.items()), held=held, convention=convention
+    )
+    film = Footage(
+        cameras=11, frames=frames, size=400, fps=24.0, field=0.52, target=0.38, distance=3.0
+    )
+    return BuiltinObject(
+        shape,
+        height,
+        material,
+        PACNERF,
+        film,
+        spacing=spacing,
+        pitch=0.006,
+        remesh=remesh,
+        reach=1.6,
+    )
 
 
 OBJECTS |= {
@@ -197,7 +247,9 @@ OBJECTS |= {
 def object_named(name: str) -> BuiltinObject:
     """Errors: ConfigError naming the known ones."""
     if name not in OBJECTS:
-        raise ConfigError(f"scene.name: expected one of the built-in {', '.join(sorted(OBJECTS))}, found {name!r}")
+        raise ConfigError(
+            f"scene.name: expected one of the built-in {', '.join(sorted(OBJECTS))}, found {name!r}"
+        )
     return OBJECTS[name]
 
 

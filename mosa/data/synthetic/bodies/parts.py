@@ -38,12 +38,16 @@ def sphere(points: np.ndarray, center, radius: float) -> np.ndarray:
     return np.linalg.norm(points - np.asarray(center), axis=-1) - radius
 
 
-def capsule(points: np.ndarray, start, end, radius: float, end_radius: float | None = None) -> np.ndarray:
+def capsule(
+    points: np.ndarray, start, end, radius: float, end_radius: float | None = None
+) -> np.ndarray:
     """Distance to a capsule; with `end_radius` its radius changes linearly along the axis."""
     start, axis = np.asarray(start), np.asarray(end) - np.asarray(start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
     end_radius = radius if end_radius is None else end_radius
-    return np.linalg.norm(points - start - along[:, None] * axis, axis=-1) - (radius + along * (end_radius - radius))
+    return np.linalg.norm(points - start - along[:, None] * axis, axis=-1) - (
+        radius + along * (end_radius - radius)
+    )
 
 
 def join(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
@@ -68,7 +72,9 @@ def blend(color: np.ndarray, other, amount: np.ndarray) -> np.ndarray:
     return color + amount[:, None] * (np.asarray(other) - color)
 
 
-def waves(points: np.ndarray, rng: np.random.Generator, wavelength: float, count: int = 24) -> np.ndarray:
+def waves(
+    points: np.ndarray, rng: np.random.Generator, wavelength: float, count: int = 24
+) -> np.ndarray:
     """Smooth random field (M,) of unit variance: a sum of plane waves of about that wavelength [m]."""
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)

@@ -23,7 +23,10 @@ def axes_matrix(r: Tensor) -> Tensor:
     zero = torch.zeros_like(r[..., 0])
     rows = [zero, -r[..., 2], r[..., 1], r[..., 2], zero, -r[..., 0], -r[..., 1], r[..., 0], zero]
     K = torch.stack(rows, -1).reshape(*r.shape[:-1], 3, 3)
-    return torch.eye(3, dtype=r.dtype, device=r.device) + 2 * (K + K @ K) / (1 + (r * r).sum(-1))[..., None, None]
+    return (
+        torch.eye(3, dtype=r.dtype, device=r.device)
+        + 2 * (K + K @ K) / (1 + (r * r).sum(-1))[..., None, None]
+    )
 
 
 def axes_parameter(axes: Tensor) -> Tensor:
@@ -34,7 +37,11 @@ def axes_parameter(axes: Tensor) -> Tensor:
     """
     axes = axes.double()
     eye = torch.eye(3, dtype=torch.float64)
-    if axes.shape != (3, 3) or (axes.mT @ axes - eye).abs().max() > 1e-6 or torch.linalg.det(axes) < 0:
+    if (
+        axes.shape != (3, 3)
+        or (axes.mT @ axes - eye).abs().max() > 1e-6
+        or torch.linalg.det(axes) < 0
+    ):
         raise ConfigError(f"axes: expected a rotation matrix (3, 3), found {axes.tolist()}")
     # 1 + trace = 4 cos^2(angle/2) is at least 1 for one of the four equivalent choices
     signs = torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64)

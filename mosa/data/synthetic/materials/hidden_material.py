@@ -30,11 +30,20 @@ def fibre_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) 
     """mu/2 (|F|^2 - 3) - mu log J + lam/2 (log J)^2 + kf/2 (|F a|^2 - 1)^2 [J/m^3]; F: (..., 3, 3), fibre: (..., 3)."""
     log_J = torch.log(torch.linalg.det(F))
     stretch = ((F @ fibre[..., None])[..., 0] ** 2).sum(-1)
-    return 0.5 * mu * ((F * F).sum((-2, -1)) - 3) - mu * log_J + 0.5 * lam * log_J**2 + 0.5 * kf * (stretch - 1) ** 2
+    return (
+        0.5 * mu * ((F * F).sum((-2, -1)) - 3)
+        - mu * log_J
+        + 0.5 * lam * log_J**2
+        + 0.5 * kf * (stretch - 1) ** 2
+    )
 
 
 register_law(
-    LAW, fibre_neo_hookean, {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}, needs_positive_J=True, energy=fibre_energy
+    LAW,
+    fibre_neo_hookean,
+    {"mu": 1, "lam": 1, "kf": 1, "fibre": 3},
+    needs_positive_J=True,
+    energy=fibre_energy,
 )
 
 
@@ -68,7 +77,12 @@ class HiddenMaterial(Hidden):
         mu, lam = self.elastic(factor)
         fibre = torch.tensor(self.fibre, dtype=rest.dtype)
         kf = fibre_stiffness(self.E, self.nu, self.ratio) * factor
-        return {"mu": mu, "lam": lam, "kf": kf, "fibre": (fibre / fibre.norm()).expand(len(rest), 3)}
+        return {
+            "mu": mu,
+            "lam": lam,
+            "kf": kf,
+            "fibre": (fibre / fibre.norm()).expand(len(rest), 3),
+        }
 
     def mean_modulus(self) -> float:
         """lam + 2 mu + 4 kf [Pa]."""

@@ -41,11 +41,20 @@ class HiddenYield(Hidden):
         factor = self.factor(rest)
         mu, lam = self.elastic(factor)
         values = {"mu": mu, "lam": lam, "yield_stress": self.yield_stress * factor}
-        values |= {name: torch.full_like(factor, c) for name, c in zip(COEFFICIENTS, self.coefficients, strict=True)}
+        values |= {
+            name: torch.full_like(factor, c)
+            for name, c in zip(COEFFICIENTS, self.coefficients, strict=True)
+        }
         axes = axes_parameter(torch.as_tensor(Rotation.from_rotvec(self.turn).as_matrix())).to(rest)
         return {**values, "axes": axes.expand(len(rest), 3)}
 
     def summary(self) -> dict[str, float]:
         """Numbers for Truth.parameters; ratio: of the largest of Hill's coefficients to the smallest."""
         ratio = max(self.coefficients) / min(self.coefficients)
-        return {"E": self.E, "nu": self.nu, "yield_stress": self.yield_stress, "ratio": ratio, "heterogeneity": self.amplitude}
+        return {
+            "E": self.E,
+            "nu": self.nu,
+            "yield_stress": self.yield_stress,
+            "ratio": ratio,
+            "heterogeneity": self.amplitude,
+        }

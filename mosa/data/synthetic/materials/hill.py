@@ -30,7 +30,9 @@ _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 @wp.func
 def hill_normal(k: vec6):
     """M on the normal components, k = (f, g, h, l, m, n)."""
-    return _THIRD * wp.mat33d(k[1] + k[2], -k[2], -k[1], -k[2], k[2] + k[0], -k[0], -k[1], -k[0], k[0] + k[1])
+    return _THIRD * wp.mat33d(
+        k[1] + k[2], -k[2], -k[1], -k[2], k[2] + k[0], -k[0], -k[1], -k[0], k[0] + k[1]
+    )
 
 
 @wp.func
@@ -100,7 +102,11 @@ def symmetric_exponential(H: wp.mat33d):
     """exp of a symmetric matrix."""
     shift = _ONE + wp.sqrt(wp.ddot(H, H))
     U, S, V = svd_value(H + shift * wp.identity(n=3, dtype=wp.float64))
-    return V * wp.diag(wp.vec3d(wp.exp(S[0] - shift), wp.exp(S[1] - shift), wp.exp(S[2] - shift))) * wp.transpose(V)
+    return (
+        V
+        * wp.diag(wp.vec3d(wp.exp(S[0] - shift), wp.exp(S[1] - shift), wp.exp(S[2] - shift)))
+        * wp.transpose(V)
+    )
 
 
 @wp.func_grad(symmetric_exponential)

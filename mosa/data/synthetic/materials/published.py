@@ -43,7 +43,10 @@ class PublishedMaterial:
     def _one(self) -> dict[str, Tensor]:
         from mosa.modules.body.material import Material
 
-        return {name: value.detach() for name, value in Material(self.law, dict(self.values)).per_particle().items()}
+        return {
+            name: value.detach()
+            for name, value in Material(self.law, dict(self.values)).per_particle().items()
+        }
 
     def parameters(self, rest: Tensor) -> dict[str, Tensor]:
         """What the law takes, per particle; rest: (N, 3) [m]."""

@@ -24,13 +24,22 @@ from mosa.modules.adapters.fused.network_kernels import (
     store_by_column,
     tile_of,
 )
-from mosa.modules.adapters.fused.sum_kernels import ones_column, outer, store_columns, store_hidden, store_square, with_ones
+from mosa.modules.adapters.fused.sum_kernels import (
+    ones_column,
+    outer,
+    store_columns,
+    store_hidden,
+    store_square,
+    with_ones,
+)
 
 
 @triton.jit
 def by_row(p, r, c, rows):
     """(BLOCK, 16) tile of (rows, 6)."""
-    return tl.load(p + r[:, None] * 6 + c[None, :], mask=(r[:, None] < rows) & (c[None, :] < 6), other=0.0)
+    return tl.load(
+        p + r[:, None] * 6 + c[None, :], mask=(r[:, None] < rows) & (c[None, :] < 6), other=0.0
+    )
 
 
 @triton.jit
@@ -58,7 +67,22 @@ def backward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl
 
 @triton.jit
 def hidden_adjoint(
-    g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr
+    g,
+    z1,
+    a1,
+    k2,
+    U2,
+    D2,
+    d2,
+    h1,
+    g1,
+    g2,
+    r,
+    M,
+    SUMS: tl.constexpr,
+    H: tl.constexpr,
+    BLOCK: tl.constexpr,
+    P: tl.constexpr,
 ):
     """(adjoint of z1, D2, d2) from g, that of the second layer's activations, whose slope is k2."""
     h = tl.arange(0, H)
@@ -91,15 +115,25 @@ def theta_backward(
         V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
         U3 = backward(W3, 6, H, H, P)
     D1, D2 = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
-    Dx, d2, D3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    Dx, d2, D3 = (
+        tl.zeros((H, 16), tl.float32),
+        tl.zeros((H, 16), tl.float32),
+        tl.zeros((H, 16), tl.float32),
+    )
     d3 = tl.zeros((BLOCK, 16), tl.float32)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x, of_state = by_column(l2, r, h, M, H), network_input(w, s2, w, r, N, M, scale, False)
-        z1 = product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 12, P), P) + tl.load(b1 + h)[None, :]
+        z1 = (
+            product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 12, P), P)
+            + tl.load(b1 + h)[None, :]
+        )
         z1 += product(of_state, Vx if SUMS == "inside" else forward(W1 + H, H, 12, H + 12, P), P)
         a1, _ = silu(z1)
-        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        a2, k2 = silu(
+            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
+            + tl.load(b2 + h)[None, :]
+        )
         g = seeds_of_b(gh, rest, unit, r, c, N, RESTED)
         if EXTRA:
             g += by_row(extra, r, c, N)
@@ -115,13 +149,41 @@ def theta_backward(
             store_by_column(l2 + H * M, of_state, r, c, M, 12)
         g = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P)
         e1, D2, d2 = hidden_adjoint(
-            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+            g,
+            z1,
+            a1,
+            k2,
+            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
+            D2,
+            d2,
+            h1,
+            g1,
+            g2,
+            r,
+            M,
+            SUMS,
+            H,
+            BLOCK,
+            P,
         )
         if SUMS == "inside":
             D1 += outer(e1, x, P)
             Dx += outer(e1, with_ones(of_state, 12), P)
-        store_by_column(gl2, product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 12, P), P), r, h, M, H)
-        store_input_adjoint(gw, gs2, scale * product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 12, H + 12, P), P), r, M)
+        store_by_column(
+            gl2,
+            product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 12, P), P),
+            r,
+            h,
+            M,
+            H,
+        )
+        store_input_adjoint(
+            gw,
+            gs2,
+            scale * product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 12, H + 12, P), P),
+            r,
+            M,
+        )
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
         store_square(at, D1, H + 12, H)
@@ -148,10 +210,16 @@ def psi2_backward(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x, normals = by_column(l1, r, h, M, H), by_column(l1 + H * M, r, c, M, 3)
-        z1 = product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 3, P), P) + tl.load(b1 + h)[None, :]
+        z1 = (
+            product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 3, P), P)
+            + tl.load(b1 + h)[None, :]
+        )
         z1 += product(normals, Vx if SUMS == "inside" else forward(W1 + H, H, 3, H + 3, P), P)
         a1, _ = silu(z1)
-        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        a2, k2 = silu(
+            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
+            + tl.load(b2 + h)[None, :]
+        )
         y = by_column(t + 36 * M, r, c, M, 12)
         e = by_column(gt + 36 * M, r, c, M, 12) * (alpha - y * y / alpha)
         yb = by_column(l2, r, h, M, H)
@@ -163,13 +231,42 @@ def psi2_backward(
         g = product(e, U3 if SUMS == "inside" else backward(W3, 12, H, H, P), P)
         g += product(eb, U4 if SUMS == "inside" else backward(W3 + 12 * H, H, H, H, P), P)
         e1, D2, d2 = hidden_adjoint(
-            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+            g,
+            z1,
+            a1,
+            k2,
+            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
+            D2,
+            d2,
+            h1,
+            g1,
+            g2,
+            r,
+            M,
+            SUMS,
+            H,
+            BLOCK,
+            P,
         )
         if SUMS == "inside":
             D1 += outer(e1, x, P)
             Dx += outer(e1, with_ones(normals, 3), P)
-        store_by_column(gl1, product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 3, P), P), r, h, M, H)
-        store_by_column(gl1 + H * M, product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 3, H + 3, P), P), r, c, M, 3)
+        store_by_column(
+            gl1,
+            product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 3, P), P),
+            r,
+            h,
+            M,
+            H,
+        )
+        store_by_column(
+            gl1 + H * M,
+            product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 3, H + 3, P), P),
+            r,
+            c,
+            M,
+            3,
+        )
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
         store_square(at, D1, H + 3, H)
@@ -187,21 +284,37 @@ def psi1_backward(
         V1, U1 = forward(W1, H, 12, 12, P), backward(W1, H, 12, 12, P)
         V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
         U3, Up = backward(W3, H, H, H, P), backward(Wp, 36, H, H, P)
-    D2, D3, Dp = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32), tl.zeros((64, H), tl.float32)
-    D1, d2, d3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    D2, D3, Dp = (
+        tl.zeros((H, H), tl.float32),
+        tl.zeros((H, H), tl.float32),
+        tl.zeros((64, H), tl.float32),
+    )
+    D1, d2, d3 = (
+        tl.zeros((H, 16), tl.float32),
+        tl.zeros((H, 16), tl.float32),
+        tl.zeros((H, 16), tl.float32),
+    )
     dp = tl.zeros((64, 16), tl.float32)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         y = by_column(t, r, planes, M, 36)
         e = by_column(gt, r, planes, M, 36) * (alpha - y * y / alpha)
-        g = by_column(gl1, r, h, M, H) + product(e, Up if SUMS == "inside" else backward(Wp, 36, H, H, P), P)
+        g = by_column(gl1, r, h, M, H) + product(
+            e, Up if SUMS == "inside" else backward(Wp, 36, H, H, P), P
+        )
         if SUMS == "inside":
             Dp += outer(e, by_column(l1, r, h, M, H), P)
             dp += outer(e, ones_column(BLOCK), P)
         inputs = network_input(w, s1, w, r, N, M, scale, False)
-        z1 = product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
+        z1 = (
+            product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P)
+            + tl.load(b1 + h)[None, :]
+        )
         a1, _ = silu(z1)
-        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        a2, k2 = silu(
+            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
+            + tl.load(b2 + h)[None, :]
+        )
         if SUMS == "inside":
             D3 += outer(g, a2, P)
             d3 += outer(g, ones_column(BLOCK), P)
@@ -212,11 +325,32 @@ def psi1_backward(
             store_by_column(h2, a2, r, h, M, H)
         g = product(g, U3 if SUMS == "inside" else backward(W3, H, H, H, P), P)
         e1, D2, d2 = hidden_adjoint(
-            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+            g,
+            z1,
+            a1,
+            k2,
+            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
+            D2,
+            d2,
+            h1,
+            g1,
+            g2,
+            r,
+            M,
+            SUMS,
+            H,
+            BLOCK,
+            P,
         )
         if SUMS == "inside":
             D1 += outer(e1, with_ones(inputs, 12), P)
-        store_input_adjoint(gw, gs, scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P), r, M)
+        store_input_adjoint(
+            gw,
+            gs,
+            scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P),
+            r,
+            M,
+        )
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
         at = store_hidden(at, D1, D2, d2, 12, 12, H)
@@ -226,7 +360,11 @@ def psi1_backward(
         at += H
         tl.store(at + planes[:, None] * H + h[None, :], Dp, mask=planes[:, None] < 36)
         at += 36 * H
-        tl.store(at + planes[:, None] + 0 * c[None, :], dp, mask=(c[None, :] == 0) & (planes[:, None] < 36))
+        tl.store(
+            at + planes[:, None] + 0 * c[None, :],
+            dp,
+            mask=(c[None, :] == 0) & (planes[:, None] < 36),
+        )
 
 
 @triton.jit(do_not_specialize=["N", "start"])
@@ -243,7 +381,11 @@ def phi_backward(
         V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
         U3 = backward(W3, 6, H, H, P)
     D2 = tl.zeros((H, H), tl.float32)
-    D1, d2, D3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    D1, d2, D3 = (
+        tl.zeros((H, 16), tl.float32),
+        tl.zeros((H, 16), tl.float32),
+        tl.zeros((H, 16), tl.float32),
+    )
     d3 = tl.zeros((BLOCK, 16), tl.float32)
     column = c[None, :]
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
@@ -256,9 +398,15 @@ def phi_backward(
         if BOUNDED:
             y = by_column(pre, r, c, M, 6)
             g *= bound - y * y / bound
-        z1 = product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
+        z1 = (
+            product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P)
+            + tl.load(b1 + h)[None, :]
+        )
         a1, _ = silu(z1)
-        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        a2, k2 = silu(
+            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
+            + tl.load(b2 + h)[None, :]
+        )
         if SUMS == "inside":
             d3 += g
             D3 += outer(a2, g, P)
@@ -268,7 +416,22 @@ def phi_backward(
             store_by_column(h2, a2, r, h, M, H)
         g = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P)
         e1, D2, d2 = hidden_adjoint(
-            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+            g,
+            z1,
+            a1,
+            k2,
+            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
+            D2,
+            d2,
+            h1,
+            g1,
+            g2,
+            r,
+            M,
+            SUMS,
+            H,
+            BLOCK,
+            P,
         )
         if SUMS == "inside":
             D1 += outer(e1, with_ones(inputs, 12), P)

@@ -38,7 +38,23 @@ def correction(t, r, M, first: tl.constexpr):
 
 @triton.jit
 def correction_adjoint(
-    t, gt, extra, r, N, M, first: tl.constexpr, EXTRA: tl.constexpr, a00, a01, a02, a10, a11, a12, a20, a21, a22
+    t,
+    gt,
+    extra,
+    r,
+    N,
+    M,
+    first: tl.constexpr,
+    EXTRA: tl.constexpr,
+    a00,
+    a01,
+    a02,
+    a10,
+    a11,
+    a12,
+    a20,
+    a21,
+    a22,
 ):
     """Store the adjoints of the 12 numbers of a matrix, from those of its entries; extra: (N, 48) adjoints from elsewhere."""
     u00, u01, u02, u11, u12, u22, l00, l10, l11, l20, l21, l22 = numbers(t, r, M, first)
@@ -76,13 +92,21 @@ def components(v, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr)
 def on_plane(v, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C):
     """(I + C) on the components of v (6, M) on a plane."""
     a, b, c = components(v, r, M, plane, c1, c2)
-    return a + C[0] * a + C[1] * b + C[2] * c, b + C[3] * a + C[4] * b + C[5] * c, c + C[6] * a + C[7] * b + C[8] * c
+    return (
+        a + C[0] * a + C[1] * b + C[2] * c,
+        b + C[3] * a + C[4] * b + C[5] * c,
+        c + C[6] * a + C[7] * b + C[8] * c,
+    )
 
 
 @triton.jit
 def store_moved(v, out, r, M, X, Y, Z, K, mine):
     """Rows r of (I + G) v (6, M) where `mine`. X, Y, Z: corrections of the planes, K: entries of C_xyz."""
-    x, y, z = on_plane(v, r, M, 0, 5, 4, X), on_plane(v, r, M, 1, 3, 5, Y), on_plane(v, r, M, 2, 4, 3, Z)
+    x, y, z = (
+        on_plane(v, r, M, 0, 5, 4, X),
+        on_plane(v, r, M, 1, 3, 5, Y),
+        on_plane(v, r, M, 2, 4, 3, Z),
+    )
     tl.store(out + r, x[0] + K[0] * x[0] + K[1] * y[0] + K[2] * z[0], mask=mine)
     tl.store(out + M + r, y[0] + K[3] * x[0] + K[4] * y[0] + K[5] * z[0], mask=mine)
     tl.store(out + 2 * M + r, z[0] + K[6] * x[0] + K[7] * y[0] + K[8] * z[0], mask=mine)
@@ -95,7 +119,11 @@ def store_moved(v, out, r, M, X, Y, Z, K, mine):
 def normal_columns(X, p: tl.constexpr, k0, k1, k2):
     """Column p of the normal rows of G; X: correction of plane p, k: column p of C_xyz."""
     x = 1.0 + X[0]
-    return k0 * x + (X[0] if p == 0 else 0.0), k1 * x + (X[0] if p == 1 else 0.0), k2 * x + (X[0] if p == 2 else 0.0)
+    return (
+        k0 * x + (X[0] if p == 0 else 0.0),
+        k1 * x + (X[0] if p == 1 else 0.0),
+        k2 * x + (X[0] if p == 2 else 0.0),
+    )
 
 
 @triton.jit
@@ -156,7 +184,12 @@ def store_operator(G, r, X, Y, Z, K, mine, others):
 @triton.jit
 def corrections(t, r, M):
     """Entries of C_x, C_y, C_z and C_xyz."""
-    return correction(t, r, M, 0), correction(t, r, M, 12), correction(t, r, M, 24), correction(t, r, M, 36)
+    return (
+        correction(t, r, M, 0),
+        correction(t, r, M, 12),
+        correction(t, r, M, 24),
+        correction(t, r, M, 36),
+    )
 
 
 @triton.jit(do_not_specialize=["N"])
@@ -176,7 +209,15 @@ def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr)
     correction: row 0 of (I + L)(I + U) on its components v of s1."""
     first = t + 12 * plane * M + r
     v0, v1, v2 = components(s1, r, M, plane, c1, c2)
-    return v0, v1, v2, tl.load(first), tl.load(first + M), tl.load(first + 2 * M), tl.load(first + 6 * M)
+    return (
+        v0,
+        v1,
+        v2,
+        tl.load(first),
+        tl.load(first + M),
+        tl.load(first + 2 * M),
+        tl.load(first + 6 * M),
+    )
 
 
 @triton.jit
@@ -204,7 +245,9 @@ def add(p, value):
 
 
 @triton.jit
-def normal_adjoint(t, s1, gn, gt, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
+def normal_adjoint(
+    t, s1, gn, gt, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr
+):
     """Adds to gt; returns the adjoints of the three components of s1."""
     v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
     g = scale * tl.load(gn + plane * M + r)
@@ -240,7 +283,9 @@ def finish(b, w, s, unit, h, N, M, RESTED: tl.constexpr, BLOCK: tl.constexpr):
     inside = (r < N) & (c < 6)
     y = tl.load(b + c * M + r, mask=inside, other=0.0)
     if RESTED:
-        state = tl.abs(tl.load(w + r * 6 + c, mask=inside, other=0.0)) + tl.abs(tl.load(s + r * 6 + c, mask=inside, other=0.0))
+        state = tl.abs(tl.load(w + r * 6 + c, mask=inside, other=0.0)) + tl.abs(
+            tl.load(s + r * 6 + c, mask=inside, other=0.0)
+        )
         y -= tl.load(b + c * M + N, mask=c < 6, other=0.0)
         y = tl.where(tl.max(state, 1)[:, None] == 0.0, 0.0, y)
     tl.store(h + r * 6 + c, tl.load(unit) * y, mask=inside)
@@ -286,7 +331,24 @@ def seed_of(gG, r, N, row: tl.constexpr, column: tl.constexpr):
 
 @triton.jit
 def plane_adjoint(
-    t, s1, pre, gG, S, B, gt, extra, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, k0, k1, k2, EXTRA: tl.constexpr
+    t,
+    s1,
+    pre,
+    gG,
+    S,
+    B,
+    gt,
+    extra,
+    r,
+    N,
+    M,
+    p: tl.constexpr,
+    c1: tl.constexpr,
+    c2: tl.constexpr,
+    k0,
+    k1,
+    k2,
+    EXTRA: tl.constexpr,
 ):
     """Stores the adjoints of the plane's numbers; returns those of column p of C_xyz (3), of the plane's components of s1 (3) and
     of pre (3). S, B: adjoints of s2 and moved (6)."""
@@ -341,9 +403,15 @@ def assemble_adjoint(
         seed_of_b(gh, rest, unit, r, N, 2, RESTED), seed_of_b(gh, rest, unit, r, N, 3, RESTED),
         seed_of_b(gh, rest, unit, r, N, 4, RESTED), seed_of_b(gh, rest, unit, r, N, 5, RESTED),
     )  # fmt: skip
-    x0, x1, x2, xa, xb, xc, xd, xe, xf = plane_adjoint(t, s1, pre, gG, S, B, gt, extra, r, N, M, 0, 5, 4, K[0], K[3], K[6], EXTRA)
-    y0, y1, y2, ya, yb, yc, yd, ye, yf = plane_adjoint(t, s1, pre, gG, S, B, gt, extra, r, N, M, 1, 3, 5, K[1], K[4], K[7], EXTRA)
-    z0, z1, z2, za, zb, zc, zd, ze, zf = plane_adjoint(t, s1, pre, gG, S, B, gt, extra, r, N, M, 2, 4, 3, K[2], K[5], K[8], EXTRA)
+    x0, x1, x2, xa, xb, xc, xd, xe, xf = plane_adjoint(
+        t, s1, pre, gG, S, B, gt, extra, r, N, M, 0, 5, 4, K[0], K[3], K[6], EXTRA
+    )
+    y0, y1, y2, ya, yb, yc, yd, ye, yf = plane_adjoint(
+        t, s1, pre, gG, S, B, gt, extra, r, N, M, 1, 3, 5, K[1], K[4], K[7], EXTRA
+    )
+    z0, z1, z2, za, zb, zc, zd, ze, zf = plane_adjoint(
+        t, s1, pre, gG, S, B, gt, extra, r, N, M, 2, 4, 3, K[2], K[5], K[8], EXTRA
+    )
     correction_adjoint(t, gt, extra, r, N, M, 36, EXTRA, x0, y0, z0, x1, y1, z1, x2, y2, z2)
     store_six(gs1, r, M, xa, ya, za, yb + zc, zb + xc, xb + yc)
     store_six(gpre, r, M, xd, yd, zd, ye + zf, ze + xf, xe + yf)

@@ -13,7 +13,12 @@ import os
 import triton
 import triton.language as tl
 
-from mosa.modules.adapters.fused.assembly_kernels import corrections, store_moved, store_normals, store_operator
+from mosa.modules.adapters.fused.assembly_kernels import (
+    corrections,
+    store_moved,
+    store_normals,
+    store_operator,
+)
 from mosa.modules.adapters.fused.network_kernels import by_column
 from mosa.modules.adapters.fused.network_kernels import tanh as exact_tanh
 
@@ -38,13 +43,20 @@ else:
     @triton.jit
     def tanh(z):
         """To 2^-11."""
-        return tl.inline_asm_elementwise("tanh.approx.f32 $0, $1;", "=r,r", [z], dtype=tl.float32, is_pure=True, pack=1)
+        return tl.inline_asm_elementwise(
+            "tanh.approx.f32 $0, $1;", "=r,r", [z], dtype=tl.float32, is_pure=True, pack=1
+        )
 
     @triton.jit
     def half(x):
         """In float16, the largest of it where x is larger: infinity would become NaN in the next product."""
         return tl.inline_asm_elementwise(
-            "cvt.rn.satfinite.f16x2.f32 $0, $2, $1;", "=r,f,f", [x], dtype=tl.float16, is_pure=True, pack=2
+            "cvt.rn.satfinite.f16x2.f32 $0, $2, $1;",
+            "=r,f,f",
+            [x],
+            dtype=tl.float16,
+            is_pure=True,
+            pack=2,
         )
 
     @triton.jit
@@ -104,7 +116,9 @@ def operator_half(
     c, hidden, planes = tl.arange(0, 16), tl.arange(0, H), tl.arange(0, 64)
     of_w, of_s = c[None, :] < 6, (c[None, :] >= 6) & (c[None, :] < 12)
     ones = tl.where(c[None, :] == 12, 1.0, 0.0)
-    two = tl.arange(0, 2 * BLOCK)  # lanes of the assembly, two for each particle: they share the stores
+    two = tl.arange(
+        0, 2 * BLOCK
+    )  # lanes of the assembly, two for each particle: they share the stores
     first, second = two < BLOCK, two >= BLOCK
     # `half_weights._tiles`: five of 16 x H, eight of H x H, three of H x 16, then H x 64, 16 x 16 and 16 x 64
     square = packed + 5 * 16 * H
@@ -115,16 +129,26 @@ def operator_half(
     biases, plane_bias = tile(packed + 64 * H, 16, H), tile(wide + 64 * H + 256, 16, 64)
     narrow_biases = tile(wide + 64 * H, 16, 16)
     F2, A2, A3 = tile(square, H, H), tile(square + H * H, H, H), tile(square + 2 * H * H, H, H)
-    B1, B2, B4 = tile(square + 3 * H * H, H, H), tile(square + 4 * H * H, H, H), tile(square + 5 * H * H, H, H)
+    B1, B2, B4 = (
+        tile(square + 3 * H * H, H, H),
+        tile(square + 4 * H * H, H, H),
+        tile(square + 5 * H * H, H, H),
+    )
     F3, B3, Ap = tile(narrow, H, 16), tile(narrow + 16 * H, H, 16), tile(wide, H, 64)
     if OPERATOR:
-        T1, T2, T3 = tile(square + 6 * H * H, H, H), tile(square + 7 * H * H, H, H), tile(narrow + 32 * H, H, 16)
+        T1, T2, T3 = (
+            tile(square + 6 * H * H, H, H),
+            tile(square + 7 * H * H, H, H),
+            tile(narrow + 32 * H, H, 16),
+        )
     ahead = w_and_s(w, s, tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), N)
     for step in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = step * BLOCK + tl.arange(0, BLOCK)
         lane, q = r[:, None], step * BLOCK + two % BLOCK
         x = tl.where(of_s, ahead / tl.load(unit), ahead)
-        ahead = w_and_s(w, s, r + tl.num_programs(0) * BLOCK, N)  # those of the next turn are on their way during this one
+        ahead = w_and_s(
+            w, s, r + tl.num_programs(0) * BLOCK, N
+        )  # those of the next turn are on their way during this one
         still = (tl.max(tl.abs(x), 1) == 0.0) & (known == 1)
         x = scale * x + ones
         z = silu(tl.dot(half(x), F1))
@@ -167,7 +191,9 @@ def operator_half(
             second_input = scale * tl.load(s2 + (c[None, :] - 6) * M + lane, mask=of_s, other=0.0)
             y0 = by_column(moved, r, c, M, 6) - tl.load(rest + c[None, :], mask=of_w, other=0.0)
             size = tl.load(unit)
-            store_operator(G, q, X, Y, Z, K, first & (q < N), second & (q < N))  # after all loads, which would wait for it
+            store_operator(
+                G, q, X, Y, Z, K, first & (q < N), second & (q < N)
+            )  # after all loads, which would wait for it
             x = tl.where(of_s, second_input, x)
             z = silu(tl.dot(half(x), Tx, z))
             z = silu(tl.dot(z, T2, row(biases, 5, BLOCK)))

@@ -39,17 +39,36 @@ def _tiles(hidden: int) -> list[_Tile]:
 
     def first(weight: int, inputs: slice = every) -> tuple[_Block, _Block]:
         """A first layer's weights for inputs of at most 12 columns, and its bias."""
-        return _Block(weight, every, inputs, halved=True), _Block(weight + 1, every, every, BIAS, halved=True)
+        return _Block(weight, every, inputs, halved=True), _Block(
+            weight + 1, every, every, BIAS, halved=True
+        )
 
-    def whole(weight: int, outputs: slice = every, inputs: slice = every, columns: int = h, column: int = 0) -> _Tile:
-        return _Tile(h, columns, (_Block(weight, outputs, inputs, column=column, halved=weight in (2, 8, 14, 16, 20, 22)),))
+    def whole(
+        weight: int,
+        outputs: slice = every,
+        inputs: slice = every,
+        columns: int = h,
+        column: int = 0,
+    ) -> _Tile:
+        return _Tile(
+            h,
+            columns,
+            (
+                _Block(
+                    weight, outputs, inputs, column=column, halved=weight in (2, 8, 14, 16, 20, 22)
+                ),
+            ),
+        )
 
     after = slice(h, None)  # the inputs of Psi2 and Theta after l1 and l2
     numbers, l2 = slice(0, 12), slice(12, None)  # the outputs of Psi2
     biases = tuple(
-        _Block(bias, l2 if bias == 19 else every, every, k, halved=bias in (3, 9, 17, 23)) for k, bias in enumerate(HIDDEN_BIASES)
+        _Block(bias, l2 if bias == 19 else every, every, k, halved=bias in (3, 9, 17, 23))
+        for k, bias in enumerate(HIDDEN_BIASES)
     )
-    first_layers = [_Tile(16, h, part) for part in (first(0), first(6), first(14, after), first(20, after))]  # F1, A1, Bn, Tx
+    first_layers = [
+        _Tile(16, h, part) for part in (first(0), first(6), first(14, after), first(20, after))
+    ]  # F1, A1, Bn, Tx
     squares = [
         whole(2), whole(8), whole(10),  # F2, A2, A3
         whole(14, inputs=slice(0, h)), whole(16), whole(18, l2),  # B1, B2, B4
@@ -59,8 +78,19 @@ def _tiles(hidden: int) -> list[_Tile]:
         whole(4, columns=16, column=6), whole(18, numbers, columns=16), whole(24, columns=16),  # F3, B3, T3
         whole(12, columns=64),  # Ap
     ]  # fmt: skip
-    narrow = _Tile(16, 16, (_Block(5, every, every, 0, 6), _Block(19, numbers, every, 1), _Block(25, every, every, 2)))
-    return [*first_layers, _Tile(16, h, biases), *squares, *outputs, narrow, _Tile(16, 64, (_Block(13, every, every),))]
+    narrow = _Tile(
+        16,
+        16,
+        (_Block(5, every, every, 0, 6), _Block(19, numbers, every, 1), _Block(25, every, every, 2)),
+    )
+    return [
+        *first_layers,
+        _Tile(16, h, biases),
+        *squares,
+        *outputs,
+        narrow,
+        _Tile(16, 64, (_Block(13, every, every),)),
+    ]
 
 
 @lru_cache
@@ -78,7 +108,10 @@ def _order(shapes: tuple[torch.Size, ...], device: torch.device) -> tuple[Tensor
         factor = torch.ones(tile.rows, tile.columns)
         for block in tile.blocks:
             part = numbers[block.weight][block.outputs, block.inputs].T
-            place = slice(block.row, block.row + part.shape[0]), slice(block.column, block.column + part.shape[1])
+            place = (
+                slice(block.row, block.row + part.shape[0]),
+                slice(block.column, block.column + part.shape[1]),
+            )
             index[place] = part
             factor[place] = 0.5 if block.halved else 1.0
         indices.append(index.flatten())

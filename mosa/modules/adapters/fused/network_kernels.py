@@ -140,13 +140,19 @@ def phi_forward(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s, unit, r, N, M, scale, True)
-        z, _ = silu(product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :])
-        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        z, _ = silu(
+            product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
+        )
+        z, _ = silu(
+            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
+        )
         y = product(z, V3 if KEEP else forward(W3, 6, H, H, P), P) + vector(b3, c, 6)[None, :]
         if BOUNDED:
             y = bound * tanh(y)
         store_by_column(pre, y, r, c, M, 6)
-        own = tl.load(s + r[:, None] * 6 + c[None, :], mask=(r[:, None] < N) & (c[None, :] < 6), other=0.0)
+        own = tl.load(
+            s + r[:, None] * 6 + c[None, :], mask=(r[:, None] < N) & (c[None, :] < 6), other=0.0
+        )
         store_by_column(s1, own / tl.load(unit) + y, r, c, M, 6)
 
 
@@ -163,17 +169,39 @@ def psi1_forward(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s1, w, r, N, M, scale, False)
-        z, _ = silu(product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :])
-        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        z, _ = silu(
+            product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
+        )
+        z, _ = silu(
+            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
+        )
         y = product(z, V3 if KEEP else forward(W3, H, H, H, P), P) + tl.load(b3 + h)[None, :]
         store_by_column(l1, y, r, h, M, H)
-        numbers = alpha * tanh(product(y, Vp if KEEP else forward(Wp, 36, H, H, P), P) + vector(bp, planes, 36)[None, :])
+        numbers = alpha * tanh(
+            product(y, Vp if KEEP else forward(Wp, 36, H, H, P), P)
+            + vector(bp, planes, 36)[None, :]
+        )
         store_by_column(t, numbers, r, planes, M, 36)
 
 
 @triton.jit(do_not_specialize=["N"])
 def psi2_forward(
-    l1, W1, b1, W2, b2, W3, b3, t, l2, N, M, alpha, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr
+    l1,
+    W1,
+    b1,
+    W2,
+    b2,
+    W3,
+    b3,
+    t,
+    l2,
+    N,
+    M,
+    alpha,
+    KEEP: tl.constexpr,
+    H: tl.constexpr,
+    BLOCK: tl.constexpr,
+    P: tl.constexpr,
 ):
     """Step 4: the 12 numbers of C_xyz, rows 36 to 47 of t, and l2 (H, M), from l1 (H + 3, M), its last rows the normals."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
@@ -183,13 +211,21 @@ def psi2_forward(
         V4 = forward(W3 + 12 * H, H, H, H, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
-        z = product(by_column(l1, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 3, P), P) + tl.load(b1 + h)[None, :]
+        z = (
+            product(by_column(l1, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 3, P), P)
+            + tl.load(b1 + h)[None, :]
+        )
         x = by_column(l1 + H * M, r, c, M, 3)
         z, _ = silu(z + product(x, Vx if KEEP else forward(W1 + H, H, 3, H + 3, P), P))
-        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        z, _ = silu(
+            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
+        )
         y = product(z, V3 if KEEP else forward(W3, 12, H, H, P), P) + vector(b3, c, 12)[None, :]
         store_by_column(t + 36 * M, alpha * tanh(y), r, c, M, 12)
-        y = product(z, V4 if KEEP else forward(W3 + 12 * H, H, H, H, P), P) + tl.load(b3 + 12 + h)[None, :]
+        y = (
+            product(z, V4 if KEEP else forward(W3 + 12 * H, H, H, H, P), P)
+            + tl.load(b3 + 12 + h)[None, :]
+        )
         store_by_column(l2, alpha * tanh(y), r, h, M, H)
 
 
@@ -205,10 +241,15 @@ def theta_forward(
         V2, V3 = forward(W2, H, H, H, P), forward(W3, 6, H, H, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
-        z = product(by_column(l2, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 12, P), P) + tl.load(b1 + h)[None, :]
+        z = (
+            product(by_column(l2, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 12, P), P)
+            + tl.load(b1 + h)[None, :]
+        )
         x = network_input(w, s2, w, r, N, M, scale, False)
         z, _ = silu(z + product(x, Vx if KEEP else forward(W1 + H, H, 12, H + 12, P), P))
-        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        z, _ = silu(
+            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
+        )
         y = product(z, V3 if KEEP else forward(W3, 6, H, H, P), P) + vector(b3, c, 6)[None, :]
         if BOUNDED:
             y = bound * tanh(y)

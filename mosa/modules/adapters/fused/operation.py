@@ -13,11 +13,27 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mosa.modules.adapters.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward
-from mosa.modules.adapters.fused.assembly_kernels import assemble, assemble_adjoint, finish, normals, normals_adjoint
+from mosa.modules.adapters.fused.adjoint_kernels import (
+    phi_backward,
+    psi1_backward,
+    psi2_backward,
+    theta_backward,
+)
+from mosa.modules.adapters.fused.assembly_kernels import (
+    assemble,
+    assemble_adjoint,
+    finish,
+    normals,
+    normals_adjoint,
+)
 from mosa.modules.adapters.fused.half_kernel import operator_half
 from mosa.modules.adapters.fused.half_weights import packed
-from mosa.modules.adapters.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
+from mosa.modules.adapters.fused.network_kernels import (
+    phi_forward,
+    psi1_forward,
+    psi2_forward,
+    theta_forward,
+)
 from mosa.modules.adapters.fused.sum_kernels import weight_gradients
 from mosa.physics.adapters.network_evaluation import backward_at_hand, from_weights
 
@@ -71,12 +87,22 @@ class _Launch:
 
     def __init__(self, settings: Settings, n: int, hidden: int, device: torch.device) -> None:
         self.n, self.hidden, self.device = n, hidden, device
-        self.rows = -(-(n + 1) // LANES) * LANES  # the particles, the state at rest, and as many more of these as fill the last one
+        self.rows = (
+            -(-(n + 1) // LANES) * LANES
+        )  # the particles, the state at rest, and as many more of these as fill the last one
         self.lanes = (self.rows // LANES,)
-        precision = "tf32" if settings.precision == "half" else settings.precision  # half is of the forward kernel alone
+        precision = (
+            "tf32" if settings.precision == "half" else settings.precision
+        )  # half is of the forward kernel alone
         # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
-        self.small = precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
-        self.half = settings.precision == "half" and hidden <= 64 and (device.type != "cuda" or _shared(device) >= HALF_SHARED)
+        self.small = (
+            precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
+        )
+        self.half = (
+            settings.precision == "half"
+            and hidden <= 64
+            and (device.type != "cuda" or _shared(device) >= HALF_SHARED)
+        )
         self.size = {"H": hidden, "P": precision}
         self.warps = 8 if hidden > 64 else 4  # a warp group for 64 rows of 64 columns
 
@@ -85,7 +111,11 @@ class _Launch:
         tiles = self.rows // block
         if self.device.type != "cuda":
             return min(tiles, INTERPRETED_PROGRAMS)
-        return min(tiles, per_multiprocessor * torch.cuda.get_device_properties(self.device).multi_processor_count)
+        return min(
+            tiles,
+            per_multiprocessor
+            * torch.cuda.get_device_properties(self.device).multi_processor_count,
+        )
 
     def forward(self) -> tuple[tuple[int], dict]:
         tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
@@ -93,34 +123,85 @@ class _Launch:
         return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
 
     def forward_half(self) -> tuple[tuple[int], dict]:
-        return (self.programs(BLOCK, HALF_PROGRAMS),), {"H": self.hidden, "BLOCK": BLOCK, "num_warps": 4, "num_stages": 1}
+        return (self.programs(BLOCK, HALF_PROGRAMS),), {
+            "H": self.hidden,
+            "BLOCK": BLOCK,
+            "num_warps": 4,
+            "num_stages": 1,
+        }
 
     def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
         if not (self.small and wanted):
-            options = {"SUMS": "outside" if wanted else "none", "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
+            options = {
+                "SUMS": "outside" if wanted else "none",
+                "BLOCK": BLOCK,
+                "num_warps": self.warps,
+                "num_stages": 1,
+            }
             return (self.rows // BLOCK,), self.size | options
         options = {"SUMS": "inside", "BLOCK": 2 * BLOCK, "num_warps": 8, "num_stages": 1}
         return (self.programs(2 * BLOCK, 1),), self.size | options
 
 
-def _evaluate(launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor | None):
+def _evaluate(
+    launch: _Launch,
+    w: Tensor,
+    s: Tensor,
+    unit: Tensor,
+    settings: Settings,
+    weights: Sequence[Tensor],
+    G: Tensor | None,
+):
     """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
     n, m = launch.n, launch.rows
-    b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, launch.hidden + 3, 48, launch.hidden + 12, 6, 6)))
+    b = _Buffers(
+        *(w.new_empty(k, m) for k in (6, 6, launch.hidden + 3, 48, launch.hidden + 12, 6, 6))
+    )
     phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
     grid, size = launch.forward()
-    phi_forward[grid](w, s, unit, *phi, b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size)
+    phi_forward[grid](
+        w,
+        s,
+        unit,
+        *phi,
+        b.pre,
+        b.s1,
+        n,
+        m,
+        scale,
+        bound,
+        BOUNDED=settings.l_max is not None,
+        **size,
+    )
     psi1_forward[grid](w, b.s1, *psi1, b.l1, b.t, n, m, scale, alpha, **size)
     normals[launch.lanes](b.t, b.s1, b.l1[launch.hidden :], m, scale, BLOCK=LANES)
     psi2_forward[grid](b.l1, *psi2, b.t, b.l2, n, m, alpha, **size)
     operator = G is not None
-    assemble[launch.lanes](b.t, b.s1, b.pre, G if operator else b.t, b.s2, b.moved, n, m, OPERATOR=operator, BLOCK=LANES)
+    assemble[launch.lanes](
+        b.t,
+        b.s1,
+        b.pre,
+        G if operator else b.t,
+        b.s2,
+        b.moved,
+        n,
+        m,
+        OPERATOR=operator,
+        BLOCK=LANES,
+    )
     return b
 
 
 def _evaluate_all(
-    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor, h: Tensor
+    launch: _Launch,
+    w: Tensor,
+    s: Tensor,
+    unit: Tensor,
+    settings: Settings,
+    weights: Sequence[Tensor],
+    G: Tensor,
+    h: Tensor,
 ) -> tuple[_Buffers, Tensor]:
     """(buffers, post (6, M)); fills G (N, 6, 6) and h (N, 6)."""
     n, m, bound = launch.n, launch.rows, settings.l_max or 0.0
@@ -128,7 +209,19 @@ def _evaluate_all(
     post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
     grid, size = launch.forward()
     theta_forward[grid](
-        b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
+        b.l2,
+        w,
+        b.s2,
+        b.moved,
+        *weights[20:],
+        post,
+        sums,
+        n,
+        m,
+        settings.scale,
+        bound,
+        BOUNDED=settings.l_max is not None,
+        **size,
     )
     finish[launch.lanes](sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES)
     return b, post
@@ -165,7 +258,15 @@ def _evaluate_half(
     """(buffers, post (6, M)) in float16. outputs: G (N, 6, 6) and h (N, 6) to be filled, None for steps 1 to 4 alone; stored: l1
     and l2 too."""
     m, hidden, operator = launch.rows, launch.hidden, outputs is not None
-    sizes = (6, 6, (hidden if stored else 0) + 3, 48, hidden + 12 if stored else 0, 6, 6 if operator else 0)
+    sizes = (
+        6,
+        6,
+        (hidden if stored else 0) + 3,
+        48,
+        hidden + 12 if stored else 0,
+        6,
+        6 if operator else 0,
+    )
     b = _Buffers(*(w.new_empty(k, m) for k in sizes))
     post = w.new_empty(6 if operator else 0, m)
     grid, size = launch.forward_half()
@@ -187,7 +288,9 @@ class _FusedOperator(torch.autograd.Function):
         G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
         stored, made = backward_at_hand(), None
         with torch.cuda.device_of(w):
-            if launch.half:  # from the weights as given: another copy of them each time would not be known again
+            if (
+                launch.half
+            ):  # from the weights as given: another copy of them each time would not be known again
                 made = _from_weights(settings, given, stored)
                 buffers, post = _evaluate_half(launch, w, s, unit, settings, made, (G, h), stored)
             else:
@@ -214,7 +317,11 @@ class _FusedOperator(torch.autograd.Function):
         with torch.cuda.device_of(w):
             buffers, inputs = ctx.buffers, (ctx.launch, w, s, unit, ctx.settings)
             if buffers is None:
-                buffers = _evaluate_half(*inputs, ctx.made, None, True)[0] if ctx.launch.half else _evaluate(*inputs, weights, None)
+                buffers = (
+                    _evaluate_half(*inputs, ctx.made, None, True)[0]
+                    if ctx.launch.half
+                    else _evaluate(*inputs, weights, None)
+                )
             gw, gs, gradients = _backward(*inputs, weights, post, seeds, extra, any(needs), buffers)
         gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
         return None, None, gw, gs, *gradients
@@ -229,7 +336,9 @@ def _backward(
     n, m, hidden = launch.n, launch.rows, launch.hidden
     grid, size = launch.backward(wanted)
     inside = size["SUMS"] == "inside"
-    h1, h2, g1, g2 = (w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4))  # of one network after the other
+    h1, h2, g1, g2 = (
+        w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4)
+    )  # of one network after the other
     scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
     flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
     programs = grid[0] if inside else launch.programs(BLOCK, 1)
@@ -239,7 +348,13 @@ def _backward(
     def empty(rows: int) -> Tensor:
         return w.new_empty(rows, m)
 
-    def sums(layer: int, inputs: Tensor, outputs: Tensor, more: tuple[Tensor, Tensor] | None = None, jobs: int = 5) -> None:
+    def sums(
+        layer: int,
+        inputs: Tensor,
+        outputs: Tensor,
+        more: tuple[Tensor, Tensor] | None = None,
+        jobs: int = 5,
+    ) -> None:
         """Gradients of the network whose first weight is weights[layer]; jobs=2: of its last layer."""
         g4, x4 = more or (outputs, inputs)
         weight_gradients[(programs, jobs)](
@@ -293,7 +408,9 @@ def _backward(
     return gw, gs, [part.view_as(p) for part, p in zip(parts, weights, strict=True)]
 
 
-def fused_operator(w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor]) -> tuple[Tensor, ...]:
+def fused_operator(
+    w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
     """(G (N, 6, 6), h (N, 6), numbers (N, 48), pre (N, 6), post (N, 6)) of w and s, each (N, 6) float32.
 
     s and h are in multiples of unit (1,), which gets no gradient: h = unit (b - b at rest), without the second where not rest_free,

@@ -20,8 +20,16 @@ POISSON_STEPS = (0.2, 0.32, 0.42)
 """Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
 FURTHER, FURTHEST = 1.5, 100.0
 """Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
-STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 1.6, "cohesion": 0.5, "nu": 0.8,
-           "friction_angle": 0.8}
+STRIDES = {
+    "E": 1.1,
+    "mu": 1.1,
+    "kappa": 1.1,
+    "yield_stress": 1.1,
+    "viscosity": 1.6,
+    "cohesion": 0.5,
+    "nu": 0.8,
+    "friction_angle": 0.8,
+}
 """First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
 range and 17 degrees in that of the angle's."""
 FINEST = 0.2
@@ -58,7 +66,9 @@ class Calibration(Protocol):
         """As when `state` was taken."""
 
 
-def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
+def compass(
+    at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]
+) -> dict[str, float]:
     """The place that a compass search of at() ends at, begun at `row`: a step up or down in one number at a time, where it
     improves, and smaller steps where none does."""
     best, share = at(row), 1.0
@@ -127,28 +137,49 @@ def search(calibration: Calibration) -> float:
 
     numbers: tuple[float | None, ...] = POISSON_STEPS if "nu" in learned else (None,)
     multiples = list(STIFFNESS_STEPS) if modulated else [1.0]
-    best = min(((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers), key=lambda found: found[0])
+    best = min(
+        ((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers),
+        key=lambda found: found[0],
+    )
     for end, factor in ((multiples[0], 1 / FURTHER), (multiples[-1], FURTHER)):
         multiple = end
-        while modulated and best[1] == multiple and math.isfinite(best[0]) and 1 / FURTHEST < multiple * factor < FURTHEST:
+        while (
+            modulated
+            and best[1] == multiple
+            and math.isfinite(best[0])
+            and 1 / FURTHEST < multiple * factor < FURTHEST
+        ):
             multiple *= factor
-            found = min(((at(row_of(multiple, nu)), multiple, nu) for nu in numbers), key=lambda found: found[0])
+            found = min(
+                ((at(row_of(multiple, nu)), multiple, nu) for nu in numbers),
+                key=lambda found: found[0],
+            )
             best = min(best, found, key=lambda found: found[0])
     if not math.isfinite(best[0]):
-        raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
-                                 "nearer to the body's, or raise simulation.max_substeps")
+        raise SimulationDiverged(
+            "fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
+            "nearer to the body's, or raise simulation.max_substeps"
+        )
     row = row_of(*best[1:])
     if set(learned) - {"E", "nu"}:
         row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
     if len(learned) >= MANY:
         stiffnesses = [row_of(m, None) for m in (WIDE if modulated else (1.0,))]
-        wide = [each | {n: each[n] + step for n, step in steps.items()} for each in stiffnesses for steps in moved(learned)]
+        wide = [
+            each | {n: each[n] + step for n, step in steps.items()}
+            for each in stiffnesses
+            for steps in moved(learned)
+        ]
         return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
     start_at(row)
     return at(row)
 
 
-def nearest_end(calibration: Calibration, start_at: Callable[[dict[str, float]], None], rows: Sequence[dict[str, float]]) -> float:
+def nearest_end(
+    calibration: Calibration,
+    start_at: Callable[[dict[str, float]], None],
+    rows: Sequence[dict[str, float]],
+) -> float:
     """Gauss-Newton from several starts, the nearest of which after a few iterations go on; the calibration is left at the nearest
     end, as if it had not begun, and its mean distance [m] is returned. Starts that cannot be simulated are left out, but the first,
     whose error is raised where none of them can."""
@@ -178,7 +209,9 @@ def nearest_end(calibration: Calibration, start_at: Callable[[dict[str, float]],
     return distance
 
 
-def went_on(calibration: Calibration, state: dict, iterations: int) -> tuple[float, dict[str, dict], dict]:
+def went_on(
+    calibration: Calibration, state: dict, iterations: int
+) -> tuple[float, dict[str, dict], dict]:
     """(mean distance [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
     calibration.restore(state)
     for _ in range(iterations):
@@ -188,7 +221,9 @@ def went_on(calibration: Calibration, state: dict, iterations: int) -> tuple[flo
 
 def calibrated(body: Body) -> dict[str, dict]:
     """What a calibration learns of a body, as it is now."""
-    return {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}
+    return {
+        part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")
+    }
 
 
 def calibrate_as(body: Body, numbers: Mapping[str, dict]) -> None:
@@ -201,7 +236,9 @@ TRIED = 4
 """Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
 
 
-def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Calibration]) -> dict[str, float]:
+def choose_law(
+    body: Body, candidates: Sequence[str], build: Callable[[], Calibration]
+) -> dict[str, float]:
     """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
     each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
     """
@@ -221,8 +258,10 @@ def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Calibr
         if best is None or found[law] < best[0]:
             best = (found[law], calibrated(body), law)
     if best is None:
-        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
-                                 "to the body's")
+        raise SimulationDiverged(
+            f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
+            "to the body's"
+        )
     calibrate_as(body, best[1])
     for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
         material.choose(best[2])

@@ -88,7 +88,9 @@ def choose_ground(
             pass  # its distance says so
 
     attempt(Ground(height, "sticky"), searching=True)
-    for mode, friction in tqdm(list(itertools.product(RUBBING, FRICTIONS)), "contact with the ground", leave=False):
+    for mode, friction in tqdm(
+        list(itertools.product(RUBBING, FRICTIONS)), "contact with the ground", leave=False
+    ):
         slide(Ground(height, mode, friction))
     if (nearest := taken_of(distances)) != "sticky":
         for factor in (1 / BETWEEN, BETWEEN):
