@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT / "tests" / "physics_verification"), str(ROOT / "tests" / "physics")]
+sys.path[:0] = [str(ROOT / "tests" / "physics_verification"), str(ROOT / "tests" / "helpers")]
 
 import bar as bars
 import closed_systems
@@ -162,7 +162,7 @@ def unit_checks(_):
         ["20", "adjoint of rotation and stretch at rest, equal, nearly singular, inverted values", "1e-6",
          f"{units.polar_gradient():.1e}"],
         ["21", f"torch twin, one substep, {len(known)} laws", "1e-12", worst(twins[law] for law in known)],
-        ["21", "CUDA against CPU", "1e-4 after 100 substeps f32", "met on an H200: tests/physics/test_cuda.py, which needs a GPU"],
+        ["21", "CUDA against CPU", "1e-4 after 100 substeps f32", "met on an H200: tests/physics/engine/test_cuda.py"],
     ]  # fmt: skip
 
 

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from data.conftest import BOX, block_scene
+from blocks_film import BOX, block_scene
 from drawn_mistakes import changed, examples, numbers, places, plain, values
 from hypothesis import given
 from hypothesis import strategies as st
 from strangers import ROOT, saved
-from test_known import composed
-from test_world import twin
 
 from mosa.config.build import rehearse
 from mosa.config.extensions import registered_keys
@@ -25,6 +23,8 @@ from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.schema import check
 from mosa.system.npz import read_npz, write_npz
 from mosa.twin.twin import Twin
+from tests.config.test_known import composed
+from tests.modules.body.test_world import twin
 
 DEFAULT = functools.cache(lambda: composed("debug=default", "world.walls={mode: separate}"))
 TWIN = functools.cache(twin)

@@ -87,7 +87,5 @@ def training_observations(
         ).flow
         for v in range(len(found.cameras))
     ]
-    # each is there, as it was asked for
-    return Observations(
-        found.images, found.mattes, torch.cat(flow), found.cameras, found.image_width
-    )  # type: ignore[arg-type]
+    flows = torch.cat(flow)  # type: ignore[arg-type]  # each is there, as it was asked for
+    return Observations(found.images, found.mattes, flows, found.cameras, found.image_width)

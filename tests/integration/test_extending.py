@@ -165,7 +165,7 @@ print(float((one - other).abs().max()), float((one - softer).abs().max()), slope
 
 def test_the_baseline_stands_in_for_the_law(tmp_path):
     written(tmp_path)
-    path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "modules")))
+    path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "helpers")))
     (tmp_path / "baseline.py").write_text(BASELINE)
     result = forked.call(
         str(tmp_path / "baseline.py"), environment=os.environ | {"PYTHONPATH": path}

@@ -1,6 +1,6 @@
 """Check 17 of docs/verification.md with the full adapter: the scene turned by 90 degrees (F_0 = Q), the scene moved by whole cells.
 
-tests/physics/test_rollout.py does both at once with a linear operator.
+tests/physics/engine/test_rollout.py does both at once with a linear operator.
 """
 
 import pytest

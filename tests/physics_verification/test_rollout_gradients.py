@@ -1,7 +1,9 @@
 """Checks 18 and 19 of docs/verification.md: the gradient of rollouts with the full adapter, random last layers, E_ref fixed.
 
-With a linear operator, losses on all frames, and the segments' recomputation: tests/physics/test_rollout.py. Differentials of the
-factorisations (check 20): tests/physics/test_kinematics.py. Torch twin (21): tests/physics/test_reference.py, test_cuda.py.
+With a linear operator, losses on all frames, and the segments' recomputation:
+tests/physics/engine/test_rollout.py. Differentials of the factorisations (check 20):
+tests/physics/constitutive/test_kinematics.py. Torch twin (21): tests/physics/test_reference.py and
+tests/physics/engine/test_cuda.py.
 """
 
 import pytest

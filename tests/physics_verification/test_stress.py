@@ -1,6 +1,7 @@
 """Checks 4 to 7 of docs/verification.md for every registered law: symmetry, frame indifference, energy, small strain.
 
-Beside the units: the adapter's stages alone in tests/modules/test_objectivity.py, gradients in tests/physics/test_elasticity.py.
+Beside the units: the adapter's stages alone in tests/baselines/test_objectivity.py, gradients in
+tests/physics/constitutive/test_elasticity.py.
 """
 
 import pytest

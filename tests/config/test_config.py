@@ -1,0 +1,302 @@
+"""Every combination of the config groups composes, and a switch changes what it names and nothing else."""
+
+import re
+from dataclasses import MISSING, fields
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import MissingConfigException
+from omegaconf import OmegaConf
+
+from mosa.config.build import build_adapter, build_stages, rehearse
+from mosa.config.extensions import registered_keys
+from mosa.config.keys import EVALUATION, SIMULATION, TRAINING
+from mosa.errors import ConfigError
+from mosa.evaluation.settings import EvaluationSettings
+from mosa.modules.adapters.registry import ADAPTERS, adapter_class
+from mosa.modules.body.heterogeneity import HeterogeneitySettings
+from mosa.modules.body.simulation_settings import SimulationSettings
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.stages import Stage
+from mosa.reconstruction.gaussians.carried import CarriedSettings
+from mosa.reconstruction.gaussians.static import FitSettings, StaticSettings
+from mosa.reconstruction.geometry.body import GeometrySettings
+from mosa.reconstruction.motion.dynamic import DynamicSettings
+from mosa.reconstruction.motion.informed import InformedSettings
+from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.schema import arguments_of, check
+
+ROOT = Path(__file__).parents[2]
+
+
+def group(name: str) -> list[str]:
+    return sorted(p.stem for p in (ROOT / "conf" / name).glob("*.yaml"))
+
+
+def composed(*overrides: str) -> dict:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return OmegaConf.to_container(compose("train", overrides=list(overrides)), resolve=False)
+
+
+@pytest.mark.parametrize("scene", group("scene"))
+def test_every_scene_with_every_prior_composes(scene):
+    """And every pair of them with an adapter: with each scene the adapters go round the priors by one."""
+    adapters, first = group("adapter"), group("scene").index(scene)
+    for i, prior in enumerate(group("prior")):
+        config = composed(
+            f"scene={scene}", f"prior={prior}", f"adapter={adapters[(first + i) % len(adapters)]}"
+        )
+        assert config["prior"] and config["scene"]
+
+
+@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "criterion", "trainer", "logger", "ablation",
+                                  "experiment"])  # fmt: skip
+def test_every_option_of_a_group_composes(name):
+    for option in group(name):
+        assert composed(f"{name}={option}")
+
+
+@pytest.mark.parametrize(
+    "override", ["debug=defualt", "scene=rabit", "prior=jelly", "ablation=no_foo", "trainer=tpu"]
+)
+def test_a_mistyped_option_is_refused(override):
+    with pytest.raises(MissingConfigException, match=override.split("=")[1]):
+        composed(override)
+
+
+@pytest.mark.parametrize("adapter, message", [
+    ({"_target_": "mosa.modules.adapters.stress.StressAdapter", "alpha": 2}, "adapter.alpha"),
+    ({"_target_": "mosa.baselines.direct.DirectAdapter", "no_C": True}, "no_C"),
+    ({"_target_": "mosa.modules.adapters.stress.StressAdapter", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
+    ({"name": "stress", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
+    ({"name": "stres"}, "adapter.name: expected hyperelastic, stress, direct, nclaw, neuma, interaction or null, found 'stres'"),
+    ({"name": ["stress"]}, "adapter.name: expected hyperelastic, stress, direct, nclaw, neuma, interaction or null"),
+    ({"name": "hyperelastic", "strain": "almansi"}, "adapter.strain: expected hencky or biot or green, found 'almansi'"),
+    ({"name": "hyperelastic", "alpha": 0.2}, "adapter.alpha: unknown key; expected one of strain"),
+    ({"name": "direct", "_target_": "mosa.modules.adapters.stress.StressAdapter"}, "found both"),
+    ({"_target_": "mosa.modules.adapters.stress.Stress"}, "adapter._target_: expected a known adapter"),
+    ({"_target_": ["subprocess.Popen"]}, "adapter._target_"),
+])  # fmt: skip
+def test_a_mistake_in_the_adapter_names_its_key(adapter, message):
+    with pytest.raises(ConfigError, match=message):
+        build_adapter(adapter)
+
+
+@pytest.mark.parametrize(
+    "key, value",
+    [("precision", 16), ("stride", 0), ("max_substeps", 2.5), ("courant", 0), ("dx", -1.0)],
+)
+def test_a_mistake_in_the_simulation_names_its_key(key, value):
+    with pytest.raises(ConfigError, match=f"simulation.{key}"):
+        SimulationSettings(**{"dx": 0.1, key: value})
+
+
+def test_a_mistake_in_a_stage_names_its_key():
+    fit = {name: {"iterations": 2, "lr": 0.1} for name in ("prior", "prior_eta", "joint")}
+    with pytest.raises(
+        ConfigError, match=r"fit\.joint\.lrr: unknown key; expected one of iterations, lr,"
+    ):
+        build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=None, adapter=None)
+    with pytest.raises(ConfigError, match=r"fit\.joint\.start"):
+        build_stages(
+            fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}},
+            heterogeneity=None,
+            adapter=None,
+        )
+
+
+@pytest.mark.parametrize(
+    "adapter, expected", [("hyperelastic", "gauss_newton"), (None, None), ("stress", "adam")]
+)
+def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter, expected):
+    fit = composed()["fit"]
+    stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    found = {stage.name: stage.optimizer for stage in stages}
+    assert (
+        found.get("joint") == expected and found["prior"] == "gauss_newton"
+    )  # without an adapter there is nothing to join
+    asked = fit | {"joint": fit["joint"] | {"optimizer": "gauss_newton"}}
+    if expected == "adam":
+        with pytest.raises(
+            ConfigError, match=r"fit\.joint\.optimizer: gauss_newton learns few numbers"
+        ):
+            build_stages(asked, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    adam = composed("fit=adam")["fit"]
+    assert {
+        s.optimizer
+        for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    } == {"adam"}
+
+
+@pytest.mark.parametrize("override, adapter, expected", [(None, None, 3), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
+                                                         (None, "hyperelastic", 0)])  # fmt: skip
+def test_a_calibration_looks_again_where_it_is_all_there_is(override, adapter, expected):
+    fit = composed(*([override] if override else []))["fit"]
+    stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    assert [stage.name for stage in stages if stage.looks_again] == [
+        "prior"
+    ] * expected and not stages[0].looks_again
+
+
+@pytest.mark.parametrize("group_name", ["adapter", "ablation", "criterion", "debug", "experiment", "fit", "logger", "prior",
+                                        "reconstruction", "rendering", "scene", "simulation", "trainer"])  # fmt: skip
+def test_every_option_passes_the_checks_before_a_run(group_name):
+    for option in group(group_name):
+        config = composed(f"{group_name}={option}")
+        check(config, TRAINING, EVALUATION, registered_keys(config))
+        rehearse(config)
+
+
+@pytest.mark.parametrize("override", [
+    "seed=abc", "seed=-1", "seed=1.5", "scene.also_train=test_60", "fit.views=1.5", "fit.views=true", "fit.clip=0",
+    "fit.prior.lr=-1",
+    "fit.joint.lr_adapter=abc", "fit.prior.iterations=1.5", "fit.joint.start=foo", "losses.image=null", "losses.flow=-1",
+    "heterogeneity.enabled=maybe", "heterogeneity.amplitude=abc", "adapter.alpha=.nan", "adapter.plastic=1",
+    "simulation.particles=1.5", "simulation.dx=abc", "simulation.courant=5", "simulation.contact_offset=abc", "prior.frozen=E",
+    "rendering.margin=abc", "reconstruction.resolution=0", "reconstruction.points=2", "reconstruction.neighbours=1",
+    "reconstruction.static.views=abc", "reconstruction.static.start=colmap", "reconstruction.static.shape=1",
+    "reconstruction.static.densify=split", "reconstruction.static.max_points=3.5", "+reconstruction.static.growth=-1",
+    "reconstruction.appearance.shape=round", "+reconstruction.appearance.axis_ratio=0.5",
+    "reconstruction.dynamic.modes=0", "world.walls=5", "world.colliders=[5]",
+    "evaluation.samples=0",
+])  # fmt: skip
+def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
+    base = (
+        ["adapter=linear"] if override.startswith("adapter.") else []
+    )  # it has the keys, and the default has not
+    with pytest.raises(
+        ConfigError, match=rf"^{override.lstrip('+').split('=')[0]}: expected .*, found "
+    ):
+        config = composed(*base, override)
+        check(config, TRAINING, EVALUATION, registered_keys(config))
+
+
+@pytest.mark.parametrize("overrides, message", [
+    (["prior.parameters.nu=0.7"], r"prior\.parameters\.nu"),
+    (["+prior.foo=1"], r"prior\.foo: unknown key; expected one of law, parameters, frozen, modulated"),
+    (["+prior.options.foo=1"], r"prior\.options\.foo: unknown key; expected one of yield_convention"),
+    (["reconstruction.static.max_points=5000"], r"reconstruction\.static\.max_points: expected null"),
+    (["adapter=linear", "adapter.alpha=2"], r"adapter\.alpha"),
+    (["adapter.strain=almansi"], r"adapter\.strain"),
+    (["heterogeneity.wavelength=3"], r"heterogeneity\.wavelength"),
+    (["criterion.name=open"], r"criterion\.name"),
+    (["criterion.gain=2"], r"criterion\.gain"),
+    (["identification.count=0"], r"identification\.count"),
+    (["heterogeneity.amplitude=2"], r"heterogeneity\.amplitude"),
+    (["simulation.precision=16"], r"simulation\.precision"),
+    (["fit.prior.iterations=0"], r"fit\.prior\.iterations"),
+    (["world.walls={foo:1}"], r"world\.walls\.foo: unknown key; expected one of mode, friction"),
+    (["world.walls={friction:abc}"], r"world\.walls\.friction"),
+    (["world.walls={mode:sticky,friction:0.1}"], r"world\.walls\.friction"),
+    (["world.colliders=[{type:cone}]"], r"world\.colliders\[0\]\.type"),
+])  # fmt: skip
+def test_a_part_that_cannot_be_built_is_named_before_anything_is_computed(overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        rehearse(composed(*overrides))
+
+
+def test_a_rehearsal_draws_no_random_number():
+    before = torch.get_rng_state()
+    rehearse(composed("adapter=mosa"))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("values, key", [
+    ({"velocity": ["a", 0, 0]}, "velocity"), ({"velocity": 5}, "velocity"), ({"rotation": [1, 0, 0]}, "rotation"),
+    ({"height": "abc"}, "height"), ({"frames": 0}, "frames"), ({"colliders": 5}, "colliders"),
+])  # fmt: skip
+def test_a_new_start_of_the_wrong_kind_is_named(values, key):
+    with pytest.raises(ConfigError, match=rf"simulate\.{key}: expected "):
+        check({"simulate": values}, SIMULATION)
+
+
+def flat(config, prefix="") -> dict:
+    result = {}
+    for key, value in config.items():
+        result |= (
+            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        )
+    return result
+
+
+EXPECTED = {
+    "full": set(),
+    "no_C": {"adapter.no_C"},
+    "no_het": {"heterogeneity.enabled"},
+    "no_pre": {"adapter.no_pre"},
+    "no_post": {"adapter.no_post"},
+    "no_flow": {"losses.flow"},
+    "no_scale": {"losses.stretch"},
+    "no_rot": {"losses.rotation"},
+    "no_prior_stress": {"adapter.no_prior_stress"},
+}
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
+    # the parts of the networks exist in the paper's adapter only
+    whole = "paper" if any(key.startswith("adapter.") for key in EXPECTED[name]) else "full"
+    full, ablated = flat(composed(f"ablation={whole}")), flat(composed(f"ablation={name}"))
+    assert {k for k in full.keys() | ablated.keys() if full.get(k) != ablated.get(k)} == EXPECTED[
+        name
+    ]
+
+
+@pytest.mark.parametrize("name, overrides", [
+    ("bird", ["scene=pacnerf_bird", "prior=neo_hookean", "scene.holdout_cameras=[5]"]),
+    ("paper_size", ["simulation=paper", "trainer=gpu", "scene.scale=1"]),
+])  # fmt: skip
+def test_an_experiment_is_what_its_overrides_are(name, overrides):
+    assert composed(f"experiment={name}") == composed(*overrides) != composed()
+    assert (
+        composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"]
+        == composed("prior=stvk")["prior"]["law"]
+    )
+
+
+@pytest.mark.parametrize("settings", [
+    SimulationSettings, Stage, FitSettings, StaticSettings, CarriedSettings, GeometrySettings, InformedSettings, DynamicSettings,
+    ReconstructionSettings, HeterogeneitySettings, Criterion, IdentificationSettings, EvaluationSettings])  # fmt: skip
+def test_a_knob_is_written_once(settings):
+    """Its default is of its kind, the check of a configuration has the same kind, and the settings refuse what that refuses."""
+    given = {"dx": 0.1, "name": "joint", "iterations": 3, "lr": 0.1}
+    given = {
+        name: value
+        for name, value in given.items()
+        if name in {f.name for f in fields(settings) if f.default is MISSING}
+    }
+    made, known = settings(**given), set(map(id, (TRAINING | EVALUATION).values()))
+    knobs = [f for f in fields(settings) if "kind" in f.metadata]
+    assert len(knobs) >= 2
+    for f in knobs:
+        kind = f.metadata["kind"]
+        assert kind.fits(getattr(made, f.name)) and (id(kind) in known or f.name == "dx"), f.name
+        wrong = object()
+        assert not kind.fits(wrong)
+        with pytest.raises(
+            ConfigError, match=rf"\.{f.name}: expected {re.escape(kind.described)}, found <object"
+        ):
+            settings(**{**given, f.name: wrong})
+
+
+@pytest.mark.parametrize("name", sorted(ADAPTERS))
+def test_an_adapters_knobs_are_its_own(name):
+    """Its class says what each argument may be, the check of a configuration has that from there, and the adapter refuses what that
+    refuses; another adapter may have an argument of the same name that is something else."""
+    build = adapter_class({"name": name})
+    arguments, keys = arguments_of(build), registered_keys({"adapter": {"name": name}})
+    assert set(build.knobs) == set(arguments)
+    for argument, kind in build.knobs.items():
+        assert kind.fits(arguments[argument].default) and keys[f"adapter.{argument}"] is kind
+        assert f"adapter.{argument}" not in TRAINING
+        wrong = object()
+        with pytest.raises(
+            ConfigError,
+            match=rf"^adapter\.{argument}: expected {re.escape(kind.described)}, found <object",
+        ):
+            build(**{argument: wrong})
+        with pytest.raises(ConfigError, match=rf"^adapter\.{argument}: expected "):
+            build_adapter({"name": name, argument: wrong})

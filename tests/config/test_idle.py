@@ -1,0 +1,37 @@
+"""A key that is set and does nothing is said; one that does something is not."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from mosa.config.build import rehearse
+from mosa.config.idle import idle
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+def found(*overrides: str) -> list[str]:
+    """Keys of the overrides that have no effect."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        values = OmegaConf.to_container(compose("train", overrides=list(overrides)), resolve=True)
+    return [sentence.split(":")[0] for sentence in idle(overrides, values, rehearse(values))]
+
+
+@pytest.mark.parametrize("overrides, expected", [
+    (["losses.flow=0", "losses.rotation=0", "fit.joint.lr=0.1", "fit.clip=2"], ["losses.flow", "fit.joint.lr", "fit.clip"]),
+    (["ablation=no_flow"], ["ablation=no_flow"]),
+    (["fit=adam", "losses.flow=0", "fit.joint.lr=0.1", "identification.count=5", "+fit.joint.newton_iterations=3"],
+     ["identification.count", "fit.joint.newton_iterations"]),
+    (["adapter=mosa", "losses.flow=0", "fit.prior.lr=0.1", "fit.joint.lr=0.1", "identification.count=5"], ["fit.prior.lr"]),
+    (["heterogeneity.hidden=8", "heterogeneity.most=20"], ["heterogeneity.hidden"]),
+    (["heterogeneity.enabled=false", "heterogeneity.most=20"], ["heterogeneity.most"]),
+    (["criterion=free", "criterion.gain=0.2"], ["criterion.gain"]),
+    (["simulation.dx=0.01", "simulation.particles=500", "simulation.min_substeps=3"],
+     ["simulation.particles", "simulation.min_substeps"]),
+    (["reconstruction.carried.iterations=0", "reconstruction.carried.degree=2"], ["reconstruction.carried.degree"]),
+    (["scene=tiny", "simulation.adaptive=true", "simulation.min_substeps=3", "seed=3"], []),
+])  # fmt: skip
+def test_what_has_no_effect_is_said(overrides, expected):
+    assert [key for key in found(*overrides)] == [each.split("=")[0] for each in expected]

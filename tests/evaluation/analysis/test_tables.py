@@ -1,0 +1,104 @@
+"""The tables and sentences that a run ends with."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from mosa.evaluation.analysis.tables import (
+    columns_text,
+    continued_text,
+    determined_text,
+    parameter_table,
+)
+from mosa.modules.body import material
+from mosa.modules.body.material import LOG, register_form, unit_of
+
+PRIORS = Path(__file__).parents[3] / "conf" / "prior"
+
+
+def cells_of(table):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+
+
+def test_both_stages_have_their_error_where_the_truth_is_known():
+    figures = {"id_prior/E": 1.1e5, "id/E": 0.95e5, "id_prior/E_relative_error": 0.1, "id/E_relative_error": 0.05,
+               "id_prior/E_ratio": 1.1, "id_prior/contact_offset_m": 0.01}  # fmt: skip
+    rows = cells_of(parameter_table(figures, "neo_hookean"))
+    assert rows[0] == ["parameter", "prior", "joint", "error of prior", "error of joint"]
+    assert rows[2:] == [
+        ["E [Pa]", "1.1e+05", "95000", "10.0%", "5.0%"],
+        ["contact_offset_m", "0.01", "nan", "", ""],
+    ]
+
+
+@pytest.mark.parametrize("file", sorted(PRIORS.glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_parameter_of_every_law_has_the_unit_that_its_configuration_says(file):
+    """Whose comment lists the units in the order of the parameters: `# Pa s, Pa: where the fit starts`."""
+    (line,) = [line for line in file.read_text().splitlines() if line.startswith("parameters:")]
+    units = [unit.strip() for unit in line.partition("#")[2].split(":")[0].split(",")]
+    prior = OmegaConf.load(file)
+    law, names = prior.get("candidates", [prior.law])[0], list(prior.parameters)
+    assert len(units) == len(names)
+    assert [unit_of(law, name) or "-" for name in names] == units
+    rows = cells_of(parameter_table({f"id_prior/{name}": 1.0 for name in names}, law))[2:]
+    assert [row[0] for row in rows] == [
+        name if unit == "-" else f"{name} [{unit}]" for name, unit in zip(names, units)
+    ]
+
+
+def test_the_same_name_is_measured_as_the_law_of_a_mixture_has_it():
+    assert (
+        unit_of("herschel_bulkley+stvk", "mu") == "Pa"
+        and unit_of("herschel_bulkley+stvk", "viscosity") == "Pa s"
+    )
+    assert unit_of("newtonian+herschel_bulkley", "kappa") == "Pa"
+
+
+def test_a_parameter_of_another_package_has_the_unit_that_it_was_registered_with(monkeypatch):
+    monkeypatch.setattr(material, "FORMS", dict(material.FORMS))
+    monkeypatch.setattr(material, "UNITS", dict(material.UNITS))
+    register_form("fibre_stiffness", LOG, unit="Pa")
+    register_form("exponent", LOG)
+    rows = cells_of(
+        parameter_table({"id_prior/fibre_stiffness": 1.0, "id_prior/exponent": 1.0}, "stvk")
+    )[2:]
+    assert [row[0] for row in rows] == ["fibre_stiffness [Pa]", "exponent"]
+
+
+def test_what_is_continued_to_a_fine_grid_has_its_unit():
+    figures = {"extrapolated/dx_m": 0.01, "extrapolated/coarse_dx_m": 0.014, "id/mu": 200.0, "extrapolated/mu": 190.0,
+               "extrapolated/mu_coarse": 210.0, "extrapolated/mu_sd": 5.0}  # fmt: skip
+    assert (
+        continued_text(figures, "newtonian").splitlines()[-1]
+        == "- mu [Pa s]: 200, 210, **190** +- 5"
+    )
+
+
+@pytest.mark.parametrize(("law", "figures", "said"), [
+    ("newtonian", {"id/mu": 224.5, "posterior/mu_relative_sd": 0.1}, "- mu = 224.5 Pa s, with a standard deviation of 10.0%."),
+    ("herschel_bulkley", {"id/mu": 1e4, "posterior/mu_relative_sd": 0.1}, "- mu = 1e+04 Pa, with a standard deviation of 10.0%."),
+    ("herschel_bulkley", {"id/viscosity": 10.0, "posterior/viscosity_relative_sd": 0.5},
+     "- viscosity = 10 Pa s, with a standard deviation of 50.0%."),
+    ("drucker_prager", {"id/friction_angle": 39.2, "posterior/friction_angle_sd": 4.8},
+     "- friction angle = 39.2 degrees, with a standard deviation of 4.8."),
+])  # fmt: skip
+def test_what_is_determined_has_its_unit(law, figures, said):
+    assert said in determined_text(figures | {"posterior/draws": 12}, law).splitlines()
+
+
+def test_the_recording_that_no_column_names_is_said():
+    figures = {
+        f"{part}/psnr_crop": 30.0 for part in ("train", "train/drop_2", "test", "test/drop_3")
+    }
+    assert columns_text(figures, "drop_1") == (
+        "Columns: `train` is the recording drop_1, `train/...` the others that were learned "
+        "from, `test/...` those held out, `test` their mean."
+    )
+    assert (
+        columns_text({"train/psnr_crop": 30.0}, "drop_1")
+        == "Columns: `train` is the recording drop_1."
+    )
+    assert (
+        columns_text({"test/a/psnr_crop": 30.0}, "a") == ""
+    )  # of another scene than the one that was learned from

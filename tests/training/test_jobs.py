@@ -1,0 +1,599 @@
+"""Exit codes and messages of a job and of a sweep, whichever process its jobs ran in."""
+
+import errno
+import io
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+
+from mosa.errors import ConfigError
+from mosa.system import refused
+from mosa.system.npz import write_npz
+from mosa.training import jobs
+from mosa.training.jobs import (
+    LONGEST,
+    Failures,
+    attempt,
+    check_files,
+    check_folders,
+    folder_name,
+    held,
+    quoted,
+)
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """HydraConfig as job 3 of a sweep sees it, and the configuration that callbacks get."""
+    config = OmegaConf.create({"sweep": {"dir": str(tmp_path)}, "job": {"num": 3}})
+    config.mode = RunMode.MULTIRUN
+    monkeypatch.setattr(HydraConfig, "get", staticmethod(lambda: config))
+    return OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
+
+
+def fail(error):
+    def job(_):
+        raise error
+
+    return job
+
+
+def test_a_sweep_counts_the_jobs_that_failed_in_this_sweep(sweep, tmp_path, capsys):
+    counter = Failures()
+    counter.on_multirun_start(sweep)
+    assert attempt(lambda _: 0.5, None) == 0.5
+    counter.on_multirun_end(sweep)
+    assert Failures.count == 0
+    assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
+    counter.on_multirun_end(sweep)
+    assert (
+        Failures.count == 1
+        and "1 jobs of the sweep failed:\n  3: ConfigError: seed: wrong" in capsys.readouterr().err
+    )
+    counter.on_multirun_start(sweep)  # the same command again, in which the job succeeds
+    counter.on_multirun_end(sweep)
+    assert Failures.count == 0
+
+
+def test_a_mistake_of_the_program_is_not_swallowed(sweep):
+    with pytest.raises(ZeroDivisionError):
+        attempt(lambda _: 1 / 0, None)
+    with pytest.raises(ConnectionResetError):
+        attempt(fail(ConnectionResetError(errno.ECONNRESET, "reset")), None)
+
+
+def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
+    """Two runs in one folder mixed their checkpoints and figures without a word."""
+    code = (
+        f"import time; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+        "    time.sleep(60)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        with (
+            pytest.raises(ConfigError, match=r"hydra\.run\.dir: another process is at work in"),
+            held(tmp_path),
+        ):
+            pass
+        other.kill()
+        other.wait()
+        with held(tmp_path):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_folder(
+    tmp_path, caplog
+):
+    """A worker that outlived its killed sweep made the job of the sweep that was given again fail."""
+    code = (
+        f"import sys; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+        "    sys.stdin.read()\n    print('ended', flush=True)"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes, text=True, cwd=ROOT) as other:
+        assert other.stdout.readline() == "held\n"
+        timer = threading.Timer(0.3, other.stdin.close)
+        timer.start()
+        with caplog.at_level("INFO"), held(tmp_path, wait=True):
+            assert other.stdout.readline() == "ended\n"
+        assert "another process is at work in" in caplog.text
+
+
+def test_a_worker_ends_once_its_launcher_is_gone_and_its_job_is_over(tmp_path):
+    """Those of a killed sweep of joblib stayed, with a gigabyte each."""
+    worker = tmp_path / "worker.py"
+    worker.write_text(
+        textwrap.dedent(f"""
+        import os, pathlib, threading, time
+        from mosa.training.jobs import at_work, leave_after
+        here = pathlib.Path({str(tmp_path)!r})
+        at_work.set()
+        threading.Thread(target=leave_after, args=(os.getppid(), 0.3), daemon=True).start()
+        (here / "started").write_text(str(os.getpid()))
+        time.sleep(1.5)  # a job, which outlives the launcher
+        (here / "done").touch()
+        at_work.clear()
+        time.sleep(60)
+    """)
+    )
+    code = f"import subprocess, sys, time; subprocess.Popen([sys.executable, {str(worker)!r}]); time.sleep(60)"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}
+    ) as launcher:
+        while not (tmp_path / "started").is_file() or not (tmp_path / "started").read_text():
+            time.sleep(0.05)
+        launcher.kill()
+    state, until = (
+        Path("/proc") / (tmp_path / "started").read_text() / "stat",
+        time.monotonic() + 20,
+    )
+    while (
+        state.is_file() and " Z " not in state.read_text() and time.monotonic() < until
+    ):  # Z: nobody asked how it ended
+        time.sleep(0.05)
+    assert time.monotonic() < until and (tmp_path / "done").is_file()
+
+
+@pytest.mark.parametrize(
+    "run, launched", [(RunMode.RUN, False), (RunMode.MULTIRUN, False), (RunMode.MULTIRUN, True)]
+)
+def test_who_launched_a_sweep_does_not_leave_with_its_own_launcher(
+    sweep, monkeypatch, run, launched
+):
+    """A shell, say, that nohup outlives: only a launcher's workers do, whose first act is a job of a sweep."""
+    HydraConfig.get().mode, left = run, []
+    monkeypatch.setattr(HydraConfig, "initialized", staticmethod(lambda: True))
+    monkeypatch.setattr(jobs, "leave_after", lambda launcher: left.append(launcher))
+    monkeypatch.setattr(jobs, "begun", [] if launched else [True])
+    attempt(lambda _: 0.0, sweep)
+    time.sleep(0.2)
+    assert left == ([os.getppid()] if launched else [])
+
+
+def test_runs_that_begin_in_the_same_second_have_a_folder_each():
+    """Of two commands given in one line the second was refused: another process was at work in its folder."""
+    folder = (
+        (ROOT / "conf" / "hydra" / "default.yaml").read_text().split("${now:", 2)[2].split("}")[0]
+    )
+    began = datetime(2026, 1, 2, 3, 4, 5, 6)
+    assert began.strftime(folder) != (began + timedelta(milliseconds=1)).strftime(folder)
+
+
+def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, capsys):
+    attempt(lambda _: write_npz(tmp_path / "gone" / "observed.npz", {}), None)
+    assert (
+        "observed.npz" in (said := capsys.readouterr().err)
+        and "its folder has been removed meanwhile" in said
+    )
+    with pytest.raises(FileNotFoundError):  # a file that is not there is the program's
+        attempt(lambda _: (tmp_path / "none").read_text(), None)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EFBIG])
+def test_what_a_disk_refuses_is_one_message(sweep, capsys, code):
+    attempt(fail(OSError(code, os.strerror(code), "/full/file")), None)
+    assert f"/full/file: cannot be written or read ({os.strerror(code)})" in capsys.readouterr().err
+
+
+def test_a_single_run_exits_with_2(sweep, monkeypatch):
+    HydraConfig.get().mode = RunMode.RUN
+    with pytest.raises(SystemExit) as caught:
+        attempt(fail(ConfigError("seed: wrong")), None)
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize("error", [
+    MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."),
+    RuntimeError("CUDA out of memory. Tried to allocate 9.00 GiB"), OSError(errno.EMFILE, os.strerror(errno.EMFILE), "/a/file"),
+])  # fmt: skip
+def test_what_the_machine_has_not_is_one_message(sweep, capsys, error):
+    attempt(fail(error), None)
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and ("simulation.particles" in said or "ulimit -n" in said)
+    with pytest.raises(RuntimeError):
+        attempt(fail(RuntimeError("another one")), None)
+
+
+def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alone(
+    sweep, capsys, monkeypatch
+):
+    """Warp raises a plain Exception for a module that finds no room, cuBLAS says that it is not initialised."""
+    for error in (
+        Exception("Failed to load CUDA module 'p2g'"),
+        RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED"),
+    ):
+        monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+        attempt(fail(error), None)
+        assert "the GPU has no memory left" in capsys.readouterr().err
+        for room in (None, (60e9, 150e9)):
+            monkeypatch.setattr(refused, "gpu_memory", lambda r=room: r)
+            with pytest.raises(type(error)):
+                attempt(fail(error), None)
+    monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+    with pytest.raises(
+        ZeroDivisionError
+    ):  # a mistake of the program stays one, full as the GPU may be
+        attempt(lambda _: 1 / 0, None)
+
+
+def test_a_warning_that_was_made_an_error_is_one_message(sweep, capsys):
+    """PYTHONWARNINGS=error, as continuous integrations set it: Python raises it wherever it arises."""
+    attempt(fail(UserWarning("simulation.particles: thin parts")), None)
+    said = capsys.readouterr().err.strip()
+    assert (
+        said.startswith("UserWarning: simulation.particles: thin parts")
+        and "PYTHONWARNINGS" in said
+    )
+
+
+def test_a_message_about_memory_names_the_checkpoint_that_is_kept(tmp_path):
+    assert refused.explained(MemoryError(), tmp_path) == refused.explained(MemoryError())
+    (tmp_path / refused.LAST).parent.mkdir()
+    (tmp_path / refused.LAST).write_text("")
+    assert f"the fit is kept in {tmp_path / refused.LAST}" in refused.explained(
+        MemoryError(), tmp_path
+    )
+    assert refused.explained(ValueError("x"), tmp_path) is None
+    assert "simulation.particles" in refused.explained(
+        OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+    )
+
+
+def test_a_long_name_is_cut_and_stays_its_own():
+    assert folder_name("a=1,b=2") == "a=1,b=2"
+    assert "/" not in folder_name("splats=../../x.ply")
+    names = {folder_name("x" * 500 + str(i)) for i in range(50)}
+    assert len(names) == 50 and all(len(name.encode()) <= LONGEST + 9 for name in names)
+    assert len(folder_name("ü" * 500).encode()) <= LONGEST + 9
+
+
+@pytest.mark.parametrize(("argument", "found"), [
+    ("scene.path=/data/höhle", "scene.path='/data/höhle'"), ("scene.path=~/x", "scene.path='~/x'"),
+    ("scene.path=/a=b & c", "scene.path='/a=b & c'"), ("scene.path=/a b", "scene.path=/a b"), ("seed=0,1", "seed=0,1"),
+    ("fit.x=[ä]", "fit.x=[ä]"), ("x='ä'", "x='ä'"), ("prior=ä,b", "prior=ä,b"), ("--cfg=ä", "--cfg=ä"), ("banana", "banana"),
+    ("scene.path=/a's b", r"scene.path='/a\'s b'"), ("scene.path=/a b, [c] {d}", "scene.path='/a b, [c] {d}'"),
+    ("x=/a,/b", "x=/a,/b"),
+])  # fmt: skip
+def test_values_that_hydra_cannot_read_are_quoted(argument, found):
+    """It ended a run whose path had an umlaut in it."""
+    assert quoted(argument) == found
+    if argument.startswith("scene.path="):
+        (read,) = OverridesParser.create().parse_overrides([found])
+        assert str(read.value()) == argument.partition("=")[2]
+
+
+def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    check_folders([f"hydra.run.dir={tmp_path}/new/folder", "hydra.sweep.dir=a/${now:%H}", "seed=0"])
+    for wrong in ("file", "file/below"):
+        with pytest.raises(SystemExit) as ended:
+            check_folders(["seed=0", f"hydra.run.dir={tmp_path}/{wrong}"])
+        assert (
+            ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+        )
+    if Path("/proc/self").is_dir():  # for root it has all rights
+        with pytest.raises(SystemExit):
+            check_folders(["hydra.run.dir=/proc/mosa"])
+        assert (
+            "hydra.run.dir: expected a folder that can be made, found /proc/mosa: /proc: "
+            in capsys.readouterr().err
+        )
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+    with pytest.raises(
+        SystemExit
+    ):  # a shell's variable that is not set: the run would lie among the program's files
+        check_folders(["hydra.run.dir="])
+    assert "hydra.run.dir: expected a folder, found nothing" in capsys.readouterr().err
+
+
+def test_jobs_of_a_sweep_have_a_folder_each(capsys):
+    """The figures of the second took the place of the first one's."""
+    check_folders(["-m", "seed=0,1", "hydra.sweep.subdir=${hydra.job.num}"])
+    check_folders(["hydra.sweep.subdir=here"])
+    with pytest.raises(SystemExit) as ended:
+        check_folders(["--multirun", "seed=0,1", "hydra.sweep.subdir=here"])
+    assert (
+        ended.value.code == 2
+        and "hydra.sweep.subdir: expected a name that is another one" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "train.log",
+        "metrics.json",
+        "checkpoints/last.ckpt",
+        "results.md",
+        "rollout.npz",
+        "checkpoints",
+        ".hydra",
+    ],
+)
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "nothing"])
+def test_what_is_no_file_of_a_run_is_said_before_it_begins(tmp_path, capsys, name, kind):
+    """A pipe in the place of the log was waited for without end, a folder in that of a table ended a run when all was done."""
+    place = tmp_path / "run" / name
+    place.parent.mkdir(parents=True)
+    check_folders([f"hydra.run.dir={tmp_path}/run"])
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to("/dev/zero" if kind == "device" else "/nonexistent")
+    if kind == "folder" and "." not in name[1:]:  # what a run has there
+        check_folders([f"hydra.run.dir={tmp_path}/run"])
+        return
+    with pytest.raises(SystemExit) as ended:
+        check_folders([f"hydra.run.dir={tmp_path}/run"])
+    assert (
+        ended.value.code == 2
+        and f"{name}: expected what a run has there" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("arguments", [["banana"], ["banana=3"], ["scene=banana"]])
+def test_what_hydra_refuses_is_a_mistake_of_the_user_too(arguments):
+    found = subprocess.run(
+        [sys.executable, "train.py", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert found.returncode == 2 and "Traceback" not in found.stderr
+
+
+PROGRAM = """
+    import os, signal, sys
+    from mosa.training.jobs import attempt
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that put pytest into the background had it ignored
+    def job(cfg):
+        os.kill(os.getpid(), signal.SIG{name})
+    attempt(job, None)
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
+def test_a_stop_says_how_to_go_on(name, code):
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(PROGRAM.format(name=name))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (
+        found.returncode == code
+        and "stopped; resume with" in found.stderr
+        and "Traceback" not in found.stderr
+    )
+
+
+@pytest.mark.parametrize("name", ["TERM", "INT"])
+def test_a_second_stop_on_the_way_out_is_no_traceback(name):
+    """It fell into a library's clearing up at the interpreter's exit."""
+    leaving = f"import atexit, os, signal; atexit.register(lambda: os.kill(os.getpid(), signal.SIG{name}))\n"
+    found = subprocess.run([sys.executable, "-c", leaving + textwrap.dedent(PROGRAM.format(name=name))], cwd=ROOT,
+                           capture_output=True, text=True, timeout=60)  # fmt: skip
+    assert found.returncode == -getattr(signal, f"SIG{name}")
+    assert "stopped; resume with" in found.stderr and "Traceback" not in found.stderr
+
+
+def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    keys = [
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        f"hydra.sweep.dir={tmp_path}",
+        "debug=default",
+        "seed=-1,-2",
+    ]
+    found = subprocess.run(
+        [sys.executable, "train.py", "-m", *keys],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert found.returncode == 1 and "2 jobs of the sweep failed" in found.stderr
+
+
+OUTLIVED = """
+    import logging, sys
+    from mosa.system.console import begin_log
+    from mosa.system.screen import outlived
+    with outlived():
+        logging.basicConfig(stream=sys.stdout, level=logging.INFO)
+        begin_log()
+        for k in range(2000):
+            logging.info("a line %d", k)
+            print("another", file=sys.stderr)
+        open({done!r}, "w").close()
+"""
+
+
+@pytest.mark.parametrize(
+    "shell", ["{} 2>&1 | head -1", "{} | head -1", "{} >&- 2>&-", "{} > /dev/full 2>&1"]
+)
+def test_a_run_outlives_whoever_reads_its_lines(tmp_path, shell):
+    """`| head -1` ended a run without a word, and printed hundreds of tracebacks where the reader of the output alone had gone."""
+    done = tmp_path / "done"
+    program = f"{sys.executable} -c {shlex.quote(textwrap.dedent(OUTLIVED.format(done=str(done))))}"
+    found = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", shell.format(program)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert found.returncode == 0 and done.is_file() and "Error" not in found.stderr
+    assert found.stdout.count("\n") <= 1
+
+
+def test_a_working_folder_that_is_gone_is_said(tmp_path):
+    (tmp_path / "gone").mkdir()
+    command = f"cd {tmp_path}/gone && rmdir ../gone && exec {sys.executable} {ROOT}/train.py debug=default"
+    found = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, cwd=ROOT,
+                           env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    assert (
+        found.returncode == 2 and "the folder that this was started in is no more" in found.stderr
+    )
+    assert "Traceback" not in found.stderr
+
+
+def test_a_stop_before_the_first_job_is_no_traceback():
+    code = textwrap.dedent("""
+        from mosa.training.jobs import run_command; import os, signal, sys
+        sys.argv[1:] = []
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        run_command(lambda: os.kill(os.getpid(), signal.SIGINT), "conf")
+    """)
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert found.returncode == 130 and found.stderr.strip() == "stopped"
+
+
+@pytest.mark.parametrize(("times", "imported"), [(1, True), (2, False)])
+@pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
+def test_a_stop_waits_for_the_imports_and_a_second_one_does_not(
+    tmp_path, name, code, times, imported
+):
+    """Ctrl-C in the middle of an extension's import aborted the interpreter, with a traceback."""
+    (tmp_path / "slow_module.py").write_text(f"""
+import os, signal
+for _ in range({times}):
+    os.kill(os.getpid(), signal.SIG{name})
+print("imported", flush=True)
+""")
+    program = """
+        import signal, sys
+        from mosa.training.jobs import attempt, held_back
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        def job(cfg):
+            with held_back():
+                import slow_module
+            print("ran")
+        attempt(job, None)
+    """
+    found = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, capture_output=True, text=True,
+                           timeout=60, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"})  # fmt: skip
+    assert (
+        found.returncode == code and "Traceback" not in found.stderr and "stopped" in found.stderr
+    )
+    assert found.stdout == ("imported\n" if imported else "")
+
+
+def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkeypatch):
+    """A worker of a launcher whose screen had gone ended in a broken pipe, and the sweep did not say why its job had failed."""
+
+    class Gone(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+        def fileno(self):
+            return nowhere
+
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
+    os.close(nowhere)
+    assert (tmp_path / "failed" / "3.txt").read_text() == "ConfigError: seed: wrong\n"
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (b"simulation:\n\tparticles: 200\n", "cannot start any token"), (b"seed: 1\nseed: 2\n", "found duplicate key"),
+    ("scene:\n  path: /h\u00f6hle\n".encode("latin-1"), "invalid start byte"),
+])  # fmt: skip
+@pytest.mark.parametrize("words", [["--config-dir={}"], ["--config-dir", "{}"], ["-cd", "{}"]])
+def test_yaml_that_cannot_be_read_is_named_with_its_file(tmp_path, capsys, text, message, words):
+    """Hydra answers with a traceback."""
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_bytes(text)
+    (tmp_path / "experiment" / "good.yaml").write_text("seed: 1\n")
+    told = [word.format(tmp_path) for word in words]
+    check_files([*told, "+experiment=good", "seed=0"], ROOT / "conf")
+    for named in ("experiment=mine", "+experiment=good,mine", "experiment=[good,mine]"):
+        with pytest.raises(SystemExit) as ended:
+            check_files([*told, named], ROOT / "conf")
+        assert ended.value.code == 2
+        said = capsys.readouterr().err.strip()
+        assert (
+            said.startswith(f"ConfigError: {tmp_path}/experiment/mine.yaml: expected YAML")
+            and message in said
+        )
+
+
+@pytest.mark.parametrize(("ending", "damage"), [
+    (".o", lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])),
+    (".o", lambda file: file.write_bytes(b"")),
+    (".o", lambda file: file.write_bytes(bytes(file.stat().st_size))), (".meta", lambda file: file.write_bytes(b"")),
+])  # fmt: skip
+def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
+    """As a killed compiler or a full disk leave them; in a process of its own, as a kernel that is loaded stays so."""
+    (tmp_path / "kernel.py").write_text(
+        textwrap.dedent("""
+        import warp as wp
+        from mosa.system import refused
+        wp.config.kernel_cache_dir = "kernels"
+
+        @wp.kernel
+        def twice(x: wp.array(dtype=float)):
+            x[wp.tid()] = 2.0 * x[wp.tid()]
+
+        try:
+            wp.launch(twice, 1, inputs=[wp.ones(1, dtype=float, device="cpu")], device="cpu")
+        except Exception as error:
+            print(refused.explained(error))
+        else:
+            print("ran")
+    """)
+    )
+
+    def launched() -> str:
+        places = os.environ | {
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+        }
+        told = subprocess.run(
+            [sys.executable, "kernel.py"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env=places,
+        )
+        return told.stdout.strip().splitlines()[-1]
+
+    assert launched() == "ran"
+    files = [file for file in (tmp_path / "kernels").rglob("*") if file.suffix == ending]
+    for file in files:
+        damage(file)
+    found = launched()
+    assert files and str(tmp_path / "kernels") in found
+    assert "expected kernels as they were compiled, found some that cannot be loaded" in found
+
+
+def test_what_a_compiler_refuses_is_no_damaged_kernel():
+    """A mistake of the program keeps its traceback."""
+    assert (
+        refused.explained(RuntimeError("Failed to load CPU module 'm'")) is None
+    )  # not from where Warp loads

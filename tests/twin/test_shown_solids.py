@@ -1,0 +1,108 @@
+"""Rigid solids and the ground in a twin's pictures and files."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mosa.errors import ConfigError
+from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Sphere, colliders_from_config
+from mosa.rendering.appearance.carried_splats import Seen
+from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
+from mosa.rendering.cameras import look_at
+from mosa.twin.shown_solids import SOLID, surface, with_solids
+from mosa.types import Cameras
+from tests.modules.body.test_world import PLATE, twin
+
+UP = torch.tensor([0.0, 1.0, 0.0])
+
+
+def outside(shape, q):
+    """(K,) [m] signed distance of points (K, 3) from a solid."""
+    if isinstance(shape, Box):
+        d = q.abs() - 0.5 * torch.tensor(shape.size)
+        return d.clamp_min(0).norm(dim=1) + d.amax(1).clamp_max(0)
+    if isinstance(shape, Cylinder):
+        d = torch.stack(
+            [q[:, :2].norm(dim=1) - shape.radius, q[:, 2].abs() - 0.5 * shape.length], 1
+        )
+        return d.clamp_min(0).norm(dim=1) + d.amax(1).clamp_max(0)
+    half = 0.5 * getattr(shape, "length", 0.0)
+    return (q - torch.stack([0 * q[:, 2], 0 * q[:, 2], q[:, 2].clamp(-half, half)], 1)).norm(
+        dim=1
+    ) - shape.radius
+
+
+@pytest.mark.parametrize("shape, area", [
+    (Box((0.2, 0.1, 0.3)), 2 * (0.02 + 0.03 + 0.06)), (Sphere(0.1), 4 * math.pi * 0.01),
+    (Capsule(0.05, 0.2), 4 * math.pi * 0.0025 + 2 * math.pi * 0.05 * 0.2),
+    (Cylinder(0.05, 0.2), 2 * math.pi * 0.0025 + 2 * math.pi * 0.05 * 0.2),
+])  # fmt: skip
+def test_points_lie_on_the_solid_and_leave_no_hole(shape, area):
+    pitch = 0.01
+    points = surface(shape, pitch)
+    assert outside(shape, points).abs().max() < 1e-6
+    # points drawn around it and moved onto the surface: none is farther than a pitch from the nearest one
+    drawn = 0.4 * torch.rand(60000, 3, generator=torch.Generator().manual_seed(0)) - 0.2
+    near = drawn[outside(shape, drawn).abs() < 1e-3]
+    assert len(near) > 50 and torch.cdist(near, points).amin(1).max() < pitch
+    assert 0.8 < len(points) * pitch**2 / area < 1.6
+
+
+def picture(shown, frame):
+    K = torch.tensor([[120.0, 0, 32], [0, 120.0, 32], [0, 0, 1]])
+    camera = Cameras(
+        K[None], look_at(torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3), UP)[None], 64, 64, ("view",)
+    )
+    return shown.images(camera, torch.ones(3))[0, frame]
+
+
+def test_a_solid_hides_what_is_behind_it_and_moves():
+    """A red blob at the origin, a plate in front of it that moves away to the right by 0.2 m a second."""
+    blob = Seen(torch.zeros(2, 1, 3), (0.02**2 * torch.eye(3)).expand(2, 1, 3, 3), torch.tensor([0.99]),
+                constant_coefficients(torch.tensor([[1.0, 0.0, 0.0]])))  # fmt: skip
+    plate = {
+        "type": "box",
+        "size": [0.2, 0.2, 0.02],
+        "position": [0, 0, 0.2],
+        "motion": {"velocity": [0.2, 0, 0]},
+    }
+    behind = {**plate, "position": [0, 0, -0.2]}
+    times, red = torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
+    shown = with_solids(blob, colliders_from_config([plate]), times, UP, 0.01)
+    grey = torch.tensor(SOLID) / 255
+    assert (picture(shown, 0)[32, 32] - grey).abs().max() < 0.2 and (
+        picture(shown, 1)[32, 32] - red
+    ).abs().max() < 0.1
+    assert (picture(shown, 1)[32, 55] - grey).abs().max() < 0.2 and (
+        picture(shown, 0)[32, 8] == 1
+    ).all()
+    before = with_solids(blob, colliders_from_config([behind]), times, UP, 0.01)
+    assert (picture(before, 0)[32, 32] - red).abs().max() < 0.1
+    assert with_solids(blob, (), times, UP, 0.01) is blob
+
+
+def test_an_exported_motion_has_its_solids_and_the_ground(tmp_path):
+    one = twin()
+    rollout, alone = one.simulate(frames=4, colliders=[PLATE]), one.simulate(frames=4)
+    with pytest.raises(
+        ConfigError,
+        match=r"colliders: expected the 1 that the rollout was simulated with, .* found 0",
+    ):
+        one.export(rollout, tmp_path / "no")
+    with pytest.raises(
+        ConfigError, match=r"expected the 0 that the rollout was simulated with.*found 1"
+    ):
+        one.export(alone, tmp_path / "no", colliders=[PLATE])
+    assert not (tmp_path / "no").exists()
+    one.export(rollout, tmp_path / "met", video=False, colliders=[PLATE])
+    assert np.load(tmp_path / "met" / "rollout.npz")["simulation/collider_position"].shape == (
+        4,
+        1,
+        3,
+    )
+    # grey lines on the ground, of which a picture in space has none
+    images = one.render(alone, size=96)
+    lines = ((images - 120 / 255).abs().amax(-1) < 0.3) & (images.amax(-1) - images.amin(-1) < 0.02)
+    assert lines[0].float().mean() > 0.01
