@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 from attacks import ROOT, Attack, composed, cube, put, refuse
-
-from mosa.config.build import build_world, rehearse
 from mosa.config.keys import EVALUATION, TRAINING
 from mosa.config.known import check_known
 from mosa.schema import check
+
+from mosa.config.build import build_world, rehearse
 
 
 def configured(config: dict):

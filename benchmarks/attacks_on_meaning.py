@@ -24,12 +24,12 @@ from attacks import ROOT, WORLD, Attack, composed, cube, put, refuse, stored
 from attacks_on_calls import configured
 from attacks_on_data import capture
 from hydra import compose, initialize_config_dir
+from mosa.config.idle import idle
+from mosa.config.known import check_known
 from omegaconf import OmegaConf
 
 from mosa.cli.experiment import arguments, run
 from mosa.config.build import rehearse
-from mosa.config.idle import idle
-from mosa.config.known import check_known
 from mosa.data.formats.export import export_pacnerf, export_particles
 from mosa.data.scene import load_scene
 from mosa.data.sequences import load_sequences

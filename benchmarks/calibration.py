@@ -18,7 +18,6 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,8 +30,6 @@ from omegaconf import OmegaConf
 import mosa
 from mosa.config.build import (
     build_body,
-    build_criterion,
-    build_identification,
     build_stages,
     build_world,
 )
@@ -49,6 +46,7 @@ from mosa.experiments.commits import commit
 from mosa.experiments.specification import SHARED, options_of, read_yaml
 from mosa.modules.body.body import Start
 from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.training_sequences import Take
 from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues
 from mosa.reconstruction.resolution import grid_spacing
@@ -214,14 +212,14 @@ def fit(
     began = time.perf_counter()
     case = case_of(path, particles, more, seed, noise, device)
     body, contact = case.body, case.take.first_contact
-    stage = replace(build_stages(case.cfg["fit"], None, None)[0], name=stages)
+    stage = build_stages(case.cfg["fit"], None, None)[0].but(name=stages)
     calibration = Identification(
         body,
         [case.take],
         case.world,
         stage,
-        build_criterion(case.cfg),
-        build_identification(case.cfg),
+        Criterion.read(case.cfg["criterion"]),
+        IdentificationSettings.read(case.cfg["identification"]),
         (True, False, False),
     )
     calibration.search()

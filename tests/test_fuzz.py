@@ -14,16 +14,12 @@ from hypothesis import strategies as st
 from strangers import ROOT, saved
 
 from mosa.config.build import rehearse
-from mosa.config.extensions import registered_keys
-from mosa.config.keys import EVALUATION, TRAINING
-from mosa.config.known import check_known
 from mosa.data.formats.export import export_pacnerf, export_spring_gaus, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
-from mosa.schema import check
 from mosa.system.npz import read_npz, write_npz
 from mosa.twin.twin import Twin
-from tests.config.test_known import composed
+from tests.config.test_commands import composed
 from tests.modules.body.test_world import twin
 
 DEFAULT = functools.cache(lambda: composed("debug=default", "world.walls={mode: separate}"))
@@ -42,9 +38,6 @@ def one_message(error: MosaError) -> None:
 def configured(config: dict) -> None:
     """What train.py checks before it reads data."""
     try:
-        schemas = TRAINING, EVALUATION, registered_keys(config)
-        check_known(config, ROOT / "conf", "train", *schemas)
-        check(config, *schemas)
         rehearse(config)
     except ConfigError as error:
         one_message(error)

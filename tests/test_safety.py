@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 from strangers import checkpoint
 
 from mosa.config.checkpoints import read_checkpoint
-from mosa.config.known import tree_of
 from mosa.data.formats.transforms import read_transforms
 from mosa.errors import DataError
 from mosa.system.npz import read_npz, write_npz
@@ -22,7 +21,7 @@ from mosa.twin.twin import Twin
 
 def set_adapter(value):
     def change(stored):
-        stored["mosa"]["config"]["cfg"]["adapter"] = value
+        stored["mosa"]["settings"]["adapter"] = value
 
     return change
 
@@ -31,14 +30,6 @@ def test_the_checkpoint_of_these_tests_is_a_good_one(tmp_path):
     """The negative control: without it every refusal below could have another reason."""
     twin = Twin.load(checkpoint(tmp_path / "good.ckpt"))
     assert type(twin.body.adapter).__name__ and len(twin.simulate(frames=2).x) == 2
-
-
-def test_the_adapter_of_an_older_checkpoint_is_still_known(tmp_path):
-    older = {"_target_": "mosa.baselines.direct.DirectAdapter", "hidden": 8}
-    stored = checkpoint(
-        tmp_path / "a.ckpt", "adapter=direct", "adapter.hidden=8", change=set_adapter(older)
-    )
-    assert type(Twin.load(stored).body.adapter).__name__ == "DirectAdapter"
 
 
 @pytest.mark.parametrize(
@@ -55,8 +46,13 @@ def test_the_adapter_of_an_older_checkpoint_is_still_known(tmp_path):
 )
 def test_what_a_checkpoint_names_is_not_called(tmp_path, target):
     touched = tmp_path / "touched"
-    malicious = {"_target_": target, "args": ["touch", str(touched)], "command": f"touch {touched}"}
-    with pytest.raises(DataError, match=r"adapter\._target_: expected a known adapter"):
+    malicious = {
+        "name": "direct",
+        "_target_": target,
+        "args": ["touch", str(touched)],
+        "command": f"touch {touched}",
+    }
+    with pytest.raises(DataError, match=r"adapter\._target_: unknown key"):
         Twin.load(checkpoint(tmp_path / "bad.ckpt", change=set_adapter(malicious)))
     assert not touched.exists()
 
@@ -94,18 +90,20 @@ def nested(levels: int, width: int) -> list:
     return found
 
 
-CFG = ("mosa", "config", "cfg")
+CFG = ("mosa", "settings")
 DAMAGED = {
     "interpolation": (at(*CFG, "scene", "cache", value="${oc.env:HOME}/x"), r"scene\.cache: expected a value.*not resolved"),
     "interpolation in the world": (at(*CFG, "world", "walls", value={"mode": "${oc.env:HOME}"}), "not resolved"),
     "no state": (at("state_dict", value=None), "expected the part state_dict"),
-    "no start": (at("mosa", "start", value=None), "mosa: expected the parts config, start, found none called start"),
-    "newer": (at("mosa", "version", value=3), "mosa.version: expected at most 2, found 3: it is of a newer version"),
-    "no number": (at("mosa", "version", value="1"), "mosa.version: expected at most 2, found '1'"),
-    "simulation": (at("mosa", "config", "cfg", "simulation", "speed", value=1), "simulation.speed: unknown key"),
-    "courant": (at("mosa", "config", "cfg", "simulation", "courant", value=7), "simulation.courant: expected a number above 0"),
-    "no world": (at("mosa", "config", "world", value=None), "mosa.config: .* found none called world"),
-    "no prior": (at(*CFG, "prior", value=None), "none called prior"),
+    "no start": (at("mosa", "start", value=None), "mosa.start: expected this key, found none"),
+    "newer": (at("mosa", "version", value=4), "mosa.version: expected 3, found '4': it is of another version of this program"),
+    "older": (at("mosa", "version", value=2), "mosa.version: expected 3, found '2': it is of another version of this program"),
+    "no version": (at("mosa", "version", value=None), "mosa.version: expected 3, found 'None'"),
+    "unknown": (at("mosa", "more", value=1), "mosa.more: unknown key; expected one of settings, law"),
+    "simulation": (at("mosa", "settings", "simulation", "speed", value=1), "simulation.speed: unknown key"),
+    "courant": (at("mosa", "settings", "simulation", "courant", value=7), "simulation.courant: expected a number above 0"),
+    "no world": (at("mosa", "world", value=None), "mosa.world: expected this key, found none"),
+    "no prior": (at(*CFG, "prior", value=None), "prior: expected this key, found none"),
     "prior no section": (at(*CFG, "prior", value=[]), "prior: expected a section of keys"),
     "no rest": (at("state_dict", "body.rest", value=None), "found no rest"),
     "no weights": (at("state_dict", "body.material.raw.E", value=None), "no body can be built from it .*material.raw.E"),
@@ -115,16 +113,16 @@ DAMAGED = {
     "no volume": (at("state_dict", "body.volume", value=torch.zeros(27)), "body.volume: expected volumes above 0"),
     "few stored": (at("state_dict", "body.rest", value=torch.zeros(1, 3).expand(10**9, 3)), "as many numbers as are stored"),
     "wide": (at(*CFG, "adapter", value={"name": "direct", "hidden": 10**9}), "adapter.hidden: expected .* at most 4096"),
-    "gravity": (at("mosa", "config", "world", "gravity", value=[0, float("nan"), 0]), "world.gravity: expected three numbers"),
-    "box": (at("mosa", "config", "world", "box", value=[[1, 1, 1], [0, 0, 0]]), "world.box: expected two corners"),
+    "gravity": (at("mosa", "world", "gravity", value=[0, float("nan"), 0]), "world.gravity: expected three numbers"),
+    "box": (at("mosa", "world", "box", value=[[1, 1, 1], [0, 0, 0]]), "world.box: expected two corners"),
     "mirror": (at("mosa", "start", "rotation", value=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "rotation: expected a 3x3 rotation"),
-    "names": (at("mosa", "config", "starts", value={"../../x": {}}), "expected names like train"),
-    "density": (at("mosa", "config", "density", value="heavy"), "density: expected a number of at least 0.1"),
+    "names": (at("mosa", "starts", value={"../../x": {}}), "expected names like train"),
+    "density": (at("mosa", "density", value="heavy"), "density: expected a number of at least 0.1"),
     "law": (at(*CFG, "prior", "law", value="os.system"), "law: expected one of"),
-    "laughs": (at("mosa", "losses", value=nested(30, 10)), "expected at most"),
-    "deep": (at("mosa", "losses", value=nested(100, 1)), "expected at most"),
-    "set": (at("mosa", "losses", value={1, 2}), "refers to|expected numbers"),
-    "bytes": (at("mosa", "losses", value=bytearray(b"12")), "refers to|expected numbers"),
+    "laughs": (at("mosa", "fit", "losses", value=nested(30, 10)), "expected at most"),
+    "deep": (at("mosa", "fit", "losses", value=nested(100, 1)), "expected at most"),
+    "set": (at("mosa", "fit", "losses", value={1, 2}), "refers to|expected numbers"),
+    "bytes": (at("mosa", "fit", "losses", value=bytearray(b"12")), "refers to|expected numbers"),
 }  # fmt: skip
 
 
@@ -136,29 +134,13 @@ def test_a_damaged_checkpoint_is_named_part_by_part(tmp_path, name):
     assert "bad.ckpt" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_law_of_the_default_adapter_from_before_its_basis_was_written_out_is_refused(tmp_path):
-    """Its numbers were coordinates in a basis of the processor it was learned on. Where nothing was learned there is no law to
-    mistake."""
-
-    def older(stored, numbers):
-        assert stored["state_dict"]["body.adapter.numbers"].shape == (
-            19,
-        )  # the name by which they are found
-        stored["mosa"]["version"] = 1
-        stored["state_dict"]["body.adapter.numbers"] = torch.full((19,), numbers)
-
-    with pytest.raises(
-        DataError, match=r"bad\.ckpt: mosa\.version: expected 2 for a law .* learn it again"
-    ):
-        Twin.load(checkpoint(tmp_path / "bad.ckpt", change=lambda stored: older(stored, 0.1)))
-    Twin.load(checkpoint(tmp_path / "prior.ckpt", change=lambda stored: older(stored, 0.0)))
-
-
 def test_a_pickle_in_a_checkpoint_runs_nothing(tmp_path):
     touched = tmp_path / "touched"
     with pytest.raises(DataError, match="refers to posix system"):
         Twin.load(
-            checkpoint(tmp_path / "bad.ckpt", change=at("mosa", "losses", value=Runs(touched)))
+            checkpoint(
+                tmp_path / "bad.ckpt", change=at("mosa", "fit", "losses", value=Runs(touched))
+            )
         )
     assert not touched.exists()
 
@@ -194,7 +176,7 @@ def test_stored_paths_are_not_written_to(tmp_path):
     """eval.py's scene comes from the stored configuration, its cache from eval.py alone."""
     evil = tmp_path / "evil"
     twin = Twin.load(checkpoint(tmp_path / "a.ckpt", f"scene.cache={evil}"))
-    assert twin.config["cfg"]["scene"]["cache"] == str(evil)
+    assert twin.record.settings["scene"]["cache"] == str(evil)
     cfg = OmegaConf.create({"ckpt_path": "a.ckpt", "cache": str(tmp_path / "mine"), "scene": None})
     keys = evaluated_scene(cfg, twin).scene
     assert keys.name == "tiny" and keys.cache == str(tmp_path / "mine")
@@ -273,11 +255,8 @@ def test_a_cut_npz_is_named(tmp_path, share):
     ["!!python/object/apply:os.system ['touch {}']", "!!python/object/new:pathlib.Path ['{}']"],
 )
 def test_a_malicious_yaml_runs_nothing(tmp_path, tag):
-    (tmp_path / "train.yaml").write_text("seed: 0\n")
     (tmp_path / "prior").mkdir()
     (tmp_path / "prior" / "evil.yaml").write_text("law: " + tag.format(tmp_path / "touched") + "\n")
-    with pytest.raises(yaml.constructor.ConstructorError):
-        tree_of(tmp_path, "train")
     with pytest.raises(yaml.constructor.ConstructorError):
         OmegaConf.load(tmp_path / "prior" / "evil.yaml")  # Hydra's reader
     assert not (tmp_path / "touched").exists()

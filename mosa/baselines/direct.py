@@ -8,9 +8,8 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
-from mosa.modules.adapters.stress import ABLATIONS, NETWORK, rested
+from mosa.modules.adapters.stress import Hidden, RestFree, Scale, StressBound, rested
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
-from mosa.schema import FLAG
 
 
 class DirectAdapter(Adapter):
@@ -21,10 +20,8 @@ class DirectAdapter(Adapter):
     Errors: ConfigError naming the key for values out of range, or for an ablation of parts it has not.
     """
 
-    knobs = {**NETWORK, **dict.fromkeys(("rest_free", *ABLATIONS), FLAG)}
-
     def __init__(
-        self, *, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64, rest_free: bool = True,
+        self, *, l_max: StressBound = 0.1, input_scale: Scale = 10.0, hidden: Hidden = 64, rest_free: RestFree = True,
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()

@@ -18,9 +18,11 @@ learned one, and images are rendered by the project's splats. The other particle
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -29,7 +31,7 @@ from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
-from mosa.schema import WIDEST, number, whole
+from mosa.settings import Width
 
 DAMPING = 0.1
 """Of d where the network answers zero: about a twentieth of critical for a bond."""
@@ -48,12 +50,11 @@ class InteractionNetwork(Adapter):
 
     replaces_law = True
     own_dynamics = True
-    knobs = {"hidden": whole(1, WIDEST), "nodes": whole(8, 10**5), "neighbours": whole(4, 1000),
-             "stiffer": number(0, 5, above=True)}  # fmt: skip
 
     def __init__(
-        self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 20, stiffer: float = 1.0
-    ) -> None:
+        self, *, hidden: Width = 32, nodes: Annotated[int, Interval(ge=8, le=10**5)] = 250,
+        neighbours: Annotated[int, Interval(ge=4, le=1000)] = 20, stiffer: Annotated[float, Interval(gt=0, le=5)] = 1.0,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.most, self.neighbours, self.stiffer = nodes, neighbours, stiffer
         self.net = TwoHiddenLayers(3, 2, hidden)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +24,7 @@ from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.warm_start import SMALLEST_STRAIN, drawn_stretches
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
-from mosa.schema import FLAG, POSITIVE, WIDEST, one_of, whole
+from mosa.settings import Positive, Width
 
 INPUTS, OUTPUTS = 13, 9
 PLACES = ((0, 5, 4), (5, 1, 3), (4, 3, 2))
@@ -90,20 +91,14 @@ class NeuralLaw(Adapter):
     """
 
     replaces_law = True
-    knobs = {
-        "hidden": whole(1, WIDEST),
-        "start": one_of("prior", "random"),
-        "plastic": FLAG,
-        "plastic_rate": POSITIVE,
-    }
 
     def __init__(
         self,
         *,
-        hidden: int = 64,
-        start: str = "prior",
+        hidden: Width = 64,
+        start: Literal["prior", "random"] = "prior",
         plastic: bool = False,
-        plastic_rate: float = 2.0,
+        plastic_rate: Positive = 2.0,
     ) -> None:
         super().__init__()
         self.start, self.plastic_rate = start, plastic_rate

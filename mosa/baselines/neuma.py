@@ -16,7 +16,7 @@ from torch.nn.functional import linear
 
 from mosa.baselines.nclaw import NeuralLaw, network, pretrain
 from mosa.physics.adapters.interface import MaterialState
-from mosa.schema import POSITIVE, WIDEST, whole
+from mosa.settings import Positive, Width
 
 
 class LowRankLinear(nn.Linear):
@@ -52,17 +52,14 @@ class LowRankLaw(NeuralLaw):
     Errors: ConfigError naming the key.
     """
 
-    knobs = {"rank": whole(1, WIDEST), "scaling": POSITIVE,
-             **{name: NeuralLaw.knobs[name] for name in ("hidden", "plastic", "plastic_rate")}}  # fmt: skip
-
     def __init__(
         self,
         *,
-        hidden: int = 64,
-        rank: int = 16,
-        scaling: float = 16.0,
+        hidden: Width = 64,
+        rank: Width = 16,
+        scaling: Positive = 16.0,
         plastic: bool = False,
-        plastic_rate: float = 2.0,
+        plastic_rate: Positive = 2.0,
     ) -> None:
         super().__init__(hidden=hidden, plastic=plastic, plastic_rate=plastic_rate)
         self.hidden = hidden

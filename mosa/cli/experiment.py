@@ -284,7 +284,7 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
             values = plain(compose("train", overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
-    check_configuration(values, Path(configuration()))
+    check_configuration(values)
 
 
 def writable(where: str, folder: Path) -> None:

@@ -11,30 +11,28 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-import mosa.config.composition  # noqa: F401  registers the resolvers that conf/ uses
+import mosa.config.composition  # noqa: F401  registers what conf/ refers to
+from mosa.config.commands import TrainSettings
+from mosa.config.record import BodyRecord
 from mosa.errors import ConfigError
-from mosa.evaluation.settings import EvaluationSettings
 from mosa.modules.adapters.registry import adapter_class
-from mosa.modules.body.body import Body, SimulationSettings, World
-from mosa.modules.body.heterogeneity import HeterogeneityField, HeterogeneitySettings
+from mosa.modules.body.body import Body, SimulationSettings, Start, World
+from mosa.modules.body.heterogeneity import HeterogeneityField
 from mosa.modules.body.material import Material
+from mosa.modules.body.settings import HeterogeneitySettings, PriorSection, names
+from mosa.modules.body.simulation_settings import SimulationSection
 from mosa.modules.body.stiffness_modes import StiffnessModes
-from mosa.modules.fitting.criteria import Criterion
-from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import few_numbers
-from mosa.modules.fitting.stages import STAGES, Stage, recalibrations
+from mosa.modules.fitting.stages import STAGES, FitSection, Stage, recalibrations
 from mosa.modules.fitting.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.colliders import colliders_from_config, domain_walls
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
-from mosa.reconstruction.settings import build_settings
-from mosa.schema import known_keys
+from mosa.settings import call
 from mosa.types import AUTO, Ground, Scene
 
-SIZES = ("particles", "particles_per_cell", "dx")
-"""Keys of `simulation` that say how fine the body is: the reconstruction's."""
 HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
 """heterogeneity.kind."""
 
@@ -85,37 +83,51 @@ def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ..
         raise ConfigError(
             "world.walls: expected null, or keys as in {mode: separate, friction: 0.1}, found none"
         )
-    return tuple(known_keys("world.walls", domain_walls, walls, box))
+    return tuple(call("world.walls", domain_walls, walls, box=box))
 
 
-def run_config(cfg: dict[str, Any], scene: Scene, dx: float) -> dict[str, Any]:
-    """What a checkpoint keeps: the configuration, and what was measured from the data."""
-    return {
-        "cfg": cfg,
-        "world": world_config(scene) | (cfg.get("world") or {}),
-        "density": scene.density,
-        "dx": dx,
-        "frame_dt": float(scene.times[1] - scene.times[0]),
-    }
-
-
-def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body:
-    """A body with the law, adapter and settings of a run. tensors: rest, volume, colors, opacities, covariances."""
-    cfg = config["cfg"]
-    torch.manual_seed(cfg["seed"])
-    settings = build_simulation(cfg["simulation"], config["dx"])
-    material, options = build_prior(cfg["prior"])
-    heterogeneity = build_heterogeneity(
-        cfg["heterogeneity"], tensors["rest"].amin(0), tensors["rest"].amax(0)
+def world_of(record: BodyRecord) -> World:
+    """The world of a run: what was measured, and the walls and solids of its settings. Errors: ConfigError."""
+    given = record.sections.world
+    ground = None if record.ground is None else record.ground.plain()
+    return build_world(
+        record.world.plain()
+        | {"ground": ground, "walls": given.walls, "colliders": given.colliders}
     )
-    adapter = fitting(build_adapter(cfg["adapter"]), material.law)
+
+
+def measured(
+    settings: Mapping[str, Any], scene: Scene, dx: float, starts: Mapping[str, Start] | None = None
+) -> BodyRecord:
+    """The record of a body that was found in a scene. settings: of the run, as they were given; dx [m]."""
+    known = world_config(scene)
+    return BodyRecord(
+        settings=dict(settings),
+        ground=known.pop("ground"),
+        world=known,
+        density=scene.density,
+        dx=dx,
+        frame_dt=float(scene.times[1] - scene.times[0]),
+        starts={prefix: start.written() for prefix, start in (starts or {}).items()},
+    )
+
+
+def build_body(record: BodyRecord, tensors: Mapping[str, Tensor]) -> Body:
+    """A body with the law, adapter and settings of a run. tensors: rest, volume, colors, opacities, covariances."""
+    sections = record.sections
+    torch.manual_seed(sections.seed)
+    material, options = build_prior(sections.prior, record.law)
+    heterogeneity = build_heterogeneity(
+        sections.heterogeneity, tensors["rest"].amin(0), tensors["rest"].amax(0)
+    )
+    adapter = fitting(build_adapter(sections.adapter.plain()), material.law)
     return Body(
         **tensors,
-        density=config["density"],
+        density=record.density,
         material=material,
         heterogeneity=heterogeneity,
         adapter=adapter,
-        settings=settings,
+        settings=sections.simulation.on_grid(record.dx),
         law_options=options,
     )
 
@@ -128,71 +140,59 @@ def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None
     return None
 
 
-def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings:
-    """Settings of the rollouts on a grid of spacing dx [m]."""
-    if missing := [
-        k
-        for k in ("stride", "max_substeps", "courant", "precision", "contact_offset")
-        if k not in config
-    ]:
-        raise ConfigError(f"simulation.{missing[0]}: expected this key, found none")
-    if config["stride"] > config["max_substeps"]:
-        raise ConfigError(
-            f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
-            f"whole strides, found {config['stride']}"
-        )
-    # whose grid is given as dx
-    return known_keys(
-        "simulation",
-        SimulationSettings,
-        {k: v for k, v in config.items() if k not in SIZES} | {"dx": dx},
+def build_simulation(
+    config: Mapping[str, Any] | SimulationSection, dx: float
+) -> SimulationSettings:
+    """Settings of the rollouts on a grid of spacing dx [m]. Errors: ConfigError naming the key."""
+    return SimulationSection.read(config).on_grid(dx)
+
+
+def build_prior(
+    config: Mapping[str, Any] | PriorSection, law: str | None = None
+) -> tuple[Material, LawOptions]:
+    """The prior's parameters, and how its law is taken. law: the one that was chosen among its candidates. Errors:
+    ConfigError naming the key."""
+    section = PriorSection.read(config)
+    material = Material(
+        law or section.law,
+        section.parameters,
+        names(section.frozen),
+        None if section.modulated is None else names(section.modulated),
+        () if law else names(section.candidates),
     )
-
-
-def build_prior(config: Mapping[str, Any]) -> tuple[Material, LawOptions]:
-    """The prior's parameters, and how its law is taken. Errors: ConfigError naming the key."""
-    keys = dict(config)
-    options = known_keys("prior.options", LawOptions, keys.pop("options", None) or {})
-    keys["frozen"], keys["candidates"] = keys.get("frozen") or (), keys.get("candidates") or ()
-    return known_keys("prior", Material, keys), options
+    return material, LawOptions.read(section.options or {})
 
 
 def build_heterogeneity(
-    config: Mapping[str, Any], low: Tensor, high: Tensor
+    config: Mapping[str, Any] | HeterogeneitySettings, low: Tensor, high: Tensor
 ) -> torch.nn.Module | None:
     """The field on the box (3,) to (3,) [m], None where it is switched off. Errors: ConfigError naming the key."""
-    settings = known_keys("heterogeneity", HeterogeneitySettings, config)
+    settings = HeterogeneitySettings.read(config)
     return HETEROGENEITY[settings.kind](low, high, settings) if settings.enabled else None
 
 
-def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
+def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
     """Build what needs no data and drop it: a mistake then shows before the reconstruction. Returns the stages of the fit.
 
     Errors: ConfigError naming the key."""
-    build_settings(**cfg["reconstruction"])
+    settings = TrainSettings.read(values)
     low, high = torch.zeros(3), torch.ones(3)
     with torch.random.fork_rng(devices=[]):
-        material, _ = build_prior(cfg["prior"])
-        heterogeneity = build_heterogeneity(cfg["heterogeneity"], low, high)
+        material, _ = build_prior(settings.prior)
+        heterogeneity = build_heterogeneity(settings.heterogeneity, low, high)
         with warnings.catch_warnings():  # said again where the body is built
             warnings.simplefilter("ignore")
-            adapter = fitting(build_adapter(cfg["adapter"]), material.law)
-    build_simulation(cfg["simulation"], 1.0)
-    stages = build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
-    build_criterion(cfg)
-    build_identification(cfg)
-    build_evaluation(cfg)
-    check_terms(cfg["losses"], adapter)
-    if not any(
-        cfg["losses"].get(name)
-        for name in ("image", "mask", "flow", "rotation", "stretch", "position")
-    ):
+            adapter = fitting(build_adapter(settings.adapter.plain()), material.law)
+    stages = build_stages(settings.fit, heterogeneity, adapter, bool(material.candidates))
+    weights = settings.losses.weights()
+    check_terms(weights, adapter)
+    if not any(weights[name] for name in ("image", "mask", "flow", "rotation", "stretch", "position")):  # fmt: skip
         raise ConfigError(
             "losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
             "tells the prior anything"
         )
-    build_walls(cfg["world"]["walls"], torch.stack([low, high]))
-    for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
+    build_walls(settings.world.walls, torch.stack([low, high]))
+    for collider in colliders_from_config(settings.world.colliders or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
     return stages
@@ -203,28 +203,11 @@ def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
     build = adapter_class(config)
     if build is None:
         return None
-    return known_keys(
-        "adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")}
-    )
-
-
-def build_criterion(cfg: Mapping[str, Any]) -> Criterion:
-    """Free rollouts where a checkpoint is older than the group. Errors: ConfigError naming the key."""
-    return known_keys("criterion", Criterion, cfg.get("criterion") or {"name": "free"})
-
-
-def build_identification(cfg: Mapping[str, Any]) -> IdentificationSettings:
-    """Errors: ConfigError naming the key."""
-    return known_keys("identification", IdentificationSettings, cfg.get("identification") or {})
-
-
-def build_evaluation(cfg: Mapping[str, Any]) -> EvaluationSettings:
-    """Errors: ConfigError naming the key."""
-    return known_keys("evaluation", EvaluationSettings, cfg.get("evaluation") or {})
+    return call("adapter", build, {key: value for key, value in config.items() if key != "name"})
 
 
 def build_stages(
-    fit: Mapping[str, Any],
+    fit: Mapping[str, Any] | FitSection,
     heterogeneity: torch.nn.Module | None,
     adapter: torch.nn.Module | None,
     searching: bool = False,
@@ -232,7 +215,8 @@ def build_stages(
     """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs.
 
     searching: whether the calibration chooses the law too."""
-    stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in STAGES]
+    section = FitSection.read(fit)
+    stages = [section.stage(name) for name in STAGES]
     learned = {s.name: s.learns(heterogeneity, adapter) for s in stages}
     wanted = [
         s

@@ -7,48 +7,21 @@ from __future__ import annotations
 
 import math
 import pickletools
-import re
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mosa.config.extensions import registered_keys
-from mosa.config.keys import BODY
+from mosa.config.record import VERSION, BodyRecord, RunRecord, SplatsRecord
 from mosa.errors import ConfigError, DataError
-from mosa.modules.body.material import RIVALS
-from mosa.modules.fitting.retreat import MOST_HALVINGS
-from mosa.physics.constitutive.laws import law_named
-from mosa.rendering.appearance.lighting import LIGHT
-from mosa.rendering.appearance.spherical_harmonics import DEGREES
-from mosa.schema import (
-    FLAG,
-    POSITIVE,
-    THREE,
-    WEIGHT,
-    Kind,
-    check,
-    is_number,
-    number,
-    one_of,
-    or_null,
-    whole,
-)
+from mosa.settings import check
 from mosa.system.limits import machine_memory
-from mosa.types import GROUND_MODES
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
-SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,),
-          "normals": (3,)}  # fmt: skip
-BOUND_BYTES = 4000
-"""Of a splat while it is bound to its neighbours."""
-VERSION = 2
-"""Of what a run keeps under `mosa` in its checkpoint; grows when a program that knows the one before could not read it. Before 2,
-the numbers of the default adapter were coordinates in a basis that each processor found for itself."""
 RESUMED = (
     "epoch",
     "global_step",
@@ -67,54 +40,12 @@ BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "callbacks", "tra
           "scene.cache", "scene.root", "identification.threads", "extensions")  # fmt: skip
 """Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
 `scene.path` the last part counts."""
-BY_CONTACT = or_null(Kind("numbers by contact", lambda v: isinstance(v, Mapping) and all(
-    isinstance(x, float) and not math.isnan(x) for x in v.values())))  # fmt: skip
-GOING_ON: dict[str, Kind] = {
-    "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE, "stage_over": FLAG,
-    "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
-    "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
-    "grounds": BY_CONTACT, "ground_gains": BY_CONTACT,
-}  # fmt: skip
-"""Of `mosa`, what a fit goes on from."""
 NODES, DEPTH = 2_000_000, 40
 """Entries and levels of a checkpoint's containers: losses of a fit of 10,000 steps are 10,000."""
-
-STRONGEST, WIDEST = 1e4, 1e5
-"""[m/s^2] of gravity and [m] of a world's box."""
 BRIGHTEST = 10.0
 """Of a colour, which a fit may bring beyond 1."""
 SPACING = 0.02, 5.0
 """Distance between particles, in cells: 1/64 to 50 of them in a cell's volume, with room."""
-BOX = Kind(
-    "two corners, min below max",
-    lambda v: (
-        isinstance(v, list)
-        and len(v) == 2
-        and all(map(THREE.fits, v))
-        and all(a < b for a, b in zip(*v))
-    ),
-)
-TURNED = Kind("a 3x3 rotation matrix", lambda v: is_rotation(v))
-START = {"rotation": TURNED, "center": THREE, "velocity": THREE, "angular_velocity": THREE}
-STORED: dict[str, Kind] = {
-    "density": number(0.1, 1e5), "dx": number(1e-6, 100), "frame_dt": number(1e-6, 100), "world.gravity": THREE, "world.box": BOX,
-    "world.up": Kind("a direction", lambda v: THREE.fits(v) and any(v)),
-    "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of(*GROUND_MODES),
-    "world.ground.friction": WEIGHT,
-    **{f"starts.*.{name}": kind for name, kind in START.items()},
-}  # fmt: skip
-"""Beside the configuration itself, what a run measured."""
-
-
-def is_rotation(value: Any) -> bool:
-    """Nested lists of a 3x3 matrix with R R^T = I and det R = 1, to 1e-3."""
-    if not (isinstance(value, list) and len(value) == 3 and all(map(THREE.fits, value))):
-        return False
-    R = torch.tensor(value, dtype=torch.float64)
-    return (
-        float((R @ R.T - torch.eye(3).double()).abs().max()) < 1e-3
-        and float(torch.linalg.det(R)) > 0
-    )
 
 
 def read_checkpoint(path: str | Path) -> dict:
@@ -140,21 +71,11 @@ def read_checkpoint(path: str | Path) -> dict:
     if not isinstance(checkpoint, dict) or "mosa" not in checkpoint:
         raise DataError(f"ckpt_path: {path} was not written by this program (no entry 'mosa')")
     saved = checkpoint["mosa"]
-    version = (
-        saved.get("version", 0) if isinstance(saved, dict) else 0
-    )  # 0: of before there were numbers
-    if not whole(0).fits(version) or version > VERSION:
+    version = saved.get("version") if isinstance(saved, dict) else None
+    if version != VERSION or isinstance(version, bool):
         raise DataError(
-            f"ckpt_path: {path}: mosa.version: expected at most {VERSION}, found {version!r}: it is of a newer "
-            "version of this program"
-        )
-    weights = checkpoint.get("state_dict")
-    numbers = weights.get("body.adapter.numbers") if isinstance(weights, Mapping) else None
-    if version < 2 and isinstance(numbers, torch.Tensor) and bool((numbers != 0).any()):
-        raise DataError(
-            f"ckpt_path: {path}: mosa.version: expected {VERSION} for a law learned by the default adapter, found "
-            f"{version}: its numbers are coordinates in a basis that depended on the processor it was learned on, and "
-            "would be another law here; learn it again"
+            f"ckpt_path: {path}: mosa.version: expected {VERSION}, found {str(version)[:80]!r}: it is of another version of this "
+            "program, whose records are not read; learn it again"
         )
     return checkpoint
 
@@ -228,7 +149,7 @@ def check_containers(checkpoint: Any, path: Path) -> None:
                 )
         elif (
             isinstance(value, str)
-            and where.startswith("mosa.config")
+            and where.startswith("mosa.settings")
             and ("${" in value or "\0" in value)
         ):
             raise DataError(
@@ -241,43 +162,19 @@ def check_containers(checkpoint: Any, path: Path) -> None:
             )
 
 
-def checked(
-    checkpoint: Mapping[str, Any], path: str | Path
-) -> tuple[dict, dict, dict[str, Tensor]]:
-    """(configuration, start, tensors of the body) of a read checkpoint. Errors: DataError naming file and part."""
-    saved, state = checkpoint["mosa"], checkpoint.get("state_dict")
+def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
+    """The record in a read checkpoint; its settings of the body are checked with it. Errors: DataError naming file and part."""
     try:
-        parts(saved, ("config", "start"), "mosa")
-        config = saved["config"]
-        parts(config, ("cfg", "world", "density", "dx", "frame_dt"), "mosa.config")
-        parts(
-            config["cfg"],
-            ("seed", "simulation", "prior", "heterogeneity", "adapter"),
-            "mosa.config.cfg",
-        )
-        parts(config["world"], ("ground", "gravity", "up", "box"), "mosa.config.world")
-        parts(saved["start"], START, "mosa.start")
-        starts = config.get("starts") or {}
-        parts(starts, (), "mosa.config.starts")
-        for name, start in starts.items():
-            if (
-                re.fullmatch(r"(train|test)(/[\w-]+)?", str(name)) is None
-            ):  # it names entries of the files that are written
-                raise ConfigError(
-                    f"mosa.config.starts: expected names like train or test/<sequence>, found {str(name)[:80]!r}"
-                )
-            parts(start, START, f"mosa.config.starts.{name}")
-        if config["world"]["ground"] is not None:
-            parts(config["world"]["ground"], ("height",), "mosa.config.world.ground")
-        stored = {name: config[name] for name in ("density", "dx", "frame_dt", "world")}
-        check(stored | {"starts": {"fit": saved["start"], **starts}}, STORED)
-        used = {
-            name: config["cfg"][name]
-            for name in ("seed", "simulation", "prior", "heterogeneity", "adapter")
-        }
-        check(used | {"world": config["cfg"].get("world") or {}}, BODY, registered_keys(used))
+        record = RunRecord.read(checkpoint["mosa"])
+        _ = record.sections
     except ConfigError as error:
-        raise DataError(f"ckpt_path: {path}: stored configuration: {error}") from error
+        raise DataError(f"ckpt_path: {path}: stored record: {error}") from error
+    return record
+
+
+def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[RunRecord, dict[str, Tensor]]:
+    """(record, tensors of the body) of a read checkpoint. Errors: DataError naming file and part."""
+    record, state = record_of(checkpoint, path), checkpoint.get("state_dict")
     if not isinstance(state, Mapping):
         raise DataError(f"ckpt_path: {path}: expected the part state_dict, found none")
     tensors = {
@@ -286,106 +183,25 @@ def checked(
         if isinstance(k, str) and k.startswith("body.")
     }
     check_tensors(tensors, path)
-    check_sense(config, tensors, path)
-    return config, saved["start"], tensors
+    check_spacing(record, tensors, path)
+    return record, tensors
 
 
-def checked_posterior(checkpoint: Mapping[str, Any], numbers: int, path: str | Path) -> dict | None:
-    """What `Posterior.read` takes, of a body with so many learned numbers; None where the run kept none. Errors: DataError."""
-    found = checkpoint["mosa"].get("posterior")
-    if found is None:
-        return None
-    where = f"ckpt_path: {path}: mosa.posterior"
-    shapes = {"mean": (numbers,), "covariance": (numbers, numbers), "determined": (numbers,)}
-    try:
-        parts(found, ("names", "model_error", *shapes), "mosa.posterior")
-    except ConfigError as error:
-        raise DataError(f"ckpt_path: {path}: {error}") from error
-    for name, shape in shapes.items():
-        value = found[name]
-        if (
-            not isinstance(value, Tensor)
-            or tuple(value.shape) != shape
-            or not bool(torch.isfinite(value).all())
-        ):
-            raise DataError(
-                f"{where}.{name}: expected {' x '.join(map(str, shape))} finite numbers"
-            )
-    names = found["names"]
-    if (
-        not isinstance(names, list)
-        or len(names) != numbers
-        or not all(isinstance(n, str) for n in names)
-    ):
-        raise DataError(f"{where}.names: expected {numbers} names")
-    if not is_number(found["model_error"]) or found["model_error"] < 0:
+def check_numbers(record: RunRecord, count: int, path: str | Path) -> None:
+    """The posterior, where there is one, is of a body with so many learned numbers. Errors: DataError."""
+    if record.posterior is not None and len(record.posterior.names) != count:
         raise DataError(
-            f"{where}.model_error: expected a distance in m, found {found['model_error']!r}"
+            f"ckpt_path: {path}: mosa.posterior.names: expected {count} names, found {len(record.posterior.names)}"
         )
-    rivals = found.get("rivals", {})
-    if not isinstance(rivals, Mapping) or not set(rivals) <= set(RIVALS):
-        raise DataError(f"{where}.rivals: expected numbers of laws among {', '.join(RIVALS)}")
-    for law, value in rivals.items():
-        if (
-            not isinstance(value, Tensor)
-            or tuple(value.shape) != (numbers,)
-            or not bool(torch.isfinite(value).all())
-        ):
-            raise DataError(f"{where}.rivals.{law}: expected {numbers} finite numbers")
-    if not float(torch.linalg.eigvalsh(found["covariance"].double()).min()) > 0:
-        raise DataError(f"{where}.covariance: expected a positive definite matrix")
+
+
+def checked_splats(found: Any, path: str | Path) -> dict[str, Tensor] | None:
+    """What `CarriedSplats.read` takes, of a file beside a rollout; None where there is none. Errors: DataError."""
+    try:
+        check("splats", found, SplatsRecord | None)
+    except ConfigError as error:
+        raise DataError(f"{path}: {str(error).partition(', found')[0]}") from error
     return found
-
-
-def checked_splats(checkpoint: Mapping[str, Any], path: str | Path) -> dict[str, Tensor] | None:
-    """What `CarriedSplats.read` takes; None where the run kept none. Errors: DataError naming file and part."""
-    found = checkpoint["mosa"].get("splats")
-    if found is None:
-        return None
-    where = f"ckpt_path: {path}: mosa.splats"
-    try:
-        parts(found, (*SPLATS, "harmonics", "light"), "mosa.splats")
-    except ConfigError as error:
-        raise DataError(f"ckpt_path: {path}: {error}") from error
-    tensors = {name: found[name] for name in (*SPLATS, "harmonics", "light")}
-    count = (
-        len(tensors["means"])
-        if isinstance(tensors["means"], Tensor) and tensors["means"].ndim
-        else 0
-    )
-    if not 0 < count <= machine_memory() // (2 * BOUND_BYTES):
-        raise DataError(
-            f"{where}.means: expected 1 to {machine_memory() // (2 * BOUND_BYTES)} splats, which take half of this "
-            f"machine's memory, found {count}"
-        )
-    for name, value in tensors.items():
-        shapes = [(count, *SPLATS[name])] if name in SPLATS else [(count, k, 3) for k in DEGREES]
-        shapes = [(LIGHT,)] if name == "light" else shapes
-        if not isinstance(value, Tensor) or tuple(value.shape) not in shapes or not value.is_floating_point() or not bool(
-                torch.isfinite(value).all()):  # fmt: skip
-            raise DataError(
-                f"{where}.{name}: expected finite numbers of shape {' or '.join(map(str, shapes))}"
-            )
-    turned = (tensors[name].norm(dim=1).min() for name in ("rotations", "normals"))
-    if not float(tensors["scales"].min()) > 0 or not all(map(float, turned)):
-        raise DataError(
-            f"{where}: expected scales above 0 m, quaternions and normals that are not zero"
-        )
-    if float(tensors["opacities"].min()) < 0 or float(tensors["opacities"].max()) > 1:
-        raise DataError(f"{where}.opacities: expected numbers from 0 to 1")
-    return tensors
-
-
-def parts(found: Any, wanted: Iterable[str], where: str) -> None:
-    """Errors: ConfigError naming the parts that are missing."""
-    if not isinstance(found, Mapping):
-        raise ConfigError(
-            f"{where}: expected a section with {', '.join(wanted)}, found {str(found)[:80]!r}"
-        )
-    if missing := [name for name in wanted if name not in found]:
-        raise ConfigError(
-            f"{where}: expected the parts {', '.join(wanted)}, found none called {', '.join(missing)}"
-        )
 
 
 def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
@@ -448,36 +264,13 @@ def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
         )
 
 
-def check_sense(config: Mapping[str, Any], tensors: Mapping[str, Tensor], path: str | Path) -> None:
-    """A body that can be, in a world that holds together: numbers may be finite and yet mean nothing. Errors: DataError."""
-    world, where = config["world"], f"ckpt_path: {path}: stored configuration: world"
-    gravity, up = (torch.tensor(world[name], dtype=torch.float64) for name in ("gravity", "up"))
-    if world["ground"] is not None:
-        corners = torch.cartesian_prod(*torch.tensor(world["box"], dtype=torch.float64).T) @ (
-            up / up.norm()
-        )
-        if not float(corners.min()) <= world["ground"]["height"] <= float(corners.max()):
-            raise DataError(
-                f"{where}.ground.height: expected a ground inside of the box {world['box']}, found "
-                f"{world['ground']['height']:g}"
-            )
-        if bool(gravity.any()) and not float(gravity @ up) < 0:
-            raise DataError(
-                f"{where}.gravity: expected a pull against up = {world['up']}, found {world['gravity']}"
-            )
-    if (
-        float(gravity.norm()) > STRONGEST
-        or max(abs(x) for corner in world["box"] for x in corner) > WIDEST
-    ):
-        raise DataError(
-            f"{where}: expected a gravity of at most {STRONGEST:g} m/s^2 and a box within {WIDEST:g} m, found "
-            f"{world['gravity']} and {world['box']}"
-        )
-    share = float(tensors["volume"].double().mean()) ** (1 / 3) / config["dx"]
+def check_spacing(record: BodyRecord, tensors: Mapping[str, Tensor], path: str | Path) -> None:
+    """Particles as far apart as the cells of their grid are wide. Errors: DataError."""
+    share = float(tensors["volume"].double().mean()) ** (1 / 3) / record.dx
     if not SPACING[0] < share < SPACING[1]:
         raise DataError(
             f"ckpt_path: {path}: body.volume: expected particles {SPACING[0]:g} to {SPACING[1]:g} cells of "
-            f"dx = {config['dx']:g} m apart, found {share:.3g}"
+            f"dx = {record.dx:g} m apart, found {share:.3g}"
         )
 
 
@@ -489,11 +282,15 @@ def check_kinds(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> No
             raise DataError(f"body.{name}: expected {value.dtype}, found {found[name].dtype}")
 
 
-def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str | Path) -> None:
-    """The checkpoint is of this very model. Errors: DataError naming the first part that is not."""
+def check_same(
+    checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str | Path
+) -> RunRecord:
+    """The record of a checkpoint, which is of this very model. Errors: DataError naming the first part that is not."""
+    record = record_of(checkpoint, path)
+    assert record.fit is not None, "check_resumed comes before"
     here, there = module.state_dict(), checkpoint["state_dict"]
     count = len(here["body.rest"])
-    if checkpoint["mosa"]["particles"] != count:
+    if record.fit.particles != count:
         raise DataError(
             f"ckpt_path: {path}: expected a body of {count} particles, found {checkpoint['mosa']['particles']}: the "
             "checkpoint belongs to another scene, reconstruction or simulation.particles"
@@ -513,25 +310,19 @@ def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str
     check_tensors(
         {k.removeprefix("body."): v for k, v in there.items() if k.startswith("body.")}, path
     )
-    stage, most = checkpoint["mosa"]["stage"], len(module.stages)
+    stage, most = record.fit.stage, len(module.stages)
     if stage > most:
         raise DataError(
-            f"ckpt_path: {path}: mosa.stage: expected at most {most}, the stages of this fit, found {stage}: the "
+            f"ckpt_path: {path}: mosa.fit.stage: expected at most {most}, the stages of this fit, found {stage}: the "
             "checkpoint belongs to another configuration (fit)"
         )
+    return record
 
 
-def check_same_run(
-    checkpoint: Mapping[str, Any], values: Mapping[str, Any], folder: str | Path
-) -> None:
+def check_same_run(record: RunRecord, values: Mapping[str, Any], folder: str | Path) -> None:
     """The checkpoint in a run's folder is of the configuration that resume=auto is to go on with: figures and steps of another one
     would else pass for this one's. Keys that only one of both has are of another version. Errors: ConfigError naming the keys."""
-    if (stored := stored_keys(checkpoint)) is None:
-        return
-    chosen = (
-        ("prior",) if checkpoint["mosa"].get("compared") else ()
-    )  # a law was chosen among prior.candidates
-    if found := list(differing(stored, values, (*BESIDE, *chosen))):
+    if found := list(differing(record.settings, values, BESIDE)):
         raise ConfigError(
             f"resume: expected in {folder} a run of this configuration, found another one's ({listed(found)}); give "
             "this run a folder of its own, begin anew in this one with resume=null, or go on from its checkpoint "
@@ -539,26 +330,17 @@ def check_same_run(
         )
 
 
-def check_same_scene(
-    checkpoint: Mapping[str, Any], values: Mapping[str, Any], path: str | Path
-) -> None:
+def check_same_scene(record: RunRecord, values: Mapping[str, Any], path: str | Path) -> None:
     """The checkpoint that ckpt_path names was fitted to the data that the fit is to go on with: a body of as many particles would
     take another's law for its own. Other keys may differ. Errors: ConfigError naming those of the scene that do."""
-    stored, without = stored_keys(checkpoint), (*BESIDE, "scene.test")
-    if stored is not None and (
-        found := list(differing(stored.get("scene"), values.get("scene"), without, "scene"))
+    without = (*BESIDE, "scene.test")
+    if found := list(
+        differing(record.settings.get("scene"), values.get("scene"), without, "scene")
     ):
         raise ConfigError(
             f"ckpt_path: expected in {path} a fit to this scene, found one to another ({listed(found)}); a law is "
             "taken to another object with python eval.py or python -m mosa.splats"
         )
-
-
-def stored_keys(checkpoint: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The configuration that a checkpoint's run had; None where it does not say."""
-    stored = checkpoint["mosa"].get("config")
-    stored = stored.get("cfg") if isinstance(stored, Mapping) else None
-    return stored if isinstance(stored, Mapping) else None
 
 
 def listed(found: Sequence[tuple[str, Any, Any]]) -> str:
@@ -585,109 +367,18 @@ def differing(
         yield where, stored, values
 
 
-def check_cues(found: Any) -> None:
-    """Positions that a fit found once more, of each sequence; None where it did not. Errors: ConfigError."""
-    shaped = isinstance(found, list) and all(
-        isinstance(t, Tensor) and t.ndim == 3 and t.shape[2] == 3 for t in found
-    )
-    if found is not None and not (
-        shaped and all(t.is_floating_point() and bool(torch.isfinite(t).all()) for t in found)
-    ):
-        described = (
-            [tuple(t.shape) if isinstance(t, Tensor) else type(t).__name__ for t in found]
-            if isinstance(found, list)
-            else type(found).__name__
-        )
-        raise ConfigError(f"mosa.cues: expected null, or for each sequence finite positions of shape (T, N, 3), found "
-                          f"{str(described)[:200]}")  # fmt: skip
-
-
-def check_responses(found: Any) -> None:
-    """What the cues of each sequence keep of the prediction that they were found about; None where none is known. Errors:
-    ConfigError."""
-
-    def kept(each: Any) -> bool:
-        return each is None or (isinstance(each, dict) and set(each) == {"about", "share"} and all(
-            isinstance(t, Tensor) and t.ndim == 3 and t.is_floating_point() and bool(torch.isfinite(t).all())
-            for t in each.values()))  # fmt: skip
-
-    if found is not None and not (isinstance(found, list) and all(kept(each) for each in found)):
-        raise ConfigError(
-            "mosa.responses: expected null, or for each sequence null or finite tensors `about` (T, N, 3) and "
-            "`share` (T, 3 K, 3 K)"
-        )
-
-
-def check_identification(found: Any) -> None:
-    """The state of a running stage of Gauss-Newton; None outside of one. Errors: ConfigError."""
-    if found is None:
-        return
-    parts(found, ("iteration", "factors", "noise"), "mosa.identification")
-    check({"mosa": {"identification": {name: found.get(name, 0) for name in ("iteration", "factors", "multiple")}}},
-          {"mosa.identification.iteration": whole(0), "mosa.identification.multiple": Kind("a number", is_number),
-           "mosa.identification.factors": Kind("numbers above 0", lambda v: isinstance(v, list) and all(
-               is_number(x) and x > 0 for x in v))})  # fmt: skip
-    for name in ("noise", "grid"):
-        groups = found.get(name)
-        if groups is not None and not (isinstance(groups, list) and all(
-            isinstance(each, (list, tuple)) and len(each) == 3 and all(
-                isinstance(t, Tensor) and t.is_floating_point() and bool(torch.isfinite(t).all()) for t in each)
-            for each in groups)):  # fmt: skip
-            raise ConfigError(
-                f"mosa.identification.{name}: expected null, or for each rollout three tensors of finite numbers"
-            )
-
-
-def check_retreat(found: Any) -> None:
-    """Of a running stage of Adam: halvings of its steps, and the numbers before the last; None where none is kept. Errors:
-    ConfigError."""
-    if found is None:
-        return
-    parts(found, ("halvings", "before"), "mosa.retreat")
-    check(
-        {"mosa": {"retreat": {"halvings": found["halvings"]}}},
-        {"mosa.retreat.halvings": whole(0, MOST_HALVINGS)},
-    )
-    before = found["before"]
-    if before is not None and not (isinstance(before, list) and all(
-        isinstance(t, Tensor) and t.is_floating_point() and bool(torch.isfinite(t).all()) for t in before)):  # fmt: skip
-        raise ConfigError("mosa.retreat.before: expected null, or a list of finite tensors")
-
-
-def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """What a fit goes on from is there. Errors: DataError naming what is missing."""
-    try:
-        parts(checkpoint, (*RESUMED, "state_dict"), "checkpoint")
-        check(checkpoint, {"state_dict": Kind("tensors by name", lambda v: isinstance(v, Mapping) and all(
-            isinstance(name, str) for name in v))})  # fmt: skip
-        saved = checkpoint["mosa"]
-        parts(saved, ("stage", "losses", "steps_done", "particles"), "mosa")
-        check(
-            {"mosa": {name: saved[name] for name in GOING_ON if name in saved}},
-            {f"mosa.{name}": kind for name, kind in GOING_ON.items()},
-        )
-        check_cues(saved.get("cues"))
-        check_responses(saved.get("responses"))
-        check_identification(saved.get("identification"))
-        check_retreat(saved.get("retreat"))
-        if (ground := ((saved.get("config") or {}).get("world") or {}).get("ground")) is not None:
-            parts(ground, ("height", "mode", "friction"), "mosa.config.world.ground")
-            check(
-                {"world": {"ground": ground}},
-                {key: kind for key, kind in STORED.items() if key.startswith("world.ground.")},
-            )
-        if saved.get("compared"):
-            law = saved["config"]["cfg"]["prior"]["law"] if "config" in saved else None
-            if not isinstance(law, str):
-                raise ConfigError(
-                    f"mosa.config.cfg.prior.law: expected the law that was chosen, found {str(law)[:80]!r}"
-                )
-            law_named(law)
-    except (KeyError, TypeError) as error:
+def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
+    """The record of a checkpoint that has all that a fit goes on from. Errors: DataError naming what is missing."""
+    again = "; a fit goes on from a checkpoint that train.py wrote"
+    wanted = (*RESUMED, "state_dict")
+    if missing := [name for name in wanted if name not in checkpoint]:
         raise DataError(
-            f"ckpt_path: {path}: mosa.config: expected the run's configuration, found none ({error})"
-        ) from error
-    except ConfigError as error:
-        raise DataError(
-            f"ckpt_path: {path}: {error}; a fit goes on from a checkpoint that train.py wrote"
-        ) from error
+            f"ckpt_path: {path}: checkpoint: expected the parts {', '.join(wanted)}, found none called {', '.join(missing)}{again}"
+        )
+    state = checkpoint["state_dict"]
+    if not (isinstance(state, Mapping) and all(isinstance(name, str) for name in state)):
+        raise DataError(f"ckpt_path: {path}: state_dict: expected tensors by name{again}")
+    record = record_of(checkpoint, path)
+    if record.fit is None:
+        raise DataError(f"ckpt_path: {path}: mosa.fit: expected this key, found none{again}")
+    return record

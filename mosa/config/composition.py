@@ -8,11 +8,17 @@ from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from mosa.config.leaf_commands import COMMANDS
+from mosa.settings import node_of
+
 GROUPED = "scene"
 """The group whose option a bare name chooses."""
+CHOSEN = ("adapter", "trainer", "callbacks", "logger")
+"""Sections whose keys depend on the option that is chosen."""
 
 
 def current_folder() -> str:
@@ -21,6 +27,10 @@ def current_folder() -> str:
 
 
 OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
+
+
+for command, model in COMMANDS.items():  # which conf/<command>.yaml begins with
+    ConfigStore.instance().store(f"{command}_settings", node_of(model, CHOSEN))
 
 
 def configuration() -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from mosa.data.checks.validation import validate
 from mosa.data.formats.scene_from_footage import check_fps, scene_from_footage
 from mosa.errors import ConfigError
-from mosa.schema import is_number
+from mosa.settings import is_number
 from mosa.types import AUTO, GROUND_MODES, RUBBING, Ground, Scene
 
 FORMATS = {

@@ -71,16 +71,15 @@ def truth_of(known: Mapping[str, Any]) -> dict[str, Any]:
 def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
     """The configuration of the built-in scene that a twin was learned from. Errors: ConfigError where it was another one, DataError
     where the checkpoint does not say."""
-    cfg = learned.config.get("cfg")
-    known = cfg.get("scene") if isinstance(cfg, Mapping) else None
+    known = learned.record.settings.get("scene")
     if not isinstance(known, Mapping) or not isinstance(known.get("format"), str):
-        raise DataError(f"checkpoint: {checkpoint}: cfg.scene: expected the scene that the twin was learned from, found none; "
+        raise DataError(f"checkpoint: {checkpoint}: settings.scene: expected the scene that the twin was learned from, found none; "
                         "name a built-in one with truth.scene=")  # fmt: skip
     if known["format"] != "builtin":
         raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {known['format']}: the truth "
                           "is known for built-in scenes only")  # fmt: skip
     if not isinstance(known.get("name"), str):
-        raise DataError(f"checkpoint: {checkpoint}: cfg.scene.name: expected the name of a built-in scene, found "
+        raise DataError(f"checkpoint: {checkpoint}: settings.scene.name: expected the name of a built-in scene, found "
                         f"{known.get('name')!r}; name one with truth.scene=")  # fmt: skip
     return known
 

@@ -11,7 +11,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mosa.config.build import known_keys, plain
+from mosa.config.build import plain
 from mosa.environments.arena import SIMULATORS
 from mosa.environments.policies import METHODS, Search
 from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, put_into, table
@@ -48,7 +48,7 @@ def setting_of(values: dict) -> Setting:
         )
     return Setting(
         **{key: values[key] for key in ("task", "checkpoint", "policy", "decisions", "trials", "options")}, **values["truth"],
-        device=device, search=known_keys("search", Search, values["search"]), worlds=min(worlds, values["trials"]),
+        device=device, search=Search(**values["search"]), worlds=min(worlds, values["trials"]),
     )  # fmt: skip
 
 

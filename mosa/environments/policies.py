@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mosa.config.leaf_commands import SearchSection
 from mosa.environments.arena import Arena, play, play_all
 from mosa.environments.task import Task, View
 from mosa.errors import ConfigError, DataError
@@ -63,24 +64,7 @@ class LinearPolicy(nn.Module):
         return policy
 
 
-@dataclass(frozen=True)
-class Search:
-    """Of a policy's numbers. iterations, each on `batch` newly drawn trials; every `every` of them the policy is tried on
-    `validation` trials of the simulator it is trained in, and the best one is kept.
-
-    By gradients: Adam at `rate`; `clip`: largest norm of a trial's gradient with respect to one action, as one that bounces off an
-    edge may have any. By covariance matrix adaptation: `candidates` policies an iteration, drawn with a standard deviation of
-    `spread` at first. By a model of how trials end: `candidates` times `batch` trials an iteration, with actions `spread` about the
-    policy's."""
-
-    iterations: int = 60
-    batch: int = 16
-    rate: float = 0.02
-    clip: float = 0.5
-    every: int = 10
-    validation: int = 32
-    candidates: int = 32
-    spread: float = 0.4
+Search = SearchSection
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,15 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.world import World
-from mosa.schema import Kind, is_number, number, whole
+from mosa.settings import Expected, described, fits, is_number, such
 from mosa.system.limits import counted
 from mosa.types import Ground
 
@@ -28,17 +29,27 @@ LAST = 5
 
 CLEARANCE = 0.04
 """Height [m] of the lowest particle above what it falls on at which the simulation begins; the flight before is a parabola."""
-LENGTH = number(0, ROOM)
-_SOME, _ANGLE = number(1e-4, ROOM), number(0, math.pi)
-RANGES: dict[str, Kind] = {
-    "extents": Kind("three lengths of the body [m]", lambda v: isinstance(v, (tuple, list)) and len(v) == 3 and all(
-        is_number(x) and 0 <= x <= ROOM for x in v)),
-    "steps": whole(1, 10**5), "control_dt": number(1e-4, 1), "low": number(CLEARANCE, ROOM), "high": number(CLEARANCE, ROOM),
-    "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME,
-    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "turning": number(0, 100),
-    "slowest": number(1e-4, 100), "across": number(0, 100), "stroke": whole(1, 10**5), "leaning": number(-math.pi, math.pi),
-    "hardest": number(0, 100), "unsteady_throw": number(0, 100),
-    "shut": whole(0, 10**5), "closing": whole(1, 10**5), "squeeze": number(0, 0.9),
+
+
+def _number(low: float, high: float) -> Any:
+    return Annotated[float, Interval(ge=low, le=high)]
+
+
+def _whole(low: int, high: int) -> Any:
+    return Annotated[int, Interval(ge=low, le=high)]
+
+
+LENGTH, _SOME, _ANGLE = _number(0, ROOM), _number(1e-4, ROOM), _number(0, math.pi)
+RANGES: dict[str, Any] = {
+    "extents": Annotated[Any, Expected("three lengths of the body [m]"), such(
+        lambda v: isinstance(v, (tuple, list)) and len(v) == 3 and all(
+        is_number(x) and 0 <= x <= ROOM for x in v))],
+    "steps": _whole(1, 10**5), "control_dt": _number(1e-4, 1), "low": _number(CLEARANCE, ROOM), "high": _number(CLEARANCE, ROOM),
+    "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": _number(1e-3, math.pi), "near": _SOME,
+    "still": _number(1e-4, 100), "fastest": _number(1e-4, 100), "turning": _number(0, 100),
+    "slowest": _number(1e-4, 100), "across": _number(0, 100), "stroke": _whole(1, 10**5), "leaning": _number(-math.pi, math.pi),
+    "hardest": _number(0, 100), "unsteady_throw": _number(0, 100),
+    "shut": _whole(0, 10**5), "closing": _whole(1, 10**5), "squeeze": _number(0, 0.9),
 }  # fmt: skip
 """What a field of a task may be: lengths [m] where nothing else is said."""
 
@@ -104,9 +115,9 @@ class Task(ABC):
         """Errors: ConfigError naming the field that is out of its range."""
         for field in fields(self):
             value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
-            if not kind.fits(value):
+            if not fits(kind, value):
                 raise ConfigError(
-                    f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}"
+                    f"options.{field.name}: expected {described(kind)}, found {str(value)[:80]!r}"
                 )
         for low, high in (("low", "high"), ("close", "far"), ("slowest", "fastest")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 import torch
+from annotated_types import Interval
 from torch import Tensor, nn
 
 from mosa.data.synthetic import BOX
@@ -18,7 +21,7 @@ from mosa.modules.body.body import Body
 from mosa.modules.body.model import Model
 from mosa.modules.body.simulation_settings import SimulationSettings
 from mosa.physics.world import Start, World
-from mosa.schema import number, whole
+from mosa.settings import Seed, fits
 from mosa.system.limits import named_device
 from mosa.twin.twin import Twin
 from mosa.types import Ground
@@ -71,12 +74,12 @@ def true_twin(
     Rest positions are those of the training sequence's frame 0, as a learned twin's are. Errors: ConfigError naming the key.
     """
     device, body, drop = named_device(device), object_named(name), drop_named(name, sequence)
-    if not whole(0, 2**32 - 1).fits(seed):
+    if not fits(Seed, seed):
         raise ConfigError(
             f"scene.seed: expected a whole number of at least 0 and below 2^32, found {str(seed)[:80]!r}"
         )
     widest = float(np.ptp(np.asarray(SHAPES[body.shape].bounds), axis=0).max()) / COARSEST
-    if spacing is not None and not number(FINEST, widest).fits(spacing):
+    if spacing is not None and not fits(Annotated[float, Interval(ge=FINEST, le=widest)], spacing):
         raise ConfigError(
             f"truth.spacing: expected a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the "
             f"body's longest side, or null, found {str(spacing)[:80]!r}"
@@ -111,4 +114,4 @@ def true_twin(
         tensor([0.0, -drop.speed, 0.0]),
         torch.zeros(3),
     )
-    return Twin(made.to(device).eval(), world, 1 / body.footage.fps, {}, start)
+    return Twin(made.to(device).eval(), world, 1 / body.footage.fps, None, start)

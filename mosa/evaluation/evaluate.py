@@ -55,10 +55,12 @@ def sequences(
     ]
 
 
-def run_sequences(config: Mapping[str, Any], body: Body) -> list[Sequence]:
-    """The sequences that the run of a checkpoint's `config` was evaluated on, read again. Errors: ConfigError, DataError."""
-    found = {prefix: Start.read(written, body.rest) for prefix, written in config["starts"].items()}
-    return sequences(body, *load_sequences(config["cfg"]["scene"]), found)
+def run_sequences(
+    scene: Mapping[str, Any], starts: Mapping[str, Any], body: Body
+) -> list[Sequence]:
+    """The sequences that a run was evaluated on, read again. scene, starts: of its record. Errors: ConfigError, DataError."""
+    found = {prefix: Start.read(written, body.rest) for prefix, written in starts.items()}
+    return sequences(body, *load_sequences(scene), found)
 
 
 @torch.no_grad()

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import ClassVar
 
-from mosa.schema import COUNT, FLAG, check_knobs, knob
+from pydantic import Field
+
+from mosa.settings import Count, Settings
 
 
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """floor: whether the true law, where it is known, is rolled out on the learner's own grid; samples: points of the chamfer
-    distance; assignment: points of the exact assignment of the earth mover's distance; video: whether a comparison is filmed.
+class EvaluationSettings(Settings):
+    """The section `evaluation`."""
 
-    Errors: ConfigError naming the key."""
+    where: ClassVar[str] = "evaluation"
 
-    floor: bool = knob(True, FLAG)
-    samples: int = knob(8192, COUNT)
-    assignment: int = knob(2048, COUNT)
-    video: bool = knob(True, FLAG)
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "evaluation")
+    floor: bool = Field(
+        True,
+        description=(
+            "roll the true law out on the learner's own grid where it is known (synthetic scenes)"
+        ),
+    )
+    samples: Count = Field(8192, description="points of the chamfer distance")
+    assignment: Count = Field(
+        2048, description="points of the exact assignment of the earth mover's distance"
+    )
+    video: bool = Field(True, description="film a comparison")

@@ -188,7 +188,7 @@ def directions(
     is drawn over its mean, on axes that show NEARLY at least, so that what is isotropic is a level line, and in kPa from 0."""
     found = []
     for record, twin in loaded(records):
-        scene = twin.config["cfg"]["scene"]
+        scene = twin.record.settings["scene"]
         hidden = OBJECTS[scene["name"]].material if scene.get("name") in OBJECTS else None
         fibre = torch.tensor(getattr(hidden, "fibre", (1.0, 0.0, 0.0))).double()
         across = torch.eye(3).double()[int(fibre.abs().argmin())]
@@ -282,7 +282,7 @@ def heterogeneity(
     grid, lines, shown = canvas.subplots(2, len(found), squeeze=False), [], []
     several = len(experiment.axes[experiment.rows]) > 1
     for column, (record, twin) in enumerate(found):
-        body, scene = twin.body, twin.config["cfg"]["scene"]
+        body, scene = twin.body, twin.record.settings["scene"]
         learned = body.factor(body.model().heterogeneity).detach()
         hidden = (
             OBJECTS[scene["name"]].material.variant(scene.get("material", "anisotropic"))

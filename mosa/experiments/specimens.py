@@ -102,7 +102,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
                 f"{kept}: not what a specimen has measured ({error}); remove it to measure again"
             ) from error
     twin = Twin.load(checkpoint(record))
-    scene = twin.config["cfg"]["scene"]
+    scene = twin.record.settings["scene"]
     name, variant = scene.get("name"), scene.get("material", "anisotropic")
     if name not in OBJECTS:
         return None

@@ -7,7 +7,7 @@ import functools
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.gaussians.carried import fit_carried
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.gaussians.static import fit_splats, start_splats
-from mosa.reconstruction.geometry.body import Geometry, find_geometry
+from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.motion.observed import Windows, object_windows
@@ -71,7 +71,7 @@ def object_geometry(
 
     def stage() -> dict[str, Any]:
         found = find_geometry(
-            scene, object_hull(scene, settings), settings.geometry, ridge_passes=settings.ridge_passes,
+            scene, object_hull(scene, settings), GeometrySettings.of(settings.geometry), ridge_passes=settings.ridge_passes,
             sigma=settings.resolution / 40, margin=settings.margin, device=device,
         )  # fmt: skip
         return found.stored()
@@ -151,7 +151,7 @@ def _geometry_cache(
     return _open_cache(
         cache_dir,
         scene,
-        parts | {"geometry": asdict(settings.geometry)},
+        parts | {"geometry": GeometrySettings.of(settings.geometry).plain()},
         0,
         free=scene.last_free_frame,
     )
@@ -180,11 +180,8 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 
 def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
     """What particles and their motion depend on."""
-    return {
-        name: value
-        for name, value in asdict(settings).items()
-        if name not in ("carried", "informed")
-    }
+    whole = settings.plain() | {"geometry": GeometrySettings.of(settings.geometry).plain()}
+    return {name: value for name, value in whole.items() if name not in ("carried", "informed")}
 
 
 def imported_splats(path: str, scene: Scene) -> Appearance:
@@ -359,7 +356,7 @@ def reconstruct(
         apart = _open_cache(
             cache_dir,
             scene,
-            _motion_settings(settings) | {"carried": asdict(settings.carried)},
+            _motion_settings(settings) | {"carried": settings.carried.plain()},
             seed,
             **more,
         )

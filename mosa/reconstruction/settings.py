@@ -1,41 +1,305 @@
-"""Settings of the reconstruction, from the plain keys of conf/reconstruction."""
+"""Settings of the reconstruction: the section `reconstruction`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Interval
+from pydantic import Field, model_validator
 
 from mosa.errors import ConfigError
-from mosa.reconstruction.gaussians.carried import CarriedSettings
-from mosa.reconstruction.gaussians.static import FitSettings, StaticSettings
-from mosa.reconstruction.geometry.body import GeometrySettings
-from mosa.reconstruction.motion.dynamic import DynamicSettings
-from mosa.reconstruction.motion.informed import InformedSettings
-from mosa.schema import TEXT, check_knobs, knob, known_keys, one_of, or_null, whole
+from mosa.settings import Count, Positive, Settings, Share, Text, Weight, Whole, Width
+
+Layers = Annotated[int, Interval(ge=1, le=100)]
+AtLeastOne = Annotated[float, Interval(ge=1)]
 
 
-@dataclass(frozen=True)
-class ReconstructionSettings:
-    """resolution: voxels along the object's longest side in the hull; geometry: what of it is the body; ridge_passes: of
-    hull.shave_ridges: the body where geometry.source is hull, else where its refinement starts; points: static Gaussians
-    (with static.densify=mcmc at the start); neighbours: of the least-squares deformation; cue: neighbourhood | gaussian
-    (docs/cues.md); margin: px of the windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's
-    world, that replaces the static stage (None: fit it); informed: the motion once more, about the calibrated
-    backbone's, where it is one of modes and the cue that of the neighbourhood."""
+class GeometrySection(Settings):
+    """What of the visual hull is the body (docs/seeing.md)."""
 
-    resolution: int = knob(80, whole(8, 1024))  # a hull of that many voxels per side has 4 GB
-    ridge_passes: int = knob(24, whole(0, 10**4))
-    points: int = knob(3000, whole(8, 10**8))
-    neighbours: int = knob(20, whole(4, 1000))  # fewer leave every deformation gradient open
-    cue: str = knob("neighbourhood", one_of("neighbourhood", "gaussian"))
-    margin: int = knob(6, whole(0, 256))  # of windows in memory, all at once
-    splats: str | None = knob(None, or_null(TEXT))
-    geometry: GeometrySettings = field(default_factory=GeometrySettings)
-    static: StaticSettings = field(default_factory=StaticSettings)
-    appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
-    dynamic: DynamicSettings = field(default_factory=DynamicSettings)
-    carried: CarriedSettings = field(default_factory=CarriedSettings)
-    informed: InformedSettings = field(default_factory=InformedSettings)
+    where: ClassVar[str] = "reconstruction.geometry"
+    needs: ClassVar[dict[str, str]] = {"frames": "source=images"}
+
+    source: Literal["images", "hull"] = Field(
+        "images",
+        description=(
+            "images: carved by colours, refined by colours and the outlines of all free"
+            " frames; hull: the hull with its ridges rounded"
+        ),
+    )
+    frames: Count = Field(
+        6,
+        description="frames of free flight whose outlines and colours are used, at most",
+    )
+
+
+class FitSettings(Settings):
+    """How Gaussians are fitted to images. Steps are Adam's."""
+
+    where: ClassVar[str] = "reconstruction.appearance"
+
+    iterations: Whole = Field(400, description="steps")
+    views: Count = Field(2, description="images in a step")
+    lr_positions: Weight = Field(0.03, description="step of positions, in units of the mean scale")
+    lr_scales: Weight = Field(0.02, description="step of the logarithms of scales")
+    lr_opacities: Weight = Field(0.05, description="step of the logits of opacities")
+    lr_colors: Weight = Field(0.02, description="step of colours")
+    lr_rotations: Weight = Field(0.02, description="step of quaternions, where anisotropic")
+    ssim: Share = Field(0.2, description="weight of 1 - SSIM against L1")
+    matte: Weight = Field(1.0, description="weight of the alpha term")
+    keep: Weight = Field(
+        0.0,
+        description=(
+            "what a Gaussian's first colour (a particle's: from nearby Gaussians) "
+            "counts for, in pixels of an image"
+        ),
+    )
+    largest: AtLeastOne = Field(2.0, description="bound of a scale in units of its start")
+    shape: Literal["isotropic", "anisotropic"] = Field(
+        "isotropic",
+        description="anisotropic: three scales and a rotation each, which start isotropic",
+    )
+    axis_ratio: AtLeastOne = Field(
+        10.0, description="an anisotropic one's largest scale over its smallest, at most"
+    )
+
+
+class StaticSettings(FitSettings):
+    """The static stage: Gaussians fitted to frame 0."""
+
+    where: ClassVar[str] = "reconstruction.static"
+    needs: ClassVar[dict[str, str]] = {"max_points refine_every growth fade noise": "densify=mcmc"}
+
+    start: Literal["hull", "random"] = Field(
+        "hull",
+        description=(
+            "where Gaussians start: hull: on the visual hull's surface; random: in its box"
+        ),
+    )
+    densify: Literal["relocate", "mcmc"] = Field(
+        "relocate",
+        description=(
+            "relocate: vanished Gaussians are moved to where opaque ones are; mcmc: and"
+            " more are added, up to max_points, as copies that leave the image as it is"
+        ),
+    )
+    max_points: Annotated[int, Interval(ge=8, le=10**9)] | None = Field(
+        None,
+        description="mcmc: Gaussians at most, at least `points`; null: as many as `points`",
+    )
+    relocate_every: Whole = Field(100, description="relocate: steps between moves; 0: never")
+    refine_every: Count = Field(10, description="mcmc: steps between moves")
+    growth: Weight = Field(
+        0.1,
+        description="mcmc: share of the number that is added",
+    )
+    fade: Weight = Field(
+        0.03,
+        description=(
+            "mcmc: what an opacity of 1 costs, in pixels of an image: Gaussians that no"
+            " image shows vanish and get moved"
+        ),
+    )
+    noise: Weight = Field(
+        0.2,
+        description=(
+            "mcmc: random steps of those about to vanish, in their standard deviations "
+            "at the first step"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _number_kept(self) -> StaticSettings:
+        if self.max_points is not None and self.densify != "mcmc":
+            raise ConfigError(
+                f"reconstruction.static.max_points: expected null, found {self.max_points}: densify={self.densify} keeps the "
+                "number of Gaussians (reconstruction.points); set reconstruction.static.densify=mcmc"
+            )
+        return self
+
+
+class CarriedSettings(FitSettings):
+    """The static Gaussians, fitted to all training frames as the observed motion carries them: what images show."""
+
+    where: ClassVar[str] = "reconstruction.carried"
+    needs: ClassVar[dict[str, str]] = {"[!i]*": "iterations!=0", "lr_light": "light=true"}
+
+    views: Count = Field(4, description="images in a step")
+    keep: Weight = Field(
+        1.0, description="what a Gaussian's first colour counts for, in pixels of an image"
+    )
+    shape: Literal["isotropic", "anisotropic"] = Field(
+        "anisotropic", description="anisotropic: three scales and a rotation each"
+    )
+    lr_colors: Weight = Field(0.03, description="step of mean colours")
+    degree: int = Field(1, ge=0, le=3, description="of the spherical harmonics")
+    lr_harmonics: Weight = Field(0.005, description="step of the coefficients of degree 1 and more")
+    keep_harmonics: Weight = Field(
+        10.0,
+        description=(
+            "what those count for in pixels of an image, since what no training camera "
+            "sees along has no other reason to be dull"
+        ),
+    )
+    light: bool = Field(True, description="fit light that stays while the body turns")
+    lr_light: Weight = Field(0.02, description="step of the light")
+
+
+class InformedSettings(Settings):
+    """The motion once more, about what the calibrated backbone predicts (docs/cues.md)."""
+
+    where: ClassVar[str] = "reconstruction.informed"
+    needs: ClassVar[dict[str, str]] = {
+        "views lr elastic bending response carriers": "iterations!=0"
+    }
+
+    iterations: Whole = Field(80, description="steps; 0: never")
+    views: Count = Field(1, description="images of every frame in a step")
+    lr: Positive = Field(
+        0.02,
+        description="step, in units of the object's radius",
+    )
+    elastic: Weight = Field(
+        0.3,
+        description="weight of the elastic energy, counted from the prediction",
+    )
+    bending: Weight = Field(
+        1.0,
+        description="weight of the curvature, counted from the prediction",
+    )
+    response: Whole = Field(
+        4,
+        description=(
+            "views of every frame that say how much of the prediction stays in what is "
+            "seen; 0: cues count as they are"
+        ),
+    )
+    carriers: Literal["auto", "fitted", "first"] = Field(
+        "auto",
+        description=(
+            "Gaussians compared with the images: fitted to all frames, in their light; "
+            "first: those of the first motion; auto: first of a body that yields or "
+            "flows, which the first motion may have lost"
+        ),
+    )
+
+
+class DynamicSettings(Settings):
+    """The motion of the particles. Steps are in units of the object's radius, for all amplitudes of a frame together."""
+
+    where: ClassVar[str] = "reconstruction.dynamic"
+    needs: ClassVar[dict[str, str]] = {
+        "modes": "model=modes",
+        "bases hidden basis_layers coefficient_layers lr_network": "model=network",
+    }
+
+    model: Literal["modes", "network"] = Field(
+        "modes",
+        description="modes: amplitudes of smooth modes in each frame; network: motion bases (GIC)",
+    )
+    carriers: Literal["static", "particles"] = Field(
+        "static",
+        description=(
+            "what is compared with the images: static: Gaussians of the static stage, "
+            "moved by the same motion and finer; particles: the paper"
+        ),
+    )
+    modes: Count = Field(120, description="number of modes")
+    free_shape: bool = Field(
+        False,
+        description=(
+            "the Gaussians' scale and rotation are free, in place of following the "
+            "deformation; always so for the network"
+        ),
+    )
+    track_iterations: Whole = Field(40, description="steps of a frame in the first pass")
+    track_views: Count = Field(4, description="images in a step of the first pass")
+    iterations: Whole = Field(150, description="steps of the joint refinement")
+    views: Count = Field(1, description="images of every frame in a step of the refinement")
+    lr_track: Weight = Field(0.03, description="step of the first pass")
+    lr: Weight = Field(0.01, description="step of the refinement")
+    ssim: Share = Field(0.0, description="weight of 1 - SSIM against L1")
+    matte: Weight = Field(1.0, description="weight of the alpha term")
+    elastic: Weight = Field(0.01, description="weight of the mean St. Venant-Kirchhoff energy")
+    bending: Weight = Field(
+        3.5, description="weight of the modes' mean squared curvature, in units of the body's size"
+    )
+    bending_scale: Weight = Field(
+        0.001,
+        description=(
+            "curvature of a frame from which on that weight falls in the refinement; 0:"
+            " never. Thick bodies stay below 0.001 but for their first impact; the "
+            "limbs of a thin one truly bend by 0.005 to 0.04"
+        ),
+    )
+    poisson: float = Field(0.3, ge=0, le=0.49, description="Poisson ratio of the elastic energy")
+    bases: Width = Field(10, description="network: motion bases")
+    hidden: Width = Field(256, description="network: width")
+    basis_layers: Layers = Field(8, description="network: layers of the bases")
+    coefficient_layers: Layers = Field(
+        3,
+        description="network: layers of the coefficients",
+    )
+    lr_network: Weight = Field(5e-4, description="network: step")
+
+
+class ReconstructionSettings(Settings):
+    """The section `reconstruction`: body, appearance and motion from images."""
+
+    where: ClassVar[str] = "reconstruction"
+    needs: ClassVar[dict[str, str]] = {"static": "splats=null"}
+
+    resolution: int = Field(
+        80, ge=8, le=1024, description="voxels along the object's longest side in the visual hull"
+    )
+    ridge_passes: int = Field(
+        24,
+        ge=0,
+        le=10**4,
+        description=(
+            "rounds the hull where two silhouettes' cones meet, from which "
+            "geometry.source=images starts; 0: the hull itself"
+        ),
+    )
+    points: int = Field(
+        3000, ge=8, le=10**8, description="static Gaussians (static.densify=mcmc: at the start)"
+    )
+    neighbours: int = Field(
+        20,
+        ge=4,
+        le=1000,
+        description="of the least-squares deformation gradient; fewer than 4 leave it open",
+    )
+    cue: Literal["neighbourhood", "gaussian"] = Field(
+        "neighbourhood",
+        description=(
+            "of rotation and stretch (docs/cues.md); gaussian needs "
+            "dynamic.free_shape=true or the network"
+        ),
+    )
+    margin: int = Field(
+        6,
+        ge=0,
+        le=256,
+        description="px of the windows around mattes, which are in memory all at once",
+    )
+    splats: Text | None = Field(
+        None,
+        description=(
+            "3DGS PLY of the object at frame 0, in the scene's world, that replaces the"
+            " static stage"
+        ),
+    )
+    geometry: GeometrySection = Field(GeometrySection(), description="what of the hull is the body")
+    static: StaticSettings = Field(StaticSettings(), description="static Gaussians")
+    appearance: FitSettings = Field(
+        FitSettings(keep=1.0), description="appearance of the particles"
+    )
+    dynamic: DynamicSettings = Field(DynamicSettings(), description="motion")
+    carried: CarriedSettings = Field(
+        CarriedSettings(), description="Gaussians carried by the motion"
+    )
+    informed: InformedSettings = Field(InformedSettings(), description="the motion once more")
 
     @property
     def looks_again(self) -> bool:
@@ -46,8 +310,8 @@ class ReconstructionSettings:
             and self.dynamic.model == "modes"
         )
 
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction")
+    @model_validator(mode="after")
+    def _together(self) -> ReconstructionSettings:
         if self.static.max_points is not None and self.static.max_points < self.points:
             raise ConfigError(
                 f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
@@ -59,14 +323,9 @@ class ReconstructionSettings:
                 "reconstruction.cue=gaussian reads the Gaussians' own scale and rotation: set "
                 "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network"
             )
+        return self
 
 
 def build_settings(**keys: Any) -> ReconstructionSettings:
-    """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
-    keys = dict(keys)
-    sections = {"geometry": GeometrySettings, "static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings,
-                "carried": CarriedSettings, "informed": InformedSettings}  # fmt: skip
-    for name, cls in sections.items():
-        if name in keys:
-            keys[name] = known_keys(f"reconstruction.{name}", cls, keys[name] or {})
-    return known_keys("reconstruction", ReconstructionSettings, keys)
+    """Settings from the plain keys of conf/reconstruction. Errors: ConfigError naming the key."""
+    return ReconstructionSettings.read(keys)

@@ -18,9 +18,9 @@ from omegaconf import DictConfig, OmegaConf
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mosa.config.build import build_body, build_world, plain
-from mosa.config.checkpoints import VERSION
+from mosa.config.build import build_body, plain, world_of
 from mosa.config.extensions import load_extensions
+from mosa.config.record import BodyRecord, RunRecord
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
@@ -164,28 +164,28 @@ def object_twin(
     )
     rest = tensors["rest"]
     learned = law if isinstance(law, Twin) else None
-    cfg = copy.deepcopy(dict(learned.config["cfg"] if learned is not None else law))
-    cfg["heterogeneity"] = {**cfg["heterogeneity"], "enabled": False}
+    cfg = copy.deepcopy(dict(learned.record.settings if learned is not None else law))
+    cfg["heterogeneity"] = {**cfg.get("heterogeneity", {}), "enabled": False}
+    cfg.pop("world", None)
     room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height
-    world = {"ground": {"height": float((rest @ direction).min()) - height, "mode": "sticky", "friction": 0.0, **(ground or {})},
-             "gravity": (-gravity * direction).tolist(), "up": direction.tolist(),
+    met = {
+        "height": float((rest @ direction).min()) - height,
+        "mode": "sticky",
+        "friction": 0.0,
+        **(ground or {}),
+    }
+    world = {"gravity": (-gravity * direction).tolist(), "up": direction.tolist(),
              "box": [(rest.amin(0) - room).tolist(), (rest.amax(0) + room).tolist()]}  # fmt: skip
     if density is None:
         density = learned.body.density if learned is not None else 1000.0
-    config = {
-        "cfg": cfg,
-        "world": world,
-        "density": density,
-        "dx": cell,
-        "frame_dt": frame_dt,
-        "starts": {},
-    }
-    body = build_body(config, tensors)
+    chosen = learned.record.law if learned is not None else None
+    record = BodyRecord(settings=cfg, law=chosen, ground=met, world=world, density=density, dx=cell, frame_dt=frame_dt)  # fmt: skip
+    body = build_body(record, tensors)
     if learned is not None:
         take_law(body, learned.body)
     body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
-    return Twin(body.eval(), build_world(world), frame_dt, config, start)
+    return Twin(body.eval(), world_of(record), frame_dt, record, start)
 
 
 @torch.no_grad()
@@ -210,12 +210,13 @@ def save_twin(twin: Twin, path: str | Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     written = twin.training_start.written()
     splats = twin.body.splats
-    torch.save({
-        "state_dict": {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()},
-        "mosa": {"version": VERSION, "config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [],
-                 "steps_done": 0, "particles": len(twin.body.rest), "start": written,
-                 "splats": None if splats is None else splats.written()},
-    }, path)  # fmt: skip
+    record = RunRecord(
+        **dict(twin.record.but(starts={"train": written})),
+        start=written,
+        splats=None if splats is None else splats.written(),
+    )
+    state = {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()}
+    torch.save({"state_dict": state, "mosa": record.plain()}, path)
     return path
 
 

@@ -12,7 +12,7 @@ from functools import cached_property
 import torch
 from omegaconf import DictConfig
 
-from mosa.config.build import build_world, plain
+from mosa.config.build import plain, world_of
 from mosa.data.sequences import load_sequences
 from mosa.evaluation.evaluate import Sequence
 from mosa.modules.body.body import Body, World
@@ -52,7 +52,7 @@ class Run:
 
     @property
     def world(self) -> World:
-        return build_world(self.data.measured["world"])
+        return world_of(self.data.measured)
 
     @property
     def scene(self) -> Scene:

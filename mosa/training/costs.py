@@ -17,7 +17,8 @@ from typing import Any
 
 import torch
 
-from mosa.config.build import build_body, run_config
+from mosa.config.build import build_body, measured
+from mosa.config.commands import TrainSettings
 from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.evaluation.uncertainty import DRAWS
@@ -198,7 +199,7 @@ def body_like(cfg: Mapping[str, Any], scene: Scene, count: int, radius: float) -
         "covariances": covariances,
     }
     dx = grid_spacing(spacing, cfg["simulation"]["particles_per_cell"])
-    return build_body(run_config(dict(cfg), scene, dx), tensors)
+    return build_body(measured(cfg, scene, dx), tensors)
 
 
 def speed_of_rollouts(
@@ -332,20 +333,21 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
 def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int) -> float:
     """Of the stages of `module`, at most: rollouts of Gauss-Newton, steps of Adam with their pictures."""
     body = module.body
-    rollout, views = (frames - 1) * speeds.frame, module.config["cfg"]["fit"]["views"]
+    settings = TrainSettings.part(module.cfg)
+    rollout, views = (frames - 1) * speeds.frame, settings.fit.views
     networks = body.adapter is not None and not body.adapter.steady
     step = (BACKWARD * rollout + views * frames * speeds.picture) * len(module.takes)
-    again = module.config["cfg"]["reconstruction"].get("informed") or {}
+    again = settings.reconstruction.informed
     looks = max(1, sum(stage.looks_again for stage in module.stages))
     pictures = len(module.takes) * (frames - 1) * speeds.picture
-    each = 0.7 * again.get("iterations", 0) * again.get("views", 1) * pictures
+    each = 0.7 * again.iterations * again.views * pictures
     total = KERNELS + looks * each
     if (
         each
-        and again.get("response", 0)
+        and again.response
         and any(stage.newton and not stage.calibrates for stage in module.stages)
     ):
-        total += each + 0.15 * 3 * MODES * again["response"] * pictures
+        total += each + 0.15 * 3 * MODES * again.response * pictures
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0
@@ -420,9 +422,9 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
     window = windows.images.shape[1] * windows.images.shape[2]
     with torch.random.fork_rng(devices=[]):
         body = body_like(cfg, scene, min(size.particles, MEASURED), radius)
-        config = run_config(dict(cfg), scene, body.settings.dx)
-        module = LitMosa.from_config(
-            config, body, takes=[None] * taught, background=scene.background
+        record = measured(cfg, scene, body.settings.dx)
+        module = LitMosa.from_record(
+            record, body, takes=[None] * taught, background=scene.background
         )
         try:
             frame_dt = float(scene.times[1] - scene.times[0])

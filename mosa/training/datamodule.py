@@ -23,8 +23,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import plain, run_config
+from mosa.config.build import measured, plain
+from mosa.config.commands import DataSections
 from mosa.config.composition import composed
+from mosa.config.record import BodyRecord
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule
 from mosa.data.observations import Observations, cropped, training_observations
 from mosa.data.sequences import load_sequences, taught_names
@@ -38,7 +40,7 @@ from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, store
 from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequence_start
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.rest_shape import RestShape
-from mosa.reconstruction.settings import ReconstructionSettings, build_settings
+from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.system.progress import tqdm
 from mosa.training.run_folder import most_particles
 from mosa.types import Reconstruction, Scene
@@ -78,6 +80,7 @@ class SceneDataModule(L.LightningDataModule):
         for: ConfigError naming the key, DataError naming the file."""
         super().__init__()
         self.cfg = composed(scene, overrides)
+        self.settings = DataSections.part(plain(self.cfg))
         self.device, self.held_out, self.predict = device, held_out, list(predict)
 
     # ---------------------------------------------------------------- Lightning's hooks
@@ -141,16 +144,17 @@ class SceneDataModule(L.LightningDataModule):
     @property
     def cache(self) -> Path:
         """Folder of cached reconstructions: scene.cache, or mosa/ in the user's cache folder."""
-        return Path(self.cfg.scene.cache) if self.cfg.scene.get("cache") else default_cache()
+        cache = self.settings.scene.cache
+        return Path(cache) if cache else default_cache()
 
     @property
     def reconstruction_settings(self) -> ReconstructionSettings:
-        return build_settings(**plain(self.cfg.reconstruction))
+        return self.settings.reconstruction
 
     @cached_property
     def spacing(self) -> float:
         """Of the particles [m]."""
-        settings = self.cfg.simulation
+        settings = self.settings.simulation
         dx, particles, per_cell = settings.dx, settings.particles, settings.particles_per_cell
         if dx is not None:
             return float(dx / grid_spacing(1.0, per_cell))
@@ -167,7 +171,7 @@ class SceneDataModule(L.LightningDataModule):
     @property
     def dx(self) -> float:
         """Grid spacing [m]."""
-        return grid_spacing(self.spacing, self.cfg.simulation.particles_per_cell)
+        return grid_spacing(self.spacing, self.settings.simulation.particles_per_cell)
 
     def reconstructed(self) -> bool:
         """Whether the training sequence's reconstruction lies in the cache."""
@@ -176,7 +180,7 @@ class SceneDataModule(L.LightningDataModule):
             lambda: self.spacing,
             self.reconstruction_settings,
             cache_dir=self.cache,
-            seed=self.cfg.seed,
+            seed=self.settings.seed,
         )
 
     @cached_property
@@ -187,14 +191,14 @@ class SceneDataModule(L.LightningDataModule):
             settings=self.reconstruction_settings,
             spacing=self.spacing,
             cache_dir=self.cache,
-            seed=self.cfg.seed,
+            seed=self.settings.seed,
             device=self.device or "cpu",
         )
 
     @cached_property
     def shape(self) -> RestShape:
         """The particles of the body, on the device."""
-        shown = plain(self.cfg.rendering).get("appearance", "splats") == "splats"
+        shown = self.settings.rendering.appearance == "splats"
         return RestShape.of(self.reconstruction, self.device or "cpu", with_splats=shown)
 
     def followed(self, scene: Scene) -> Reconstruction:
@@ -209,7 +213,7 @@ class SceneDataModule(L.LightningDataModule):
             rest_center=self.shape.center,
             settings=self.reconstruction_settings,
             cache_dir=self.cache,
-            seed=self.cfg.seed,
+            seed=self.settings.seed,
             device=self.device or "cpu",
         )
 
@@ -233,12 +237,9 @@ class SceneDataModule(L.LightningDataModule):
         return sequences(self.shape, *self.scenes, self.starts)
 
     @property
-    def measured(self) -> dict[str, Any]:
-        """What a checkpoint keeps of the data, beside the configuration: world, density, spacing, starts."""
-        found = run_config(plain(self.cfg), self.scene, self.dx)
-        return found | {
-            "starts": {prefix: start.written() for prefix, start in self.starts.items()}
-        }
+    def measured(self) -> BodyRecord:
+        """What a checkpoint keeps of the data, beside the settings: world, density, spacing, starts."""
+        return measured(plain(self.cfg), self.scene, self.dx, self.starts)
 
     # ---------------------------------------------------------------- what a fit reads
     @cached_property
@@ -256,7 +257,7 @@ class SceneDataModule(L.LightningDataModule):
         """What the fit reads of one sequence, on the device."""
         device, frames = self.device or "cpu", len(scene.training_frames)
         return Take(
-            start, training_observations(scene, reconstruction, margin=self.cfg.rendering.margin, device=device),
+            start, training_observations(scene, reconstruction, margin=self.settings.rendering.margin, device=device),
             reconstruction.cues.first(frames).to(device), float(scene.times[1] - scene.times[0]),
             first_contact(self.shape, start, scene), self.second_look(scene, reconstruction), scene.sequence,
             self.further_cues(scene, reconstruction),
@@ -267,7 +268,7 @@ class SceneDataModule(L.LightningDataModule):
         settings = self.reconstruction_settings
         if not settings.looks_again:
             return None
-        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device or "cpu")
+        return SecondLook(scene, reconstruction, settings, self.settings.seed, self.device or "cpu")
 
     def further_cues(self, scene: Scene, reconstruction: Reconstruction) -> dict[str, Tensor]:
         """Tensors by name that batches carry as `extra`, for loss terms of one's own, frames first. A subclass returns them."""
@@ -277,7 +278,7 @@ class SceneDataModule(L.LightningDataModule):
     def epochs(self) -> Epochs:
         """The batches of training; the fit says before each epoch what it is."""
         views = len(self.takes[0].observations.cameras)
-        return Epochs(ViewSchedule(views, self.cfg.fit.views, self.cfg.seed), self.batch)
+        return Epochs(ViewSchedule(views, self.settings.fit.views, self.settings.seed), self.batch)
 
     def batch(self, views: Sequence[int]) -> MotionBatch:
         """These views of all sequences that are learned from, in all frames that may be read."""
@@ -303,7 +304,7 @@ class SceneDataModule(L.LightningDataModule):
     @cached_property
     def held_back(self) -> list[MotionBatch]:
         """The batches of validation, named `cameras` and `frames`."""
-        scene, margin = self.scene, self.cfg.rendering.margin
+        scene, margin = self.scene, self.settings.rendering.margin
         parts = {"cameras": (scene.holdout_cameras, scene.training_frames),
                  "frames": (range(len(scene.cameras)), scene.holdout_frames)}  # fmt: skip
         return [self.seen_in(name, cropped(scene, views, frames, margin), views, frames)

@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
-from mosa.config.checkpoints import check_same, checked_posterior, read_checkpoint
+from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
 from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.system.refused import lacks_memory
@@ -123,8 +123,8 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
     """The staged optimisation under Lightning; goes on from ckpt_path. Errors: DataError for a checkpoint of another run."""
     if ckpt_path is not None:
         stored = read_checkpoint(ckpt_path)
-        check_same(stored, module, ckpt_path)
-        checked_posterior(stored, len(read_numbers(module.body)), ckpt_path)
+        record = check_same(stored, module, ckpt_path)
+        check_numbers(record, len(read_numbers(module.body)), ckpt_path)
     for logger in trainer.loggers:
         if isinstance(logger, DescribingLogger):
             logger.law = module.body.material.law

@@ -19,7 +19,7 @@ import copy
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +30,11 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import (
-    build_body,
-    build_criterion,
-    build_evaluation,
-    build_identification,
-    build_stages,
-    build_world,
-    plain,
-)
-from mosa.config.checkpoints import VERSION, read_checkpoint
+from mosa.config.build import build_body, build_stages, plain, world_of
+from mosa.config.checkpoints import read_checkpoint
+from mosa.config.commands import TrainSettings
 from mosa.config.composition import composed
+from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
@@ -66,7 +60,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.observer import deformed_covariances, observe
-from mosa.types import AUTO, Ground, Rollout
+from mosa.types import Ground, Rollout
 
 log = logging.getLogger(__name__)
 
@@ -80,26 +74,26 @@ OF_DATA = ("scene", "reconstruction", "rendering", "seed")
 """Sections of the configuration that the data module decides."""
 
 
-def body_of(shape: RestShape, config: Mapping[str, Any]) -> Body:
+def body_of(shape: RestShape, record: BodyRecord) -> Body:
     """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
-    body = build_body(config, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
+    body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
     body.splats = shape.splats
     return body.to(shape.rest.device)
 
 
-def parts_of(config: Mapping[str, Any], body: Body) -> dict[str, Any]:
-    """What `LitMosa._begin` takes of a configuration that a checkpoint keeps. Errors: ConfigError naming the key."""
-    cfg = config["cfg"]
-    stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
-    if not (cfg["reconstruction"].get("informed") or {}).get("iterations", 0):
+def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
+    """What `LitMosa._begin` takes of a record. Errors: ConfigError naming the key."""
+    settings = TrainSettings.part(record.settings)
+    stages = build_stages(settings.fit, body.heterogeneity, body.adapter)
+    if not settings.reconstruction.informed.iterations:
         stages = [stage for stage in stages if not stage.looks_again]
     return {
-        "world": build_world(config["world"]),
+        "world": world_of(record),
         "stages": stages,
-        "weights": cfg["losses"],
-        "clip": cfg["fit"]["clip"],
-        "criterion": build_criterion(cfg),
-        "settings": build_identification(cfg),
+        "weights": settings.losses.weights(),
+        "clip": settings.fit.clip,
+        "criterion": settings.criterion,
+        "settings": settings.identification,
     }
 
 
@@ -120,11 +114,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             else plain(composed(first, overrides))
         )
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
+        if self.cfg:
+            TrainSettings.read(self.cfg)
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
-        self._begin({"cfg": self.cfg, "world": None}, None, (), torch.ones(3), (), {})
+        self._begin(None, None, (), torch.ones(3), (), {})
 
     def _begin(
-        self, config: dict, body: Body | None, takes: Sequence[Take], background: Tensor, stages: Sequence[Stage],
+        self, record: BodyRecord | None, body: Body | None, takes: Sequence[Take], background: Tensor, stages: Sequence[Stage],
         weights: Mapping[str, float], *, world: World | None = None, clip: float = 1.0, criterion: Criterion | None = None,
         settings: IdentificationSettings | None = None,
     ) -> None:  # fmt: skip
@@ -134,7 +130,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             check_terms(weights, body.adapter)
         self.body, self.world, self.background = body, world, background
         self.takes, self.first_takes, self.stages = list(takes), list(takes), list(stages)
-        self.weights, self.clip, self.config = dict(weights), clip, config
+        self.weights, self.clip, self.record = dict(weights), clip, record
         self.stage_index, self.losses, self.steps_done, self.stage_over = 0, [], 0, False
         self.start = (
             takes[0].start.written() if takes and takes[0] is not None else None
@@ -142,7 +138,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
         self.last: dict[str, float] = {}
         self.criterion, self.settings = (
-            criterion or Criterion("free"),
+            criterion or Criterion(name="free"),
             settings or IdentificationSettings(),
         )
         self.identification: Identification | None = (
@@ -178,22 +174,26 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     @classmethod
     def of_parts(
         cls, body: Body, *, takes: Sequence[Take | None], world: World, background: Tensor, stages: Sequence[Stage],
-        weights: Mapping[str, float], config: dict | None = None, **parts,
+        weights: Mapping[str, float], record: BodyRecord | None = None, **parts,
     ) -> LitMosa:  # fmt: skip
-        """Of parts that were made elsewhere (see `_begin`). config: plain containers that a checkpoint keeps."""
-        config = {} if config is None else config
-        module = cls(config.get("cfg") or {})
-        module._begin(config, body, takes, background, stages, weights, world=world, **parts)
+        """Of parts that were made elsewhere (see `_begin`). record: what a checkpoint keeps of them, None: what they say."""
+        if record is None:
+            frame_dt = takes[0].frame_dt if takes and takes[0] is not None else 1.0
+            record = BodyRecord.of(body, world, frame_dt)
+        module = cls({})
+        module.cfg = record.settings
+        module.save_hyperparameters({"cfg": module.cfg}, logger=False)
+        module._begin(record, body, takes, background, stages, weights, world=world, **parts)
         return module
 
     @classmethod
-    def from_config(
-        cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor
+    def from_record(
+        cls, record: BodyRecord, body: Body, *, takes: Sequence[Take | None], background: Tensor
     ) -> LitMosa:
-        """The module that fits `body` in the stages of a run. config: what a checkpoint keeps (`mosa.config.run_config`); takes:
-        what it learns from, none where it is only used. Errors: ConfigError naming the key."""
+        """The module that fits `body` in the stages of a run. record: of the run (`mosa.config.build.measured`); takes: what it
+        learns from, none where it is only used. Errors: ConfigError naming the key."""
         return cls.of_parts(
-            body, takes=takes, background=background, config=config, **parts_of(config, body)
+            body, takes=takes, background=background, record=record, **parts_of(record, body)
         )
 
     # ---------------------------------------------------------------- data
@@ -244,15 +244,15 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         a body from a checkpoint has other particles."""
         if self.body is None:
             measured = data.measured
-            config = measured | {"cfg": self.cfg | {key: measured["cfg"][key] for key in OF_DATA}}
-            config["world"] = measured["world"] | (self.cfg.get("world") or {})
-            body = body_of(data.shape, config)
+            own = {key: measured.settings[key] for key in OF_DATA if key in measured.settings}
+            record = measured.but(settings=self.cfg | own)
+            body = body_of(data.shape, record)
             self._begin(
-                config,
+                record,
                 body,
                 (),
                 data.scene.background.to(body.rest.device),
-                **parts_of(config, body),
+                **parts_of(record, body),
             )
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
@@ -284,52 +284,57 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        checkpoint["mosa"] = {
-            "version": VERSION,
-            "config": self.config,
-            "stage": self.stage_index,
-            "losses": list(self.losses),
-            "steps_done": self.steps_done,
-            "stage_over": self.stage_over,
-            "particles": len(self.body.rest),
-            "misfit": self.misfit,
-            "start": self.start,
-            "identification": self.identification.state() if self.identification else None,
-            "compared": self.compared,
-            "grounds": self.grounds,
-            "ground_gains": self.ground_gains,
-            "retreat": self.retreat.written(),
-            "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
-            "responses": [take.response and take.response.written() for take in self.takes]
+        fit = FitRecord(
+            stage=self.stage_index,
+            steps_done=self.steps_done,
+            losses=list(self.losses),
+            stage_over=self.stage_over,
+            particles=len(self.body.rest),
+            misfit=self.misfit,
+            compared=self.compared,
+            grounds=self.grounds,
+            ground_gains=self.ground_gains,
+            identification=self.identification.state() if self.identification else None,
+            retreat=self.retreat.written(),
+            cues=[take.cues.positions.cpu() for take in self.takes] if self.informed else None,
+            responses=[take.response and take.response.written() for take in self.takes]
             if self.informed
             else None,
-            "posterior": self.posterior.written() if self.posterior else None,
-            "splats": self.body.splats.written() if self.body.splats is not None else None,
-        }
+        )
+        record = RunRecord(
+            **dict(self.record),
+            start=self.start,
+            fit=fit,
+            posterior=self.posterior.written() if self.posterior else None,
+            splats=self.body.splats.written() if self.body.splats is not None else None,
+        )
+        checkpoint["mosa"] = record.plain()
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if "mosa" not in checkpoint:
             raise ConfigError(
                 "ckpt_path: the checkpoint was not written by this program (no entry 'mosa')"
             )
-        saved = checkpoint["mosa"]
-        if saved["particles"] != len(self.body.rest):
+        record = RunRecord.read(checkpoint["mosa"])
+        saved = record.fit
+        if saved is None or saved.particles != len(self.body.rest):
             raise ConfigError(
-                f"ckpt_path: expected a body of {len(self.body.rest)} particles, found {saved['particles']}: the "
-                "checkpoint belongs to another scene, reconstruction or simulation.particles"
+                f"ckpt_path: expected a fit to a body of {len(self.body.rest)} particles, found "
+                f"{'none' if saved is None else saved.particles}: the checkpoint belongs to another scene, reconstruction or "
+                "simulation.particles"
             )
         self.stage_index, self.losses, self.steps_done = (
-            saved["stage"],
-            list(saved["losses"]),
-            saved["steps_done"],
+            saved.stage,
+            list(saved.losses),
+            saved.steps_done,
         )
-        self.stage_over, self.start = bool(saved.get("stage_over", False)), saved["start"]
-        self.misfit = saved.get("misfit", MISFIT)
-        self.saved_identification = saved.get("identification")
-        self.saved_retreat = saved.get("retreat")
-        self.compared = dict(saved.get("compared") or {})
+        self.stage_over, self.start = saved.stage_over, record.start.plain()
+        self.misfit = saved.misfit
+        self.saved_identification = saved.identification and saved.identification.plain()
+        self.saved_retreat = saved.retreat and saved.retreat.plain()
+        self.compared = dict(saved.compared)
         if self.compared and (candidates := self.body.material.candidates):
-            if (law := saved["config"]["cfg"]["prior"]["law"]) not in candidates:
+            if (law := record.law) not in candidates:
                 raise ConfigError(
                     f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
                     "the checkpoint: it belongs to another configuration"
@@ -340,15 +345,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             ):
                 material.choose(law)
             self.settle_law()
-        self.grounds, self.ground_gains = (
-            dict(saved.get("grounds") or {}),
-            dict(saved.get("ground_gains") or {}),
-        )
-        if self.ground_is_sought and (written := saved["config"]["world"]["ground"]) is not None:
-            self.settle_ground(Ground(**written))
-        self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
-        if saved.get("cues") is not None:
-            self.saved_cues = saved["cues"], saved.get("responses")
+        self.grounds, self.ground_gains = dict(saved.grounds), dict(saved.ground_gains)
+        if self.ground_is_sought and record.ground is not None and not record.ground_is_sought:
+            self.settle_ground(Ground(**record.ground.plain()))
+        self.posterior = Posterior.read(record.posterior.plain()) if record.posterior else None
+        if saved.cues is not None:
+            self.saved_cues = saved.cues, saved.responses
             if self.takes:
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
         elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
@@ -359,20 +361,17 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             )
 
     def settle_law(self) -> None:
-        """What is written from now on is a run of the law that was chosen."""
-        prior = dict(self.config.get("cfg", {}).get("prior", {}))
-        if prior:
-            self.config["cfg"]["prior"] = prior | {"law": self.body.material.law, "candidates": []}
+        """The law that was chosen is the run's from now on."""
+        self.record = self.record.but(law=self.body.material.law)
 
     @property
     def ground_is_sought(self) -> bool:
         """Whether nobody said how the ground is touched (scene.ground.mode=auto), and it is not found yet."""
-        return ((self.config.get("world") or {}).get("ground") or {}).get("mode") == AUTO
+        return self.record is not None and self.record.ground_is_sought
 
     def settle_ground(self, ground: Ground) -> None:
         """What is simulated and written from now on meets this ground."""
-        self.world = replace(self.world, ground=ground)
-        self.config["world"]["ground"] = asdict(ground)
+        self.world, self.record = replace(self.world, ground=ground), self.record.on(ground)
 
     def begin_again(self, ground: Ground) -> None:
         """All stages from the start, on another ground, with the motion that was seen at first: the second look was about a body
@@ -466,7 +465,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """Without a data module: the sequences that the run was evaluated on, from the configuration in its checkpoint. Errors:
         DataError, ConfigError."""
         return DataLoader(
-            run_sequences(self.config, self.body),
+            run_sequences(
+                self.record.settings["scene"],
+                {prefix: start.plain() for prefix, start in self.record.starts.items()},
+                self.body,
+            ),
             batch_size=None,
             collate_fn=lambda sequence: sequence,
         )
@@ -474,7 +477,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def test_step(self, batch, batch_idx: int) -> None:
         """Logs the figures of docs/figures.md of one sequence, of every model. batch: `evaluation.Sequence`."""
         here = replace(batch, start=type(batch.start).read(batch.start.written(), self.body.rest))
-        figures, _ = evaluate(self.body, [here], self.world, build_evaluation(self.config["cfg"]))
+        figures, _ = evaluate(
+            self.body, [here], self.world, TrainSettings.part(self.cfg).evaluation
+        )
         figures.pop("time/particle_substeps_per_s")
         self.log_dict(figures, batch_size=1)  # `test/<metric>` of several sequences is averaged
 
@@ -487,9 +492,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         from mosa.twin.twin import Twin
 
         first = Start.read(self.start, self.body.rest)
-        return Twin(
-            self.body, self.world, self.config["frame_dt"], self.config, first, self.posterior
-        )
+        return Twin(self.body, self.world, self.record.frame_dt, self.record, first, self.posterior)
 
     @classmethod
     def load_from_checkpoint(
@@ -504,7 +507,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         from mosa.twin.twin import Twin
 
         twin = Twin.load(checkpoint_path, "cpu" if map_location is None else map_location)
-        module = cls.from_config(twin.config, twin.body, takes=(), background=torch.ones(3))
+        module = cls.from_record(twin.record, twin.body, takes=(), background=torch.ones(3))
         module.on_load_checkpoint(read_checkpoint(checkpoint_path))
         return module.to(twin.body.rest.device).eval()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -12,10 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
-from mosa.config.extensions import registered_keys
-from mosa.config.idle import warn_of_idle
-from mosa.config.keys import CAPTURE, ENVIRONMENTS, EVALUATION, SIMULATION, SPLATS, TRAINING
-from mosa.config.known import check_known, conf_folder
+from mosa.config.commands import EvalSettings, TrainSettings
+from mosa.config.effects import warn_of_idle
+from mosa.config.leaf_commands import CaptureSettings, EnvironmentsSettings, SplatsSettings
 from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
@@ -26,7 +24,6 @@ from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
-from mosa.schema import check
 from mosa.system.limits import counted
 from mosa.twin.twin import Twin
 from mosa.types import Scene
@@ -38,58 +35,47 @@ DEFORMED = 3
 """Frames after first contact: of three a smoke run on the tiny scene finds E to 15 %, of one to a seventh of it."""
 
 
-def check_configuration(values: Mapping[str, Any], conf: Path | None = None) -> None:
-    """All that train.py's configuration says by itself; a warning for each key that was set and does nothing. conf: the folder of
-    its YAML files, None for the running program's. Errors: ConfigError naming the key."""
-    schemas = TRAINING, EVALUATION, registered_keys(values)
-    if (conf := conf or conf_folder()) is not None:
-        check_known(values, conf, "train", *schemas)
-    check(values, *schemas)
-    if values["simulation"]["particles"] != "auto":
-        check_particles("simulation.particles", values["simulation"]["particles"])
-    if values["evaluation"]["video"]:
+def check_configuration(values: Mapping[str, Any]) -> TrainSettings:
+    """All that train.py's configuration says by itself; a warning for each key that was set and does nothing. Errors: ConfigError
+    naming the key."""
+    settings = TrainSettings.read(values)
+    if settings.simulation.particles != "auto":
+        check_particles("simulation.particles", settings.simulation.particles)
+    if settings.evaluation.video:
         ffmpeg("evaluation.video")
-    stages = rehearse(values)
+    stages = rehearse(settings)
     if HydraConfig.initialized():
-        warn_of_idle(HydraConfig.get().overrides.task, values, stages)
+        warn_of_idle(HydraConfig.get().overrides.task, settings, stages)
+    return settings
 
 
-def check_evaluation(values: Mapping[str, Any]) -> None:
+def check_evaluation(values: Mapping[str, Any]) -> EvalSettings:
     """All that eval.py's configuration says by itself. Errors: ConfigError naming the key."""
-    if (conf := conf_folder()) is not None:
-        check_known(
-            {k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION
-        )
-    check(values, EVALUATION, SIMULATION)
-    if values["evaluation"]["video"]:
+    settings = EvalSettings.read(values)
+    if settings.evaluation.video:
         ffmpeg("evaluation.video")
+    return settings
 
 
-def check_splats(values: Mapping[str, Any]) -> None:
+def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
     """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
-    schemas = SPLATS, registered_keys(values)
-    if (conf := conf_folder()) is not None:
-        check_known(values, conf, "splats", *schemas)
-    check(values, *schemas)
-    if values["video"]:
+    settings = SplatsSettings.read(values)
+    if settings.video:
         ffmpeg("video")
-    check_formats(values["formats"])
-    if values["simulation"]["particles"] != "auto":
-        check_particles("simulation.particles", values["simulation"]["particles"])
+    check_formats(settings.formats)
+    if settings.simulation.particles != "auto":
+        check_particles("simulation.particles", settings.simulation.particles)
+    return settings
 
 
-def check_capture(values: Mapping[str, Any]) -> None:
+def check_capture(values: Mapping[str, Any]) -> CaptureSettings:
     """All that the configuration of `python -m mosa.capture` says by itself. Errors: ConfigError naming the key."""
-    if (conf := conf_folder()) is not None:
-        check_known(values, conf, "capture", CAPTURE)
-    check(values, CAPTURE)
+    return CaptureSettings.read(values)
 
 
-def check_environments(values: Mapping[str, Any]) -> None:
+def check_environments(values: Mapping[str, Any]) -> EnvironmentsSettings:
     """All that the configuration of `python -m mosa.environments` says by itself. Errors: ConfigError naming the key."""
-    if (conf := conf_folder()) is not None:
-        check_known(values, conf, "environments", ENVIRONMENTS)
-    check(values, ENVIRONMENTS)
+    return EnvironmentsSettings.read(values)
 
 
 def check_particles(key: str, count: float) -> None:
@@ -103,13 +89,13 @@ def check_begin(cfg: DictConfig) -> None:
         return
     try:
         found = read_checkpoint(cfg.ckpt_path)
-        check_resumed(found, cfg.ckpt_path)
+        record = check_resumed(found, cfg.ckpt_path)
     except DataError as error:
         again = (
             "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
         )
         raise DataError(f"{error}{again}") from error
-    check_same_scene(found, plain(cfg), cfg.ckpt_path)
+    check_same_scene(record, plain(cfg), cfg.ckpt_path)
 
 
 def check_seen(cfg: DictConfig, scene: Scene) -> None:
@@ -174,14 +160,14 @@ def warn_of_little(
 def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
     """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
     from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
-    stored = twin.config["cfg"].get("scene")
-    if not cfg.get("scene") and not (
-        isinstance(stored, dict) and all(isinstance(key, str) for key in stored)
-    ):
+    stored = twin.record.settings.get("scene")
+    if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
+        stored = None
+    if not cfg.get("scene") and stored is None:
         raise DataError(
             f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>"
         )
-    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "cache": None}
+    keys = plain(cfg.scene) if cfg.get("scene") else {**(stored or {}), "cache": None}
     if not cfg.get("scene") and keys.get("path") is not None:
         print(
             f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)"

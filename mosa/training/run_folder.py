@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mosa.config.build import plain
-from mosa.config.checkpoints import check_same_run, read_checkpoint
+from mosa.config.checkpoints import check_same_run, read_checkpoint, record_of
 from mosa.errors import ConfigError, DataError
 from mosa.system.refused import LAST
 from mosa.system.whole_files import written_whole
@@ -87,7 +87,7 @@ def finished(cfg: DictConfig, folder: Path) -> dict[str, float] | None:
 def check_own(cfg: DictConfig, folder: Path) -> None:
     """The folder's checkpoint, where it has one that can be read, is of this configuration. Errors: ConfigError."""
     try:
-        found = read_checkpoint(folder / LAST)
+        found = record_of(read_checkpoint(folder / LAST), folder / LAST)
     except DataError:  # said where a fit is to go on from it
         return
     check_same_run(found, plain(cfg), folder)

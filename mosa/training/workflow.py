@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__
-from mosa.config.build import build_evaluation, build_world, plain, world_config
+from mosa.config.build import measured, plain, world_of
 from mosa.config.extensions import load_extensions
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
@@ -25,6 +25,7 @@ from mosa.physics.contact.colliders import colliders_from_config
 from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.rendering.rasterizer import use_backend
+from mosa.rendering.settings import RenderingSettings
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import assemble, scenes
@@ -79,7 +80,7 @@ def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
     load_extensions(plain(cfg).get("extensions"))
-    check_configuration(plain(cfg))
+    settings = check_configuration(plain(cfg))
     L.seed_everything(cfg.seed, verbose=False)
     exact_sums.use(cfg.deterministic)
     clock, folder = StageTimes(), run_folder()
@@ -93,13 +94,13 @@ def train(cfg: DictConfig) -> float | None:
     device = str(trainer.strategy.root_device)
     run = assemble(cfg, device)
     data = run.data
-    log.info(before_data(plain(cfg), most_particles(device)))
+    log.info(before_data(settings.plain(), most_particles(device)))
     with clock.measure("data"):
         scene, others = data.scenes
     sequences_taught = 1 + len(data.taught)
     check_seen(cfg, scene)
     clock.costs = estimate(
-        plain(cfg),
+        settings.plain(),
         scene,
         len(others),
         sequences_taught,
@@ -153,7 +154,7 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         evaluated = run.sequences
         figures, kept = figures_of(
-            build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder
+            settings.evaluation, body, evaluated, world, module.posterior, folder
         )
         figures |= start_figures(starts["train"]) | data.reconstruction.geometry
         figures |= {
@@ -188,12 +189,14 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
             "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt"
         )
     load_extensions(plain(cfg).get("extensions"))
-    check_evaluation(plain(cfg))
+    settings = check_evaluation(plain(cfg))
     exact_sums.use(cfg.deterministic)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
     # as the run rendered; a machine without it renders the same pictures by warp
-    use_backend((twin.config["cfg"].get("rendering") or {}).get("backend", "warp"), required=False)
+    use_backend(
+        RenderingSettings.part(twin.record.settings.get("rendering") or {}).backend, required=False
+    )
     if cfg.plan is not None:
         ranked = plan(twin, count=cfg.plan)
         log.info("\n%s", plan_text(ranked))
@@ -224,13 +227,13 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
             for s in (scene, *held_out)
         }
         # the body moves in the world that the scene shows, among the run's walls and colliders
-        world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
+        world = world_of(measured(twin.record.settings, scene, twin.record.dx))
         if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
             touched = replace(twin.world.ground, height=scene.ground.height)  # as the run found it
             world = replace(world, ground=touched)
         warn_of_others(body, found, [scene, *held_out])
     else:
-        found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}
+        found = {k: Start.read(s.plain(), body.rest) for k, s in twin.record.starts.items()}
         if len(found) != 1 + len(held_out):
             raise DataError(
                 f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
@@ -238,9 +241,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
             )
     check_starts(world, body, found)
     evaluated = sequences(body, scene, held_out, found)
-    figures, kept = figures_of(
-        build_evaluation(plain(cfg)), body, evaluated, world, twin.posterior, folder
-    )
+    figures, kept = figures_of(settings.evaluation, body, evaluated, world, twin.posterior, folder)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, "test/rms_m")
 

@@ -51,7 +51,7 @@ class ShownBody:
             written = {
                 name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)
             }
-            known = checked_splats({"mosa": {"splats": written or None}}, path)
+            known = checked_splats(written or None, path)
             splats = None if known is None else CarriedSplats.read(known, found["rest"])
         except MosaError as error:
             raise DataError(str(error).removeprefix("ckpt_path: ")) from error

@@ -16,7 +16,7 @@ from mosa.modules.body.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
 from mosa.physics.time.time_step import MOST_SUBSTEPS
-from mosa.schema import is_number
+from mosa.settings import is_number
 from mosa.system.limits import counted
 
 STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")

@@ -17,15 +17,15 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from mosa.config.build import build_body, build_world
+from mosa.config.build import build_body, world_of
 from mosa.config.checkpoints import (
     TENSORS,
     check_kinds,
+    check_numbers,
     checked,
-    checked_posterior,
-    checked_splats,
     read_checkpoint,
 )
+from mosa.config.record import BodyRecord
 from mosa.data.io.splat_formats import check_formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation.analysis.comparison import ground_lines, on_ground
@@ -68,12 +68,19 @@ class Twin:
     """A learned body in its world. `frame_dt` [s]: time between the frames it was trained on."""
 
     def __init__(
-        self, body: Body, world: World, frame_dt: float, config: dict[str, Any], training_start: Start,
+        self, body: Body, world: World, frame_dt: float, record: BodyRecord | None, training_start: Start,
         posterior: Posterior | None = None,
     ) -> None:  # fmt: skip
         self.body, self.world, self.frame_dt = body, world, frame_dt
-        self.config, self.training_start, self.posterior = config, training_start, posterior
+        self._record, self.training_start, self.posterior = record, training_start, posterior
         self._episode: Episode | None = None
+
+    @property
+    def record(self) -> BodyRecord:
+        """What the body was built from; of a body that no run has made, its parts."""
+        if self._record is None:
+            self._record = BodyRecord.of(self.body, self.world, self.frame_dt, self.training_start)
+        return self._record
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
@@ -81,15 +88,14 @@ class Twin:
         or was not written by this program; ConfigError for a device that is not here."""
         device = named_device(device)
         checkpoint = read_checkpoint(path)
-        config, begun, tensors = checked(checkpoint, path)
-        splats = checked_splats(checkpoint, path)
+        record, tensors = checked(checkpoint, path)
         try:
-            body = build_body(config, {name: tensors[name] for name in TENSORS})
+            body = build_body(record, {name: tensors[name] for name in TENSORS})
             check_kinds(tensors, body.state_dict())
             body.load_state_dict(tensors)
-            if splats is not None:
-                body.splats = CarriedSplats.read(splats, body.rest)
-            world, start = build_world(config["world"]), Start.read(begun)
+            if record.splats is not None:
+                body.splats = CarriedSplats.read(record.splats, body.rest)
+            world, start = world_of(record), Start.read(record.start.plain())
         except (
             Exception
         ) as error:  # every part has been checked; a file of a stranger may still fit no body
@@ -99,9 +105,9 @@ class Twin:
             raise DataError(
                 f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})"
             ) from error
-        known = checked_posterior(checkpoint, len(read_numbers(body)), path)
-        posterior = None if known is None else Posterior.read(known)
-        return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
+        check_numbers(record, len(read_numbers(body)), path)
+        posterior = None if record.posterior is None else Posterior.read(record.posterior.plain())
+        return cls(body.to(device).eval(), world, record.frame_dt, record.body, start, posterior)
 
     def predict(self, *, draws: int = DRAWS, seed: int = 0, **start: Any) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.

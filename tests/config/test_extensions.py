@@ -7,7 +7,7 @@ import torch
 
 from mosa.baselines import direct
 from mosa.baselines.direct import DirectAdapter
-from mosa.config.extensions import load_extensions, registered_keys
+from mosa.config.extensions import load_extensions
 from mosa.data import scene
 from mosa.errors import ConfigError
 from mosa.evaluation import metrics
@@ -81,17 +81,6 @@ def test_a_name_is_taken_once(monkeypatch):
             register_metric(name, Metric(mine, "mine"))
 
 
-def test_the_arguments_of_an_adapter_and_the_weights_of_terms_are_keys():
-    keys = registered_keys({"adapter": {"name": "nclaw", "hidden": 8}})
-    assert {"adapter.start", "adapter.plastic_rate"} <= set(keys) and "adapter.rank" not in keys
-    weights = {f"losses.{name}" for name in (*terms.TERMS, *PENALTIES)}
-    assert (
-        set(registered_keys({"adapter": {"name": None}}))
-        == weights
-        == set(registered_keys({"adapter": None}))
-    )
-
-
 def test_an_adapter_brings_its_penalties(monkeypatch):
     class Costly(DirectAdapter):
         penalties = {**PENALTIES, "cost": lambda found, misfit: found.mean_abs_C + misfit}
@@ -100,7 +89,6 @@ def test_an_adapter_brings_its_penalties(monkeypatch):
     monkeypatch.setattr(
         adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.baselines.direct:Costly"}
     )
-    assert "losses.cost" in registered_keys({"adapter": {"name": "costly"}})
     terms.check_terms({"cost": 1.0}, Costly())
     with pytest.raises(ConfigError, match="cost"):
         terms.check_terms({"cost": 1.0}, DirectAdapter())

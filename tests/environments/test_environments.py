@@ -53,7 +53,7 @@ SHORT = {"placement": 8, "hanging": 8, "striking": 8, "pushing": 8}
 def simulator(name="learned", E=6e4, precision=32):
     body = small_body(precision=precision, contact=True, adapter=False, E=E)
     dtype = torch.float64 if precision == 64 else torch.float32
-    return Simulator(name, Twin(body, WORLD, 1 / 60, {}, start(dtype=dtype)))
+    return Simulator(name, Twin(body, WORLD, 1 / 60, None, start(dtype=dtype)))
 
 
 def arena(task="pushing", worlds=3, steps=None, precision=32, **options):

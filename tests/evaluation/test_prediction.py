@@ -35,7 +35,7 @@ def posterior_of(body, sd: float, model_error: float = 0.004) -> Posterior:
 
 def twin_of(sd: float) -> Twin:
     body = small_body(numbers=0.1 * torch.ones(19))
-    return Twin(body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0), posterior_of(body, sd))
+    return Twin(body, WORLD, 0.01, None, start(height=0.05, speed=-1.0), posterior_of(body, sd))
 
 
 def test_the_body_is_what_it_was_also_after_an_error():
@@ -102,7 +102,7 @@ def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more()
         read_numbers(unsure.body), before
     )
     with pytest.raises(ConfigError, match="no posterior"):
-        Twin(sure.body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0)).predict(frames=3)
+        Twin(sure.body, WORLD, 0.01, None, start(height=0.05, speed=-1.0)).predict(frames=3)
 
 
 def test_a_law_that_can_be_simulated_nowhere_has_no_draws_that_can(monkeypatch):

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from made_up import CONF, NAMES, PAPER, experiment, made_up, write_metrics
+from mosa.config.keys import EVALUATION, TRAINING
+from mosa.schema import check
 from omegaconf import OmegaConf
 
 from mosa.cli.experiment import arguments, run, run_counted, shown
 from mosa.config.build import rehearse
-from mosa.config.keys import EVALUATION, TRAINING
 from mosa.errors import ConfigError, DataError
 from mosa.experiments import processes, running, specimens
 from mosa.experiments.analyses import ANALYSES
@@ -42,7 +43,6 @@ from mosa.experiments.specification import (
     narrowed,
     pairs,
 )
-from mosa.schema import check
 from mosa.system import whole_files
 
 

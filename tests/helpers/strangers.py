@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from mosa.config.build import build_body
+from mosa.config.record import RunRecord
 from mosa.modules.body.body import Start
 
 ROOT = Path(__file__).parents[2]
@@ -39,20 +40,15 @@ def _saved(*overrides: str) -> dict:
     start = Start(
         torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)
     ).written()
-    config = {"cfg": cfg, "world": world | cfg["world"], "density": 1000.0, "dx": 0.1, "frame_dt": 1 / 60,
-              "starts": {"train": start}}  # fmt: skip
-    body = build_body(config, cube())
+    fit = {"stage": 3, "losses": [], "steps_done": 5, "particles": N, "misfit": 0.01}
+    record = RunRecord(
+        settings=cfg, ground=world.pop("ground"), world=world, density=1000.0, dx=0.1, frame_dt=1 / 60, starts={"train": start},
+        start=start, fit=fit,
+    )  # fmt: skip
+    body = build_body(record, cube())
     return {
         "state_dict": {f"body.{k}": v for k, v in body.state_dict().items()},
-        "mosa": {
-            "config": config,
-            "stage": 3,
-            "losses": [],
-            "steps_done": 5,
-            "particles": N,
-            "misfit": 0.01,
-            "start": start,
-        },
+        "mosa": record.plain(),
     }
 
 

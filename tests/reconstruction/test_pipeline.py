@@ -14,9 +14,8 @@ import yaml
 from mosa.errors import ConfigError
 from mosa.reconstruction import pipeline
 from mosa.reconstruction.motion import moved
-from mosa.reconstruction.motion.informed import InformedSettings
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
-from mosa.reconstruction.settings import build_settings
+from mosa.reconstruction.settings import InformedSettings, build_settings
 from mosa.rendering.appearance.lighting import shading, surface_normals
 
 CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
@@ -137,7 +136,7 @@ def test_the_second_look_takes_what_the_first_motion_was_fitted_with(squashed, f
     """Modes and hulls take as long as both fits where there are many particles."""
     monkeypatch.setattr(moved, "deformation_modes", None)
     monkeypatch.setattr(moved, "hull_centroid", None)
-    settings = replace(SETTINGS, informed=InformedSettings(iterations=1))
+    settings = SETTINGS.but(informed=InformedSettings(iterations=1))
     again = moved.SecondLook(squashed, found, settings, progress=False).about(found.cues.positions)
     assert again.positions.shape == found.cues.positions.shape and bool(
         torch.isfinite(again.positions).all()
@@ -146,7 +145,7 @@ def test_the_second_look_takes_what_the_first_motion_was_fitted_with(squashed, f
 
 def test_the_second_look_compares_what_was_fitted_to_all_frames(squashed, found):
     """In the light of every frame; `first` and a reconstruction without such Gaussians compare those of the first motion."""
-    fitted, first = (moved.SecondLook(squashed, found, replace(SETTINGS, informed=InformedSettings(carriers=name)), progress=False)
+    fitted, first = (moved.SecondLook(squashed, found, SETTINGS.but(informed=InformedSettings(carriers=name)), progress=False)
                      for name in ("fitted", "first"))  # fmt: skip
     carried = fitted._carried
     assert torch.equal(carried.splats.means, found.appearance.splats.means)

@@ -15,8 +15,8 @@ class Fit:
 
     def __init__(self, first="adam", second="adam"):
         self.stages = [
-            Stage("prior", iterations=2, lr=0.1, optimizer=first),
-            Stage("joint", iterations=1, lr=0.01, optimizer=second),
+            Stage(name="prior", iterations=2, lr=0.1, optimizer=first),
+            Stage(name="joint", iterations=1, lr=0.01, optimizer=second),
         ]
         self.stage_index, self.losses, self.logged, self.stage_over = 0, [], [], False
         self.last = {"loss/total": 0.25, "id/E": 2e5, "gradient_norm/material": 3.0}

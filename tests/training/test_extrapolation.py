@@ -84,8 +84,8 @@ def test_a_calibration_is_continued_from_the_scene_s_own_images(tmp_path):
 
 def test_a_fit_by_adam_cannot_be_continued():
     stages = [
-        Stage("prior", 5, 0.1, optimizer="gauss_newton"),
-        Stage("joint", 5, 0.1, optimizer="adam"),
+        Stage(name="prior", iterations=5, lr=0.1, optimizer="gauss_newton"),
+        Stage(name="joint", iterations=5, lr=0.1, optimizer="adam"),
     ]
     with pytest.raises(ConfigError, match=r"extrapolate.*fit\.joint\.optimizer=adam"):
         check_can_extrapolate(SimpleNamespace(stages=stages))

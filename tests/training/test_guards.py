@@ -6,7 +6,6 @@ import os
 import struct
 import sys
 import zlib
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -26,7 +25,7 @@ from mosa.system.limits import machine_memory
 from mosa.training.preflight import check_begin, check_configuration, check_particles, check_seen
 from mosa.training.run_folder import read_figures
 from mosa.types import Ground
-from tests.config.test_known import composed
+from tests.config.test_commands import composed
 
 
 def test_more_particles_than_memory_holds_are_refused_with_the_most_that_fit():
@@ -173,14 +172,11 @@ def test_a_cache_that_holds_something_else_is_made_again(tmp_path, wrong, caplog
 def test_a_video_without_an_ffmpeg_is_refused_before_anything_long(monkeypatch):
     """It was found out after the fit, when the video was to be written."""
     values = composed("debug=default")
-    check_configuration(values, Path(__file__).parents[2] / "conf")
+    check_configuration(values)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ConfigError, match=r"evaluation\.video: expected false, or an ffmpeg"):
-        check_configuration(values, Path(__file__).parents[2] / "conf")
-    check_configuration(
-        values | {"evaluation": values["evaluation"] | {"video": False}},
-        Path(__file__).parents[2] / "conf",
-    )
+        check_configuration(values)
+    check_configuration(values | {"evaluation": values["evaluation"] | {"video": False}})
 
 
 def test_a_cache_whose_bits_have_changed_is_made_again(tmp_path, caplog):

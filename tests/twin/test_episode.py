@@ -30,7 +30,11 @@ BALL.pop("position")
 def twin(precision=64, world=WORLD, **options):
     body = small_body(precision=precision, contact=True, numbers=NUMBERS, **options)
     return Twin(
-        body, world, FRAME_DT, {}, start(dtype=torch.float64 if precision == 64 else torch.float32)
+        body,
+        world,
+        FRAME_DT,
+        None,
+        start(dtype=torch.float64 if precision == 64 else torch.float32),
     )
 
 
@@ -39,7 +43,7 @@ def twin(precision=64, world=WORLD, **options):
 def test_a_state_of_any_speed_is_refused_by_what_it_takes(added, adaptive):
     """Read from a file as docs/twin.md shows; its window has more nodes than 64 bits count."""
     made = twin(32)
-    made.body.settings = replace(made.body.settings, adaptive=adaptive)
+    made.body.settings = made.body.settings.but(adaptive=adaptive)
     tensors = made.reset(velocity=(0.0, -1.0, 0.0)).tensors()
     made.state = TwinState.read({**tensors, "v": tensors["v"] + added})
     with pytest.raises((SimulationDiverged, ConfigError), match=r"speeds (to|reach) "):
@@ -61,7 +65,7 @@ def test_a_step_that_is_too_long_for_its_speed_is_refused():
 def test_steps_are_one_long_simulation_to_the_last_bit(precision, adaptive):
     """Also from a state that was saved and read, and with colliders on motions of their own."""
     made = twin(precision)
-    made.body.settings = replace(made.body.settings, adaptive=adaptive)
+    made.body.settings = made.body.settings.but(adaptive=adaptive)
     given = {
         "colliders": [PUSHER, BALL],
         "position": (0.01, None, -0.02),
@@ -336,7 +340,7 @@ def test_worlds_are_so_many_twins():
         for b in range(count):
             single = twin()
             if numbers is not None:
-                single = Twin(_with(made.body, numbers[b]), WORLD, FRAME_DT, {}, start())
+                single = Twin(_with(made.body, numbers[b]), WORLD, FRAME_DT, None, start())
             single.reset(**starts[b], colliders=[PUSHER, BALL], substeps=12, frames=5)
             for k in range(4):
                 own, forces = single.step({"pusher": pushes[b], "1": (0.0, -0.1 * k, 0.0)})

@@ -40,7 +40,7 @@ def twin(**settings) -> Twin:
         torch.tensor([0.0, -1.0, 0.0]),
         torch.zeros(3),
     )
-    return Twin(body.eval(), build_world(world), DT, {}, start)
+    return Twin(body.eval(), build_world(world), DT, None, start)
 
 
 class Drawn:

@@ -82,7 +82,7 @@ def run(tmp_path, monkeypatch):
         body,
         build_world(world),
         0.02,
-        {},
+        None,
         Start(torch.eye(3), torch.zeros(3), torch.zeros(3), torch.zeros(3)),
     )
     monkeypatch.setattr(Twin, "load", lambda path: twin)

@@ -14,7 +14,7 @@ from mosa.data.checks.validation import fingerprint
 from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
 from mosa.errors import ConfigError
-from mosa.schema import is_number
+from mosa.settings import is_number
 from mosa.types import Ground, Scene, Truth
 
 DENSITIES = 0.1, 1e5

@@ -22,7 +22,7 @@ from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.constitutive.laws import Law
-from mosa.schema import Kind, check_kinds
+from mosa.settings import annotation_of, arguments_of, check_values
 
 
 class Adapter(nn.Module, AdapterProtocol):
@@ -33,13 +33,13 @@ class Adapter(nn.Module, AdapterProtocol):
     few_numbers = False
     replaces_law = False
     own_dynamics = False
-    knobs: Mapping[str, Kind] = {}
     penalties: Mapping[str, Penalty] = PENALTIES
     flow: Callable[[Tensor, float], Tensor] | None = None
 
     def __new__(cls, *_: Any, **given: Any) -> Self:
-        """Errors: ConfigError naming a keyword argument that is not what `knobs` says."""
-        check_kinds(given, cls.knobs, "adapter")
+        """Errors: ConfigError naming a keyword argument that is not what its annotation says."""
+        known = arguments_of(cls, "adapter").model_fields
+        check_values(given, {k: annotation_of(f) for k, f in known.items()}, "adapter")
         return super().__new__(cls)
 
     def __init__(self) -> None:

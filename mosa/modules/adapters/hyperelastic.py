@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from mosa.modules.adapters.base import Adapter
@@ -23,8 +25,6 @@ from mosa.modules.adapters.penalties import OperatorStatistics
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN, acoustic_stiffening
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.constitutive.laws import Law
-from mosa.physics.constitutive.strain import STRAINS
-from mosa.schema import one_of
 
 SHARPNESS = 60.0
 """Of the smoothed smallest eigenvalue: it is above the true one by at most log(6)/60."""
@@ -87,9 +87,9 @@ class HyperelasticAdapter(Adapter):
     """
 
     few_numbers = True
-    knobs = {"strain": one_of(*STRAINS)}
 
-    def __init__(self, *, strain: str = "green") -> None:
+    def __init__(self, *, strain: Annotated[Literal["hencky", "biot", "green"], Field(
+            description="strain measure E of the energy mu E : S : E")] = "green") -> None:  # fmt: skip
         super().__init__()
         self.strain = strain
         self.numbers = nn.Parameter(torch.zeros(NUMBERS))

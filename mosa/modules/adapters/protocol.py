@@ -15,7 +15,6 @@ from torch import Tensor
 from mosa.modules.adapters.penalties import OperatorStatistics, Penalty
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.constitutive.laws import Law
-from mosa.schema import Kind
 
 
 class AdapterProtocol(Protocol):
@@ -38,8 +37,6 @@ class AdapterProtocol(Protocol):
     """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
     own_dynamics: bool
     """Whether it moves the particles itself, without a law and a grid (`simulator`)."""
-    knobs: Mapping[str, Kind]
-    """What its keyword arguments may be, by name; one that is not named is checked by the adapter itself."""
     penalties: Mapping[str, Penalty]
     """Terms of the loss that it brings, by name; their weights are `losses.<name>`."""
     flow: Callable[[Tensor, float], Tensor] | None

@@ -33,21 +33,8 @@ def register_adapter(name: str, place: str) -> None:
 
 
 def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
-    """The class that `name` names, None where there is none. `_target_` of older files and checkpoints means the same where it is
-    the class of a known adapter. Errors: ConfigError naming the key."""
-    older = {place.replace(":", "."): name for name, place in ADAPTERS.items()}
-    name, target = config.get("name"), config.get("_target_")
-    if target is not None:
-        if not isinstance(target, str) or target not in older:
-            raise ConfigError(
-                f"adapter._target_: expected a known adapter ({', '.join(older)}), found {target!r}; "
-                "nothing else is imported or called"
-            )
-        if name is not None and name != older[target]:
-            raise ConfigError(
-                f"adapter: expected name or the older _target_, found both, {name!r} and {target!r}"
-            )
-        name = older[target]
+    """The class that `name` names, None where there is none. Errors: ConfigError naming the key."""
+    name = config.get("name")
     if name is None:
         return None
     if not isinstance(name, str) or name not in ADAPTERS:

@@ -3,24 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
-from mosa.modules.adapters.fused.selection import FUSED, PRECISIONS, chosen, weights_of
+from mosa.modules.adapters.fused.selection import PRECISIONS, chosen, weights_of
 from mosa.modules.adapters.progressive import Correction, ProgressiveOperator, apply
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
 from mosa.modules.adapters.warm_start import warm_start
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.adapters.network_evaluation import backward_at_hand
-from mosa.schema import FLAG, POSITIVE, WIDEST, number, one_of, or_null, whole
+from mosa.settings import Expected, Positive, Width
 
-NETWORK = {"l_max": or_null(POSITIVE), "input_scale": POSITIVE, "hidden": whole(1, WIDEST)}
-"""What the arguments of a bounded network may be."""
-ABLATIONS = ("no_C", "no_pre", "no_post", "no_prior_stress")
+Bound = Annotated[float, Field(gt=0, lt=1, description="bound of the entries of the LU factors")]
+NormalBound = Annotated[
+    float | None,
+    Field(gt=0, lt=1, description="of those of C_xyz; null: alpha (the paper's two alphas)"),
+]
+StressBound = Annotated[
+    Positive | None, Field(description="bound of L_pre and L_post, in units of E_ref; null: none")
+]
+Scale = Annotated[Positive, Field(description="factor of what the networks read")]
+Hidden = Annotated[Width, Field(description="width of the networks")]
+RestFree = Annotated[
+    bool, Field(description="an undeformed body stays stress-free; false: the paper's literal form")
+]
+Fused = Annotated[
+    bool | Literal["auto"],
+    Expected("auto, true or false"),
+    Field(description="Triton kernels on CUDA; auto: where they can"),
+]
 
 
 class StressAdapter(Adapter):
@@ -37,16 +54,11 @@ class StressAdapter(Adapter):
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 
-    knobs = {
-        "alpha": number(0, 1, above=True, below=True), "alpha_normal": or_null(number(0, 1, above=True, below=True)),
-        "state_dependence": one_of("full", "constant"), "fused": FUSED, "precision": one_of(*PRECISIONS), **NETWORK,
-        **dict.fromkeys(("rest_free", "plastic", "major_symmetry", "recompute", *ABLATIONS), FLAG),
-    }  # fmt: skip
-
     def __init__(
-        self, *, alpha: float = 0.1, alpha_normal: float | None = None, l_max: float | None = 0.1, input_scale: float = 10.0,
-        hidden: int = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
-        state_dependence: str = "full", recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
+        self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: StressBound = 0.1, input_scale: Scale = 10.0,
+        hidden: Hidden = 64, rest_free: RestFree = True, plastic: bool = False, major_symmetry: bool = False,
+        state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
+        precision: Literal["accurate", "tf32", "half"] = "accurate",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()

@@ -2,35 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
-from mosa.schema import FLAG, WIDEST, check_knobs, knob, number, one_of, whole
-
-
-@dataclass(frozen=True)
-class HeterogeneitySettings:
-    """kind: modes (`StiffnessModes`) | network (`HeterogeneityField`), what checkpoints that do not say have; amplitude: largest
-    relative deviation.
-
-    Of the modes, wavelength: of the shortest, over the box's longest side; most: of them, the longest waves first. Of the network,
-    hidden: width of its layers; frequencies: sines and cosines of pi 2^k x, k = 0 .. frequencies - 1, beside x in [-1, 1] itself.
-    Errors: ConfigError naming the key."""
-
-    enabled: bool = knob(True, FLAG)
-    kind: str = knob("network", one_of("modes", "network"))
-    amplitude: float = knob(0.2, number(0, 1, above=True, below=True))
-    wavelength: float = knob(0.33, number(0.02, 2))
-    most: int = knob(50, whole(1, WIDEST))
-    hidden: int = knob(32, whole(1, WIDEST))
-    frequencies: int = knob(2, whole(0, 32))
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "heterogeneity")
+from mosa.modules.body.settings import HeterogeneitySettings
 
 
 class StiffnessField(nn.Module):

@@ -16,7 +16,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import friction_alpha
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
-from mosa.schema import LARGEST, is_number
+from mosa.settings import LARGEST, is_number
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 AUTO = "auto"

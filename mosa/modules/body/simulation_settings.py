@@ -2,30 +2,90 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass
+from typing import Annotated, ClassVar, Literal
 
-from mosa.schema import FLAG, POSITIVE, Kind, check_knobs, is_number, knob, number, whole
+from annotated_types import Interval
+from pydantic import Field, model_validator
 
-PRECISION = Kind("32 or 64 (16 bits cannot carry an MPM)", lambda v: is_number(v) and v in (32, 64))
+from mosa.errors import ConfigError
+from mosa.settings import Expected, Positive, Settings
+
+Substeps = Annotated[int, Interval(ge=1, le=10**6)]
 
 
-@dataclass(frozen=True)
-class SimulationSettings:
-    """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64;
-    `adaptive`: choose the substeps of each frame from the state at its start, at least `min_substeps` (`adaptive_steps.py`)."""
+class TimeStepping(Settings):
+    """What the rollouts of a body are made with, whatever its grid."""
 
-    dx: float = knob(MISSING, POSITIVE)
-    stride: int = knob(8, whole(1, 10**6))
-    max_substeps: int = knob(400, whole(1, 10**6))
-    courant: float = knob(0.6, number(0, 1, above=True))  # beyond, an explicit step is unstable
-    precision: int = knob(32, PRECISION)
-    contact_offset: bool = knob(True, FLAG)
-    adaptive: bool = knob(False, FLAG)
-    min_substeps: int = knob(1, whole(1, 10**6))
+    where: ClassVar[str] = "simulation"
+    needs: ClassVar[dict[str, str]] = {"min_substeps": "adaptive=true"}
+
+    stride: Substeps = Field(
+        8,
+        description=(
+            "substeps between evaluations of the adapter's networks (adapter=mosa, "
+            "direct); a frame has a multiple of it"
+        ),
+    )
+    max_substeps: Substeps = Field(400, description="substeps of a frame, at most")
+    courant: float = Field(
+        0.6, gt=0, le=1, description="wave speed times dt/dx; beyond 1 an explicit step is unstable"
+    )
+    adaptive: bool = Field(
+        False,
+        description=(
+            "choose the substeps of each frame from the state at its start: current "
+            "stiffness and speed"
+        ),
+    )
+    min_substeps: Substeps = Field(1, description="substeps of a frame, at least")
+    precision: Annotated[Literal[32, 64], Expected("32 or 64 (16 bits cannot carry an MPM)")] = (
+        Field(32, description="bits of the simulation's numbers")
+    )
+    contact_offset: bool = Field(
+        True,
+        description=(
+            "learn by how much the grid's contact lies above the ground [m] (a grid "
+            "feels a wall before it is reached)"
+        ),
+    )
 
     def strides(self, least: int) -> int:
         """Substeps of the fewest whole strides that are at least `least`."""
         return self.stride * -(-least // self.stride)
 
-    def __post_init__(self) -> None:
-        check_knobs(self, "simulation")
+
+class SimulationSettings(TimeStepping):
+    """Of a body on its grid. dx [m]: spacing of the grid."""
+
+    dx: Positive
+
+
+class SimulationSection(TimeStepping):
+    """The section `simulation`: how fine the body is, and its time steps."""
+
+    needs: ClassVar[dict[str, str]] = {"particles": "dx=null"}
+
+    particles: Annotated[int, Interval(ge=8, le=10**8)] | Literal["auto"] = Field(
+        "auto",
+        description=(
+            "particles of the body; auto: as many as its thin parts need, 4000 to 6000 "
+            "on a CPU and to 30000 on a GPU"
+        ),
+    )
+    particles_per_cell: float = Field(4, ge=1, le=64, description="particles in a cell of the grid")
+    dx: Positive | None = Field(None, description="grid spacing [m]; null: of the particles")
+
+    @model_validator(mode="after")
+    def _whole_strides(self) -> SimulationSection:
+        if self.stride > self.max_substeps:
+            raise ConfigError(
+                f"simulation.stride: expected at most simulation.max_substeps={self.max_substeps}, as a frame has "
+                f"whole strides, found {self.stride}"
+            )
+        return self
+
+    def on_grid(self, dx: float) -> SimulationSettings:
+        """Of a body on a grid of spacing dx [m]."""
+        return SimulationSettings(
+            **{name: getattr(self, name) for name in TimeStepping.model_fields}, dx=dx
+        )

@@ -8,32 +8,15 @@ is Luenberger's with a fixed gain on the velocities; positions and deformation g
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from mosa.schema import check_knobs, knob, number, one_of
+from mosa.modules.fitting.identification_settings import Criterion
 from mosa.types import Rollout
 
-
-@dataclass(frozen=True)
-class Criterion:
-    """name: free | corrected | both; gain: share of the distance to what was seen that a corrected velocity would close in a frame.
-
-    Errors: ConfigError naming the key.
-    """
-
-    name: str = knob("corrected", one_of("free", "corrected", "both"))
-    gain: float = knob(0.5, number(0, 1, above=True))
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "criterion")
-
-    @property
-    def gains(self) -> tuple[float, ...]:
-        """One rollout is compared for each; 0 is the free one."""
-        return {"free": (0.0,), "corrected": (self.gain,), "both": (0.0, self.gain)}[self.name]
+__all__ = ["Criterion", "corrected_rollout"]
 
 
 def corrected_rollout(

@@ -262,7 +262,7 @@ class Identification:
     def _coarser(self) -> list[residuals.Fields] | None:
         """What the numbers predict on a coarser grid; None where it cannot simulate them."""
         body = copy.deepcopy(self.body)
-        body.settings = replace(body.settings, dx=COARSER * body.settings.dx)
+        body.settings = body.settings.but(dx=COARSER * body.settings.dx)
         body.contact.dx *= COARSER
         try:
             return self._fields(body)

@@ -1,29 +1,136 @@
-"""What the configuration says of an identification: which prior the learned numbers have, and the noise."""
+"""What the configuration says of an identification: what is compared, which prior the learned numbers have, the noise, weights."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
 
-from mosa.schema import FLAG, POSITIVE, WEIGHT, check_knobs, knob, number, whole
+from annotated_types import Interval
+from pydantic import ConfigDict, Field
+
+from mosa.settings import Positive, Settings, Weight
 
 
-@dataclass(frozen=True)
-class IdentificationSettings:
-    """count: independent data in a frame; grid_error: what the grid gets wrong, in differences from a grid `COARSER` times as
-    coarse (`Identification`), 0 for none; model_error: what is wrong beside that, in cells; operator_sd, stiffness_sd: prior
-    standard deviations of the operator's numbers and of the stiffness modes before the evidence finds their factor; smoothness:
-    power with which that of the modes falls with their wave number; evidence: whether it is found; tolerance: of the last step, in
-    posterior standard deviations; threads: rollouts side by side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
+class Criterion(Settings):
+    """What a fit compares with the motion that was seen. Calibration always compares free rollouts."""
 
-    count: float = knob(30.0, POSITIVE)
-    grid_error: float = knob(1.0, number(0, 10))
-    model_error: float = knob(0.02, number(0, 1))
-    operator_sd: float = knob(0.1, POSITIVE)
-    stiffness_sd: float = knob(0.12, POSITIVE)
-    smoothness: float = knob(1.0, WEIGHT)
-    evidence: bool = knob(True, FLAG)
-    tolerance: float = knob(0.3, POSITIVE)
-    threads: int = knob(0, whole(0, 256))
+    where: ClassVar[str] = "criterion"
+    needs: ClassVar[dict[str, str]] = {"gain": "name!=free"}
 
-    def __post_init__(self) -> None:
-        check_knobs(self, "identification")
+    name: Literal["free", "corrected", "both"] = Field(
+        "corrected",
+        description=(
+            "corrected: after every frame the velocities are corrected towards what was"
+            " seen, and the next frame is predicted; free: rollouts from the start, as "
+            "the paper has it; both: each with half of the weight"
+        ),
+    )
+    gain: float = Field(
+        0.5,
+        gt=0,
+        le=1,
+        description="share of the distance that the corrected velocity would close within a frame",
+    )
+
+    @property
+    def gains(self) -> tuple[float, ...]:
+        """One rollout is compared for each; 0 is the free one."""
+        return {"free": (0.0,), "corrected": (self.gain,), "both": (0.0, self.gain)}[self.name]
+
+
+class IdentificationSettings(Settings):
+    """Gauss-Newton (`Identification`): which prior the learned numbers have, and the noise."""
+
+    where: ClassVar[str] = "identification"
+    needs: ClassVar[dict[str, str]] = {"*": "newton"}
+
+    count: Positive = Field(
+        30.0,
+        description="independent data in a frame of the cues: neighbouring particles move alike",
+    )
+    grid_error: Annotated[float, Interval(ge=0, le=10)] = Field(
+        1.0,
+        description=(
+            "of the grid, in differences from one that is 1.25 times as coarse: no "
+            "frame is trusted beyond it, and a multiple of it is identified beside the "
+            "law; 0: none"
+        ),
+    )
+    model_error: float = Field(0.02, ge=0, le=1, description="of all else, in cells")
+    operator_sd: Positive = Field(
+        0.1,
+        description=(
+            "prior standard deviation of the adapter's numbers, before the evidence "
+            "finds their size"
+        ),
+    )
+    stiffness_sd: Positive = Field(
+        0.12,
+        description=(
+            "of the stiffness modes, likewise; of a wave number k it falls as (1 + "
+            "(k/2)^2)^(-smoothness/2)"
+        ),
+    )
+    smoothness: Weight = Field(1.0, description="power of that fall")
+    evidence: bool = Field(
+        True,
+        description="find the size of both from the data (MacKay)",
+    )
+    tolerance: Positive = Field(
+        0.3,
+        description=(
+            "a stage ends when its last step is this small, in standard deviations of the posterior"
+        ),
+    )
+    threads: int = Field(
+        0,
+        ge=0,
+        le=256,
+        description="rollouts side by side on a CPU; 0: one for each core, at most 8",
+    )
+
+
+class LossWeights(Settings):
+    """Weights of the loss terms (`mosa/modules/fitting/losses.py`); 0 switches a term off. Terms of extensions are further keys."""
+
+    model_config = ConfigDict(extra="allow")
+    where: ClassVar[str] = "losses"
+    needs: ClassVar[dict[str, str]] = {
+        "image mask flow heterogeneity operator operator_variance": "adam"
+    }
+    __pydantic_extra__: dict[str, Weight] = Field(init=False)
+
+    image: Weight = Field(1.0, description="rendered images")
+    mask: Weight = Field(1.0, description="rendered mattes")
+    flow: Weight = Field(1.0, description="optical flow")
+    rotation: Weight = Field(
+        0.1, description="cue of rotation; Gauss-Newton asks whether it is above 0"
+    )
+    stretch: Weight = Field(
+        0.1, description="cue of stretch; Gauss-Newton asks whether it is above 0"
+    )
+    heterogeneity: Weight = Field(0.1, description="size of the heterogeneity")
+    position: Weight = Field(
+        1.0,
+        description=(
+            "not in the paper: particle positions of the reconstruction, over the "
+            "object's size; Gauss-Newton asks whether it is above 0"
+        ),
+    )
+    operator: Weight = Field(
+        0.0,
+        description=(
+            "not in the paper: root mean square of the entries of C and of L_pre, "
+            "L_post: a departure from the prior has to earn its keep, as in a group "
+            "lasso. The weight holds where the calibrated prior misses the "
+            "reconstruction by 1 % of the object's size, and falls as 1 / misfit^2 "
+            "(misfit: of the model that the joint stage starts from, at least 0.1 %)"
+        ),
+    )
+    operator_variance: Weight = Field(
+        0.0,
+        description="not in the paper: variance of the operator over particles and states",
+    )
+
+    def weights(self) -> dict[str, Any]:
+        """By term."""
+        return self.model_dump()

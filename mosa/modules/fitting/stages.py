@@ -3,44 +3,67 @@
 from __future__ import annotations
 
 import math
-from dataclasses import MISSING, dataclass, fields, replace
+from typing import ClassVar, Literal
+
+from pydantic import Field
 
 from mosa.errors import ConfigError
-from mosa.schema import COUNT, WEIGHT, check_knobs, knob, one_of, or_null, whole
+from mosa.settings import Count, Positive, Settings, Weight, Whole
 
 STAGES = ("prior", "prior_eta", "joint")
 
 
-@dataclass(frozen=True)
-class Stage:
-    """One stage of the fit.
+class StageSettings(Settings):
+    """A section of `fit`: how one stage is learned."""
 
-    iterations: of Adam; optimizer: auto | gauss_newton | adam, auto being the first where all that is learned has few numbers;
-    newton_iterations: of Gauss-Newton, at most. The rates are Adam's. lr: global parameters; lr_networks: heterogeneity field;
-    lr_adapter: adapter; lr_contact [cells]: contact offset;
-    converged: relative change of the mean loss of 10 iterations below which the stage ends (0: run all iterations);
-    start: backbone whose parameters the stage starts from (joint: prior | prior_eta); looks: of prior, where nothing else is
-    learned and Gauss-Newton does: how often it goes on from the motion found once more about its own result (`Recalibration`).
-    """
+    where: ClassVar[str] = "fit.*"
+    needs: ClassVar[dict[str, str]] = {
+        "newton_iterations": "newton",
+        "lr lr_networks lr_adapter lr_contact": "adam",
+    }
 
-    name: str
-    iterations: int = knob(MISSING, whole(0))
-    lr: float = knob(MISSING, WEIGHT)
-    lr_networks: float = knob(0.0, WEIGHT)
-    lr_adapter: float = knob(0.0, WEIGHT)
-    lr_contact: float = knob(0.0, WEIGHT)
-    converged: float = knob(0.0, WEIGHT)
-    start: str | None = knob(None, or_null(one_of("prior", "prior_eta")))
-    optimizer: str = knob("auto", one_of("auto", "gauss_newton", "adam"))
-    newton_iterations: int = knob(8, COUNT)
-    looks: int = knob(0, whole(0))
+    optimizer: Literal["auto", "gauss_newton", "adam"] = Field(
+        "auto",
+        description=(
+            "auto: Gauss-Newton where all that the stage learns has few numbers "
+            "(adapter=operator or none, heterogeneity.kind=modes), Adam where there are"
+            " networks"
+        ),
+    )
+    newton_iterations: Count = Field(8, description="iterations of Gauss-Newton, at most")
+    looks: Whole = Field(
+        0,
+        description=(
+            "of `prior`, where nothing else is learned and Gauss-Newton does: "
+            "calibrations that follow, each about the motion found once more"
+        ),
+    )
+    iterations: Whole = Field(description="steps of Adam; 0 leaves the stage out")
+    lr: Weight = Field(
+        description="Adam's rate, on the logarithms and logits of the global parameters",
+    )
+    lr_networks: Weight = Field(0.0, description="Adam's rate of the heterogeneity field")
+    lr_adapter: Weight = Field(0.0, description="Adam's rate of the adapter")
+    lr_contact: Weight = Field(
+        0.0,
+        description="Adam's rate of the contact offset [cells]",
+    )
+    converged: Weight = Field(
+        0.0,
+        description=(
+            "Adam: stop when the mean loss of 10 iterations differs by less, "
+            "relatively, from that of the 10 before; 0: never"
+        ),
+    )
+    start: Literal["prior", "prior_eta"] | None = Field(
+        None, description="of `joint`: the stage whose global parameters and eta it starts from"
+    )
 
-    def __post_init__(self) -> None:
-        if self.name not in STAGES:
-            raise ConfigError(
-                f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}"
-            )
-        check_knobs(self, f"fit.{self.name}")
+
+class Stage(StageSettings):
+    """One stage of the fit, as it runs."""
+
+    name: Literal["prior", "prior_eta", "joint"]
 
     @property
     def calibrates(self) -> bool:
@@ -92,7 +115,7 @@ class Stage:
             if chosen == "gauss_newton"
             else self.iterations
         )
-        return replace(self, optimizer=chosen, iterations=iterations)
+        return self.but(optimizer=chosen, iterations=iterations)
 
     def decay(self, iteration: int) -> float:
         """Factor of the learning rates: constant for the first half, then a cosine down to a tenth."""
@@ -117,7 +140,6 @@ class Stage:
         return abs(last - before) < self.converged * abs(before)
 
 
-@dataclass(frozen=True)
 class Recalibration(Stage):
     """A calibration that goes on from the one before, with the motion found once more about that one's result. What flows or yields
     is seen too poorly by a reconstruction that knows no mechanics; each look lets the calibrated law say what images do not."""
@@ -131,5 +153,42 @@ def recalibrations(stages: list[Stage]) -> list[Stage]:
     """With those that follow a calibration which is all there is, as many as it asks for."""
     if len(stages) != 1 or not stages[0].newton:
         return stages
-    own = {f.name: getattr(stages[0], f.name) for f in fields(Stage)}
-    return stages + [Recalibration(**own) for _ in range(stages[0].looks)]
+    return stages + [Recalibration(**dict(stages[0])) for _ in range(stages[0].looks)]
+
+
+class FitSection(Settings):
+    """The section `fit`: the stages, and what Adam's steps read."""
+
+    where: ClassVar[str] = "fit"
+    needs: ClassVar[dict[str, str]] = {"views clip": "adam"}
+
+    views: Count = Field(2, description="cameras rendered in a step of Adam")
+    clip: Positive = Field(
+        1.0,
+        description="Adam: bound of the gradient norm of the networks",
+    )
+    prior: StageSettings = Field(
+        StageSettings(
+            newton_iterations=8, looks=3, iterations=40, lr=0.1, lr_contact=0.03, converged=1e-3
+        ),
+        description="first stage: the calibrated prior",
+    )
+    prior_eta: StageSettings = Field(
+        StageSettings(newton_iterations=3, iterations=20, lr=0.02, lr_networks=5e-3),
+        description="second stage: with the stiffness over the body",
+    )
+    joint: StageSettings = Field(
+        StageSettings(
+            newton_iterations=8,
+            iterations=40,
+            lr=0.01,
+            lr_networks=2e-3,
+            lr_adapter=5e-3,
+            start="prior",
+        ),
+        description="last stage: with the adapter",
+    )
+
+    def stage(self, name: str) -> Stage:
+        """Of this name. Errors: ConfigError."""
+        return Stage(name=name, **dict(getattr(self, name)))

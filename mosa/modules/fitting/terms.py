@@ -18,6 +18,7 @@ from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.modules.body.body import Body, Start
 from mosa.modules.fitting import losses
 from mosa.rendering.observer import Views, deformed_covariances, observe
+from mosa.settings import nearest
 from mosa.types import MotionCues, Rollout
 
 
@@ -119,7 +120,9 @@ def term_names(adapter: AdapterProtocol | type[AdapterProtocol] | None) -> list[
 def check_terms(weights: Mapping[str, float], adapter: AdapterProtocol | None) -> None:
     """Errors: ConfigError naming weights of no term."""
     if unknown := sorted(set(weights) - set(known := term_names(adapter))):
-        raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(known)}")
+        raise ConfigError(
+            f"losses.{unknown[0]}: unknown key; expected one of {', '.join(known)}{nearest(unknown[0], known, 'losses')}"
+        )
 
 
 def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor]:

@@ -21,7 +21,7 @@ from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.contact.motion import Motion, Trajectory
 from mosa.physics.contact.planes import MODES, Plane
 from mosa.physics.contact.touch import GRIP
-from mosa.schema import is_number
+from mosa.settings import is_number
 from mosa.types import RUBBING
 
 

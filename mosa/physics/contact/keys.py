@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from annotated_types import Interval
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.planes import MODES
-from mosa.schema import SECTION, WEIGHT, Kind, is_number, number, one_of
+from mosa.settings import Expected, Section, Text, Weight, described, is_number, such
+from mosa.settings import fits as is_one
 
 FARTHEST = 1e6
 """Lengths and places [m] of a solid, and its speeds [m/s]: beyond, single precision has no centimetres left."""
@@ -19,58 +22,51 @@ def listed(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def numbers(described: str, count: int, further: Callable[[list], bool] = lambda v: True) -> Kind:
-    return Kind(
-        described,
-        lambda v: (
-            isinstance(listed(v), list)
-            and len(listed(v)) == count
-            and all(is_number(x) and abs(x) <= FARTHEST for x in listed(v))
-            and further(listed(v))
-        ),
+def told(text: str, valid: Callable[[Any], bool]) -> Any:
+    """A type of which `valid` says what it is."""
+    return Annotated[Any, Expected(text), such(valid)]
+
+
+def numbers(count: int, further: Callable[[list], bool] = lambda v: True) -> Callable[[Any], bool]:
+    return lambda v: (
+        isinstance(listed(v), list)
+        and len(listed(v)) == count
+        and all(is_number(x) and abs(x) <= FARTHEST for x in listed(v))
+        and further(listed(v))
     )
 
 
-def either(described: str, *kinds: Kind) -> Kind:
-    return Kind(described, lambda v: any(kind.fits(v) for kind in kinds))
-
-
-def rows(kind: Kind, described: str, least: int = 1) -> Kind:
-    return Kind(
-        described,
-        lambda v: (
-            isinstance(listed(v), list)
-            and len(listed(v)) >= least
-            and all(map(kind.fits, listed(v)))
-        ),
+def rows(valid: Callable[[Any], bool], least: int = 1) -> Callable[[Any], bool]:
+    return lambda v: (
+        isinstance(listed(v), list) and len(listed(v)) >= least and all(map(valid, listed(v)))
     )
 
 
-TEXT = Kind("a text", lambda v: isinstance(v, str))
-LENGTH = number(0, FARTHEST, above=True)
-THREE = numbers(f"three finite numbers within {FARTHEST:g}", 3)
-TURN = numbers(
-    "(ax, ay, az, degrees), four finite numbers with a non-zero axis", 4, lambda v: any(v[:3])
+three = numbers(3)
+Length = Annotated[float, Interval(gt=0, le=FARTHEST)]
+Three = told(f"three finite numbers within {FARTHEST:g}", three)
+Turn = told(
+    "(ax, ay, az, degrees), four finite numbers with a non-zero axis",
+    numbers(4, lambda v: any(v[:3])),
 )
-VELOCITY = either(
+Velocity = told(
     f"three finite numbers within {FARTHEST:g}, or such a triple for each piece",
-    THREE,
-    rows(THREE, ""),
+    lambda v: three(v) or rows(three)(v),
 )
-RISING = rows(Kind("", is_number), "")
 KEYS = {
-    "radius": LENGTH, "length": LENGTH, "size": numbers("three lengths above 0 [m]", 3, lambda v: min(v) > 0),
-    "path": TEXT, "spacing": LENGTH, "scale": LENGTH, "margin": number(0, FARTHEST), "mode": one_of(*MODES),
-    "friction": WEIGHT, "name": TEXT, "position": THREE, "rotation": TURN, "motion": SECTION,
-    "normal": numbers("a non-zero vector of three finite numbers", 3, any),
+    "radius": Length, "length": Length, "size": told("three lengths above 0 [m]", numbers(3, lambda v: min(v) > 0)),
+    "path": Text, "spacing": Length, "scale": Length,
+    "margin": Annotated[float, Interval(ge=0, le=FARTHEST)],
+    "mode": Literal[MODES], "friction": Weight, "name": Text, "position": Three, "rotation": Turn,
+    "motion": Section, "normal": told("a non-zero vector of three finite numbers", numbers(3, any)),
 }  # fmt: skip
 MOTION = {
-    "velocity": VELOCITY, "angular_velocity": VELOCITY,
-    "times": Kind("ascending finite numbers",
-                  lambda v: RISING.fits(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:]))),
-    "waypoints": rows(SECTION, "a list of poses {time, position, rotation}", 0),
+    "velocity": Velocity, "angular_velocity": Velocity,
+    "times": told("ascending finite numbers",
+                  lambda v: rows(is_number)(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:]))),
+    "waypoints": told("a list of poses {time, position, rotation}", rows(lambda v: isinstance(v, Mapping), 0)),
 }  # fmt: skip
-WAYPOINT = {"time": Kind("a finite number", is_number), "position": THREE, "rotation": TURN}
+WAYPOINT = {"time": told("a finite number", is_number), "position": Three, "rotation": Turn}
 
 
 def check_keys(item: Mapping, where: str) -> None:
@@ -91,10 +87,10 @@ def check_keys(item: Mapping, where: str) -> None:
         fits(point, WAYPOINT, at)
 
 
-def fits(values: Mapping, kinds: Mapping[str, Kind], where: str) -> None:
+def fits(values: Mapping, kinds: Mapping[str, Any], where: str) -> None:
     """Errors: ConfigError naming the first value that is not of its kind."""
     for key, kind in kinds.items():
-        if values.get(key) is not None and not kind.fits(values[key]):
+        if values.get(key) is not None and not is_one(kind, values[key]):
             raise ConfigError(
-                f"{where}.{key}: expected {kind.described}, found {str(values[key])[:120]!r}"
+                f"{where}.{key}: expected {described(kind)}, found {str(values[key])[:120]!r}"
             )

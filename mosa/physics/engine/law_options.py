@@ -1,28 +1,42 @@
 """How a law is taken: what the paper leaves open and public simulators do in ways of their own."""
 
-from dataclasses import dataclass
+from __future__ import annotations
 
-from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
-from mosa.schema import FLAG, WEIGHT, check_knobs, knob, one_of
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from mosa.settings import Settings, Weight
 
 
-@dataclass(frozen=True)
-class LawOptions:
-    """yield_convention: paper | sqrt23, of von Mises. norm_eps: under the root of yield norms. rebuild: write U S V^T back also
-    where nothing yielded (PAC-NeRF does). on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is
-    an error where it has none. init_affine: `spin` takes a start's C_affine, `zero` replaces it by 0. mass_cutoff: node mass [kg]
-    above which a node has a velocity (None: 0 in float64, 1e-12 of a particle's in float32), no key of a configuration.
-    Errors: ConfigError naming the field."""
+class LawOptions(Settings):
+    """The section `prior.options`. Errors: ConfigError naming the field."""
 
-    yield_convention: str = knob("paper", one_of(*YIELD_CONVENTIONS))
-    norm_eps: float = knob(0.0, WEIGHT)
-    rebuild: bool = knob(False, FLAG)
-    on_inversion: str = knob("warn", one_of("warn", "ignore", "error"))
-    init_affine: str = knob("spin", one_of("spin", "zero"))
-    mass_cutoff: float | None = None
+    where: ClassVar[str] = "prior.options"
 
-    def __post_init__(self) -> None:
-        check_knobs(self, "prior.options")
+    yield_convention: Literal["paper", "sqrt23"] = Field(
+        "paper", description="of von Mises; sqrt23 is PAC-NeRF's"
+    )
+    norm_eps: Weight = Field(0.0, description="under the root of yield norms")
+    rebuild: bool = Field(
+        False, description="write U S V^T back also where nothing yielded (PAC-NeRF does)"
+    )
+    on_inversion: Literal["warn", "ignore", "error"] = Field(
+        "warn",
+        description=(
+            "where det F <= 0 and the law has a value there; it is an error where it has none"
+        ),
+    )
+    init_affine: Literal["spin", "zero"] = Field(
+        "spin", description="spin takes a start's C_affine, zero replaces it by 0"
+    )
+    mass_cutoff: float | None = Field(
+        None,
+        description=(
+            "node mass [kg] above which a node has a velocity; null: 0 in float64, "
+            "1e-12 of a particle's in float32"
+        ),
+    )
 
 
 AS_USUAL = LawOptions()

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from mosa.reconstruction.gaussians.photometric import image_loss
-from mosa.reconstruction.gaussians.static import SMALLEST, FitSettings
+from mosa.reconstruction.gaussians.static import SMALLEST
 from mosa.reconstruction.motion.observed import Windows
+from mosa.reconstruction.settings import CarriedSettings
 from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_basis
 from mosa.rendering.appearance.spherical_harmonics import (
@@ -29,29 +29,7 @@ from mosa.rendering.appearance.spherical_harmonics import (
 )
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
-from mosa.schema import COUNT, FLAG, WEIGHT, check_knobs, knob, one_of, whole
 from mosa.types import Appearance, Splats
-
-
-@dataclass(frozen=True)
-class CarriedSettings(FitSettings):
-    """As `FitSettings`, of Gaussians that start from the static ones; lr_colors counts for their mean colours. degree: of the
-    spherical harmonics, 0 to 3; lr_harmonics: of those of degree 1 and more, per coefficient; keep_harmonics: what those count for
-    in pixels of an image, since what no training camera sees along has no other reason to be dull; light: whether the light is
-    fitted, lr_light: its step."""
-
-    views: int = knob(4, COUNT)
-    keep: float = knob(1.0, WEIGHT)
-    shape: str = knob("anisotropic", one_of("isotropic", "anisotropic"))
-    lr_colors: float = knob(0.03, WEIGHT)
-    degree: int = knob(1, whole(0, 3))
-    lr_harmonics: float = knob(0.005, WEIGHT)
-    keep_harmonics: float = knob(10.0, WEIGHT)
-    light: bool = knob(True, FLAG)
-    lr_light: float = knob(0.02, WEIGHT)
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction.carried")
 
 
 class RestGaussians:

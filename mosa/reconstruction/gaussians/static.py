@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mosa.data.hull import Volume
-from mosa.errors import ConfigError
 from mosa.reconstruction.gaussians.densification import MarkovChain, Relocation
 from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
 from mosa.reconstruction.gaussians.initial import initial_splats, random_splats
 from mosa.reconstruction.gaussians.photometric import image_loss
 from mosa.reconstruction.motion.observed import Windows
+from mosa.reconstruction.settings import FitSettings, StaticSettings
 from mosa.rendering.rasterizer import rasterize
-from mosa.schema import COUNT, WEIGHT, check_knobs, knob, number, one_of, or_null, whole
 from mosa.types import Splats
 
 SMALLEST = 0.25
@@ -25,63 +23,17 @@ SMALLEST = 0.25
 STARTS = {"hull": initial_splats, "random": random_splats}
 
 
-@dataclass(frozen=True)
-class FitSettings:
-    """iterations; views: images per step; lr_*: Adam steps, of positions in units of the mean scale, of the others per
-    unconstrained number; ssim: weight of 1 - SSIM against L1; matte: weight of the alpha term; keep: what a Gaussian's first colour
-    counts for, in pixels of an image; largest: bound of a scale in units of its start; shape: isotropic | anisotropic, three scales
-    and a rotation, which start isotropic; axis_ratio: an anisotropic one's largest scale over its smallest, at most."""
-
-    iterations: int = knob(400, whole(0))
-    views: int = knob(2, COUNT)
-    lr_positions: float = knob(0.03, WEIGHT)
-    lr_scales: float = knob(0.02, WEIGHT)
-    lr_opacities: float = knob(0.05, WEIGHT)
-    lr_colors: float = knob(0.02, WEIGHT)
-    lr_rotations: float = knob(0.02, WEIGHT)
-    ssim: float = knob(0.2, number(0, 1))
-    matte: float = knob(1.0, WEIGHT)
-    keep: float = knob(0.0, WEIGHT)
-    largest: float = knob(2.0, number(1))
-    shape: str = knob("isotropic", one_of("isotropic", "anisotropic"))
-    axis_ratio: float = knob(10.0, number(1))
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction.*")
-
-
-@dataclass(frozen=True)
-class StaticSettings(FitSettings):
-    """start: hull, on the visual hull's surface | random, in its box; densify: relocate, every `relocate_every` steps (0: never)
-    vanished Gaussians are moved to where opaque ones are | mcmc, every `refine_every` steps they are moved and `growth` of the
-    number is added, up to `max_points` (None: the number at the start), as copies that leave the image as it is. Of mcmc also:
-    fade, what an opacity of 1 costs, in pixels of an image: Gaussians that no image shows vanish and get moved; noise: random
-    steps of those about to vanish, in their standard deviations at the first step."""
-
-    start: str = knob("hull", one_of(*STARTS))
-    densify: str = knob("relocate", one_of("relocate", "mcmc"))
-    max_points: int | None = knob(None, or_null(whole(8)))
-    relocate_every: int = knob(100, whole(0))
-    refine_every: int = knob(10, COUNT)
-    growth: float = knob(0.1, WEIGHT)
-    fade: float = knob(0.03, WEIGHT)
-    noise: float = knob(0.2, WEIGHT)
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction.static")
-        if self.max_points is not None and self.densify != "mcmc":
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected null, found {self.max_points}: densify={self.densify} keeps the "
-                "number of Gaussians (reconstruction.points); set reconstruction.static.densify=mcmc"
-            )
-
-    def densifier(self, count: int) -> Relocation | MarkovChain:
-        """What moves and adds Gaussians, of which there are `count` at the start."""
-        if self.densify == "relocate":
-            return Relocation(self.relocate_every)
-        return MarkovChain(
-            self.max_points or count, self.refine_every, self.growth, self.fade, self.noise
-        )
+def densifier_of(settings: StaticSettings, count: int) -> Relocation | MarkovChain:
+    """What moves and adds Gaussians, of which there are `count` at the start."""
+    if settings.densify == "relocate":
+        return Relocation(settings.relocate_every)
+    return MarkovChain(
+        settings.max_points or count,
+        settings.refine_every,
+        settings.growth,
+        settings.fade,
+        settings.noise,
+    )
 
 
 def start_splats(
@@ -108,7 +60,7 @@ def fit_splats(
     """
     generator = torch.Generator().manual_seed(seed)
     densifier = (
-        settings.densifier(len(splats.means))
+        densifier_of(settings, len(splats.means))
         if move and isinstance(settings, StaticSettings)
         else None
     )

@@ -7,7 +7,7 @@ that is."""
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -26,7 +26,7 @@ from mosa.reconstruction.geometry.refinement import (
 )
 from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pose.flight import free_motions
-from mosa.schema import COUNT, check_knobs, knob, one_of
+from mosa.reconstruction.settings import GeometrySection
 from mosa.types import Scene
 
 OPTIMISM = 1.3
@@ -34,21 +34,18 @@ OPTIMISM = 1.3
 independent, and a neighbourhood does not move as one. Measured on the gorilla and the bowl."""
 
 
-@dataclass(frozen=True)
-class GeometrySettings:
-    """source: images, the hull carved by colours and refined | hull, with its ridges rounded; frames: of free flight whose
-    outlines and colours are used, at most; first: rounds and blur [px] of the refinement on frame 0, from which the flight is
-    followed; then: on all free frames."""
+class GeometrySettings(GeometrySection):
+    """With what no configuration says. first: rounds and blur [px] of the refinement on frame 0, from which the flight is followed;
+    then: on all free frames."""
 
-    source: str = knob("images", one_of("images", "hull"))
-    frames: int = knob(6, COUNT)
     first: tuple[tuple[int, float], ...] = ((4, 2.0), (4, 1.0))
     then: tuple[tuple[int, float], ...] = ((3, 1.0), (9, 0.4))
-    carving: CarvingSettings = field(default_factory=CarvingSettings)
-    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    carving: CarvingSettings = CarvingSettings()
+    refinement: RefinementSettings = RefinementSettings()
 
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction.geometry")
+    @classmethod
+    def of(cls, section: GeometrySection) -> GeometrySettings:
+        return section if isinstance(section, cls) else cls(**dict(section))
 
 
 @dataclass(frozen=True)

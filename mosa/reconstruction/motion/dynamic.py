@@ -20,8 +20,8 @@ from mosa.reconstruction.motion.cues import Neighbourhood
 from mosa.reconstruction.motion.modes import Modes
 from mosa.reconstruction.motion.motion import ModalMotion, MotionBasisNetwork, MotionSample
 from mosa.reconstruction.motion.observed import Windows
+from mosa.reconstruction.settings import DynamicSettings
 from mosa.rendering.rasterizer import rasterize
-from mosa.schema import COUNT, FLAG, WEIGHT, WIDEST, check_knobs, knob, number, one_of, whole
 from mosa.types import Splats
 
 Motion = ModalMotion | MotionBasisNetwork
@@ -41,50 +41,6 @@ class Scaffold:
         """(S, M, 3) in frames (S,), (1, M, 3) where they are the same in all."""
         colors = self.splats.colors[None]
         return colors if self.shades is None else colors * self.shades[frames][..., None]
-
-
-@dataclass(frozen=True)
-class DynamicSettings:
-    """model: `modes` (amplitudes of smooth modes per frame) or `network` (motion bases, GIC).
-
-    carriers: Gaussians that are compared with the images: `particles` (the paper) or `static`, those of the static stage
-    moved by the same motion. They are finer: the built-in rabbit's particles had an RMS error of
-    0.92 mm against 1.17 mm (network with 600 iterations: 3.5 mm).
-    modes: number of modes; free_shape: Gaussians' scale and rotation are free instead of following the deformation (always
-    so for the network); track_iterations, track_views, lr_track: steps per frame of the first pass, images per step, step;
-    iterations: steps of the joint refinement, each sees `views` images of every frame; lr: its step. Steps are in units of
-    the object's radius, for all amplitudes of a frame together.
-    elastic: weight of the mean St. Venant-Kirchhoff energy, poisson its Poisson ratio; bending: weight of the modes' mean
-    squared curvature (in units of the body's size: it does not depend on spacing or number of modes); bending_scale: curvature of
-    a frame from which on its weight falls in the joint refinement, 0 for never. Thick bodies stay below 0.001 but for their first
-    impact; the limbs of a thin one truly bend by 0.005 to 0.04, and a weight that suits the first would straighten them.
-    bases, hidden, basis_layers, coefficient_layers, lr_network: size and Adam step of the network.
-    """
-
-    model: str = knob("modes", one_of("modes", "network"))
-    carriers: str = knob("static", one_of("static", "particles"))
-    modes: int = knob(120, COUNT)
-    free_shape: bool = knob(False, FLAG)
-    track_iterations: int = knob(40, whole(0))
-    track_views: int = knob(4, COUNT)
-    iterations: int = knob(150, whole(0))
-    views: int = knob(1, COUNT)
-    lr_track: float = knob(0.03, WEIGHT)
-    lr: float = knob(0.01, WEIGHT)
-    ssim: float = knob(0.0, number(0, 1))
-    matte: float = knob(1.0, WEIGHT)
-    elastic: float = knob(0.01, WEIGHT)
-    bending: float = knob(3.5, WEIGHT)
-    bending_scale: float = knob(0.001, WEIGHT)
-    poisson: float = knob(0.3, number(0, 0.49))
-    bases: int = knob(10, whole(1, WIDEST))
-    hidden: int = knob(256, whole(1, WIDEST))
-    basis_layers: int = knob(8, whole(1, 100))
-    coefficient_layers: int = knob(3, whole(1, 100))
-    lr_network: float = knob(5e-4, WEIGHT)
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction.dynamic")
 
 
 def elastic_energy(deformation: Tensor, poisson: float) -> Tensor:

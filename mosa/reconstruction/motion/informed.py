@@ -11,7 +11,6 @@ motion where no image is: then the first motion stays.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,7 +18,6 @@ from torch import Tensor
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
 from mosa.reconstruction.motion.cues import polar
 from mosa.reconstruction.motion.dynamic import (
-    DynamicSettings,
     Objective,
     Predicted,
     Scaffold,
@@ -28,7 +26,7 @@ from mosa.reconstruction.motion.dynamic import (
 from mosa.reconstruction.motion.modes import coefficients_of
 from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.motion.observed import Windows
-from mosa.schema import COUNT, POSITIVE, WEIGHT, check_knobs, knob, one_of, whole
+from mosa.reconstruction.settings import DynamicSettings, InformedSettings
 
 WORSE, SLACK = 1.2, 0.005
 """A prediction has misled the fit where the loss of images is more than so many times the first motion's, and so much beside. On
@@ -38,27 +36,6 @@ COMPARED = 2
 AS_IT_IS = 0.8
 """A frame of a prediction stays where it is if its loss of images there is so many times that of the frame laid onto what was seen:
 what was seen of a liquid's late frames may be a tenth of a metre off."""
-
-
-@dataclass(frozen=True)
-class InformedSettings:
-    """iterations: 0 for never; views: of every frame in each; lr: its step in units of the object's radius; elastic, bending:
-    weights of the energies, counted from the prediction, as in `DynamicSettings`; response: views of every frame from which it is
-    found how much of the prediction stays in what is seen (`response`), 0 for not at all; carriers: Gaussians compared with
-    the images: `fitted`, those that were fitted to all frames, in their light (`carried`), where there are any; `first`, those of
-    the first motion; `auto`, these of a body that yields or flows, else the fitted ones. Gaussians that were fitted as the first
-    motion carried them hold a body to that motion, which of a liquid may be a tenth of a metre off."""
-
-    iterations: int = knob(80, whole(0))
-    views: int = knob(1, COUNT)
-    lr: float = knob(0.02, POSITIVE)
-    elastic: float = knob(0.3, WEIGHT)
-    bending: float = knob(1.0, WEIGHT)
-    response: int = knob(4, whole(0))
-    carriers: str = knob("auto", one_of("auto", "fitted", "first"))
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "reconstruction.informed")
 
 
 def laid_onto(predicted: Tensor, seen: Tensor) -> Tensor:
@@ -102,7 +79,7 @@ def informed_motion(
     motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
     every = torch.arange(len(offsets), device=offsets.device)
     chosen = torch.cat([(windows.frame == t).nonzero()[:COMPARED, 0] for t in every[1:].tolist()])
-    compared, alone = windows.select(chosen), replace(dynamic, elastic=0.0, bending=0.0)
+    compared, alone = windows.select(chosen), dynamic.but(elastic=0.0, bending=0.0)
 
     @torch.no_grad()
     def losses(positions: Tensor) -> Tensor:
@@ -122,9 +99,7 @@ def informed_motion(
     with torch.no_grad():
         deformation = motion.displacement(every, scaffold.modes)[1]
         about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
-    weights = replace(
-        dynamic, elastic=settings.elastic, bending=settings.bending, bending_scale=0.0
-    )
+    weights = dynamic.but(elastic=settings.elastic, bending=settings.bending, bending_scale=0.0)
     objective = Objective(motion, carried, scaffold, background, weights, about)
     optimizer = UniformAdam(motion.parameters(), lr=settings.lr)
     generator = torch.Generator().manual_seed(seed)

@@ -44,7 +44,7 @@ def twin(material=("neo_hookean", {"E": 5e4, "nu": 0.3}), adapter=None, **settin
     start = Start(
         torch.eye(3), torch.tensor([0.0, 0.15, 0.0]), torch.tensor([0.0, -2.0, 0.0]), torch.zeros(3)
     )
-    return Twin(body, build_world(WORLD), 0.02, {}, start)
+    return Twin(body, build_world(WORLD), 0.02, None, start)
 
 
 def test_the_twin_records_and_replays_its_counts():

@@ -50,8 +50,8 @@ def test_the_direction_of_the_fibres_is_found_from_two_drops(body_with):
         body,
         takes,
         WORLD,
-        Stage("prior", 40, 0.1),
-        Criterion("free"),
+        Stage(name="prior", iterations=40, lr=0.1),
+        Criterion(name="free"),
         IdentificationSettings(),
         seats=1,
     )

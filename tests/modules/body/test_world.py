@@ -27,7 +27,7 @@ def twin(world=WORLD):
                 material=Material("corotated", {"E": 5e4, "nu": 0.3}), heterogeneity=None, adapter=None,
                 settings=SimulationSettings(dx=0.06))  # fmt: skip
     start = Start(torch.eye(3), torch.tensor([0.0, 0.11, 0.0]), torch.zeros(3), torch.zeros(3))
-    return Twin(body, build_world(world), 0.02, {}, start)
+    return Twin(body, build_world(world), 0.02, None, start)
 
 
 def test_a_plate_presses_the_body_down():

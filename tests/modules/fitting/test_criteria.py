@@ -115,15 +115,17 @@ def test_one_frame_is_the_start():
 
 
 def test_what_a_criterion_compares_and_refuses():
-    assert Criterion("free", 0.5).gains == (0.0,) and Criterion("corrected", 0.3).gains == (0.3,)
-    assert Criterion("both", 0.3).gains == (0.0, 0.3)
+    assert Criterion(name="free", gain=0.5).gains == (0.0,) and Criterion(
+        name="corrected", gain=0.3
+    ).gains == (0.3,)
+    assert Criterion(name="both", gain=0.3).gains == (0.0, 0.3)
     with pytest.raises(
         ConfigError, match=r"criterion\.name: expected free or corrected or both, found 'open'"
     ):
-        Criterion("open")
+        Criterion(name="open")
     for gain in (0.0, -0.1, 1.1, float("nan")):
         with pytest.raises(ConfigError, match=r"criterion\.gain: expected"):
-            Criterion("corrected", gain)
+            Criterion(name="corrected", gain=gain)
 
 
 def test_laws_side_by_side_are_so_many_simulations():

@@ -37,7 +37,7 @@ def fibres(strength: float, axis: torch.Tensor = AXIS) -> torch.Tensor:
 def identification(
     body, takes, stage="joint", criterion=None, seats=1, kinds=(True, True, True), **settings
 ) -> Identification:
-    return Identification(body, takes, WORLD, Stage(stage, 40, 0.1), criterion or Criterion("corrected"),
+    return Identification(body, takes, WORLD, Stage(name=stage, iterations=40, lr=0.1), criterion or Criterion(name="corrected"),
                           IdentificationSettings(**settings), kinds, seats=seats)  # fmt: skip
 
 
@@ -81,8 +81,8 @@ def test_the_first_iterations_on_several_drops_count_a_part_of_the_data():
         small_body(),
         several,
         WORLD,
-        Stage("joint", 3, 0.1),
-        Criterion("corrected"),
+        Stage(name="joint", iterations=3, lr=0.1),
+        Criterion(name="corrected"),
         IdentificationSettings(),
     )
     assert identification(small_body(), several[:1]).softly == short.softly == ()
@@ -145,7 +145,7 @@ def test_a_calibration_stays_where_the_time_step_allows_it():
     stiff = 100 * E
     truth, body = small_body(adapter=False, E=stiff), small_body(adapter=False, E=stiff / 12)
     found = identification(body, [take_and_turn(truth, 0.5)], "prior")
-    body.settings = replace(body.settings, max_substeps=32)
+    body.settings = body.settings.but(max_substeps=32)
 
     def allowed(share: float) -> bool:
         try:
@@ -201,7 +201,7 @@ def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
     truth = small_body(numbers=fibres(0.6))
     takes = [take_and_turn(truth, 0.5), take_and_turn(truth, 1.6, (1.0, 0.0, 0.2))]
     body = small_body()
-    found = identification(body, takes, criterion=Criterion(criterion))
+    found = identification(body, takes, criterion=Criterion(name=criterion))
     missed = found.distance()
     run(found)
     true_axis, true_ratio = stiffest(truth.adapter.stiffness().detach())
@@ -379,7 +379,7 @@ def test_write_numbers_sets_what_the_posterior_names():
 def test_a_grid_without_a_start_that_can_be_simulated_is_an_error():
     body = small_body(adapter=False)
     take = take_and_turn(body, 0.5)
-    body.settings = replace(body.settings, max_substeps=1)
+    body.settings = body.settings.but(max_substeps=1)
     with pytest.raises(SimulationDiverged, match="none of the starts of the coarse grid"):
         identification(body, [take], "prior").search()
 
@@ -399,7 +399,7 @@ def test_a_body_whose_grid_is_changed_is_simulated_on_that_one():
     body, fresh = small_body(adapter=False), small_body(adapter=False)
     body.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40)
     for each in (body, fresh):
-        each.settings = replace(each.settings, dx=COARSER * each.settings.dx)
+        each.settings = each.settings.but(dx=COARSER * each.settings.dx)
     moved = [
         each.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40).x for each in (body, fresh)
     ]
@@ -409,7 +409,7 @@ def test_a_body_whose_grid_is_changed_is_simulated_on_that_one():
 def seen_on_a_coarser_grid(truth, angle=0.5):
     """What the law of `truth` does on a grid 1.25 times as coarse, as if it had been seen."""
     other = copy.deepcopy(truth)
-    other.settings = replace(other.settings, dx=COARSER * other.settings.dx)
+    other.settings = other.settings.but(dx=COARSER * other.settings.dx)
     return take_and_turn(other, angle)
 
 
@@ -440,7 +440,7 @@ def test_a_calibration_knows_what_a_grid_may_have_done_to_it():
         1.0
     )  # all of what it counts, so that the grid alone is what widens
     aware = found.posterior()
-    found.settings = replace(found.settings, grid_error=0.0)
+    found.settings = found.settings.but(grid_error=0.0)
     unaware = found.posterior()
     off = (aware.mean - read_numbers(small_body(adapter=False))[: len(aware.mean)]).abs()
     sds = [each.covariance.diagonal().sqrt() for each in (aware, unaware)]
@@ -491,7 +491,7 @@ def test_what_cues_keep_of_a_prediction_is_not_taken_for_the_law(criterion):
         ).abs().max() > 1e-3
         take.response = take.response if known else None
         body = small_body(adapter=False, E=2e4, nu=0.3)
-        found = identification(body, [take], criterion=Criterion(criterion), grid_error=0.0)
+        found = identification(body, [take], criterion=Criterion(name=criterion), grid_error=0.0)
         run(found)
         wrong[known] = abs(values(body)["E"] / E - 1) + abs(values(body)["nu"] - NU)
     assert wrong[True] < 1e-3 and wrong[False] > 0.01
@@ -508,7 +508,7 @@ def test_columns_as_worlds_are_those_one_by_one(criterion):
         take_and_turn(truth, 1.5, frames=SHORT),
     ]
     assert max(take.first_contact for take in takes) < SHORT - 2
-    found = identification(body, takes, criterion=Criterion(criterion))
+    found = identification(body, takes, criterion=Criterion(name=criterion))
     found.iterate()
     newton, seat = found.newton, found.newton.seats[0]
     numbers = seat.read()

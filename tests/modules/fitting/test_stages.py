@@ -7,19 +7,19 @@ from mosa.modules.fitting.stages import Stage
 
 
 def test_prior_stage_brings_frames_in_progressively_and_reaches_all():
-    stage = Stage("prior", 30, 0.1)
+    stage = Stage(name="prior", iterations=30, lr=0.1)
     counts = [stage.active_frames(i, 5, 15) for i in range(30)]
     assert counts[0] == 5 and counts[10] == 15 and counts == sorted(counts)
 
 
 def test_learning_rate_decays_to_a_tenth():
-    stage = Stage("joint", 50, 0.1)
+    stage = Stage(name="joint", iterations=50, lr=0.1)
     assert stage.decay(0) == stage.decay(25) == 1.0
     assert abs(stage.decay(50) - 0.1) < 1e-12
 
 
 def test_convergence_needs_a_flat_loss_after_all_frames_are_in():
-    stage = Stage("prior", 100, 0.1, converged=1e-3)
+    stage = Stage(name="prior", iterations=100, lr=0.1, converged=1e-3)
     falling = [1.0 / (i + 1) for i in range(60)]
     assert not stage.ended(falling)
     assert stage.ended(falling[:40] + [0.02] * 20)
@@ -28,7 +28,7 @@ def test_convergence_needs_a_flat_loss_after_all_frames_are_in():
 
 def test_unknown_stage_is_named():
     with pytest.raises(ConfigError, match="warmup"):
-        Stage("warmup", 1, 0.1)
+        Stage(name="warmup", iterations=1, lr=0.1)
 
 
 def test_views_cover_all_cameras_once_per_pass_and_depend_on_seed_and_step_alone():
@@ -58,7 +58,9 @@ def test_an_epoch_is_a_pass_over_the_views_and_one_that_is_resumed_is_finished()
 
 
 def test_a_stage_says_what_it_learns_and_what_its_result_is_kept_as():
-    prior, prior_eta, joint = (Stage(name, 1, 0.1) for name in ("prior", "prior_eta", "joint"))
+    prior, prior_eta, joint = (
+        Stage(name=name, iterations=1, lr=0.1) for name in ("prior", "prior_eta", "joint")
+    )
     assert [s.calibrates for s in (prior, prior_eta, joint)] == [True, False, False]
     assert [s.learns("eta", "adapter") for s in (prior, prior_eta, joint)] == [
         (),

@@ -6,10 +6,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mosa.reconstruction.gaussians.carried import CarriedSettings, fit_carried
+from mosa.reconstruction.gaussians.carried import fit_carried
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.pipeline import reconstruct
-from mosa.reconstruction.settings import build_settings
+from mosa.reconstruction.settings import CarriedSettings, build_settings
 from mosa.rendering.appearance.carried_splats import CarriedSplats, Seen
 from mosa.rendering.appearance.lighting import shading
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
@@ -95,7 +95,7 @@ def test_colours_and_light_are_found_from_all_frames(filmed):
     )
     found = fit_carried(dull, particles, positions, windows, torch.ones(3), settings, seed=0)
     dark = fit_carried(
-        dull, particles, positions, windows, torch.ones(3), replace(settings, light=False), seed=0
+        dull, particles, positions, windows, torch.ones(3), settings.but(light=False), seed=0
     )
     assert torch.equal(dark.light, torch.zeros(8))
 

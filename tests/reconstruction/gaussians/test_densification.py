@@ -22,9 +22,9 @@ from mosa.reconstruction.gaussians.densification import (
 )
 from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
 from mosa.reconstruction.gaussians.initial import random_splats
-from mosa.reconstruction.gaussians.static import StaticSettings, fit_splats, start_splats
+from mosa.reconstruction.gaussians.static import fit_splats, start_splats
 from mosa.reconstruction.motion.observed import object_windows
-from mosa.reconstruction.settings import build_settings
+from mosa.reconstruction.settings import StaticSettings, build_settings
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_to_matrix
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats

@@ -12,10 +12,11 @@ from mosa.errors import DataError
 from mosa.reconstruction.gaussians.gaussians import isotropic_covariances
 from mosa.reconstruction.gaussians.initial import initial_splats, projected_colors, surface_points
 from mosa.reconstruction.gaussians.photometric import ssim
-from mosa.reconstruction.gaussians.static import FitSettings, fit_splats
+from mosa.reconstruction.gaussians.static import fit_splats
 from mosa.reconstruction.geometry.filling import body_volume, fill
 from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pipeline import scaffold_splats
+from mosa.reconstruction.settings import FitSettings
 from mosa.rendering.rasterizer import rasterize
 
 QUICK = FitSettings(iterations=120, views=2)

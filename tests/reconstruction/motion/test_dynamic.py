@@ -8,10 +8,11 @@ import torch
 from mosa.errors import ConfigError
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
 from mosa.reconstruction.motion.cues import neighbourhood
-from mosa.reconstruction.motion.dynamic import DynamicSettings, Scaffold, elastic_energy, fit_motion
+from mosa.reconstruction.motion.dynamic import Scaffold, elastic_energy, fit_motion
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import ModalMotion, MotionBasisNetwork
 from mosa.reconstruction.motion.observed import object_windows
+from mosa.reconstruction.settings import DynamicSettings
 from mosa.rendering.covariance import covariance_from, quaternion_multiply, quaternion_to_matrix
 from mosa.types import Splats
 

@@ -9,16 +9,12 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.reconstruction.motion.cues import neighbourhood
-from mosa.reconstruction.motion.dynamic import DynamicSettings, Scaffold
-from mosa.reconstruction.motion.informed import (
-    InformedSettings,
-    informed_motion,
-    laid_onto,
-    project,
-)
+from mosa.reconstruction.motion.dynamic import Scaffold
+from mosa.reconstruction.motion.informed import informed_motion, laid_onto, project
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.motion.observed import object_windows
+from mosa.reconstruction.settings import DynamicSettings, InformedSettings
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Splats
 from tests.reconstruction.motion.test_dynamic import block, rendered_windows

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.reconstruction.motion.dynamic import DynamicSettings
-from mosa.reconstruction.motion.informed import InformedSettings, informed_motion
+from mosa.reconstruction.motion.informed import informed_motion
 from mosa.reconstruction.motion.modes import Modes
 from mosa.reconstruction.motion.moved import SecondLook
 from mosa.reconstruction.motion.response import (
@@ -18,6 +17,7 @@ from mosa.reconstruction.motion.response import (
     response_of,
     responses,
 )
+from mosa.reconstruction.settings import DynamicSettings, InformedSettings
 from tests.reconstruction.motion.test_informed import EVERY, OFFSETS, away, bent, scaffold  # noqa: F401
 
 K, N, T = 5, 40, 4

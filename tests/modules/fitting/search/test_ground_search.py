@@ -41,8 +41,8 @@ def world(ground: Ground) -> World:
 def search(body, take):
     """`choose_ground` as a run does it."""
     stage, criterion, settings = (
-        Stage("prior", 40, 0.1),
-        Criterion("corrected"),
+        Stage(name="prior", iterations=40, lr=0.1),
+        Criterion(name="corrected"),
         IdentificationSettings(),
     )
     return choose_ground(
@@ -269,7 +269,7 @@ def fit_of(take, **changed) -> LitMosa:
     """A calibration of a body whose ground is sought, as a run has it."""
     body = small_body(adapter=False, E=1.7 * E, nu=0.3)
     config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
-    stage = replace(Stage("prior", 1, 0.1), optimizer="gauss_newton", **changed)
+    stage = Stage(name="prior", iterations=1, lr=0.1).but(optimizer="gauss_newton", **changed)
     return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
                    weights={"position": 1.0}, stages=[stage])  # fmt: skip
 
@@ -311,10 +311,13 @@ def learning(truth: Ground) -> LitMosa:
     take = take_of(small_body(numbers=numbers), begins, FRAMES, world(truth))
     take.again = None
     config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
-    stages = [replace(Stage(name, 8, 0.1), optimizer="gauss_newton") for name in ("prior", "joint")]
+    stages = [
+        Stage(name=name, iterations=8, lr=0.1).but(optimizer="gauss_newton")
+        for name in ("prior", "joint")
+    ]
     return LitMosa.of_parts(small_body(E=1.2 * E, nu=0.3, on=False), takes=[take], world=world(Ground(0.0, "sticky")),
                    background=torch.ones(3), config=config, weights={"position": 1.0}, stages=stages,
-                   criterion=Criterion("corrected"), settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
+                   criterion=Criterion(name="corrected"), settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
 
 
 def stages_begun(module: LitMosa, monkeypatch) -> list[tuple[str, Ground]]:
@@ -396,7 +399,7 @@ def test_of_frictions_that_explain_the_motion_alike_the_first_is_taken(monkeypat
         "fitted_on",
         lambda ground, _: (cost - 1.0 - (ground != module.world.ground), fitted),
     )
-    assert module.better_ground(replace(module.stages[0], name="joint")) is None
+    assert module.better_ground(module.stages[0].but(name="joint")) is None
     assert len(module.ground_gains) > 1 and len(set(module.ground_gains.values())) == 1
     assert named(module.world.ground) == next(iter(module.ground_gains))
 
@@ -454,7 +457,7 @@ def test_a_fit_is_compared_with_itself_gone_on(monkeypatch, near):
         module.identification.cost(),
     )
     monkeypatch.setattr(module, "fitted_on", lambda ground, _: (cost - 7.0, module.identification))
-    assert module.better_ground(replace(module.stages[0], name="joint")) is None
+    assert module.better_ground(module.stages[0].but(name="joint")) is None
     assert (
         set(module.ground_gains.values()) == {0.0} and named(module.world.ground) == "separate_0.6"
     )
@@ -479,7 +482,7 @@ def test_a_fit_that_cannot_go_on_is_compared_as_it_stands(monkeypatch):
             module.identification,
         ),
     )
-    assert module.better_ground(replace(module.stages[0], name="joint")) is None
+    assert module.better_ground(module.stages[0].but(name="joint")) is None
     assert (
         set(module.ground_gains.values()) == {-2.0} and named(module.world.ground) == "separate_0.6"
     )
@@ -505,7 +508,7 @@ def test_adam_takes_a_body_that_sticks_and_says_so():
     module = fit_of(
         take_of(small_body(adapter=False), start(turn=0.5), FRAMES), newton_iterations=1
     )
-    stage = replace(module.stages[0], optimizer="adam")
+    stage = module.stages[0].but(optimizer="adam")
     with pytest.warns(
         UserWarning, match="scene.ground.mode: auto asks for fit.prior.optimizer=gauss_newton"
     ):

@@ -7,7 +7,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from mosa.config.build import rehearse
-from mosa.config.idle import idle
+from mosa.config.commands import TrainSettings
+from mosa.config.effects import sentences
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -16,13 +17,15 @@ def found(*overrides: str) -> list[str]:
     """Keys of the overrides that have no effect."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         values = OmegaConf.to_container(compose("train", overrides=list(overrides)), resolve=True)
-    return [sentence.split(":")[0] for sentence in idle(overrides, values, rehearse(values))]
+    return [
+        sentence.split(":")[0]
+        for sentence in sentences(overrides, TrainSettings.read(values), rehearse(values))
+    ]
 
 
 @pytest.mark.parametrize("overrides, expected", [
     (["losses.flow=0", "losses.rotation=0", "fit.joint.lr=0.1", "fit.clip=2"], ["losses.flow", "fit.joint.lr", "fit.clip"]),
-    (["ablation=no_flow"], ["ablation=no_flow"]),
-    (["fit=adam", "losses.flow=0", "fit.joint.lr=0.1", "identification.count=5", "+fit.joint.newton_iterations=3"],
+    (["fit=adam", "losses.flow=0", "fit.joint.lr=0.1", "identification.count=5", "fit.joint.newton_iterations=3"],
      ["identification.count", "fit.joint.newton_iterations"]),
     (["adapter=mosa", "losses.flow=0", "fit.prior.lr=0.1", "fit.joint.lr=0.1", "identification.count=5"], ["fit.prior.lr"]),
     (["heterogeneity.hidden=8", "heterogeneity.most=20"], ["heterogeneity.hidden"]),

@@ -1,0 +1,218 @@
+"""All settings of each command, one model for each: what its configuration may say, the defaults, and a line on every key.
+
+Models of sections stay in the packages that use them; importing them takes no torch, so that a command line is read at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Interval
+from pydantic import ConfigDict, Field
+
+from mosa.evaluation.settings import EvaluationSettings
+from mosa.modules.body.settings import HeterogeneitySettings, PriorSection, WorldSection
+from mosa.modules.body.simulation_settings import SimulationSection
+from mosa.modules.fitting.identification_settings import (
+    Criterion,
+    IdentificationSettings,
+    LossWeights,
+)
+from mosa.modules.fitting.stages import FitSection
+from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.rendering.settings import RenderingSettings
+from mosa.settings import (
+    Count,
+    Entries,
+    Expected,
+    Folder,
+    Four,
+    Names,
+    Number,
+    Section,
+    Seed,
+    Settings,
+    Text,
+    Three,
+    such,
+)
+
+FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames",
+           "extrapolated", "val")  # fmt: skip
+"""What the names of figures begin with."""
+Figure = Annotated[
+    str, Expected("a figure's name like test/rms_m (docs/figures.md)"), such(lambda v: "/" in v and v.split("/")[0] in FIGURES)
+]  # fmt: skip
+Sequences = Annotated[
+    list[Any], Expected("a list of names or folders like [a, b], or of sections like {path: a, frames: [0, 9]}"),
+    such(lambda v: all(isinstance(s, str) or (isinstance(s, Mapping) and isinstance(s.get("path"), str)) for s in v)),
+]  # fmt: skip
+Extensions = Annotated[
+    Names | None,
+    Field(description="modules that register laws, adapters, loss terms, metrics, formats (docs/extending.md)"),
+]  # fmt: skip
+
+
+class AdapterSection(Settings):
+    """The section `adapter`. Its other keys are the arguments of the adapter that is named (`mosa.modules.adapters`)."""
+
+    model_config = ConfigDict(extra="allow")
+    where: ClassVar[str] = "adapter"
+
+    name: Text | None = Field(
+        None, description="the adapter, by the name that it is registered with; null: none"
+    )
+
+
+class SceneSection(Settings):
+    """The section `scene`. Its other keys are the arguments of the format's loader (docs/data.md)."""
+
+    model_config = ConfigDict(extra="allow")
+    where: ClassVar[str] = "scene"
+
+    also_train: Sequences | None = Field(
+        None, description="further sequences that are learned from"
+    )
+    test: Sequences | None = Field(None, description="sequences that are held out")
+    cache: Folder | None = Field(
+        None, description="folder of what is made; null: mosa/ in the user's cache folder"
+    )
+
+
+class LawSections(Settings):
+    """What a body's law is built from."""
+
+    seed: Seed = Field(0, description="of everything that is drawn")
+    prior: PriorSection = Field(description="the law")
+    simulation: SimulationSection = Field(SimulationSection(), description="grid and time steps")
+    heterogeneity: HeterogeneitySettings = Field(
+        HeterogeneitySettings(), description="variation of the stiffness"
+    )
+    adapter: AdapterSection = Field(AdapterSection(), description="the correction of the law")
+
+
+class BodySections(LawSections):
+    """What a body and its world are built from."""
+
+    world: WorldSection = Field(WorldSection(), description="what stands in the world")
+
+
+class DataSections(Settings):
+    """What a scene's data are made by."""
+
+    seed: Seed = Field(0, description="of everything that is drawn")
+    scene: SceneSection = Field(description="the films")
+    reconstruction: ReconstructionSettings = Field(
+        ReconstructionSettings(), description="body and motion from images"
+    )
+    simulation: SimulationSection = Field(SimulationSection(), description="grid and time steps")
+    fit: FitSection = Field(FitSection(), description="the stages")
+    rendering: RenderingSettings = Field(RenderingSettings(), description="images")
+
+
+class TrainSettings(BodySections, DataSections):
+    """train.py"""
+
+    deterministic: bool = Field(
+        False,
+        description=(
+            "the same bits in every run on the same GPU; slower there. On a CPU a run's"
+            " bits are always the same"
+        ),
+    )
+    extensions: Extensions = []
+    ckpt_path: Text | None = Field(
+        None, description="checkpoint, of the same configuration, that the fit goes on from"
+    )
+    resume: Literal["auto"] | None = Field(
+        None,
+        description=(
+            "auto: skip where the run folder has metrics.json, go on from its "
+            "checkpoints/last.ckpt (docs/sweeps.md); a checkpoint's path is ckpt_path"
+        ),
+    )
+    extrapolate: bool = Field(
+        False,
+        description=(
+            "identify once more on a grid 1.44 times as coarse, and continue E, nu, ..."
+            " to a spacing of 0"
+        ),
+    )
+    optimized_metric: Figure = Field(
+        "test/rms_m",
+        description=(
+            "what a sweep gets back: val/loss where something is held out and the sweep"
+            " is to choose by it; the first of its fallbacks that exists is used where "
+            "it does not"
+        ),
+    )
+    criterion: Criterion = Field(Criterion(), description="what is compared")
+    trainer: Section = Field({}, description="arguments of Lightning's Trainer")
+    callbacks: Section | None = Field({}, description="callbacks by name, each with _target_")
+    logger: Section | None = Field({}, description="loggers by name, each with _target_")
+    identification: IdentificationSettings = Field(
+        IdentificationSettings(), description="Gauss-Newton"
+    )
+    losses: LossWeights = Field(LossWeights(), description="weights of the loss terms")
+    evaluation: EvaluationSettings = Field(EvaluationSettings(), description="figures")
+
+
+class SimulateSection(Settings):
+    """A new start, in place of the evaluation. What is left out is taken from the training sequence."""
+
+    where: ClassVar[str] = "simulate"
+
+    velocity: Three | None = Field(
+        None, description="[vx, vy, vz] m/s; any of these six starts a new simulation"
+    )
+    rotation: Four | None = Field(None, description="[ax, ay, az, degrees] about the body's centre")
+    position: (
+        Annotated[
+            list[float | None],
+            Expected("three numbers, null for one that is left as it is"),
+            such(lambda v: len(v) == 3),
+        ]
+        | None
+    ) = Field(
+        None,
+        description="[x, y, z] m of the body's centre, null for a number that is left as it is",
+    )
+    height: Number | None = Field(None, description="m, lowest point of the body above the ground")
+    angular_velocity: Three | None = Field(None, description="[wx, wy, wz] rad/s")
+    colliders: Entries | None = Field(
+        None, description="in place of the world's: a list as world.colliders of train.py"
+    )
+    frames: Count = Field(
+        30, description="frames; this and variant count with one of the six above"
+    )
+    variant: Literal["adapted", "prior_eta", "prior"] = Field("adapted", description="the model")
+
+
+class EvalSettings(Settings):
+    """eval.py"""
+
+    extensions: Extensions = []
+    ckpt_path: Text = Field(description="checkpoint of a run")
+    device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
+    deterministic: bool = Field(False, description="as in train.py")
+    cache: Folder | None = Field(
+        None,
+        description=(
+            "folder for made scenes; null: ~/.cache/mosa. The one that a checkpoint "
+            "names is not used"
+        ),
+    )
+    appearance: Literal["splats", "particles"] | None = Field(
+        None, description="what images show; null: as the run showed it"
+    )
+    plan: Annotated[int, Interval(ge=2, le=10**9)] | None = Field(
+        None,
+        description=(
+            "candidates: instead of the evaluation, rank so many starts by what their "
+            "motion would tell"
+        ),
+    )
+    scene: Section | None = Field(None, description="another scene to evaluate on; null: the run's")
+    evaluation: EvaluationSettings = Field(EvaluationSettings(), description="figures")
+    simulate: SimulateSection = Field(SimulateSection(), description="a new start")

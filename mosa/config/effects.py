@@ -1,0 +1,73 @@
+"""Keys that a user sets and that do nothing beside the others: said, because a table of runs that differ in one would say that it
+makes no difference. A model says what its fields need (`Settings.needs`)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from fnmatch import fnmatchcase
+
+from mosa.modules.fitting.stages import STAGES, Stage
+from mosa.settings import Settings, word
+
+
+def without_effect(settings: Settings, path: Sequence[str], stages: Sequence[Stage]) -> str | None:
+    """Why the key at a path has no effect beside the others and the stages that run; None where it has one."""
+    where: list[str] = []
+    for key in path:
+        if key not in type(settings).model_fields:
+            return None
+        for need in needs_of(type(settings), key):
+            if (reason := unmet(settings, need, where, stages)) is not None:
+                return reason
+        where, inner = [*where, key], getattr(settings, key)
+        if not isinstance(inner, Settings):
+            return None
+        settings = inner
+    return None
+
+
+def needs_of(model: type[Settings], key: str) -> list[str]:
+    """What the field needs, by its own model and by those that this one derives from."""
+    stated = [vars(each).get("needs", {}) for each in model.__mro__]
+    return [
+        need
+        for needs in stated
+        for names, needed in needs.items()
+        if any(fnmatchcase(key, name) for name in names.split())
+        for need in needed.split(", ")
+    ]
+
+
+def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stage]) -> str | None:
+    if need in ("newton", "adam"):
+        own = where[-1] if where[:1] == ["fit"] and where[-1] in STAGES else None
+        running = [stage.newton for stage in stages if own in (None, stage.name)]
+        if not running or (need == "newton") in running:
+            return None
+        if own is not None:
+            runs = "Adam" if need == "newton" else "Gauss-Newton; the rates are Adam's"
+            return f"fit.{own} runs {runs}"
+        return "no stage runs Gauss-Newton" if need == "newton" else (
+            "all stages run Gauss-Newton, which looks at no image (fit=adam does)")  # fmt: skip
+    key, unequal, value = need.partition("!=") if "!=" in need else need.partition("=")
+    found = word(getattr(settings, key))
+    return (
+        None if (found == value) != (unequal == "!=") else f"{'.'.join([*where, key])} is {found}"
+    )
+
+
+def sentences(
+    overrides: Iterable[str], settings: Settings, stages: Sequence[Stage]
+) -> Iterator[str]:
+    """One for each key of the overrides (KEY=VALUE) that has no effect."""
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~").split("@")[0]
+        if (reason := without_effect(settings, key.split("."), stages)) is not None:
+            yield f"{key}: has no effect in this run: {reason}"
+
+
+def warn_of_idle(overrides: Iterable[str], settings: Settings, stages: Sequence[Stage]) -> None:
+    """One warning for each such key."""
+    for sentence in sentences(overrides, settings, stages):
+        warnings.warn(sentence, stacklevel=3)

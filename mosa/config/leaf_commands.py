@@ -1,0 +1,333 @@
+"""Settings of the commands whose packages nothing else needs: splats, capture, environments."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Interval
+from pydantic import Field
+
+from mosa.config.commands import EvalSettings, Extensions, LawSections, TrainSettings
+from mosa.settings import (
+    Count,
+    Expected,
+    Folder,
+    Four,
+    Names,
+    Positive,
+    Seed,
+    Settings,
+    Share,
+    Text,
+    Three,
+    Weight,
+    is_number,
+    such,
+)
+
+Period = Annotated[
+    list[float], Expected("two numbers [from, to] in seconds"), such(lambda v: len(v) == 2 and v[0] < v[1])
+]  # fmt: skip
+Rate = Annotated[float, Interval(ge=1, le=1e5)]
+Readout = Annotated[float, Interval(ge=0, le=0.1)]
+Seconds = Annotated[float, Interval(gt=0, le=60)]
+Spacing = Annotated[float, Interval(ge=1e-4, le=1)]
+Scan = Literal["auto", "down", "up", "left", "right"]
+
+
+class GroundSection(Settings):
+    """The ground that an object falls onto."""
+
+    where: ClassVar[str] = "ground"
+
+    mode: Literal["sticky", "slip", "separate", "touch"] = Field(
+        "separate", description="how it is touched"
+    )
+    friction: Weight = Field(0.5, description="Coulomb's coefficient, of separate and touch")
+
+
+class SplatsSettings(LawSections):
+    """python -m mosa.splats"""
+
+    extensions: Extensions = []
+    ply: Text = Field(description="3DGS PLY (INRIA's layout) of the object")
+    ckpt_path: Text | None = Field(
+        None, description="a run whose law the object gets, in place of `prior`"
+    )
+    device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
+    size: Positive | None = Field(
+        None, description="m, of the object's longest side; null: the file is in metres"
+    )
+    up: Three = Field([0, 1, 0], description="in the file's axes; [0, -1, 0] where it has COLMAP's")
+    box: (
+        Annotated[
+            list[Three], Expected("two corners [[x, y, z], [x, y, z]]"), such(lambda v: len(v) == 2)
+        ]
+        | None
+    ) = Field(
+        None,
+        description=(
+            "[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all"
+        ),
+    )
+    opacity: Share = Field(0.1, description="Gaussians below are left out")
+    open_below: bool = Field(False, description="the underside was never filmed: it is closed")
+    resolution: int = Field(
+        80,
+        ge=8,
+        le=512,
+        description="voxels along the longest side, of the solid that the Gaussians enclose",
+    )
+    share: float = Field(
+        0.9,
+        gt=0,
+        le=1,
+        description="of 26 directions that have to end at Gaussians where it is inside",
+    )
+    density: Positive | None = Field(None, description="kg/m^3; null: 1000, or that of the run")
+    gravity: Weight = Field(9.81, description="m/s^2")
+    height: Weight = Field(0.2, description="m, of the lowest particle above the ground")
+    ground: GroundSection = Field(GroundSection(), description="the ground")
+    rotation: Four | None = Field(
+        None, description="[ax, ay, az, degrees] about the body's centre, before it falls"
+    )
+    velocity: Three = Field([0, 0, 0], description="m/s")
+    angular_velocity: Three = Field([0, 0, 0], description="rad/s")
+    frames: Count = Field(40, description="frames")
+    rate: Positive = Field(30, description="frames per second")
+    formats: Names = Field(
+        ["ply"],
+        description=(
+            "for each frame: ply, splat, spz (needs gsply); usd (needs usd-core) is one file"
+        ),
+    )
+    video: bool = Field(True, description="film it")
+
+
+class PhoneSection(Settings):
+    """What one phone has otherwise."""
+
+    fps: Rate | None = Field(None, description="frames per second as they were taken")
+    scan: Scan = Field("auto", description="where the sensor's next row lies in the picture")
+    readout: Readout | None = Field(None, description="s from the sensor's first row to its last")
+
+
+class CaptureSettings(Settings):
+    """python -m mosa.capture"""
+
+    videos: Folder = Field(description="folder of videos, one of each phone")
+    poses: Folder = Field(
+        description=(
+            "folder of a COLMAP model (.bin or .txt), or a transforms.json; images "
+            "named as the videos"
+        )
+    )
+    output: Folder = Field(description="folder that gets transforms.json, images, capture.md")
+    like: Folder | None = Field(
+        None,
+        description=(
+            "folder of an earlier capture by the same phones, whose world (scale, up, "
+            "ground) this one gets"
+        ),
+    )
+    mattes: Literal["plates", "rembg", "masks"] = Field(
+        "plates",
+        description=(
+            "plates: empty backgrounds; rembg: a network (pip install 'mosa[rembg]'); "
+            "masks: videos of them"
+        ),
+    )
+    plates: Folder | None = Field(
+        None,
+        description=(
+            "folder of <phone>.png, .jpg or .mp4; null: plates beside or in the videos' folder"
+        ),
+    )
+    plate_seconds: Period | None = Field(
+        None, description="[from, to] of each video's clock in which it shows the empty background"
+    )
+    masks: Folder | None = Field(
+        None, description="folder of mask videos <phone>.mp4, white: the object"
+    )
+    fps: Rate | None = Field(
+        None,
+        description=(
+            "frames per second as they were taken; null: what the videos say (slow motion: set it)"
+        ),
+    )
+    scan: Scan = Field(
+        "auto", description="where the sensor's next row lies in the picture; auto: from the video"
+    )
+    readout: Readout | None = Field(
+        None, description="s from the sensor's first row to its last; null: found from the fall"
+    )
+    phones: dict[str, PhoneSection] | None = Field(
+        None,
+        description=(
+            "what one phone has otherwise: {phone3: {fps: 240, scan: left, readout: 0.01}}"
+        ),
+    )
+    max_offset: Seconds = Field(5.0, description="s by which the videos' beginnings may be apart")
+    flight: Period | None = Field(
+        None, description="[from, to] s on the first phone's clock, of the free fall; null: found"
+    )
+    gravity: float = Field(9.81, ge=0.01, le=1000, description="m/s^2")
+    scale: Annotated[float, Interval(ge=1e-6, le=1e6)] | None = Field(
+        None, description="metres per unit of the poses; null: from the acceleration of the fall"
+    )
+    up: (
+        Annotated[
+            list[float],
+            Expected("a direction of three numbers, not zero"),
+            such(lambda v: len(v) == 3 and any(v)),
+        ]
+        | None
+    ) = Field(None, description="in the poses' world; null: from its direction")
+    ground: Three | None = Field(
+        None,
+        description="a point of the floor in the poses' world; null: where the object is lowest",
+    )
+    rate: Annotated[float, Interval(ge=1, le=2000)] | None = Field(
+        None, description="frames per second that are written; null: the slowest phone's"
+    )
+    before: Seconds = Field(0.1, description="s of free fall that are written")
+    after: Seconds = Field(0.25, description="s that are written from its end on")
+    interpolation: Literal["flow", "shift", "none"] = Field(
+        "flow",
+        description="between frames; shift: the nearest frame, moved; none: the nearest frame",
+    )
+    colours: Literal["floor", "none"] = Field(
+        "floor", description="floor: phones get one colour of the floor, of plates"
+    )
+
+
+class TruthSection(Settings):
+    """The hidden truth of a built-in scene."""
+
+    where: ClassVar[str] = "truth"
+
+    scene: Text | None = Field(
+        None, description="a built-in one; null: the one that the run learned from"
+    )
+    spacing: Spacing | None = Field(
+        None, description="m, of the truth's particles in tests; null: those of the films"
+    )
+    train_spacing: Spacing | None = Field(
+        None, description="m, where a policy is trained in the truth; coarser is quicker"
+    )
+
+
+class SearchSection(Settings):
+    """policy=gradient, cma, model"""
+
+    where: ClassVar[str] = "search"
+
+    iterations: Count = Field(60, description="iterations")
+    batch: int = Field(16, ge=1, le=10**5, description="trials of an iteration")
+    rate: float = Field(
+        0.02, gt=0, le=10, description="gradient: Adam's learning rate, falling to a tenth"
+    )
+    clip: Positive = Field(
+        0.5, description="gradient: largest norm of one trial's with respect to one action"
+    )
+    every: Count = Field(10, description="iterations between looks at the validation trials")
+    validation: Count = Field(32, description="trials, of the simulator trained in")
+    candidates: int = Field(
+        32,
+        ge=4,
+        le=10**9,
+        description=(
+            "cma: policies of an iteration, each on the whole batch; model: so many "
+            "batches an iteration"
+        ),
+    )
+    spread: Positive = Field(
+        0.4,
+        description=(
+            "first standard deviation: cma: of the policy's numbers; model: of actions "
+            "about the policy's"
+        ),
+    )
+
+
+OPTIONS = (
+    "steps low high near lean still tilt aim askew far close aside free leaning hardest before grip shut closing squeeze "
+    "fastest slowest across turning stroke apart unsteady_tilt unsteady_aim unsteady_throw"
+).split()
+"""Fields of the tasks' classes (docs/environments.md)."""
+
+
+class EnvironmentsSettings(Settings):
+    """python -m mosa.environments"""
+
+    task: Text = Field("pushing", description="placement, hanging, striking or pushing")
+    checkpoint: Text | None = Field(
+        None, description="of a run: what the learned and the isotropic twin are read from"
+    )
+    simulator: Annotated[
+        Any,
+        Expected("a name, or a list of names"),
+        such(
+            lambda v: (
+                isinstance(v, str)
+                or (isinstance(v, list) and bool(v) and all(isinstance(n, str) for n in v))
+            )
+        ),
+    ] = Field(
+        "learned",
+        description="learned, isotropic or truth to train in; a list of them is the table",
+    )
+    seed: Seed = Field(0, description="of one policy")
+    seeds: Annotated[list[Seed], Expected("a list of whole numbers"), such(bool)] = Field(
+        [0, 1, 2], description="of the table"
+    )
+    policy: Text = Field(
+        "gradient",
+        description="gradient, cma, model, sac or ppo (cma, sac and ppo need '.[environments]')",
+    )
+    trials: Count = Field(100, description="tested, in the truth and in the simulator trained in")
+    device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
+    worlds: Count | Literal["auto"] = Field(
+        "auto", description="tested at a time; auto: 8 on a CPU, all of them on a GPU"
+    )
+    out: Text | None = Field(None, description="folder of the results; null: the run folder")
+    jobs_only: bool = Field(
+        False,
+        description=(
+            "of a list: its jobs without the table, for several processes that share "
+            "one `out`; `none` is one too"
+        ),
+    )
+    page: Text | None = Field(
+        None,
+        description=(
+            "a Markdown file into which the table goes, between its lines <!-- table: "
+            "<task> --> and <!-- end -->"
+        ),
+    )
+    films: int = Field(
+        3, ge=0, le=100, description="trials, of the first tested ones, that are filmed"
+    )
+    options: Annotated[
+        dict[str, Any],
+        Expected("numbers by the names of the task's fields"),
+        such(lambda v: all(value is None or is_number(value) for value in v.values())),
+    ] = Field(
+        dict.fromkeys(OPTIONS),
+        description="of the task, the fields of its class (docs/environments.md); null: its own",
+    )
+    truth: TruthSection = Field(TruthSection(), description="the hidden truth")
+    search: SearchSection = Field(SearchSection(), description="the search of a policy")
+    decisions: Count = Field(
+        4000,
+        description=(
+            "policy=sac, ppo: actions in all worlds together (search.batch of them step at a time)"
+        ),
+    )
+
+
+COMMANDS: dict[str, type[Settings]] = {
+    "train": TrainSettings, "eval": EvalSettings, "splats": SplatsSettings, "capture": CaptureSettings,
+    "environments": EnvironmentsSettings,
+}  # fmt: skip
+"""By the name of the file in conf/."""

@@ -1,0 +1,99 @@
+"""What the configuration says of a body beside its grid: the prior, its variation in space, the world it moves in."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from mosa.settings import Entries, Names, Section, Settings, Text, Width
+
+
+class HeterogeneitySettings(Settings):
+    """Stiffness over the body: P(X) = P_global (1 + amplitude tanh eta(X)) (paper, section 3.1)."""
+
+    where: ClassVar[str] = "heterogeneity"
+    needs: ClassVar[dict[str, str]] = {
+        "amplitude kind": "enabled=true",
+        "wavelength most": "enabled=true, kind=modes",
+        "hidden frequencies": "enabled=true, kind=network",
+    }
+
+    enabled: bool = Field(True, description="learn how the stiffness varies over the body")
+    amplitude: float = Field(
+        0.5,
+        gt=0,
+        lt=1,
+        description="largest relative deviation; the paper's network: 0.2",
+    )
+    kind: Literal["modes", "network"] = Field(
+        "modes",
+        description=(
+            "modes: a sum of smooth waves, for Gauss-Newton; network: the paper's "
+            "coordinate network"
+        ),
+    )
+    wavelength: float = Field(
+        0.33,
+        ge=0.02,
+        le=2,
+        description="modes: the shortest wave, over the body's longest side",
+    )
+    most: Width = Field(
+        50,
+        description="modes: number of waves, at most, the longest first",
+    )
+    hidden: Width = Field(
+        32,
+        description="network: width of its layers",
+    )
+    frequencies: int = Field(
+        2,
+        ge=0,
+        le=32,
+        description="network: sines and cosines of pi 2^k x that it reads beside x",
+    )
+
+
+class PriorSection(Settings):
+    """The section `prior`: the law, and where its parameters start."""
+
+    where: ClassVar[str] = "prior"
+
+    law: Text = Field(
+        description="name of the law (docs/theory_to_code.md); auto: chosen among `candidates`"
+    )
+    parameters: Section = Field(
+        description="where the fit starts, by name, in SI units; a direction is three numbers"
+    )
+    frozen: Names | None = Field(None, description="parameters that are not learned")
+    modulated: Names | None = Field(
+        None, description="parameters that the heterogeneity multiplies; null: the stiffness"
+    )
+    candidates: Names | None = Field(
+        None, description="with law=auto: the laws that are calibrated and compared"
+    )
+    options: Section | None = Field(None, description="how the law is taken (`LawOptions`)")
+
+
+class WorldSection(Settings):
+    """The section `world`: what stands in the world beside the scene's ground, gravity and box."""
+
+    where: ClassVar[str] = "world"
+
+    walls: Section | None = Field(
+        None, description="{mode: separate, friction: 0.1}, of the six sides of the box; null: none"
+    )
+    colliders: Entries | None = Field(
+        [],
+        description=(
+            "rigid solids, such as {type: sphere, radius: 0.1, position: [0, 0, 0], "
+            "mode: separate, friction: 0.3, motion: {velocity: [1, 0, 0]}} "
+            "(docs/colliders.md)"
+        ),
+    )
+
+
+def names(values: Any) -> tuple[str, ...]:
+    """A list of names, or none, as a tuple."""
+    return tuple(values or ())

@@ -1,0 +1,32 @@
+"""How images are rendered, and what they show."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from mosa.settings import Settings, Text
+
+
+class RenderingSettings(Settings):
+    """The section `rendering`."""
+
+    where: ClassVar[str] = "rendering"
+
+    backend: Text = Field(
+        "warp",
+        description=(
+            "warp: CPU and CUDA; gsplat: rendering=gsplat, which needs the package on CUDA"
+        ),
+    )
+    margin: int = Field(
+        6, ge=0, le=256, description="px around the mattes' box that a training step renders"
+    )
+    appearance: Literal["splats", "particles"] = Field(
+        "splats",
+        description=(
+            "what evaluation, video, viewer and export show: the static stage's splats,"
+            " carried by the rollout, or particles"
+        ),
+    )

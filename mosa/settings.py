@@ -1,0 +1,377 @@
+"""What a user may set: pydantic models, whose mistakes are messages of this program.
+
+A field is written once, with its default, its range and a line of description:
+
+    class Search(Settings):
+        where = "search"
+        rate: Positive = Field(0.02, description="learning rate of Adam")
+
+The checks of a configuration, Hydra's keys (`mosa.config.composition`), the reference (docs/reference/configuration.md) and the
+record of a run follow from the models. Nothing is converted: a flag is no number, a text is no number, a number is finite.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Self,
+    Union,
+    get_args,
+    get_origin,
+)
+
+from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    TypeAdapter,
+    ValidationError,
+    create_model,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from mosa.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+LARGEST, MOST = 1e20, 10**9
+"""Of numbers and of whole numbers without limits of their own: single precision and an array's length hold them."""
+WIDEST = 4096
+"""Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
+
+
+class Expected(NamedTuple):
+    """In the metadata of a type: what a message says after 'expected'."""
+
+    text: str
+
+
+Positive = Annotated[float, Gt(0), Le(LARGEST)]
+Weight = Annotated[float, Ge(0), Le(LARGEST)]
+Share = Annotated[float, Ge(0), Le(1)]
+Number = Annotated[float, Expected("a number")]
+Count = Annotated[int, Ge(1), Le(MOST)]
+Whole = Annotated[int, Ge(0), Le(MOST)]
+Width = Annotated[int, Ge(1), Le(WIDEST)]
+Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
+Text = Annotated[str, Expected("a text")]
+Names = Annotated[list[str], Expected("a list of names like [a, b]")]
+Section = Annotated[dict[str, Any], Expected("a section of keys")]
+Entries = Annotated[list[dict[str, Any]], Expected("a list of sections")]
+Three = Annotated[
+    list[float], Expected("three numbers"), MinLen(3), AfterValidator(lambda v: _long(v, 3))
+]
+Four = Annotated[
+    list[float],
+    Expected("four numbers, an axis and degrees"),
+    AfterValidator(lambda v: _long(v, 4)),
+]
+
+
+def _long(values: list[Any], count: int) -> list[Any]:
+    if len(values) != count:
+        raise ValueError(f"{count} of them")
+    return values
+
+
+def such(valid: Callable[[Any], bool]) -> AfterValidator:
+    """In the metadata of a type: what else holds for its values."""
+
+    def checked(value: Any) -> Any:
+        if not valid(value):
+            raise ValueError("another")
+        return value
+
+    return AfterValidator(checked)
+
+
+def folder(value: str) -> str:
+    """Errors: ValueError for an empty one, which would be the folder that the program was started in."""
+    if not value.strip() or "\0" in value:
+        raise ValueError("no folder")
+    return value
+
+
+Folder = Annotated[str, Expected("the path of a folder"), AfterValidator(folder)]
+
+
+class _Checked(ModelMetaclass):
+    """Makes a settings object of keyword arguments with the messages of this program."""
+
+    def __call__(cls, **values: Any) -> Any:
+        return cls.read(values)  # type: ignore[attr-defined]
+
+
+class Settings(BaseModel, metaclass=_Checked):
+    """Settings of one part, checked when they are made, constant afterwards. `where`: its key in a configuration.
+
+    A section that is given in part keeps the defaults of the field that it is for. Errors: ConfigError naming the key, what was
+    expected and what was found."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, arbitrary_types_allowed=True, protected_namespaces=()
+    )  # fmt: skip
+    where: ClassVar[str] = ""
+    needs: ClassVar[dict[str, str]] = {}
+    """What fields need to have an effect, by their names: `kind=modes`, the value of a field beside them, with `!=` another one;
+    `newton` or `adam`, what a stage has to run (`mosa.config.effects`)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        known = cls.model_fields
+        return {
+            key: {**dict(default), **value}
+            if key in known
+            and isinstance(value, Mapping)
+            and isinstance(default := known[key].get_default(call_default_factory=True), Settings)
+            else value
+            for key, value in values.items()
+        }
+
+    @classmethod
+    def read(cls, values: Any, where: str | None = None) -> Self:
+        """Of plain values by key, or of what was checked before. where: the section's key, for messages. Errors: ConfigError."""
+        where = cls.where if where is None else where
+        if isinstance(values, cls):
+            return values
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"{where}: expected a section of keys, found {values!r}")
+        try:
+            return cls.model_validate(dict(values))
+        except ValidationError as error:
+            raise mistake(error, cls, values, where) from None
+
+    @classmethod
+    def part(cls, values: Mapping[str, Any]) -> Self:
+        """Of a configuration that may have further keys. Errors: ConfigError."""
+        return cls.read({key: value for key, value in values.items() if key in cls.model_fields})
+
+    def but(self, **changes: Any) -> Self:
+        """A copy with other values of these fields. Errors: ConfigError."""
+        return type(self).read(dict(self) | changes)
+
+    def plain(self) -> dict[str, Any]:
+        """Nested plain containers, for a YAML file, a checkpoint or the key of a cache."""
+        return self.model_dump()
+
+
+def mistake(
+    error: ValidationError, model: type[BaseModel], values: Any, where: str = ""
+) -> ConfigError:
+    """The first mistake that pydantic found, as a message with the key, what was expected, what was found and the way out."""
+    first = error.errors(include_url=False, include_context=False)[0]
+    path, wanted, owner = ([where] if where else []), None, model
+    for key in first["loc"]:
+        step = next_in(owner if wanted is None else wanted, key)
+        if step is None:
+            break
+        path, wanted = [*path, str(key)], step
+        values = values[key] if isinstance(values, Mapping) and key in values else None
+        inside = model_in(wanted)
+        owner = inside or owner
+    name = ".".join(path)
+    if first["type"] in ("extra_forbidden", "invalid_key"):
+        section, key = model_in(wanted) if wanted is not None else owner, str(first["loc"][-1])
+        known = [name for name, f in (section or owner).model_fields.items()]
+        return ConfigError(
+            f"{'.'.join([*path, key])}: unknown key; expected one of {', '.join(known)}{nearest(key, known, '.'.join(path))}"
+        )
+    if first["type"] == "missing":
+        return ConfigError(f"{name}: expected this key, found none")
+    return ConfigError(f"{name}: expected {described(wanted)}, found {shown(values)}")
+
+
+def nearest(key: str, known: list[str], where: str) -> str:
+    """The end of a message on an unknown key: which known one is like it, nothing where none is."""
+    near = get_close_matches(key, known, 1)
+    return f"; the nearest is {f'{where}.{near[0]}'.strip('.')}" if near else ""
+
+
+def shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+def next_in(kind: Any, key: Any) -> Any:
+    """The type of what lies at `key` of a model or of a mapping of models; None where that is no key of a user's."""
+    inside = model_in(kind)
+    if inside is not None and get_origin(bare(kind)) is not dict:
+        f = inside.model_fields.get(key)
+        return None if f is None else annotation_of(f)
+    if get_origin(bare(kind)) is dict and model_in(get_args(bare(kind))[1]) is not None:
+        return get_args(bare(kind))[1]
+    return None
+
+
+def annotation_of(f: FieldInfo) -> Any:
+    """A field's type with all that it says about it."""
+    return Annotated[(f.annotation, *f.metadata)] if f.metadata else f.annotation
+
+
+def bare(kind: Any) -> Any:
+    """A type without metadata and without null."""
+    if get_origin(kind) is Annotated:
+        return bare(get_args(kind)[0])
+    if get_origin(kind) in (Union, types.UnionType):
+        some = [each for each in get_args(kind) if each is not type(None)]
+        return bare(some[0]) if len(some) == 1 else kind
+    return kind
+
+
+def model_in(kind: Any) -> type[BaseModel] | None:
+    """The model that a type is; None for another type."""
+    found = bare(kind)
+    if get_origin(found) is dict:
+        return None
+    return found if inspect.isclass(found) and issubclass(found, BaseModel) else None
+
+
+def described(kind: Any) -> str:
+    """What a type expects, in words."""
+    if kind is Any or kind is None:
+        return "a value" if kind is Any else "null"
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        inner, told = inside[0], inside[1:]
+        for each in told:
+            if isinstance(each, Expected):
+                return each.text
+        return numbers_described(inner, list(flattened(told))) or described(inner)
+    if origin is Literal:
+        return " or ".join(word(each) for each in inside)
+    if origin in (Union, types.UnionType):
+        some = [described(each) for each in inside if each is not type(None)]
+        return ", or ".join(some + ["null"] * (type(None) in inside))
+    if kind in (int, float):
+        return numbers_described(kind, []) or ""
+    return {bool: "true or false", str: "a text", type(None): "null"}.get(
+        kind, "a list" if origin is list or kind is list else "a section of keys"
+    )
+
+
+def word(value: Any) -> str:
+    return (
+        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    )
+
+
+def flattened(told: Iterable[Any]) -> Iterable[Any]:
+    """Metadata, of groups and of fields their parts."""
+    for each in told:
+        if isinstance(each, FieldInfo):
+            yield from flattened(each.metadata)
+        elif isinstance(each, Interval):
+            yield from each
+        else:
+            yield each
+
+
+def numbers_described(kind: Any, told: list[Any]) -> str | None:
+    """Of a whole number or a number with bounds; None for another type."""
+    if kind not in (int, float):
+        return None
+    low = max(((b.ge if isinstance(b, Ge) else b.gt), isinstance(b, Gt)) for b in told
+              if isinstance(b, (Ge, Gt))) if any(isinstance(b, (Ge, Gt)) for b in told) else None  # fmt: skip
+    high = min(((b.le if isinstance(b, Le) else b.lt), not isinstance(b, Lt)) for b in told
+               if isinstance(b, (Le, Lt))) if any(isinstance(b, (Le, Lt)) for b in told) else None  # fmt: skip
+    number = (lambda v: f"{v:g}") if kind is float else str
+    parts = ["a number" if kind is float else "a whole number"]
+    if low is not None:
+        parts.append(f"{'above' if low[1] else 'of at least'} {number(low[0])}")
+    if high is not None:
+        more = "and " if low is not None else ""
+        parts.append(f"{more}{'at most' if high[1] else 'below'} {number(high[0])}")
+    return " ".join(parts)
+
+
+# -------------------------------------------------------------------------------- single values
+def is_number(value: Any) -> bool:
+    """A finite number that is no flag."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+@functools.cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    own = model_in(kind) is not None  # a model has its own
+    return TypeAdapter(kind, config=None if own else ConfigDict(strict=True, allow_inf_nan=False))
+
+
+def fits(kind: Any, value: Any) -> bool:
+    """Whether a value is of a type, with nothing converted."""
+    try:
+        _adapter(kind).validate_python(value)
+    except ValidationError:
+        return False
+    return True
+
+
+def check(where: str, value: Any, kind: Any) -> None:
+    """Errors: ConfigError where a value is not of a type."""
+    if not fits(kind, value):
+        raise ConfigError(f"{where}: expected {described(kind)}, found {shown(value)}")
+
+
+def check_values(values: Mapping[str, Any], kinds: Mapping[str, Any], where: str) -> None:
+    """Every value that has a type is of it. Errors: ConfigError naming the first that is not, as a key below `where`."""
+    for name, kind in kinds.items():
+        if name in values:
+            check(f"{where}.{name}", values[name], kind)
+
+
+# -------------------------------------------------------------------------------- arguments
+@functools.cache
+def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Settings]:
+    """The keyword arguments of a class or function as settings, from their annotations. given: those that no key says.
+
+    An argument without an annotation may be anything."""
+    call = build.__init__ if inspect.isclass(build) else build  # type: ignore[misc]
+    hints = typing.get_type_hints(call, include_extras=True)
+    wanted = {
+        name: (hints.get(name, Any), ... if p.default is p.empty else p.default)
+        for name, p in inspect.signature(build).parameters.items()
+        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) and name not in given
+    }
+    made: type[Settings] = create_model(build.__name__, __base__=Settings, **wanted)  # type: ignore[call-overload]
+    made.where = where
+    return made
+
+
+def call(where: str, build: Callable[..., Any], keys: Mapping[str, Any], **given: Any) -> Any:
+    """build(**given, **keys), the keys checked by its annotations. Errors: ConfigError for a key that it does not take, that is
+    missing, or whose value is of another type."""
+    checked = arguments_of(build, where, *given).read(keys, where)
+    return build(**given, **{key: getattr(checked, key) for key in keys})
+
+
+def node_of(model: type[Settings], without: Iterable[str] = ()) -> dict[str, Any]:
+    """The defaults of a model as plain data, for Hydra, with '???' for a text that has none. without: keys that groups
+    choose whole."""
+    found: dict[str, Any] = {}
+    for name, f in model.model_fields.items():
+        default = f.get_default(call_default_factory=True)
+        if default is not PydanticUndefined and name not in without:
+            found[name] = default.plain() if isinstance(default, Settings) else default
+        elif bare(annotation_of(f)) is str:
+            found[name] = "???"
+    return found
