@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from mosa.config.build import build_body
+from mosa.config.record import RunRecord
 from mosa.errors import MosaError
 from mosa.modules.body.body import Start
 from mosa.twin.twin import Twin
@@ -64,17 +65,13 @@ def stored() -> dict:
     start = Start(
         torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)
     ).written()
-    config = {
-        "cfg": cfg,
-        "world": world,
-        "density": 1000.0,
-        "dx": 0.1,
-        "frame_dt": 1 / 60,
-        "starts": {"train": start},
-    }
-    state = {f"body.{k}": v for k, v in build_body(config, tensors).state_dict().items()}
-    return {"state_dict": state, "mosa": {"config": config, "start": start, "stage": 3, "losses": [], "steps_done": 1,
-                                          "particles": n}}  # fmt: skip
+    fit = {"stage": 3, "losses": [], "steps_done": 1, "particles": n, "misfit": 0.01}
+    record = RunRecord(
+        settings=cfg, ground=world.pop("ground"), world=world, density=1000.0, dx=0.1, frame_dt=1 / 60, starts={"train": start},
+        start=start, fit=fit,
+    )  # fmt: skip
+    state = {f"body.{k}": v for k, v in build_body(record, tensors).state_dict().items()}
+    return {"state_dict": state, "mosa": record.plain()}
 
 
 @cache

@@ -10,17 +10,12 @@ from pathlib import Path
 
 import numpy as np
 from attacks import ROOT, Attack, composed, cube, put, refuse
-from mosa.config.keys import EVALUATION, TRAINING
-from mosa.config.known import check_known
-from mosa.schema import check
 
 from mosa.config.build import build_world, rehearse
 
 
 def configured(config: dict):
     """What a run checks of its configuration before anything else."""
-    check_known(config, ROOT / "conf", "train", TRAINING, EVALUATION)
-    check(config, TRAINING, EVALUATION)
     rehearse(config)
 
 

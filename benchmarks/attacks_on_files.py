@@ -41,7 +41,7 @@ def same(found, wanted) -> None:
 
 
 def checkpoints(folder: Path) -> Iterator[Attack]:
-    target, config = folder / "touched", "mosa.config"
+    target, config = folder / "touched", "mosa"
 
     def load(content: dict):
         torch.save(content, folder / "a.ckpt")
@@ -50,42 +50,42 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
     bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.twin.rollout_file.save_parts", "mosa.modules.body.body.Body",
            5, ("a",)}  # fmt: skip
     changes = [
-        (f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]})
+        (
+            f"{config}.settings.adapter",
+            {"name": "direct", "_target_": name, "args": ["touch", str(target)]},
+        )
         for name in bad
     ]
     changes += [
-        (f"{config}.cfg.{key}", "${oc.env:HOME}/x")
+        (f"{config}.settings.{key}", "${oc.env:HOME}/x")
         for key in ("scene.cache", "scene.path", "prior.law", "seed")
     ]
     changes += [
         (f"{config}.{key}", ...)
         for key in (
-            "cfg",
+            "settings",
             "world",
             "density",
             "dx",
             "frame_dt",
-            "cfg.prior",
-            "cfg.adapter",
-            "cfg.simulation",
-            "cfg.heterogeneity",
+            "settings.prior",
+            "settings.adapter",
+            "settings.simulation",
+            "settings.heterogeneity",
             "world.gravity",
             "world.box",
         )
     ]
-    changes += [
-        (key, ...)
-        for key in ("mosa", "state_dict", "mosa.config", "mosa.start", "mosa.start.rotation")
-    ]
+    changes += [(key, ...) for key in ("mosa", "state_dict", "mosa.start", "mosa.start.rotation")]
     changes += [
         (f"{config}.{key}", value)
-        for key in ("density", "dx", "frame_dt", "world.ground.height")
+        for key in ("density", "dx", "frame_dt", "ground.height")
         for value in (math.nan, math.inf, "a", True, [1])
     ]
     changes += [
-        ("mosa.losses", Touch(target)),
-        ("mosa.losses", bytearray(9)),
-        ("mosa.losses", {1, 2}),
+        ("mosa.fit.losses", Touch(target)),
+        ("mosa.fit.losses", bytearray(9)),
+        ("mosa.fit.losses", {1, 2}),
     ]
     for key, value in changes:
         yield (

@@ -24,12 +24,13 @@ from attacks import ROOT, WORLD, Attack, composed, cube, put, refuse, stored
 from attacks_on_calls import configured
 from attacks_on_data import capture
 from hydra import compose, initialize_config_dir
-from mosa.config.idle import idle
-from mosa.config.known import check_known
 from omegaconf import OmegaConf
 
 from mosa.cli.experiment import arguments, run
 from mosa.config.build import rehearse
+from mosa.config.commands import TrainSettings
+from mosa.config.effects import sentences
+from mosa.config.leaf_commands import COMMANDS
 from mosa.data.formats.export import export_pacnerf, export_particles
 from mosa.data.scene import load_scene
 from mosa.data.sequences import load_sequences
@@ -761,7 +762,7 @@ def commands(_: Path) -> Iterator[Attack]:
     for name in known:
         yield (
             f"{name}: foo",
-            lambda n=name: check_known(other(n, *required[n]) | {"foo": 1}, ROOT / "conf", n),
+            lambda n=name: COMMANDS[n].read(other(n, *required[n]) | {"foo": 1}),
         )
 
 
@@ -835,7 +836,7 @@ def idle_keys(_: Path) -> Iterator[Attack]:
 
         def attack(overrides=tuple(overrides)):
             values = composed(*overrides)
-            for sentence in idle(overrides, values, rehearse(values)):
+            for sentence in sentences(overrides, TrainSettings.read(values), rehearse(values)):
                 refuse(sentence)
 
         yield " ".join(overrides), attack

@@ -31,8 +31,9 @@ import mosa
 from mosa.config.build import (
     build_body,
     build_stages,
-    build_world,
+    world_of,
 )
+from mosa.config.record import BodyRecord
 from mosa.data.synthetic import BOX
 from mosa.data.synthetic.bodies.objects import BuiltinObject, object_named
 from mosa.data.synthetic.bodies.shapes import SHAPES
@@ -161,10 +162,12 @@ def learner_of(
     n, reach = len(rest), body.reach or BOX[1][0]
     world = {"ground": {"height": 0.0, "mode": "sticky"}, "gravity": list(GRAVITY), "up": [0.0, 1.0, 0.0],
              "box": [[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]]}  # fmt: skip
-    config = {"cfg": cfg, "world": world, "density": body.material.density, "frame_dt": 1 / body.footage.fps,
-              "dx": grid_spacing(spacing, cfg["simulation"]["particles_per_cell"])}  # fmt: skip
+    record = BodyRecord(
+        settings=cfg, ground=world.pop("ground"), world=world, density=body.material.density, frame_dt=1 / body.footage.fps,
+        dx=grid_spacing(spacing, cfg["simulation"]["particles_per_cell"]),
+    )  # fmt: skip
     # made on the CPU, where a new field's waves are, and moved as a whole
-    made = build_body(config, {"rest": tensor(rest).cpu(), "volume": torch.full((n,), spacing**3), "colors": torch.zeros(n, 3),
+    made = build_body(record, {"rest": tensor(rest).cpu(), "volume": torch.full((n,), spacing**3), "colors": torch.zeros(n, 3),
                                "opacities": torch.ones(n), "covariances": torch.eye(3).expand(n, 3, 3)}).to(device)  # fmt: skip
     start = Start(
         torch.eye(3, device=device),
@@ -176,15 +179,15 @@ def learner_of(
         tensor(seen), torch.zeros(1, device=device), neighbourhood(tensor(rest))
     )
     contact = first_contact(truth, spacing)
-    take = Take(start, None, cues, config["frame_dt"], contact)
+    take = Take(start, None, cues, record.frame_dt, contact)
     return SimpleNamespace(
         object=body,
         body=made,
-        world=build_world(world),
+        world=world_of(record),
         take=take,
         cfg=cfg,
         truth=tensor(truth),
-        config=config,
+        record=record,
     )
 
 
@@ -242,7 +245,7 @@ def fit(
     away = calibration.rollout(body, 0).x[contact:] - case.truth[contact:]
     return {
         "scene": case.name, "law": body.material.law, "set": more, "particles": len(body.rest),
-        "dx": case.config["dx"], "seed": seed, "noise": noise, "parameters": {
+        "dx": case.record.dx, "seed": seed, "noise": noise, "parameters": {
             name: {"true": true, "start": searched[name], "found": found[name],
                    "error": identification_errors(name, found[name], true)[f"{name}_relative_error"],
                    "sd": said.get(f"posterior/{name}_relative_sd", said.get(f"posterior/{name}_sd")),

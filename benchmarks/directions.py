@@ -222,8 +222,8 @@ def fit(
     body, take = case.body, case.take
     takes = [take, *(further(case, motion_of(path, drop), noise, np.random.default_rng([seed, 12, i]))
                      for i, drop in enumerate(drops) if drop != "train")]  # fmt: skip
-    module = LitMosa.from_config(
-        case.config, body, takes=takes, background=torch.ones(3, device=device)
+    module = LitMosa.from_record(
+        case.record, body, takes=takes, background=torch.ones(3, device=device)
     )
     calibrated = module.identifying(module.stages[0])
     calibrated.search()

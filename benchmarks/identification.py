@@ -25,6 +25,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from mosa.config.build import build_body
+from mosa.config.record import BodyRecord
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.evaluation.evaluate import true_motion
 from mosa.evaluation.floor import floor_rollout, hidden_of
@@ -96,7 +97,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
                 for part in dataclasses.fields(Response)
             }
     problem = {
-        "config": made.data.measured, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
+        "record": made.data.measured.plain(), "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
         "factor": hidden.factor(body.rest.cpu().float()),
     }  # fmt: skip
@@ -127,13 +128,12 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
     """The module that fits the body of a problem with the law and the settings of `overrides`, and its sequences."""
     problem = torch.load(path, weights_only=True)
     cfg = OmegaConf.to_container(configuration(overrides), resolve=True)
-    config = problem["config"] | {
-        "cfg": problem["config"]["cfg"] | {name: cfg[name] for name in LAW}
-    }
+    record = BodyRecord.read(problem["record"])
+    record = record.but(settings=record.settings | {name: cfg[name] for name in LAW})
     n = len(problem["rest"])
     tensors = {"rest": problem["rest"], "volume": problem["volume"], "colors": torch.zeros(n, 3), "opacities": torch.ones(n),
                "covariances": torch.eye(3).expand(n, 3, 3).clone()}  # fmt: skip
-    body = build_body(config, tensors).to(device)
+    body = build_body(record, tensors).to(device)
     takes = []
     for own in problem["sequences"].values():
         own["start"] = Start.read(own["start"], body.rest)
@@ -150,7 +150,7 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
                     response=kept and Response(**{k: v.to(device) for k, v in kept.items()}),
                 )
             )
-    module = LitMosa.from_config(config, body, takes=takes, background=torch.ones(3, device=device))
+    module = LitMosa.from_record(record, body, takes=takes, background=torch.ones(3, device=device))
     return SimpleNamespace(problem=problem, module=module, body=body)
 
 

@@ -79,7 +79,7 @@ def fit(path: Path, overrides: list[str], device: str) -> dict:
 
     case = learned(None)
     train = problem["sequences"]["train"]
-    twin = Twin(case.body, case.module.world, train["frame_dt"], problem["config"], Start.read(train["start"], case.body.rest),
+    twin = Twin(case.body, case.module.world, train["frame_dt"], case.module.record, Start.read(train["start"], case.body.rest),
                 case.joint.posterior())  # fmt: skip
     gains = {
         each.rotation: each.gain for each in plan(twin, count=count + 1, frames=train["frames"])

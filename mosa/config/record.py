@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from annotated_types import Interval
-from pydantic import AfterValidator, AllowInfNan, model_validator
+from pydantic import AllowInfNan, BeforeValidator, model_validator
 from torch import Tensor
 
 from mosa.config.commands import BodySections
@@ -100,12 +100,12 @@ Responses = Annotated[
 ]  # fmt: skip
 
 
-def sequence_names(starts: dict[str, Any]) -> dict[str, Any]:
+def sequence_names(starts: Any) -> Any:
     """They name entries of the files that are written. Errors: ConfigError."""
-    for name in starts:
-        if re.fullmatch(r"(train|test)(/[\w-]+)?", name) is None:
+    for name in starts if isinstance(starts, Mapping) else ():
+        if re.fullmatch(r"(train|test)(/[\w-]+)?", str(name)) is None:
             raise ConfigError(
-                f"mosa.starts: expected names like train or test/<sequence>, found {name[:80]!r}"
+                f"mosa.starts: expected names like train or test/<sequence>, found {str(name)[:80]!r}"
             )
     return starts
 
@@ -114,7 +114,7 @@ class GroundRecord(Settings):
     """The ground that the body met: the scene's, or with mode auto the one that the fit decided on."""
 
     height: Number
-    mode: Literal["sticky", "slip", "separate", "touch", "auto"]
+    mode: Literal["sticky", "slip", "separate", "touch", "auto"] = "sticky"
     friction: Weight = 0.0
 
 
@@ -150,7 +150,7 @@ class BodyRecord(Settings):
     density: Annotated[float, Interval(ge=0.1, le=1e5)]
     dx: Annotated[float, Interval(ge=1e-6, le=100)]
     frame_dt: Annotated[float, Interval(ge=1e-6, le=100)]
-    starts: Annotated[dict[str, StartRecord], AfterValidator(sequence_names)] = {}
+    starts: Annotated[dict[str, StartRecord], BeforeValidator(sequence_names)] = {}
     data: Section = {}
 
     @property

@@ -17,6 +17,7 @@ from mosa.baselines.nclaw import NeuralLaw, invariants, matrix_of, polar_rotatio
 from mosa.baselines.neuma import LowRankLaw
 from mosa.baselines.pair_dynamics import Frame
 from mosa.config.build import build_body
+from mosa.config.record import BodyRecord
 from mosa.errors import ConfigError
 from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.body import Body
@@ -333,7 +334,11 @@ def test_the_file_lists_the_arguments_with_their_defaults(name):
 def test_a_body_that_is_built_again_and_loaded_moves_alike(name):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", overrides=["debug=default", f"adapter={name}", "prior=neo_hookean"])
-    config = {"cfg": OmegaConf.to_container(cfg, resolve=True), "density": 1000.0, "dx": DX}
+    world = {"gravity": [0, -9.8, 0], "up": [0, 1, 0], "box": [[-1, -1, -1], [1, 1, 1]]}
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    record = BodyRecord(
+        settings=settings, ground=None, world=world, density=1000.0, dx=DX, frame_dt=0.02
+    )
     rest = lattice().float()
     n = len(rest)
     tensors = {
@@ -343,10 +348,10 @@ def test_a_body_that_is_built_again_and_loaded_moves_alike(name):
         "opacities": torch.ones(n),
         "covariances": 1e-4 * torch.eye(3).expand(n, 3, 3),
     }
-    first = build_body(config, tensors)
+    first = build_body(record, tensors)
     first.adapter.switch_on(E, NU)
     randomise(first.adapter, 0.1)
-    again = build_body(config | {"cfg": config["cfg"] | {"seed": 7}}, tensors)
+    again = build_body(record.but(settings=settings | {"seed": 7}), tensors)
     again.load_state_dict(first.state_dict())
     with torch.no_grad():
         here, there = (

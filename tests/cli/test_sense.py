@@ -23,14 +23,14 @@ from tests.modules.body.test_world import twin
 
 @pytest.mark.parametrize("section, key, value, message", [
     ("world", "gravity", [0, 9.8, 0], "world.gravity: expected a pull against up"),
-    ("world", "ground", {"height": 1e9}, "world.ground.height: expected a ground inside of the box"),
+    (None, "ground", {"height": 1e9}, "mosa.ground.height: expected a ground inside of the box"),
     ("world", "box", [[-1e9] * 3, [1e9] * 3], "a box within 100000 m"),
     (None, "density", 1e30, "density: expected a number of at least 0.1 and at most 100000"),
     (None, "frame_dt", 1e-9, "frame_dt: expected a number of at least 1e-06"),
 ])  # fmt: skip
 def test_a_strangers_world_holds_together(tmp_path, section, key, value, message):
     def change(stored):
-        config = stored["mosa"]["config"]
+        config = stored["mosa"]
         (config if section is None else config[section])[key] = value
 
     with pytest.raises(DataError, match=message):
@@ -64,14 +64,14 @@ def test_a_strangers_body_can_be(tmp_path, name, change, message):
 )
 def test_a_run_without_a_built_in_scene_has_no_truth(tmp_path, scene, error):
     def change(stored):
-        cfg = stored["mosa"]["config"]["cfg"]
+        cfg = stored["mosa"]["settings"]
         cfg.pop("scene", None)
         if scene is not ...:
             cfg["scene"] = scene
 
     with pytest.raises(
         error,
-        match=r"cfg\.scene|expected learned or isotropic for a run on a scene of format transforms",
+        match=r"settings\.scene|mosa\.settings|expected learned or isotropic for a run on a scene of format transforms",
     ):
         simulator_named("truth", checkpoint(tmp_path / "bad.ckpt", change=change))
 

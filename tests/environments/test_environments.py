@@ -501,21 +501,21 @@ def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
 
 def test_a_checkpoint_that_does_not_say_its_scene_is_named(monkeypatch):
     """One line that names file and field; with a scene that is named it is not asked."""
-    learned = SimpleNamespace(config={"cfg": {}})
+    learned = SimpleNamespace(record=SimpleNamespace(settings={}))
     monkeypatch.setattr(arenas.Twin, "load", lambda *a: learned)
     with pytest.raises(
         DataError,
-        match=r"old\.ckpt: cfg\.scene: expected the scene that the twin was learned from, found none",
+        match=r"old\.ckpt: settings\.scene: expected the scene that the twin was learned from, found none",
     ):
         simulator_named("truth", "old.ckpt")
     for scene, error, message in (
-        ({"format": "builtin"}, DataError, r"old\.ckpt: cfg\.scene\.name: expected the name"),
+        ({"format": "builtin"}, DataError, r"old\.ckpt: settings\.scene\.name: expected the name"),
         ({"format": "transforms", "name": "x"}, ConfigError, "truth is known for built-in"),
     ):
-        learned.config["cfg"]["scene"] = scene
+        learned.record.settings["scene"] = scene
         with pytest.raises(error, match=message):
             simulator_named("truth", "old.ckpt")
-    learned.config.clear()
+    learned.record.settings.clear()
     assert (
         len(simulator_named("truth", "old.ckpt", scene="tiny", spacing=0.03).twin.body.rest) < 300
     )
@@ -553,14 +553,15 @@ def test_the_truths_jobs_do_not_wait_for_a_twin(tmp_path, monkeypatch):
     checkpoint = tmp_path / "last.ckpt"
     checkpoint.write_bytes(b"a twin")
     bench = small_bench(tmp_path, monkeypatch, checkpoint=str(checkpoint), scene=None)
-    bench.simulator("learned").twin.config["cfg"] = {"scene": {"format": "builtin", "name": "tiny"}}
+    settings = bench.simulator("learned").twin.record.settings
+    settings["scene"] = {"format": "builtin", "name": "tiny"}
     made, record = [], study._record
     monkeypatch.setattr(
         study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed)
     )
     study.table(bench, ["learned", "truth"], [0], tmp_path, filmed=0)
     assert made == ["learned"]
-    bench.simulator("learned").twin.config["cfg"]["scene"]["seed"] = 3
+    settings["scene"]["seed"] = 3
     with pytest.raises(
         DataError,
         match=r"pushing_truth_0.json: expected a job of the same setting, .*'seed': 0.*'seed': 3",

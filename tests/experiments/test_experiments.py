@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from made_up import CONF, NAMES, PAPER, experiment, made_up, write_metrics
-from mosa.config.keys import EVALUATION, TRAINING
-from mosa.schema import check
 from omegaconf import OmegaConf
 
 from mosa.cli.experiment import arguments, run, run_counted, shown
@@ -66,7 +64,6 @@ def test_every_option_of_every_experiment_composes_and_passes_the_checks_before_
             config = OmegaConf.to_container(
                 compose("train", overrides=list(overrides)), resolve=False
             )
-            check(config, TRAINING, EVALUATION)
             rehearse(config)
 
 

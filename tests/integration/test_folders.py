@@ -143,7 +143,8 @@ def test_eval_finds_the_folders_again(run, tmp_path, monkeypatch):
         pipeline.evaluate_checkpoint(cfg)
     body, stored = seen["body"], np.load(run / "rollout.npz")
     named = [("train", "train"), ("train/test_60", "test_60"), ("test/second", "second")]
-    found = run_sequences(Twin.load(run / "checkpoints" / "last.ckpt").config, body)
+    record = Twin.load(run / "checkpoints" / "last.ckpt").record.plain()
+    found = run_sequences(record["settings"]["scene"], record["starts"], body)
     for sequences in (seen["sequences"], found):
         assert [(s.prefix, s.scene.sequence) for s in sequences] == named
         for each in sequences:

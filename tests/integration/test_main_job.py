@@ -291,7 +291,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
             time.sleep(0.02)
             if (
                 checkpoint.exists()
-                and torch.load(checkpoint, weights_only=True)["mosa"]["steps_done"] >= 2
+                and torch.load(checkpoint, weights_only=True)["mosa"]["fit"]["steps_done"] >= 2
             ):
                 break
         assert process.poll() is None, (
@@ -312,7 +312,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
     )
     whole = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     resumed = torch.load(checkpoint, weights_only=True)
-    assert whole["mosa"]["steps_done"] == resumed["mosa"]["steps_done"]
+    assert whole["mosa"]["fit"]["steps_done"] == resumed["mosa"]["fit"]["steps_done"]
     for key, value in whole["state_dict"].items():
         assert torch.equal(value, resumed["state_dict"][key]), key
     figures, expected = (

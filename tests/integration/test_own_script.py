@@ -99,7 +99,7 @@ def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
         float(trainer.callback_metrics["val/loss"]), rel=1e-6
     )
     assert not {"trainer", "callbacks", "logger"} & set(
-        theirs["mosa"]["config"]["cfg"]
+        theirs["mosa"]["settings"]
     )  # what it holds is data
 
 

@@ -66,13 +66,12 @@ def test_a_fit_goes_on_from_its_own_checkpoint_alone(tmp_path):
 
 
 def going_on(**changes):
-    """A checkpoint's content that a fit can go on from, with parts of `mosa` in the place of its own."""
+    """A checkpoint's content that a fit can go on from, with parts of its fit in the place of its own."""
     stored = {"epoch": 0, "global_step": 0, "pytorch-lightning_version": "2", "loops": {}, "callbacks": {}, "optimizer_states": [],
               "lr_schedulers": [], "state_dict": {}}  # fmt: skip
-    return stored | {
-        "mosa": {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7, "misfit": 0.01}
-        | changes
-    }
+    known = saved()["mosa"]
+    fit = {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7, "misfit": 0.01} | changes
+    return stored | {"mosa": known | {"fit": fit}}
 
 
 RUNNING = {
@@ -87,22 +86,25 @@ CUES = torch.zeros(5, 7, 3)
 
 def test_what_a_fit_goes_on_from_is_checked_whole():
     check_resumed(going_on(), "a.ckpt")
-    check_resumed(going_on(cues=[CUES], identification=RUNNING, compared=None), "a.ckpt")
+    check_resumed(
+        going_on(cues=[CUES], identification=RUNNING, compared={}, grounds={"slip": math.inf}),
+        "a.ckpt",
+    )
 
 
 @pytest.mark.parametrize("changes, message", [
-    *((dict(cues=value), r"mosa\.cues: expected null, or for each sequence finite positions of shape \(T, N, 3\)") for value in (
+    *((dict(cues=value), r"mosa\.fit\.cues: expected null, or for each sequence finite positions of shape \(T, N, 3\)") for value in (
         5, "a", {"train": CUES}, [5], ["a"], [CUES[0]], [CUES.long()], [CUES * math.nan], [CUES[..., :2]])),
-    (dict(identification=5), r"mosa\.identification: expected a section"),
-    (dict(identification={}), r"mosa\.identification: expected the parts"),
-    (dict(identification=RUNNING | {"iteration": "a"}), r"mosa\.identification\.iteration: expected a whole number"),
-    (dict(identification=RUNNING | {"factors": [math.nan]}), r"mosa\.identification\.factors: expected numbers above 0"),
-    (dict(identification=RUNNING | {"multiple": math.inf}), r"mosa\.identification\.multiple: expected a number"),
-    (dict(identification=RUNNING | {"noise": [[5]]}), r"mosa\.identification\.noise: expected null, or for each rollout"),
-    (dict(identification=RUNNING | {"grid": [[CUES * math.nan] * 3]}), r"mosa\.identification\.grid: expected null, or"),
-    (dict(misfit="a"), r"mosa\.misfit: expected a number"), (dict(losses=[math.nan]), r"mosa\.losses: expected numbers"),
-    (dict(stage=None), r"mosa\.stage: expected a whole number"), (dict(compared=5), r"mosa\.compared: expected distances"),
-    (dict(compared={"corotated": 1.0}), r"mosa\.config\.cfg\.prior\.law: expected the law"),
+    (dict(identification=5), r"mosa\.fit\.identification: expected a section of keys, or null"),
+    (dict(identification={}), r"mosa\.fit\.identification\.iteration: expected this key, found none"),
+    (dict(identification=RUNNING | {"iteration": "a"}), r"mosa\.fit\.identification\.iteration: expected a whole number"),
+    (dict(identification=RUNNING | {"factors": [math.nan]}), r"mosa\.fit\.identification\.factors: expected numbers above 0"),
+    (dict(identification=RUNNING | {"multiple": math.inf}), r"mosa\.fit\.identification\.multiple: expected a number"),
+    (dict(identification=RUNNING | {"noise": [[5]]}), r"mosa\.fit\.identification\.noise: expected null, or for each rollout"),
+    (dict(identification=RUNNING | {"grid": [[CUES * math.nan] * 3]}), r"mosa\.fit\.identification\.grid: expected null, or"),
+    (dict(misfit="a"), r"mosa\.fit\.misfit: expected a number"), (dict(losses=[math.nan]), r"mosa\.fit\.losses: expected numbers"),
+    (dict(stage=None), r"mosa\.fit\.stage: expected a whole number"), (dict(compared=5), r"mosa\.fit\.compared: expected numbers by name"),
+    (dict(compared={"corotated": 1.0}), r"mosa\.law: expected the law that was chosen"),
 ])  # fmt: skip
 def test_a_damaged_state_of_a_fit_is_named(changes, message):
     with pytest.raises(DataError, match=message):
@@ -125,17 +127,21 @@ class Model:
         return self.stored
 
 
+def with_fit(stored, **changes):
+    return {**stored, "mosa": stored["mosa"] | {"fit": stored["mosa"]["fit"] | changes}}
+
+
 def test_a_checkpoint_of_another_model_is_named(tmp_path):
     stored = read_checkpoint(checkpoint(tmp_path / "a.ckpt"))
     check_same(stored, Model(), "a.ckpt")
     with pytest.raises(DataError, match=r"body\.adapter.*belongs to another configuration"):
         check_same(stored, Model("adapter=direct"), "a.ckpt")
     with pytest.raises(DataError, match="expected a body of 27 particles, found 28"):
-        check_same({**stored, "mosa": stored["mosa"] | {"particles": 28}}, Model(), "a.ckpt")
+        check_same(with_fit(stored, particles=28), Model(), "a.ckpt")
     with pytest.raises(
-        DataError, match=r"mosa\.stage: expected at most 3, the stages of this fit, found 4"
+        DataError, match=r"mosa\.fit\.stage: expected at most 3, the stages of this fit, found 4"
     ):
-        check_same({**stored, "mosa": stored["mosa"] | {"stage": 4}}, Model(), "a.ckpt")
+        check_same(with_fit(stored, stage=4), Model(), "a.ckpt")
     rest = stored["state_dict"]["body.rest"]
     for wrong, message in ((rest.long(), "of whole numbers"), (rest * math.nan, "finite")):
         with pytest.raises(DataError, match=rf"body\.rest: .*{message}"):

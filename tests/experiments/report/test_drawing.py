@@ -201,7 +201,7 @@ def test_the_factors_of_all_bodies_have_one_range_about_one(tmp_path, monkeypatc
     factors = {"a": 1 + 0.1 * rest[:, 0], "b": 1 + 0.6 * rest[:, 1]}
     model = SimpleNamespace(heterogeneity=None)
     twins = [SimpleNamespace(body=SimpleNamespace(rest=rest, heterogeneity=True, model=lambda: model, factor=lambda _, f=f: f),
-                             config={"cfg": {"scene": {"name": "other"}}})
+                             record=SimpleNamespace(settings={"scene": {"name": "other"}}))
              for f in (factors[record.place["scene"].name] for record in records)]  # fmt: skip
     monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
     drawn = []
@@ -232,7 +232,8 @@ def test_the_rounding_of_an_isotropic_law_is_no_curve_and_a_response_of_zero_is_
     }
     twins = [
         SimpleNamespace(
-            body=record.place["scene"].name, config={"cfg": {"scene": {"name": "rabbit"}}}
+            body=record.place["scene"].name,
+            record=SimpleNamespace(settings={"scene": {"name": "rabbit"}}),
         )
         for record in records
     ]

@@ -1,12 +1,12 @@
 """Adaptive substeps of a learned body: from the configuration to the twin."""
 
-import copy
 import math
 
 import pytest
 import torch
 
 from mosa.config.build import build_body, build_world
+from mosa.config.record import BodyRecord
 from mosa.errors import ConfigError
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.modules.adapters.stress import StressAdapter
@@ -124,8 +124,11 @@ def test_the_configuration_reaches_the_body():
                   "min_substeps": 3}  # fmt: skip
     cfg = {"seed": 0, "simulation": simulation, "prior": {"law": "newtonian", "parameters": {"mu": 100.0, "kappa": 1e5}},
            "heterogeneity": {"enabled": False}, "adapter": {}}  # fmt: skip
-    config = {"cfg": cfg, "dx": 0.06, "density": 1000.0}
-    body = build_body(config, tensors())
+    world = {name: WORLD[name] for name in ("gravity", "up", "box")}
+    record = BodyRecord(
+        settings=cfg, ground=WORLD["ground"], world=world, dx=0.06, density=1000.0, frame_dt=0.03
+    )
+    body = build_body(record, tensors())
     assert body.settings.adaptive and body.settings.min_substeps == 3
     start = twin().training_start
     with pytest.raises(
@@ -133,6 +136,3 @@ def test_the_configuration_reaches_the_body():
         match=r"simulation\.max_substeps: expected at least 2\d for frame 1, found 20.*simulation\.dx",
     ):
         body.simulate(start, build_world(WORLD), 3, 0.03)
-    old = copy.deepcopy(config)  # of a checkpoint from before
-    del old["cfg"]["simulation"]["adaptive"], old["cfg"]["simulation"]["min_substeps"]
-    assert not build_body(old, tensors()).settings.adaptive

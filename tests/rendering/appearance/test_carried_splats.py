@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from strangers import N, checkpoint, cube, saved
 
 from mosa.config.build import build_body
+from mosa.config.record import RunRecord
 from mosa.errors import DataError
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
@@ -44,7 +45,7 @@ def appearance(count: int = 40, degree: int = 1, light: bool = True, seed: int =
 
 
 def body_with(found: Appearance | None):
-    body = build_body(saved()["mosa"]["config"], cube())
+    body = build_body(RunRecord.read(saved()["mosa"]), cube())
     body.splats = None if found is None else CarriedSplats(found, body.rest)
     return body
 

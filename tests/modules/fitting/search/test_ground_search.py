@@ -8,6 +8,7 @@ import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
 from mosa.config.checkpoints import check_resumed
+from mosa.config.record import BodyRecord
 from mosa.errors import DataError, SimulationDiverged
 from mosa.evaluation.analysis.tables import (
     determined_text,
@@ -265,12 +266,18 @@ def test_another_friction_is_sought_downhill(truth, expected):
     assert most == pytest.approx(gain(friction)) and (most > 0) == (truth != 0.6)
 
 
+def sought(body) -> BodyRecord:
+    """Of a run whose ground is sought."""
+    ground = Ground(0.0, "sticky")
+    return BodyRecord.of(body, world(ground), 0.02, start()).on(replace(ground, mode=AUTO))
+
+
 def fit_of(take, **changed) -> LitMosa:
     """A calibration of a body whose ground is sought, as a run has it."""
     body = small_body(adapter=False, E=1.7 * E, nu=0.3)
-    config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
+    record = sought(body)
     stage = Stage(name="prior", iterations=1, lr=0.1).but(optimizer="gauss_newton", **changed)
-    return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
+    return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), record=record,
                    weights={"position": 1.0}, stages=[stage])  # fmt: skip
 
 
@@ -287,18 +294,18 @@ def test_a_run_goes_on_with_the_ground_that_it_found():
     assert (
         not module.ground_is_sought
         and module.world.ground == truth
-        and module.config["world"]["ground"] == asdict(truth)
+        and module.record.ground.plain() == asdict(truth)
     )
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
-    assert checkpoint["mosa"]["grounds"]["separate_0.3"] == min(
-        checkpoint["mosa"]["grounds"].values()
+    assert checkpoint["mosa"]["fit"]["grounds"]["separate_0.3"] == min(
+        checkpoint["mosa"]["fit"]["grounds"].values()
     )
     again = fit_of(take)
     again.on_load_checkpoint(checkpoint)
     assert (
         again.world.ground == truth
-        and again.config["world"]["ground"] == asdict(truth)
+        and again.record.ground.plain() == asdict(truth)
         and again.grounds == module.grounds
     )
 
@@ -310,13 +317,13 @@ def learning(truth: Ground) -> LitMosa:
     numbers = torch.linspace(-0.02, 0.03, 19, dtype=torch.float64)
     take = take_of(small_body(numbers=numbers), begins, FRAMES, world(truth))
     take.again = None
-    config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
+    body = small_body(E=1.2 * E, nu=0.3, on=False)
     stages = [
         Stage(name=name, iterations=8, lr=0.1).but(optimizer="gauss_newton")
         for name in ("prior", "joint")
     ]
-    return LitMosa.of_parts(small_body(E=1.2 * E, nu=0.3, on=False), takes=[take], world=world(Ground(0.0, "sticky")),
-                   background=torch.ones(3), config=config, weights={"position": 1.0}, stages=stages,
+    return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")),
+                   background=torch.ones(3), record=sought(body), weights={"position": 1.0}, stages=stages,
                    criterion=Criterion(name="corrected"), settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
 
 
@@ -355,7 +362,7 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
     assert (
-        checkpoint["mosa"]["ground_gains"] == gains
+        checkpoint["mosa"]["fit"]["ground_gains"] == gains
     )  # so that a fit that goes on does not begin again once more
 
 
@@ -375,9 +382,9 @@ def test_a_fit_goes_to_a_friction_that_is_a_little_better(monkeypatch):
     module.identify()
     best = max(module.ground_gains, key=module.ground_gains.get)
     assert best == "separate_0.5" and 0 < module.ground_gains[best] and len(begun) == 2
-    assert module.world.ground.friction == pytest.approx(0.5) and module.config["world"][
-        "ground"
-    ] == asdict(module.world.ground)
+    assert module.world.ground.friction == pytest.approx(
+        0.5
+    ) and module.record.ground.plain() == asdict(module.world.ground)
     numbers = read_numbers(module.body)
     assert torch.allclose(module.posterior.mean.to(numbers), numbers)
 
@@ -513,10 +520,7 @@ def test_adam_takes_a_body_that_sticks_and_says_so():
         UserWarning, match="scene.ground.mode: auto asks for fit.prior.optimizer=gauss_newton"
     ):
         module.begin(stage)
-    assert (
-        module.world.ground == Ground(0.0, "sticky")
-        and module.config["world"]["ground"]["mode"] == "sticky"
-    )
+    assert module.world.ground == Ground(0.0, "sticky") and module.record.ground.mode == "sticky"
 
 
 @pytest.mark.parametrize("ground, message", [
