@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mosa.config.record import VERSION, BodyRecord, RunRecord, SplatsRecord
 from mosa.errors import ConfigError, DataError
-from mosa.settings import check
 from mosa.system.limits import machine_memory
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
@@ -198,10 +197,9 @@ def check_numbers(record: RunRecord, count: int, path: str | Path) -> None:
 def checked_splats(found: Any, path: str | Path) -> dict[str, Tensor] | None:
     """What `CarriedSplats.read` takes, of a file beside a rollout; None where there is none. Errors: DataError."""
     try:
-        check("splats", found, SplatsRecord | None)
+        return None if found is None else SplatsRecord.read(found, "splats").plain()
     except ConfigError as error:
-        raise DataError(f"{path}: {str(error).partition(', found')[0]}") from error
-    return found
+        raise DataError(f"{path}: {error}") from error
 
 
 def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
@@ -292,7 +290,7 @@ def check_same(
     count = len(here["body.rest"])
     if record.fit.particles != count:
         raise DataError(
-            f"ckpt_path: {path}: expected a body of {count} particles, found {checkpoint['mosa']['particles']}: the "
+            f"ckpt_path: {path}: expected a body of {count} particles, found {record.fit.particles}: the "
             "checkpoint belongs to another scene, reconstruction or simulation.particles"
         )
     for name in sorted(set(here) | set(there)):

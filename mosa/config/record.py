@@ -266,27 +266,45 @@ class FitRecord(Settings):
     responses: Responses = None
 
 
-def are_splats(found: Any) -> bool:
-    """What `CarriedSplats.read` takes, of at most as many splats as memory holds."""
-    if not isinstance(found, Mapping) or set(found) != {*SPLATS, "harmonics", "light"}:
-        return False
-    means = found["means"]
-    count = len(means) if isinstance(means, Tensor) and means.ndim else 0
-    shapes = {name: [(count, *shape)] for name, shape in SPLATS.items()}
-    shapes |= {"harmonics": [(count, k, 3) for k in DEGREES], "light": [(LIGHT,)]}
-    return (
-        0 < count <= machine_memory() // (2 * BOUND_BYTES)
-        and all(finite(found[name], *shape) for name, shape in shapes.items())
-        and float(found["scales"].min()) > 0
-        and all(float(found[name].norm(dim=1).min()) for name in ("rotations", "normals"))
-        and 0 <= float(found["opacities"].min()) <= float(found["opacities"].max()) <= 1
-    )
+class SplatsRecord(Settings):
+    """M splats that the body carries, as `CarriedSplats.read` takes them."""
 
+    where: ClassVar[str] = "mosa.splats"
 
-SplatsRecord = Annotated[
-    Any, Expected("finite tensors (M, ...) of means, scales above 0 m, rotations and normals that are not zero, opacities "
-    "from 0 to 1, colors, harmonics, and a light, at most as many as fill half of this machine's memory"), such(are_splats),
-]  # fmt: skip
+    means: Finite
+    scales: Finite
+    rotations: Finite
+    opacities: Finite
+    colors: Finite
+    normals: Finite
+    harmonics: Finite
+    light: Finite
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        count, most = (
+            len(self.means) if self.means.ndim else 0,
+            machine_memory() // (2 * BOUND_BYTES),
+        )
+        if not 0 < count <= most:
+            raise ConfigError(
+                f"mosa.splats.means: expected 1 to {most} splats, which take half of this machine's memory, found {count}"
+            )
+        shapes = {name: [(count, *shape)] for name, shape in SPLATS.items()}
+        shapes |= {"harmonics": [(count, k, 3) for k in DEGREES], "light": [(LIGHT,)]}
+        for name, allowed in shapes.items():
+            if not finite(getattr(self, name), *allowed):
+                raise ConfigError(
+                    f"mosa.splats.{name}: expected finite numbers of shape {' or '.join(map(str, allowed))}"
+                )
+        turned = (getattr(self, name).norm(dim=1).min() for name in ("rotations", "normals"))
+        if not float(self.scales.min()) > 0 or not all(map(float, turned)):
+            raise ConfigError(
+                "mosa.splats: expected scales above 0 m, quaternions and normals that are not zero"
+            )
+        if float(self.opacities.min()) < 0 or float(self.opacities.max()) > 1:
+            raise ConfigError("mosa.splats.opacities: expected numbers from 0 to 1")
+        return self
 
 
 class RunRecord(BodyRecord):

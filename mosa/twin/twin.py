@@ -94,7 +94,7 @@ class Twin:
             check_kinds(tensors, body.state_dict())
             body.load_state_dict(tensors)
             if record.splats is not None:
-                body.splats = CarriedSplats.read(record.splats, body.rest)
+                body.splats = CarriedSplats.read(record.splats.plain(), body.rest)
             world, start = world_of(record), Start.read(record.start.plain())
         except (
             Exception

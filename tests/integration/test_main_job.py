@@ -76,7 +76,7 @@ def run(tmp_path_factory, cache):
 def stepped(tmp_path_factory, cache):
     """A run of Adam in all stages, with steps of two cells of the contact offset."""
     folder = tmp_path_factory.mktemp("stepped")
-    adam = [f"+fit.{stage}.optimizer=adam" for stage in ("prior", "prior_eta", "joint")]
+    adam = [f"fit.{stage}.optimizer=adam" for stage in ("prior", "prior_eta", "joint")]
     result = call(
         "train.py",
         folder,

@@ -51,7 +51,7 @@ def test_a_step_that_cannot_be_simulated_is_taken_back_and_the_fit_goes_on(cache
 
 
 def test_without_a_step_to_take_back_the_fit_stops(cache):
-    run = made(cache, "adapter=direct", "heterogeneity.enabled=false", "+fit.prior.optimizer=adam")
+    run = made(cache, "adapter=direct", "heterogeneity.enabled=false", "fit.prior.optimizer=adam")
     run.module.descend = lambda *_: (_ for _ in ()).throw(SimulationDiverged("at its start"))
     with pytest.raises(SimulationDiverged, match="at its start"):
         trainer().fit(run.module, datamodule=run.data)

@@ -10,7 +10,7 @@ from assembled import assembled, made
 
 
 def test_a_step_descends_the_mean_over_the_sequences(cache):
-    run = made(cache, "+fit.prior.optimizer=adam", taught=["test_60"])
+    run = made(cache, "fit.prior.optimizer=adam", taught=["test_60"])
     module, batch = run.module, run.data.batch([0, 1])
     assert len(module.takes) == len(batch.sequences) == 2
     module.configure_optimizers()

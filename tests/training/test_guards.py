@@ -93,7 +93,7 @@ def test_what_a_fit_goes_on_from_is_checked_whole():
 
 
 @pytest.mark.parametrize("changes, message", [
-    *((dict(cues=value), r"mosa\.fit\.cues: expected null, or for each sequence finite positions of shape \(T, N, 3\)") for value in (
+    *((dict(cues=value), r"mosa\.fit\.cues: expected null, or for each sequence finite positions of shape") for value in (
         5, "a", {"train": CUES}, [5], ["a"], [CUES[0]], [CUES.long()], [CUES * math.nan], [CUES[..., :2]])),
     (dict(identification=5), r"mosa\.fit\.identification: expected a section of keys, or null"),
     (dict(identification={}), r"mosa\.fit\.identification\.iteration: expected this key, found none"),
@@ -102,8 +102,10 @@ def test_what_a_fit_goes_on_from_is_checked_whole():
     (dict(identification=RUNNING | {"multiple": math.inf}), r"mosa\.fit\.identification\.multiple: expected a number"),
     (dict(identification=RUNNING | {"noise": [[5]]}), r"mosa\.fit\.identification\.noise: expected null, or for each rollout"),
     (dict(identification=RUNNING | {"grid": [[CUES * math.nan] * 3]}), r"mosa\.fit\.identification\.grid: expected null, or"),
-    (dict(misfit="a"), r"mosa\.fit\.misfit: expected a number"), (dict(losses=[math.nan]), r"mosa\.fit\.losses: expected numbers"),
-    (dict(stage=None), r"mosa\.fit\.stage: expected a whole number"), (dict(compared=5), r"mosa\.fit\.compared: expected numbers by name"),
+    (dict(misfit="a"), r"mosa\.fit\.misfit: expected a number"), 
+    (dict(losses=[math.nan]), r"mosa\.fit\.losses: expected numbers"),
+    (dict(stage=None), r"mosa\.fit\.stage: expected a whole number"),
+    (dict(compared=5), r"mosa\.fit\.compared: expected numbers by name"),
     (dict(compared={"corotated": 1.0}), r"mosa\.law: expected the law that was chosen"),
 ])  # fmt: skip
 def test_a_damaged_state_of_a_fit_is_named(changes, message):

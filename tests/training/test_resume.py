@@ -94,7 +94,8 @@ def test_figures_of_runs_before_are_read(tmp_path):
 
 def trained(folder, figures=True, **changed):
     """A run folder whose checkpoint and figures are of a configuration, with `changed` in it; the configuration."""
-    cfg = OmegaConf.create({"resume": "auto", "ckpt_path": None, "seed": 0, "prior": {"law": "corotated", "parameters": {}}, "fit": {"views": 1},
+    cfg = OmegaConf.create({"resume": "auto", "ckpt_path": None, "seed": 0, "prior": {"law": "corotated", "parameters": {}},
+                            "fit": {"views": 1},
                             "scene": {"path": "/a/duck", "cache": None}, "evaluation": {"video": True}})  # fmt: skip
     (folder / "checkpoints").mkdir()
     stored = OmegaConf.to_container(OmegaConf.merge(cfg, OmegaConf.create(changed)))

@@ -57,7 +57,7 @@ KEYS = {
     "radius": Length, "length": Length, "size": told("three lengths above 0 [m]", numbers(3, lambda v: min(v) > 0)),
     "path": Text, "spacing": Length, "scale": Length,
     "margin": Annotated[float, Interval(ge=0, le=FARTHEST)],
-    "mode": Literal[MODES], "friction": Weight, "name": Text, "position": Three, "rotation": Turn,
+    "mode": Literal[tuple(MODES)], "friction": Weight, "name": Text, "position": Three, "rotation": Turn,
     "motion": Section, "normal": told("a non-zero vector of three finite numbers", numbers(3, any)),
 }  # fmt: skip
 MOTION = {

@@ -1,0 +1,100 @@
+"""The page of all settings, from their models:  python -m mosa.config.reference > docs/reference/configuration.md
+
+With the name of a command, and of a key, it says what that is:  python -m mosa.config.reference train fit.joint
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from mosa.config.leaf_commands import COMMANDS
+from mosa.settings import Settings, annotation_of, described, model_in
+
+HEAD = """# Configuration
+
+Every key of every command, with its default, what it may be, and what it is. Made by `python -m mosa.config.reference` from the models
+in `mosa/config/commands.py`, `mosa/config/leaf_commands.py` and beside the code that each section is for; a test keeps it true.
+`python -m mosa.config.reference train fit.joint` prints a part.
+
+A file of `conf/` says what it chooses beside these defaults; `key=value` on the command line and in `mosa.compose` changes any of them.
+A key under `adapter` is an argument of the adapter that is named, one under `scene` of the format's loader ([data.md](../data.md)).
+"""
+
+
+def default_of(f: FieldInfo) -> str:
+    found = f.get_default(call_default_factory=True)
+    if found is PydanticUndefined:
+        return "needed"
+    return (
+        "null" if found is None else str(found).lower() if isinstance(found, bool) else str(found)
+    )
+
+
+def rows(model: type[Settings], instance: Settings | None, where: str = "") -> Iterator[tuple[str, str, str, str]]:  # fmt: skip
+    """(key, default, expected, meaning) of all keys, those of sections under them."""
+    for name, f in model.model_fields.items():
+        kind, key = annotation_of(f), f"{where}{name}"
+        default = f.get_default(call_default_factory=True)
+        if instance is not None:
+            default = getattr(instance, name)
+        inner = model_in(kind)
+        if inner is not None and issubclass(inner, Settings):
+            yield key, "", "", str(f.description)
+            yield from rows(inner, default if isinstance(default, inner) else None, f"{key}.")
+            continue
+        shown = default_of(f) if instance is None else default_of(FieldInfo(default=default))
+        yield key, shown, described(kind), str(f.description)
+
+
+def arguments() -> Iterator[tuple[str, str, str, str]]:
+    """Of the adapters, and of `prior.options`."""
+    from mosa.modules.adapters.registry import ADAPTERS, adapter_class
+    from mosa.physics.engine.law_options import LawOptions
+    from mosa.settings import arguments_of
+
+    yield from rows(LawOptions, LawOptions(), "prior.options.")
+    for name in ADAPTERS:
+        if (build := adapter_class({"name": name})) is not None:
+            for key, default, kind, about in rows(arguments_of(build, "adapter"), None, "adapter."):
+                note = "" if about == "None" else f": {about}"
+                yield key, default, kind, f"name={name}{note}"
+
+
+def table(found: Iterator[tuple[str, str, str, str]]) -> str:
+    lines = ["| Key | Default | Expected | Meaning |", "|---|---|---|---|"]
+    for key, default, kind, about in found:
+        kind = kind.replace(" and at most 1000000000", "").replace(" and at most 1e+20", "")
+        cells = (f"`{key}`", f"`{default}`" if default else "", kind, about)
+        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+    return "\n".join(lines)
+
+
+def page() -> str:
+    parts = [HEAD.strip()]
+    for name, model in COMMANDS.items():
+        parts += [f"## {model.__doc__}", f"`conf/{name}.yaml`", table(rows(model, None))]
+    parts += ["## Options of a law and arguments of the adapters", table(arguments())]
+    return "\n\n".join(parts) + "\n"
+
+
+def main(words: list[str]) -> None:
+    if not words:
+        print(page(), end="")
+        return
+    if words[0] not in COMMANDS:
+        print(f"expected one of {', '.join(COMMANDS)}, found {words[0]}", file=sys.stderr)
+        sys.exit(2)
+    found = [*rows(COMMANDS[words[0]], None), *(arguments() if words[0] == "train" else ())]
+    for key, default, kind, about in found:
+        if len(words) == 1 or f"{key}.".startswith(f"{words[1]}."):
+            print(
+                f"{key}{f' = {default}' if default else ''}\n    {about}{f' ({kind})' if kind else ''}"
+            )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
