@@ -27,14 +27,14 @@ This page lists every table and figure of the paper that this program reproduces
 claims hold. Each section links to the page with its tables, the paper's printed figures, commit,
 seeds and machine. The paper's data were not released: the bodies here are simulated, so their
 true motion is known. `mosa-experiment --page` makes this page from `docs/results/` ([how to run
-the experiments](experiments.md)).
+the experiments](reproduce.md)).
 
-- **ours** is the default of this program (`adapter=operator`, [fitted](identification.md) by
+- **ours** is the default of this program (`adapter=operator`, [fitted](uncertainty.md) by
   Gauss-Newton).
 - **four networks (paper)** is the paper's adapter (`adapter=mosa`) with alpha = 0.1, as in its
   text. Two things differ from the paper: the correction of the stress is bounded
   (`adapter.l_max`) and vanishes at rest (`adapter.rest_free`). It learns for 40 steps. [The other
-  methods](experiments.md#methods-it-compares).
+  methods](reproduce.md#methods-compared).
 - **rms error** is the root mean square distance of particles from their true positions after
   first contact, on held-out drops unless said otherwise. **PSNR** and **SSIM** are those of a
   window around the body ([all metrics](figures.md), [glossary](glossary.md)).
