@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,44 @@ def test_figures_of_the_readme_are_those_of_the_files_that_it_names():
         assert figures and not [
             each for each in figures if not re.search(rf"(?<![\d.]){re.escape(each)}(?!\d)", text)
         ], sources
+
+
+@pytest.fixture(scope="module")
+def prose():
+    loader = SourceFileLoader("prose", str(ROOT / ".ci" / "prose"))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("prose", loader))
+    loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "What a run leaves",
+        "motions of the learned law, of its prior, what was seen, what is true where that is known",
+        "What is left is the corotated law's form, which is not the truth's, and the run knows it",
+        "none on the last three, but that chick2 made us widen eta's bound",
+        "A direction that one drop does not tell is named as such, and is not always wrong then.",
+        "A model below it has made up for a part of the grid's error.",
+        "What images do not say then speaks neither for nor against the prior.",
+        "Not seen: a focal length that is wrong in all cameras by less than a fifth",
+        "Nor is more to be had from more looks: after six the letter is where it was after three.",
+        "The jobs of what is named first begin first, of one word the longest.",
+        "With three cameras the stretch cue knows less than nothing.",
+        "Pushing cannot tell simulators apart, as whoever sees the body corrects what its law does.",
+        "The figures are of commit c80805f.",
+        "| check | asked |\n|---|---|\n| volume | 1.4 %, met |",
+        "| law | mm |\n|---|---|\n| prior | 0.87 / 2.84 |",
+        " ".join(["word"] * 41) + ".",
+    ],
+)
+def test_the_linter_finds_what_readers_read_twice(prose, tmp_path, monkeypatch, text):
+    monkeypatch.setattr(prose, "ROOT", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(text + "\n")
+    assert prose.findings(page)[0]
+    page.write_text("Run outputs are in one folder. The uncertainty covers 96 % of the errors.\n")
+    assert not prose.findings(page)[0]
 
 
 def test_commands_of_the_guides_name_options_that_exist():
