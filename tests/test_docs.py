@@ -1,5 +1,6 @@
 """README and docs: named files, links and sections exist, figures are those of their source, the site builds, ten stops."""
 
+import ast
 import importlib.util
 import re
 import subprocess
@@ -123,6 +124,28 @@ def test_commands_of_the_guides_name_options_that_exist():
         for group, option in named
         if option not in own and not (conf / group / f"{option}.yaml").is_file()
     ]
+
+
+def test_python_on_the_guides_imports_names_that_exist():
+    blocks = [
+        (page.name, block)
+        for page in PAGES
+        if page.parent != LAB
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    ]
+    imports = [
+        (page, node.module, name.name)
+        for page, block in blocks
+        for node in ast.walk(ast.parse(block))
+        if isinstance(node, ast.ImportFrom) and node.module.partition(".")[0] == "mosa"
+        for name in node.names
+    ]
+    assert len(imports) > 10
+    for page, module, name in imports:
+        place = ROOT.joinpath(*module.split("."))
+        source = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        assert source.is_file(), (page, module)
+        assert re.search(rf"\b{name}\b", source.read_text()), (page, module, name)
 
 
 @pytest.mark.slow
