@@ -95,7 +95,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
                 )
             )
         if provenance:
-            parts.append(f"[Tables]({results.name}/{name}.md); " + "; ".join(provenance) + ".")
+            parts.append(f"[Tables, seeds, machine and command]({results.name}/{name}.md)")
     beside = [
         f"[{read_title(page)}]({results.name}/{page.name})"
         for page in sorted(results.glob("*_from_motion.md"))
