@@ -1,4 +1,4 @@
-"""Measures the checks of docs/verification.md, writes its table and its plots.
+"""Measures the checks of docs/verification.md, writes their table (docs/results/verification.md) and plots.
 
     OMP_NUM_THREADS=1 MOSA_DATA=... python benchmarks/verification.py [--only bar,gradient] [--bar-cells 30]
 
@@ -482,7 +482,7 @@ def main() -> None:
         results[name] = bar(data, options.bar_cells) if name == "bar" else PARTS[name](data)
         store.write_text(json.dumps(results, indent=1))
         print(name, *(" | ".join(row) for row in results[name]), sep="\n  ", flush=True)
-    publish(results, ROOT / "docs" / "verification.md")
+    publish(results, ROOT / "docs" / "results" / "verification.md")
 
 
 def publish(results: dict[str, list[list[str]]], page: Path) -> None:

@@ -1,9 +1,7 @@
 """The rollout benchmark's check: ratios of times in one run against the stored ones."""
 
-import argparse
 import importlib
 import json
-import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -187,96 +185,6 @@ def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatc
     assert json.loads((tmp_path / "results" / "calibration_from_motion.json").read_text()) == [
         record
     ]
-
-
-def equal_run(folder, *, E: float, nu: float, moved: float, error: float):
-    """What a run leaves, as far as two are compared."""
-    folder.mkdir()
-    figures = {
-        "id/E": E,
-        "id/nu": nu,
-        "posterior/E_relative_sd": 0.1,
-        "posterior/nu_sd": 0.02,
-        "test/rms_m": error,
-    }
-    (folder / "metrics.json").write_text(json.dumps(figures | {"time/fit_s": 1.0}))
-    np.savez(
-        folder / "rollout.npz",
-        **{"train/x": np.full((3, 10, 3), moved), "train/v": np.zeros((3, 10, 3))},
-    )
-    np.savez(folder / "uncertainty.npz", **{"train/sd": np.full((3, 10), 0.004)})
-    return folder
-
-
-def test_two_equal_runs_are_compared_in_what_they_say_they_do_not_know(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    long_runs = importlib.import_module("long_runs")
-    one = equal_run(tmp_path / "a", E=1e5, nu=0.03, moved=0.0, error=0.01)
-    other = equal_run(tmp_path / "b", E=1.04e5, nu=0.04, moved=0.001, error=0.0102)
-    differ, compared = long_runs.apart(one, other)
-    assert set(differ) == {"id/E", "id/nu", "test/rms_m", "rollout.npz:train/x"}
-    far = {each.name: each.far for each in compared}
-    assert far == pytest.approx(
-        {"E": 0.4, "nu": 0.5, "test/rms_m": 0.02, "motion train/x": 0.001 * 3**0.5 / 0.004},
-        rel=1e-6,
-    )
-    assert [each.name for each in compared if each.far > each.bound] == ["nu"] == [compared[0].name]
-    assert long_runs.apart(one, one)[0] == [] and not any(
-        each.far for each in long_runs.apart(one, one)[1]
-    )
-    widened = (
-        1 + long_runs.SPREADS**2 / 2
-    ) ** 0.5  # of a standard deviation, by two runs that are so far apart
-    assert widened == pytest.approx(1 + long_runs.AGREE)
-
-
-def test_drawn_runs_are_counted_over_calls_and_compared_where_one_program_made_both(
-    monkeypatch, tmp_path
-):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    drawn_runs = importlib.import_module("drawn_runs")
-    assert drawn_runs.drawn(4, random.Random(0)) == drawn_runs.drawn(9, random.Random(0))[:4]
-    options = argparse.Namespace(runs=4, launched=1, kills=1)
-    monkeypatch.setattr(drawn_runs, "version", lambda: "one")
-    first = drawn_runs.Record(tmp_path / "record.json", {"seed": 0})
-    for k in range(3):
-        first.put("alone", k, {"E": float(k)})
-    first.put("joblib", 0, {"E": 0.0})
-    resumed = {"skipped": 1, "went on": 1}
-    first.note(
-        "sweeps",
-        {"launcher": "joblib", "jobs": 3, "code": None, "met": [2], "resumed": resumed, "took": 9},
-    )
-    first.note("left", [0, 0])
-    assert [row.met for row in drawn_runs.rows_of(first, options)] == [False, False, False, True]
-    monkeypatch.setattr(
-        drawn_runs, "version", lambda: "other"
-    )  # the program changed between two calls
-    second = drawn_runs.Record(tmp_path / "record.json", {"seed": 0})
-    second.put("joblib", 1, {"E": 1.0})
-    assert (
-        second.complete() == [0, 1, 2]
-        and second.compared("joblib") == {0: []}
-        and second.of_kind("alone") == {}
-    )
-    for k in (1, 2, 3):
-        second.put("alone", k, {"E": float(k)})
-        second.put("joblib", k, {"E": float(k)})
-    second.put("alone", 0, {"E": 0.0})
-    second.put("submitit_local", 0, {"E": 0.0})
-    for launcher in ("joblib", "submitit_local"):
-        second.note(
-            "sweeps",
-            {"launcher": launcher, "jobs": 3, "code": 0, "met": [1], "resumed": resumed, "took": 9},
-        )
-    assert all(row.met for row in drawn_runs.rows_of(second, options))
-    second.put("joblib", 2, {"E": 2.5})
-    assert second.compared("joblib")[2] == ["E"]
-    assert [row.met for row in drawn_runs.rows_of(second, options)] == [True, False, True, True]
-    second.put("alone", 3, {"exit code": 1})
-    assert [row.met for row in drawn_runs.rows_of(second, options)] == [False, False, True, True]
-    with pytest.raises(SystemExit, match="expected a record of"):
-        drawn_runs.Record(tmp_path / "record.json", {"seed": 1})
 
 
 def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):

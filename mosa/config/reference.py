@@ -16,12 +16,34 @@ from mosa.settings import Settings, annotation_of, described, model_in
 
 HEAD = """# Configuration
 
-Every key of every command, with its default, what it may be, and what it is. Made by `python -m mosa.config.reference` from the models
-in `mosa/config/commands.py`, `mosa/config/leaf_commands.py` and beside the code that each section is for; a test keeps it true.
-`python -m mosa.config.reference train fit.joint` prints a part.
+`conf/train.yaml` is the configuration of `train.py`. It takes one option of each group, and every key can be set on the command line.
 
-A file of `conf/` says what it chooses beside these defaults; `key=value` on the command line and in `mosa.compose` changes any of them.
-A key under `adapter` is an argument of the adapter that is named, one under `scene` of the format's loader ([data.md](../data.md)).
+| group | options | sets |
+|---|---|---|
+| `scene` | `rabbit`, `transforms`, `pacnerf`, ... | data ([Read your data](../data.md)) |
+| `prior` | `neo_hookean`, `auto`, `von_mises`, ... | the isotropic law ([Choose](../choosing.md)) |
+| `adapter` | `operator`, `mosa`, `none`, ... | the learned correction |
+| `criterion` | `corrected`, `free`, `both` | what a fit compares |
+| `fit` | `fast`, `adam`, `paper`, `tiny` | optimisers, iterations, rates |
+| `simulation` | `fast`, `paper` | particles, grid, time step |
+| `reconstruction` | `fast`, `paper` | hull, Gaussians, motion |
+| `rendering` | `warp`, `gsplat` | rasteriser |
+| `trainer` | `cpu`, `gpu` | Lightning's Trainer |
+| `callbacks`, `logger` | `default`, ...; `tensorboard`, `csv`, `wandb`, `none` | Lightning's callbacks and loggers |
+| `ablation`, `debug`, `experiment` | `full`, ...; `default`; `bird`, ... | sets of keys that belong together |
+
+The other commands have `conf/eval.yaml`, `conf/capture.yaml`, `conf/splats.yaml` and `conf/environments.yaml`.
+
+## Defaults and descriptions
+
+The tables below list every key of every command with its default, its range and its unit. A file in `conf/` holds only the values that
+differ from these defaults. `key=value` on the command line or in `mosa.compose` changes one. `python -m mosa.config.reference train
+fit.joint` prints a part.
+
+Keys under `adapter` are arguments of the named adapter. Keys under `scene` are arguments of the format's loader ([data](../data.md)).
+
+The settings models generate this page (`python -m mosa.config.reference`), and a test compares both. The models are in
+`mosa/config/commands.py`, `mosa/config/leaf_commands.py` and in the package of each section.
 """
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mosa.data.synthetic import BOX
 from mosa.data.synthetic.bodies.objects import drop_named, object_named
 from mosa.data.synthetic.bodies.shapes import SHAPES
-from mosa.data.synthetic.drop import CONTACT_CELLS, COURANT, GRAVITY, place
+from mosa.data.synthetic.drop import COURANT, GRAVITY, place
 from mosa.data.synthetic.films import built
 from mosa.data.synthetic.materials.hidden import Hidden
 from mosa.data.synthetic.materials.published import PublishedMaterial
@@ -93,7 +93,7 @@ def true_twin(
     begun, _ = place(particles, center, drop, surface.vertices)
     colors = SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1]))
     opacity, width = APPEARANCE
-    n, dx = len(rest), 2 * spacing
+    n, dx, meeting = len(rest), body.meeting.cell * spacing, body.meeting
     points = torch.tensor(rest, dtype=torch.float32)
     made = TrueBody(
         rest=points, volume=torch.full((n,), spacing**3), colors=torch.tensor(colors, dtype=torch.float32),
@@ -102,12 +102,13 @@ def true_twin(
         settings=SimulationSettings(dx=dx, stride=1, max_substeps=MAX_SUBSTEPS, courant=COURANT), law_options=hidden.options,
     )  # fmt: skip
     with torch.no_grad():
-        made.contact.cells.fill_(CONTACT_CELLS)
+        made.contact.cells.fill_(meeting.lift)
     made.requires_grad_(False)
     tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
     reach = BOX[1][0] if body.reach is None else body.reach
     box = torch.tensor([[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]])
-    world = World(Ground(0.0, "sticky"), tensor(GRAVITY), torch.tensor([0.0, 1.0, 0.0]), box)
+    ground = Ground(0.0, meeting.mode, meeting.friction)
+    world = World(ground, tensor(GRAVITY), torch.tensor([0.0, 1.0, 0.0]), box)
     start = Start(
         tensor(drop.rotation),
         tensor(begun.mean(0)),

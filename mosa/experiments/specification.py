@@ -80,8 +80,7 @@ class Claim:
 class Experiment:
     """rows, columns: axes of the table (every other one but the seed is a table of its own); printed: entry of printed.yaml; note:
     how the data differ from the paper's; minutes: of a job that runs alone, on cpu and gpu; analysis: a function of `analyses`, or
-    None; listed: whether the page of results shows the table of figures, which an analysis may say better; alone: its jobs have
-    runs of their own, each with nothing beside it on its device; claims: for the page."""
+    None; alone: its jobs have runs of their own, each with nothing beside it on its device; claims: for the page."""
 
     name: str
     title: str
@@ -97,7 +96,6 @@ class Experiment:
     plot: str | None = "bars"
     analysis: str | None = None
     mean: bool = True
-    listed: bool = True
     alone: bool = False
     claims: tuple[Claim, ...] = ()
     quick: bool = False

@@ -79,8 +79,10 @@ def load_builtin(
         if body.reach is None
         else ((-body.reach, BOX[0][1], -body.reach), (body.reach, BOX[1][1], body.reach))
     )
+    meeting = body.meeting
+    ground = Ground(meeting.stated, meeting.mode, meeting.friction)
     return scene_from_footage(
-        footage, name=name, gravity=GRAVITY, box=box, ground=Ground(0.0, "sticky"), density=hidden.density, sequence=sequence,
+        footage, name=name, gravity=GRAVITY, box=box, ground=ground, density=hidden.density, sequence=sequence,
         last_free_frame=last_free_frame, holdout_cameras=holdout_cameras, holdout_frames=holdout_frames, truth=truth,
         known_parameters=hidden.known, synthetic=True,
     )  # fmt: skip

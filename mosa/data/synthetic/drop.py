@@ -15,9 +15,6 @@ from mosa.physics.time.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 
 GRAVITY = (0.0, -9.8, 0.0)
-# A grid stops a body's surface this many cells above the plane (measured on the rabbit at impact speeds of 3 to 4 m/s).
-# The truth is simulated that much higher, so that in the pictures the body touches the ground at height 0.
-CONTACT_CELLS = 0.4
 # share of the sound-speed bound on the time step that is used: squashed, the material is stiffer than at rest
 COURANT = 0.3
 
@@ -57,7 +54,7 @@ def simulate(
     )
     rest, _ = place(particles, center, training, surface)
     start, _ = place(particles, center, drop, surface)
-    frame_dt, dx = 1 / body.footage.fps, 2 * body.spacing
+    frame_dt, dx = 1 / body.footage.fps, body.dx
     reach = drop.speed + 9.8 * frame_dt * body.footage.frames
     substeps = required_substeps(
         material.wave_modulus(),
@@ -75,13 +72,13 @@ def simulate(
         substeps=substeps,
         frame_dt=frame_dt,
         gravity=GRAVITY,
-        ground=Ground(0.0),
+        ground=Ground(0.0, body.meeting.mode, body.meeting.friction),
         up=(0.0, 1.0, 0.0),
         options=material.options,
     )
     velocity = np.array([0.0, -drop.speed, 0.0])
     n = len(particles)
-    lift = np.array([0.0, CONTACT_CELLS * dx, 0.0])
+    lift = np.array([0.0, body.meeting.lift * dx, 0.0])
     tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
     F = tensor(drop.rotation).expand(n, 3, 3).contiguous()
     # velocities half a substep early: symplectic Euler then follows the parabola exactly

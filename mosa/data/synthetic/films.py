@@ -13,7 +13,13 @@ import torch
 
 from mosa.data.formats.footage import WHITE
 from mosa.data.images.reading import composite, resize
-from mosa.data.synthetic.bodies.objects import OBJECTS, BuiltinObject, drop_named, object_named
+from mosa.data.synthetic.bodies.objects import (
+    OBJECTS,
+    BuiltinObject,
+    Meeting,
+    drop_named,
+    object_named,
+)
 from mosa.data.synthetic.bodies.shapes import SHAPES
 from mosa.data.synthetic.drop import simulate
 from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
@@ -76,6 +82,8 @@ def take_file(
     made_of: tuple = (VERSION, object_named(name), hidden, drop_named(name, sequence), seed)
     if object_named(name).remesh:
         made_of += (LEVEL,)
+    if object_named(name).meeting != Meeting():
+        made_of += (object_named(name).meeting, hidden.law)
     key = hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]
     folder = Path(cache) if cache is not None else default_cache()
     return folder / "builtin" / f"{name}-{sequence}-{material}-{seed}-{key}.npz"

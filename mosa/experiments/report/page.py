@@ -1,4 +1,4 @@
-"""The page of results: for every experiment the paper's printed figures beside ours, and which of its claims hold.
+"""The overview of results: for every experiment its data, which claims hold, and a link to the page with its tables.
 
 It is made from the files `<name>.json` that `write_results` leaves beside the tables; nothing on it is typed by hand."""
 
@@ -11,53 +11,47 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.tables import markdown
-from mosa.experiments.collecting import INSTEAD, Cell, said_below
+from mosa.experiments.collecting import Cell
 from mosa.experiments.commits import commits_since
-from mosa.experiments.report.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
 from mosa.system.whole_files import write_whole, written_whole
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
 NOT_RUN, OURS = "not run", "ours"
-EMPTY: dict[str, Any] = {"extra": "", "provenance": [], "pictures": []}
-INTRODUCTION = """# The paper's tables, and what comes out here
+INTRODUCTION = """# Results
 
-Made by `mosa-experiment --page` from `docs/results/`; [experiments.md](experiments.md) says how its tables are run, what of the
-paper is not among them and why. Under each title: how the data differ from the paper's, which have not been released; the
-figures made here; the paper's own; and what of the claims holds here.
+This page lists every table and figure of the paper that this program reproduces, and says which
+claims hold. Each section links to the page with its tables, the paper's printed figures, commit,
+seeds and machine. The paper's data were not released: the bodies here are simulated, so their
+true motion is known. `mosa-experiment --page` makes this page from `docs/results/` ([how to run
+the experiments](reproduce.md)).
 
-- **ours** is the default of this project (`adapter=operator`, [identified](identification.md) by Gauss-Newton). **four networks
-  (paper)** is the paper's adapter (`adapter=mosa`), with its bounds alpha of 0.1 (its text; its appendix chooses 0.15); other than
-  in the paper, what it adds to the stress is bounded (`adapter.l_max`) and vanishes at rest (`adapter.rest_free`), and it learns
-  for 40 steps. [The other rows](experiments.md#methods-it-compares).
-- **rms error** is the root mean square distance of the particles from where they truly are, after first contact, on drops that
-  were not learned from unless said otherwise. **PSNR** and **SSIM** are of the part of a picture about the body.
-  [All figures](figures.md), [all terms](glossary.md).
-- With seeds, a claim holds where it does by more than the spread of the two rows over them. *not run*: no job of that place is
-  complete."""
+- **ours** is the default of this program (`adapter=operator`, [fitted](uncertainty.md) by
+  Gauss-Newton).
+- **four networks (paper)** is the paper's adapter (`adapter=mosa`) with alpha = 0.1, as in its
+  text. Two things differ from the paper: the correction of the stress is bounded
+  (`adapter.l_max`) and vanishes at rest (`adapter.rest_free`). It learns for 40 steps. [The other
+  methods](reproduce.md#methods-compared).
+- **rms error** is the root mean square distance of particles from their true positions after
+  first contact, on held-out drops unless said otherwise. **PSNR** and **SSIM** are those of a
+  window around the body ([all metrics](figures.md), [glossary](glossary.md)).
+- With several seeds, a claim *holds* if the difference exceeds the spread of both rows over the
+  seeds. *not run*: no job is complete."""
 
 
-def write_json(
-    path: Path, tables: Tables, extra: str, lines: Sequence[str], pictures: Sequence[Path]
-) -> None:
-    """What the page needs of an experiment's results. extra: what its analysis says; lines: where the figures come from."""
+def write_json(path: Path, tables: Tables, lines: Sequence[str]) -> None:
+    """The part of an experiment's results that the page needs. lines: where the figures come from."""
     cells = {label: {row: {c: None if cell is None else [cell.mean, cell.sd, cell.count] for c, cell in found.items()}
                      for row, found in rows.items()} for label, rows in tables.items()}  # fmt: skip
-    found = {
-        "cells": cells,
-        "extra": extra,
-        "provenance": list(lines),
-        "pictures": [picture.name for picture in pictures],
-    }
+    found = {"cells": cells, "provenance": list(lines)}
     with written_whole(path) as partial:
         partial.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def read_tables(path: Path) -> tuple[Tables, dict[str, Any]] | None:
+def read_tables(path: Path) -> tuple[Tables, list[str]] | None:
     """Of `write_json`; None where there is no file. Errors: DataError naming a damaged one."""
     if not path.is_file():
         return None
@@ -65,7 +59,7 @@ def read_tables(path: Path) -> tuple[Tables, dict[str, Any]] | None:
         found = json.loads(path.read_text())
         tables = {label: {row: {c: None if cell is None else Cell(*cell) for c, cell in cells.items()}
                           for row, cells in rows.items()} for label, rows in found["cells"].items()}  # fmt: skip
-        return tables, {name: found[name] for name in EMPTY}
+        return tables, list(found["provenance"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: not the results of an experiment ({error}); write them again with --collect"
@@ -81,7 +75,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         experiment = load_experiment(folder, name)
         parts.append(f"## {experiment.title}\n\n{experiment.note.strip()}")
         found = read_tables(results / f"{name}.json")
-        tables, about = found if found is not None else ({}, EMPTY)
+        tables, provenance = found if found is not None else ({}, [])
         known = {
             option.name for option in experiment.axes[experiment.rows]
         }  # results of before may have other rows
@@ -89,23 +83,10 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             label: {row: cells for row, cells in rows.items() if row in known}
             for label, rows in tables.items()
         }
-        lines.append(
-            [experiment.title, *state_of(about["provenance"]), *claims_of(experiment, tables)]
-        )
-        parts += older(about["provenance"])
-        if any(
-            cell for rows in tables.values() for cells in rows.values() for cell in cells.values()
-        ):
-            parts += [ours(experiment, tables)] if experiment.listed else []
-        else:
-            parts.append(f"Here: {NOT_RUN}. `mosa-experiment {name}`")
-        if about["extra"]:
-            parts.append(about["extra"])
-        parts += [
-            f"![{experiment.title}]({results.name}/{picture})" for picture in about["pictures"]
-        ]
-        if experiment.printed is not None:
-            parts.append(printed_table(experiment.printed))
+        lines.append([experiment.title, *state_of(provenance), *claims_of(experiment, tables)])
+        parts += older(provenance)
+        if not provenance:
+            parts.append(f"Not run. Command: `mosa-experiment {name}`")
         if experiment.claims:
             parts.append(
                 "\n".join(
@@ -113,19 +94,15 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
                     for claim in experiment.claims
                 )
             )
-        if about["provenance"]:
-            parts.append(
-                f"All of it: [{name}.md]({results.name}/{name}.md). "
-                + "; ".join(about["provenance"])
-                + "."
-            )
+        if provenance:
+            parts.append(f"[Tables, seeds, machine and command]({results.name}/{name}.md)")
     beside = [
         f"[{read_title(page)}]({results.name}/{page.name})"
         for page in sorted(results.glob("*_from_motion.md"))
     ]
     if beside:
         parts.append(
-            f"## Without images\n\nLaws that were learned from the true motion of a body: {', '.join(beside)}."
+            f"## Without images\n\nLaws learned from the true motion of a body: {', '.join(beside)}."
         )
     page = results.parent / "results.md"
     header = [
@@ -180,65 +157,8 @@ def older(lines: Sequence[str]) -> list[str]:
         return []
     made, count = found
     changed = "1 commit has" if count == 1 else f"{count} commits have"
-    return [f"**These figures are of an older commit, {made}:** {changed} changed the program (`mosa/`, `conf/`) since, up to when "
-            "this page was made. What it gives now was not run."]  # fmt: skip
-
-
-def ours(experiment: Experiment, tables: Tables) -> str:
-    """A table of all figures: a column for each figure where there is one column, else figures side by side in a cell."""
-    figures = [figure for figure in experiment.figures if figure.label in tables]
-    rows, columns = (
-        list(tables[figures[0].label]),
-        list(next(iter(tables[figures[0].label].values()))),
-    )
-
-    def text(figure: Figure, row: str, column: str) -> str:
-        found = tables[figure.label].get(row, {}).get(column)
-        return "" if found is None else found.text(figure.decimals)
-
-    if len(columns) == 1:
-        shown = [f for f in figures if any(text(f, row, columns[0]) for row in rows)]
-        lines = [[row, *(text(f, row, columns[0]) for f in shown)] for row in rows]
-        lines = [
-            [row, *cells] if any(cells) else [row, NOT_RUN, *([""] * (len(shown) - 1))]
-            for row, *cells in lines
-        ]
-        return f"Here ({columns[0]}):\n\n" + markdown(
-            [experiment.rows, *(f.label for f in shown)], lines
-        )
-    lines = []
-    for row in rows:
-        cells = [[text(f, row, column) for f in figures] for column in columns]
-        lines.append(
-            [
-                row,
-                *(
-                    side_by_side(values, "-" if column == "mean" else NOT_RUN)
-                    for column, values in zip(columns, cells)
-                ),
-            ]
-        )
-    said = said_below(tables)
-    header = [
-        f"{experiment.rows} \\ {experiment.columns}"
-        if experiment.plot == "map"
-        else experiment.rows,
-        *columns,
-    ]
-    return (
-        f"Here ({' / '.join(f.label for f in figures)}):\n\n"
-        + markdown(header, lines)
-        + (f"\n\n{said}" if said else "")
-    )
-
-
-def side_by_side(values: Sequence[str], without: str) -> str:
-    """Figures of a cell; one word where all say it; without: where there are none."""
-    return (
-        values[0]
-        if len(set(values)) == 1 and values[0] in INSTEAD
-        else (" / ".join(values) if any(values) else without)
-    )
+    return [f"**Older commit:** the figures are those of {made}; {changed} changed the program (`mosa/`, `conf/`) since, "
+            "up to the date of this page."]  # fmt: skip
 
 
 def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:

@@ -39,7 +39,7 @@ def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, com
         pictures += more
     page = folder / f"{name}.md"
     lines = provenance(experiment, jobs, records, command)
-    write_json(folder / f"{name}.json", tables, extra, lines, pictures)
+    write_json(folder / f"{name}.json", tables, lines)
     write_whole(page, markdown_page(experiment, jobs, tables, pictures, extra, lines))
     return page
 

@@ -14,10 +14,11 @@ from mosa.data.images.reading import composite, resize
 from mosa.data.scene import held_out_sequences, load_scene
 from mosa.data.synthetic import films as takes
 from mosa.data.synthetic import sequences
-from mosa.data.synthetic.bodies.objects import OBJECTS
+from mosa.data.synthetic.bodies.objects import NAMES, OBJECTS, RING, Meeting
 from mosa.data.synthetic.bodies.shapes import SHAPES
 from mosa.data.synthetic.bodies.standin_shapes import STANDIN_SHAPES
-from mosa.data.synthetic.drop import CONTACT_CELLS, COURANT, place
+from mosa.data.synthetic.drop import COURANT, place, simulate
+from mosa.data.synthetic.materials.hidden_material import FORMS
 from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
 from mosa.data.synthetic.surface import Surface, bind, extract_surface, fill
 from mosa.errors import ConfigError
@@ -299,7 +300,7 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     world = World(scene.ground, scene.gravity, scene.up, scene.box)
     rest = training.truth.rest
     contact = ContactOffset(2 * spacing)
-    torch.nn.init.constant_(contact.cells, CONTACT_CELLS)
+    torch.nn.init.constant_(contact.cells, OBJECTS["tiny"].meeting.lift)
     body = SimpleNamespace(
         rest=rest, volume=torch.full((len(rest),), spacing**3), contact=contact,
         settings=SimpleNamespace(dx=2 * spacing, courant=COURANT),
@@ -323,6 +324,43 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     assert (
         walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005
     )  # spreading by 13 mm is held within 2
+
+
+def test_version_2_meets_the_ground_in_its_own_way_and_version_1_as_before():
+    """A sticky grid's nodes stop a body above the plane, `touch` at half a spacing from it."""
+    body = OBJECTS["tiny"]
+    particles = fill(SHAPES[body.shape], body.spacing, np.random.default_rng([0, 2]))
+    drop, lowest = body.drops["train"], {}
+    for meeting in (Meeting(), Meeting(lift=0.0), Meeting(lift=0.0, mode="touch", friction=0.5)):
+        other = replace(body, meeting=meeting)
+        found = simulate(other, RING, particles, particles, drop, drop)
+        lowest[meeting] = found.positions[..., 1].min() / body.dx
+    filmed, nodes, touching = lowest.values()
+    assert filmed == pytest.approx(nodes - 0.4, abs=0.05)
+    assert -0.1 < touching < nodes - 0.1
+    drawn = [OBJECTS[f"{name}_v2"].meeting for name in NAMES]
+    assert len(set(drawn)) == len(NAMES) and {m.mode for m in drawn} == {"sticky", "touch"}
+    assert all(abs(m.stated) <= 0.005 and 0 <= m.lift <= 0.6 for m in drawn)
+    assert {OBJECTS[f"{name}_v2"].material.law for name in NAMES} == {"hill", *FORMS}
+
+
+def test_what_is_kept_of_version_1_is_found_as_before(tmp_path):
+    """The key of a film is made of its object's repr, in which version 2 has no part."""
+    name = takes.take_file("rabbit", "train", "anisotropic", 0, tmp_path).name
+    assert name == "rabbit-train-anisotropic-0-9e62727fa106.npz"
+    assert takes.take_file("rabbit_v2", "train", "anisotropic", 0, tmp_path).name != name
+
+
+def test_the_scene_of_version_2_states_a_height_that_is_a_little_wrong(
+    training, cache, monkeypatch
+):
+    """The pictures are version 1's, so that nothing is filmed: what the scene says is asked."""
+    take = takes.make("tiny", "train", cache=cache, progress=False)
+    monkeypatch.setattr(takes, "film_drop", lambda *a: take)
+    meeting = Meeting(lift=0.0, stated=0.003, mode="touch", friction=0.5)
+    monkeypatch.setitem(OBJECTS, "tiny", replace(OBJECTS["tiny"], meeting=meeting))
+    ground = tiny(cache).ground
+    assert (ground.height, ground.mode, ground.friction) == (0.003, "touch", 0.5)
 
 
 def test_an_object_of_another_spacing_is_filled_anew(monkeypatch):

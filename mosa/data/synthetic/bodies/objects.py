@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mosa.data.synthetic.materials.hidden import Hidden
-from mosa.data.synthetic.materials.hidden_material import HiddenMaterial
+from mosa.data.synthetic.materials.hidden_material import FORMS, HiddenMaterial
 from mosa.data.synthetic.materials.hidden_yield import HiddenYield
 from mosa.data.synthetic.materials.published import PublishedMaterial
 from mosa.errors import ConfigError
@@ -48,10 +48,27 @@ class Footage:
 
 
 @dataclass(frozen=True)
+class Meeting:
+    """How a truth meets the ground, and what its scene says of that.
+
+    cell: of the truth's grid, in particle spacings; lift [cells]: how much higher it is simulated than
+    it is filmed; stated [m]: the ground's height in the scene, which truly is 0; mode, friction: of the
+    ground, in the truth and in the scene. A sticky grid stops a body's surface about 0.4 cells above the
+    plane (rabbit, impacts at 3 to 4 m/s), so that with that lift the pictures show contact at height 0."""
+
+    cell: float = 2.0
+    lift: float = 0.4
+    stated: float = 0.0
+    mode: str = "sticky"
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
 class BuiltinObject:
-    """height: of the shape [m]; spacing of the truth's particles [m] (its grid is twice as coarse: 0.015 m for the
-    rabbit, finer than a learner's of up to 9000 particles); pitch of its surface mesh [m]. remesh: whether the surface is found
-    anew in every frame, as that of what flows; reach: half width of the world that may be used [m], None: as for all."""
+    """height: of the shape [m]; spacing of the truth's particles [m] (the rabbit's grid has 0.015 m,
+    finer than a learner's of up to 9000 particles); pitch of its surface mesh [m]. remesh: whether the
+    surface is found anew in every frame, as that of what flows; reach: half width of the world that may
+    be used [m], None: as for all; meeting: with the ground."""
 
     shape: str
     height: float
@@ -63,6 +80,12 @@ class BuiltinObject:
     # no part of a cached film's name, or those of the other objects would all be made again
     remesh: bool = field(default=False, repr=False)
     reach: float | None = field(default=None, repr=False)
+    meeting: Meeting = field(default_factory=Meeting, repr=False)
+
+    @property
+    def dx(self) -> float:
+        """Grid spacing of the truth [m]."""
+        return self.meeting.cell * self.spacing
 
 
 RABBIT = HiddenMaterial(
@@ -242,6 +265,57 @@ OBJECTS |= {
     "trophy": stand_in("trophy", 0.418, "drucker_prager", E=1e6, nu=0.3, friction_angle=40.0, cohesion=0.0,
                        held=("E", "nu", "cohesion"), remesh=True, spacing=0.011),
 }  # fmt: skip
+
+
+# Version 2: the truths above share one convention with a learner: each is simulated 0.4 cells
+# higher than it is filmed, over a ground that is stated where it is. Films of the world share no
+# convention, so that a learner may have learned this one. Version 2 keeps shapes, drops, cameras
+# and moduli, and draws from a generator that the body's name seeds: the truth's grid, the height
+# of its contact, the height that the scene states, the contact's mode and, where the body is
+# elastic, the form of its law. Gorilla, rabbit and rainbowball yield, as in the paper. Fixed:
+# figures depend on it.
+SUFFIX = "_v2"
+"""Of the names: `scene.name=calf_v2`."""
+NAMES = (
+    "rabbit", "peanut", "mandarin", "chick1", "gorilla", "chick2", "rainbowball", "calf", "ring",
+)  # fmt: skip
+YIELDING = {
+    "rabbit": HiddenYield(
+        E=2e5, nu=0.3, yield_stress=1.5e4, coefficients=(0.6, 1.5, 2.0, 0.7, 1.8, 0.6),
+        turn=(0.4, 0.3, 0.2), amplitude=0.2, period=0.125,
+    ),
+    "gorilla": HiddenYield(
+        E=3e5, nu=0.3, yield_stress=2.2e4, coefficients=(1.7, 0.7, 0.9, 1.9, 0.6, 1.2),
+        turn=(-0.3, 0.5, 0.1), amplitude=0.2, period=0.15, axis=(0.6, 0.7, 0.3),
+    ),
+    "rainbowball": HiddenYield(
+        E=1.8e5, nu=0.36, yield_stress=1.4e4, coefficients=(0.8, 2.1, 1.1, 0.7, 1.0, 1.6),
+        turn=(0.1, -0.4, 0.6), amplitude=0.18, period=0.11, axis=(0.6, 0.2, -0.7),
+    ),
+}  # fmt: skip
+LIFTS, STATED, CELLS = (0.0, 0.6), 0.005, (1.7, 2.4)
+"""Lifts [cells of the truth's grid]; largest error of the stated height [m]; cell [spacings]."""
+
+
+def drawn(name: str) -> BuiltinObject:
+    """The body of that name in version 2."""
+    rng = np.random.default_rng([2, *name.encode()])
+    body = OBJECTS[name]
+    cell, height = float(rng.uniform(*CELLS)), float(rng.uniform(-STATED, STATED))
+    lift, kind, form = float(rng.uniform(*LIFTS)), rng.integers(4), str(rng.choice(list(FORMS)))
+    if kind == 0:  # a grid's nodes as they are
+        meeting = Meeting(cell, 0.0, height)
+    elif kind == 1:  # particles meet the plane: nothing stops them above it
+        meeting = Meeting(cell, 0.0, height, "touch", 0.5)
+    else:
+        meeting = Meeting(cell, lift, height)
+    material = YIELDING.get(name, body.material)
+    if isinstance(material, HiddenMaterial):
+        material = replace(material, form=form)
+    return replace(body, material=material, meeting=meeting)
+
+
+OBJECTS |= {name + SUFFIX: drawn(name) for name in NAMES}
 
 
 def object_named(name: str) -> BuiltinObject:

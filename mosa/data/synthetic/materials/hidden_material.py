@@ -1,6 +1,6 @@
 """The material of the built-in scenes, which no prior of the learner can express: fibres, and stiffness that varies."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 import warp as wp
@@ -38,6 +38,42 @@ def fibre_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) 
     )
 
 
+@wp.func
+def fibre_corotated(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    """2 mu sym((F - R) F^T) + lam (J - 1) J I + 2 kf (I4 - 1) exp(2 (I4 - 1)^2) (F a)(F a)^T.
+
+    Energy: the fixed corotated one (Stomakhin et al. 2012) plus kf/4 (exp(2 (I4 - 1)^2) - 1), the
+    exponential of Holzapfel, Gasser and Ogden (2000), in compression too. At rest its stiffness is
+    that of `fibre_neo_hookean`."""
+    one = wp.float64(1.0)
+    two = wp.float64(2.0)
+    fa = F * wp.vec3d(p[3], p[4], p[5])
+    J = wp.determinant(F)
+    T = (F - R) * wp.transpose(F)
+    matrix = p[0] * (T + wp.transpose(T)) + p[1] * (J - one) * J * wp.identity(
+        n=3, dtype=wp.float64
+    )
+    e = wp.dot(fa, fa) - one
+    return matrix + two * p[2] * e * wp.exp(two * e * e) * wp.outer(fa, fa)
+
+
+def corotated_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) -> Tensor:
+    """mu |S - I|^2 + lam/2 (J - 1)^2 + kf/4 (exp(2 (|F a|^2 - 1)^2) - 1) [J/m^3]; (..., 3, 3)."""
+    S = torch.linalg.svdvals(F)
+    stretch = ((F @ fibre[..., None])[..., 0] ** 2).sum(-1)
+    matrix = mu * ((S - 1) ** 2).sum(-1) + 0.5 * lam * (S.prod(-1) - 1) ** 2
+    return matrix + 0.25 * kf * (torch.exp(2 * (stretch - 1) ** 2) - 1)
+
+
+register_law(
+    "fibre_corotated",
+    fibre_corotated,
+    {"mu": 1, "lam": 1, "kf": 1, "fibre": 3},
+    uses_rotation=True,
+    energy=corotated_energy,
+)
+FORMS = {LAW: 1.0, "fibre_corotated": 3.0}
+"""Laws of this material, each with how much stiffer its fibres get than at rest, for the time step."""
 register_law(
     LAW,
     fibre_neo_hookean,
@@ -62,10 +98,12 @@ class HiddenMaterial(Hidden):
 
     ratio: float
     fibre: tuple[float, float, float]
+    form: str = field(default=LAW, repr=False)
+    """One of `FORMS`."""
 
     @property
     def law(self) -> str:
-        return LAW
+        return self.form
 
     def isotropic(self) -> "HiddenMaterial":
         """Its twin without fibres and with one stiffness everywhere."""
@@ -85,8 +123,9 @@ class HiddenMaterial(Hidden):
         }
 
     def mean_modulus(self) -> float:
-        """lam + 2 mu + 4 kf [Pa]."""
-        return super().mean_modulus() + 4 * fibre_stiffness(self.E, self.nu, self.ratio)
+        """lam + 2 mu + 4 kf [Pa], kf as stiff as the fibres get."""
+        fibres = FORMS[self.form] * fibre_stiffness(self.E, self.nu, self.ratio)
+        return super().mean_modulus() + 4 * fibres
 
     def summary(self) -> dict[str, float]:
         """Numbers for Truth.parameters: E, nu of the matrix, moduli along and across the fibre [Pa], their ratio."""
