@@ -345,7 +345,7 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
     """The keyword arguments of a class or function as settings, from their annotations. given: those that no key says.
 
     An argument without an annotation may be anything."""
-    call = build.__init__ if inspect.isclass(build) else build  # type: ignore[misc]
+    call = build.__init__ if inspect.isclass(build) else build
     hints = typing.get_type_hints(call, include_extras=True)
     wanted = {
         name: (hints.get(name, Any), ... if p.default is p.empty else p.default)

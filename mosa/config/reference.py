@@ -16,7 +16,8 @@ from mosa.settings import Settings, annotation_of, described, model_in
 
 HEAD = """# Configuration
 
-`conf/train.yaml` is the configuration of `train.py`. It takes one option of each group, and every key can be set on the command line.
+`conf/train.yaml` is the configuration of `train.py`. It takes one option of each group, and every key can be set on the
+command line.
 
 | group | options | sets |
 |---|---|---|
@@ -36,11 +37,12 @@ The other commands have `conf/eval.yaml`, `conf/capture.yaml`, `conf/splats.yaml
 
 ## Defaults and descriptions
 
-The tables below list every key of every command with its default, its range and its unit. A file in `conf/` holds only the values that
-differ from these defaults. `key=value` on the command line or in `mosa.compose` changes one. `python -m mosa.config.reference train
-fit.joint` prints a part.
+The tables below list every key of every command with its default, its range and its unit. A file in `conf/` holds only the
+values that differ from these defaults. `key=value` on the command line or in `mosa.compose` changes one.
+`python -m mosa.config.reference train fit.joint` prints a part.
 
-Keys under `adapter` are arguments of the named adapter. Keys under `scene` are arguments of the format's loader ([data](../data.md)).
+Keys under `adapter` are arguments of the named adapter. Keys under `scene` are arguments of the format's loader
+([data](../data.md)).
 
 The settings models generate this page (`python -m mosa.config.reference`), and a test compares both. The models are in
 `mosa/config/commands.py`, `mosa/config/leaf_commands.py` and in the package of each section.
@@ -81,7 +83,7 @@ def arguments() -> Iterator[tuple[str, str, str, str]]:
     yield from rows(LawOptions, LawOptions(), "prior.options.")
     for name in ADAPTERS:
         if (build := adapter_class({"name": name})) is not None:
-            for key, default, kind, about in rows(arguments_of(build, "adapter"), None, "adapter."):
+            for key, default, kind, about in rows(arguments_of(build, "adapter"), None, "adapter.")  # type: ignore[arg-type]:
                 note = "" if about == "None" else f": {about}"
                 yield key, default, kind, f"name={name}{note}"
 
