@@ -83,7 +83,8 @@ def arguments() -> Iterator[tuple[str, str, str, str]]:
     yield from rows(LawOptions, LawOptions(), "prior.options.")
     for name in ADAPTERS:
         if (build := adapter_class({"name": name})) is not None:
-            for key, default, kind, about in rows(arguments_of(build, "adapter"), None, "adapter.")  # type: ignore[arg-type]:
+            model = arguments_of(build, "adapter")  # type: ignore[arg-type]
+            for key, default, kind, about in rows(model, None, "adapter."):
                 note = "" if about == "None" else f": {about}"
                 yield key, default, kind, f"name={name}{note}"
 
