@@ -19,7 +19,7 @@ from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.system.npz import read_npz, write_npz
 from mosa.twin.twin import Twin
-from tests.config.test_commands import composed
+from tests.config.test_command_settings import composed
 from tests.modules.body.test_world import twin
 
 DEFAULT = functools.cache(lambda: composed("debug=default", "world.walls={mode: separate}"))

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import mosa.config.composition  # noqa: F401  registers what conf/ refers to
-from mosa.config.commands import TrainSettings
+from mosa.config.command_settings import TrainSettings
 from mosa.config.record import BodyRecord
 from mosa.errors import ConfigError
 from mosa.modules.adapters.registry import adapter_class

@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from mosa.config.leaf_commands import COMMANDS
+from mosa.config.leaf_settings import COMMANDS
 from mosa.settings import node_of
 
 GROUPED = "scene"

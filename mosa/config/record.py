@@ -16,7 +16,7 @@ from annotated_types import Interval
 from pydantic import AllowInfNan, BeforeValidator, model_validator
 from torch import Tensor
 
-from mosa.config.commands import BodySections
+from mosa.config.command_settings import BodySections
 from mosa.errors import ConfigError
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.body.material import RIVALS

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from mosa.config.leaf_commands import COMMANDS
+from mosa.config.leaf_settings import COMMANDS
 from mosa.settings import Settings, annotation_of, described, model_in
 
 HEAD = """# Configuration
@@ -45,7 +45,7 @@ Keys under `adapter` are arguments of the named adapter. Keys under `scene` are 
 ([data](../data.md)).
 
 The settings models generate this page (`python -m mosa.config.reference`), and a test compares both. The models are in
-`mosa/config/commands.py`, `mosa/config/leaf_commands.py` and in the package of each section.
+`mosa/config/command_settings.py`, `mosa/config/leaf_settings.py` and in the package of each section.
 """
 
 

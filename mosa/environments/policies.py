@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mosa.config.leaf_commands import SearchSection
+from mosa.config.leaf_settings import SearchSection
 from mosa.environments.arena import Arena, play, play_all
 from mosa.environments.task import Task, View
 from mosa.errors import ConfigError, DataError

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from mosa.config.build import build_body, measured
-from mosa.config.commands import TrainSettings
+from mosa.config.command_settings import TrainSettings
 from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.evaluation.uncertainty import DRAWS

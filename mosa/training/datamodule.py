@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import measured, plain
-from mosa.config.commands import DataSections
+from mosa.config.command_settings import DataSections
 from mosa.config.composition import composed
 from mosa.config.record import BodyRecord
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule

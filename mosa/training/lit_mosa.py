@@ -32,7 +32,7 @@ from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_stages, plain, world_of
 from mosa.config.checkpoints import read_checkpoint
-from mosa.config.commands import TrainSettings
+from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch

@@ -11,9 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
-from mosa.config.commands import EvalSettings, TrainSettings
+from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
-from mosa.config.leaf_commands import CaptureSettings, EnvironmentsSettings, SplatsSettings
+from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
 from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError

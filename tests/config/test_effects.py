@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from mosa.config.build import rehearse
-from mosa.config.commands import TrainSettings
+from mosa.config.command_settings import TrainSettings
 from mosa.config.effects import sentences
 
 CONF = Path(__file__).parents[2] / "conf"

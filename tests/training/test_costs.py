@@ -12,7 +12,7 @@ from mosa.data.scene import load_scene
 from mosa.errors import ConfigError
 from mosa.reconstruction.settings import build_settings
 from mosa.training import costs
-from tests.config.test_commands import CONF
+from tests.config.test_command_settings import CONF
 
 TINY = ["debug=default"]
 

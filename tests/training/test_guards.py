@@ -25,7 +25,7 @@ from mosa.system.limits import machine_memory
 from mosa.training.preflight import check_begin, check_configuration, check_particles, check_seen
 from mosa.training.run_folder import read_figures
 from mosa.types import Ground
-from tests.config.test_commands import composed
+from tests.config.test_command_settings import composed
 
 
 def test_more_particles_than_memory_holds_are_refused_with_the_most_that_fit():

@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 from pydantic_core import PydanticUndefined
 
 from mosa.config.build import rehearse
-from mosa.config.commands import EvalSettings, TrainSettings
+from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.composition import CHOSEN
-from mosa.config.leaf_commands import COMMANDS
+from mosa.config.leaf_settings import COMMANDS
 from mosa.errors import ConfigError
 from mosa.settings import annotation_of, described, fits, model_in, node_of
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Interval
 from pydantic import Field
 
-from mosa.config.commands import EvalSettings, Extensions, LawSections, TrainSettings
+from mosa.config.command_settings import EvalSettings, Extensions, LawSections, TrainSettings
 from mosa.settings import (
     Count,
     Expected,
