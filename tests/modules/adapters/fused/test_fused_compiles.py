@@ -37,6 +37,7 @@ def compiled() -> dict[str, dict]:
     return dict(zip(PRECISIONS, map(json.loads, lines), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_they_compile_for_hopper(compiled, precision):
     found = compiled[precision]
