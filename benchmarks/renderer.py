@@ -217,7 +217,8 @@ def print_parts(counts: list[int], repeats: int, views: int) -> None:
 def print_parity() -> None:
     """Both backends on the scene that tests/rendering/test_backends.py compares, on CUDA; without gsplat, the two orders of
     work of this package."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "rendering"))
+    tests = Path(__file__).parents[1] / "tests"
+    sys.path[:0] = [str(tests / "rendering"), str(tests / "helpers")]
     from test_backends import NAMES, outcome, parity_scene
 
     drawn, clear = parity_scene()

@@ -8,6 +8,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+import warp as wp
 
 torch.set_num_threads(1)
 if not torch.cuda.is_available():
@@ -23,6 +24,10 @@ LONG = ("integration", "experiments", "physics_verification", "analysis")
 FIRST = "test_main_job.py"
 """Its first run makes the scene and the reconstruction that others find in the cache."""
 
+UNOPTIMISED = ("constitutive",)
+"""Folders whose tests launch each of their many kernels a few times. Clang's -O0 gives the same bits
+and compiles in a third of the time of -O2. They come last: a process keeps a kernel as compiled."""
+
 
 def pytest_configure(config):
     # xdist would begin with the files of most tests: the last ones, of one long test each, would keep one process alone
@@ -31,12 +36,15 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """The files in the order in which processes take them: whole runs first, then those of most tests."""
+    """The order in which processes take the files: whole runs, those marked slow, then by tests."""
     tests = Counter(item.path for item in items)
+    slow = {item.path for item in items if "slow" in item.keywords}
     items.sort(
         key=lambda item: (
             item.path.name != FIRST,
+            item.path.parent.name in UNOPTIMISED,
             item.path.parent.name not in LONG,
+            item.path not in slow,
             -tests[item.path],
             str(item.path),
         )
@@ -46,6 +54,15 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if "gpu" in item.keywords:
                 item.add_marker(skip)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def optimisation(request):
+    """How Warp compiles for a CPU: as in the program, or without optimisation (`UNOPTIMISED`)."""
+    if request.path.parent.name in UNOPTIMISED and not torch.cuda.is_available():
+        wp.config.optimization_level = 0
+    yield
+    wp.config.optimization_level = None
 
 
 @pytest.fixture(scope="session")

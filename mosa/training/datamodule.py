@@ -117,12 +117,6 @@ class SceneDataModule(L.LightningDataModule):
         ]  # fmt: skip
         return served(given)
 
-    def transfer_batch_to_device(
-        self, batch: Any, device: torch.device, dataloader_idx: int
-    ) -> Any:
-        """Sequences and starts stay where they are: what of them is needed on the device is brought there where it is needed."""
-        return batch.to(device) if isinstance(batch, MotionBatch) else batch
-
     # ---------------------------------------------------------------- films
     @cached_property
     def taught(self) -> list[str]:

@@ -274,7 +274,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
     ) -> Any:
-        """What is no batch of a fit stays where it is: what of it is needed on the device is brought there where it is needed."""
+        """Moves a batch of a fit. Sequences and starts stay: the parts that are needed move later."""
         return batch.to(device) if isinstance(batch, MotionBatch) else batch
 
     # ---------------------------------------------------------------- state

@@ -1,6 +1,7 @@
-"""Compiles the fused kernels for Hopper with the options they are launched with, without a GPU; prints what each takes, as JSON.
+"""Compiles the fused kernels for Hopper with the options they are launched with, without a GPU; prints a line of JSON for each
+precision: what each kernel takes.
 
-A program of its own: in the tests' process Triton only interprets. python compile_fused.py PRECISION HIDDEN
+A program of its own: in the tests' process Triton only interprets. python compile_fused.py HIDDEN PRECISION ...
 """
 
 import importlib
@@ -43,7 +44,7 @@ def compiled(module: str, name: str, options: dict) -> dict:
     }
 
 
-def main(precision: str, hidden: int) -> None:
+def main(hidden: int, precision: str) -> None:
     launch = _Launch(Settings(0.1, 0.1, 10.0, True, precision), 1000, hidden, torch.device("cpu"))
     found = {name: compiled("network_kernels", name, launch.forward()[1]) for name in FORWARD}
     found |= {
@@ -59,8 +60,9 @@ def main(precision: str, hidden: int) -> None:
             found[f"half {stored} {operator} forward"] = compiled(
                 "half_kernel", "operator_half", options
             )
-    print(json.dumps(found))
+    print(json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    for asked in sys.argv[2:]:
+        main(int(sys.argv[1]), asked)

@@ -15,21 +15,32 @@ SHARED = 227 * 1024
 """Bytes of a multiprocessor's shared memory that one program may have (compute capability 9.0)."""
 
 
-@pytest.mark.parametrize("precision, hidden", [("tf32", 64), ("tf32x3", 64), ("half", 64)])
-def test_they_compile_for_hopper(precision, hidden):
+PRECISIONS = ("tf32", "tf32x3", "half")
+
+
+@pytest.fixture(scope="module")
+def compiled() -> dict[str, dict]:
+    """What each kernel takes, by precision. One process compiles them all: the libraries are imported once."""
     script = Path(__file__).with_name("compile_fused.py")
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
     environment["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parents[4]), os.environ.get("PYTHONPATH", "")]
     )
     result = subprocess.run(
-        [sys.executable, str(script), precision, str(hidden)],
+        [sys.executable, str(script), "64", *PRECISIONS],
         capture_output=True,
         text=True,
         env=environment,
     )
     assert result.returncode == 0, result.stderr[-3000:]
-    found = json.loads(result.stdout.splitlines()[-1])
+    lines = result.stdout.splitlines()[-len(PRECISIONS) :]
+    return dict(zip(PRECISIONS, map(json.loads, lines), strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_they_compile_for_hopper(compiled, precision):
+    found = compiled[precision]
     assert len(found) == (16 if precision == "half" else 13)
     for name, kernel in found.items():
         assert kernel["shared"] <= (HALF_SHARED if name.startswith("half") else SHARED), name
