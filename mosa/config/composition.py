@@ -29,8 +29,11 @@ def current_folder() -> str:
 OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
 
 
+STORE = ConfigStore.instance()
 for command, model in COMMANDS.items():  # which conf/<command>.yaml begins with
-    ConfigStore.instance().store(f"{command}_settings", node_of(model, CHOSEN))
+    STORE.store(f"{command}_settings", node_of(model, CHOSEN))
+# --help copies Hydra's repository once for each group, and with it this store, of which there is one: a second of copies
+STORE.__deepcopy__ = lambda memo: STORE  # type: ignore[attr-defined]
 
 
 def configuration() -> str:
