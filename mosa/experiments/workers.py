@@ -44,20 +44,21 @@ class Worker:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # inherited by the process
         try:
             try:
-                self.start()
+                pool = self.started()
             except BrokenProcessPool:  # the process was killed since its last job
                 self.end()
-                self.start()
-            return self.pool.submit(work, program, list(words), str(screen))
+                pool = self.started()
+            return pool.submit(work, program, list(words), str(screen))
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def start(self) -> None:
+    def started(self) -> ProcessPoolExecutor:
         if self.pool is None:
             self.pool = ProcessPoolExecutor(
                 1, timeout=IDLE, env=self.environment, initializer=await_jobs
             )
         self.number = self.pool.submit(os.getpid)
+        return self.pool
 
     def stop(self) -> None:
         """SIGTERM to the job, which writes its checkpoint and ends."""
