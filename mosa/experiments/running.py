@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from pathlib import Path
 
 from mosa.experiments.commits import commit
 from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
@@ -66,8 +65,8 @@ def run_jobs(
                 known |= {job.film, job.first} - in_making(job)
                 minutes = (time.perf_counter() - began) / 60
                 done += 1
-                job_failed = future.exception() is not None or future.result() != 0
-                if job_failed := job_failed or not job.finished:
+                killed = future.exception() is not None
+                if job_failed := killed or future.result() != 0 or not job.finished:
                     places[0].end()  # a GPU that has raised an error answers no further job
                     failed[job.folder.name] = reason(job, future)
                     write_whole(job.folder / FAILED, failed[job.folder.name] + "\n")
@@ -94,11 +93,10 @@ def run_jobs(
 
 def environment(device: int | None) -> dict[str, str]:
     """Variables of a worker: of the GPUs that this process sees, the one of that number."""
-    found = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-    if device is not None:
-        listed = [part for part in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
-        found["CUDA_VISIBLE_DEVICES"] = listed[device] if device < len(listed) else str(device)
-    return found
+    if device is None:
+        return {}
+    listed = [part for part in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
+    return {"CUDA_VISIBLE_DEVICES": listed[device] if device < len(listed) else str(device)}
 
 
 def begin(job: Job, worker: Worker) -> Future[int]:
@@ -122,10 +120,10 @@ def in_making(job: Job) -> set[str]:
 def reason(job: Job, future: Future[int]) -> str:
     """Why a job failed: the last line of its output with an error, else how its process ended."""
     lines = (job.folder / "screen.log").read_text(errors="replace").splitlines()
-    said = [line.strip() for line in lines if "Error" in line or "Diverged" in line]
-    if said:
+    if said := [line.strip() for line in lines if "Error" in line or "Diverged" in line]:
         return said[-1][:300]
-    log = Path(job.folder) / "screen.log"
     if future.exception() is not None:
-        return f"its process was killed, which the system does where memory runs out; see {log}"
-    return f"exit code {future.result()}, see {log}"
+        ended = "its process was killed, which the system does where memory runs out"
+    else:
+        ended = f"exit code {future.result()}"
+    return f"{ended}; see {job.folder / 'screen.log'}"

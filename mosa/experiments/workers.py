@@ -1,7 +1,4 @@
-"""Worker processes of `running`: each runs one job after the other, so that the libraries are imported once per worker.
-
-Importing torch, Lightning and the rest takes 6 to 15 s of a core. Sharing them was measured against forks of a server that had
-them imported: docs/experiments.md."""
+"""Worker processes of `running`: each runs one job after the other, and so imports torch, Lightning and the rest only once."""
 
 from __future__ import annotations
 
@@ -13,13 +10,13 @@ import traceback
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from pathlib import Path
 
 from loky.process_executor import ProcessPoolExecutor
 
 from mosa.system.refused import let_go
 
-STOPS = (signal.SIGINT, signal.SIGTERM)
 IDLE = 300.0
 """Seconds without a job after which a worker process ends. One whose command was killed finishes its job first."""
 
@@ -41,29 +38,24 @@ class Worker:
         screen.write_bytes(
             b""
         )  # the output of an earlier run in this folder is not read as this one's
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # inherited by the process
         try:
-            try:
-                pool = self.started()
-            except BrokenProcessPool:  # the process was killed since its last job
-                self.end()
-                pool = self.started()
-            return pool.submit(work, program, list(words), str(screen))
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            pool = self.started()
+        except BrokenProcessPool:  # the process was killed since its last job
+            self.end()
+            pool = self.started()
+        return pool.submit(work, program, list(words), str(screen))
 
     def started(self) -> ProcessPoolExecutor:
         if self.pool is None:
-            self.pool = ProcessPoolExecutor(
-                1, timeout=IDLE, env=self.environment, initializer=await_jobs
-            )
+            self.pool = ProcessPoolExecutor(1, timeout=IDLE, env=self.environment, initializer=await_jobs)  # fmt: skip
         self.number = self.pool.submit(os.getpid)
         return self.pool
 
     def stop(self) -> None:
         """SIGTERM to the job, which writes its checkpoint and ends."""
         if self.number is not None and self.number.exception() is None:
-            os.kill(self.number.result(), signal.SIGTERM)
+            with suppress(ProcessLookupError):  # it has ended by itself
+                os.kill(self.number.result(), signal.SIGTERM)
 
     def end(self, at_once: bool = False) -> None:
         """End the process, after its job or at once; the next job has a new one."""
@@ -72,24 +64,20 @@ class Worker:
             self.pool = self.number = None
 
 
-stopped: list[int] = []
-"""Signals that this worker process has received between two jobs."""
-
-
 def await_jobs() -> None:
-    """Initialises a worker process: no screen, and a stop that comes between two jobs is kept for the next one."""
+    """Initialises a worker process, which has no screen."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for number in range(3):
         os.dup2(nothing, number)
     # the command may have been started without a screen; lines are read while the job runs
     sys.stdout, sys.stderr = (open(number, "w", buffering=1, closefd=False) for number in (1, 2))
-    keep_stops()
+    end_at_a_stop()
 
 
-def keep_stops() -> None:
-    for number in STOPS:
-        signal.signal(number, lambda number, _: stopped.append(number))
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+def end_at_a_stop() -> None:
+    """Until a job has begun to answer signals, a stop ends the process."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def work(program: str, words: list[str], screen: str) -> int:
@@ -100,19 +88,17 @@ def work(program: str, words: list[str], screen: str) -> int:
     os.close(written)
     where, _, function = program.partition(":")
     sys.argv = [where, *words]
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        if not stopped:
-            getattr(importlib.import_module(where), function)()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        getattr(importlib.import_module(where), function)()
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except BaseException:
         traceback.print_exc()
         return 1
     finally:
-        keep_stops()
+        end_at_a_stop()
         sys.stdout.flush()
         sys.stderr.flush()
         let_go()
-    return 128 + stopped[0] if stopped else 0
+    return 0
