@@ -44,7 +44,7 @@ from mosa.data.synthetic.surface import bind, extract_surface, fill
 from mosa.evaluation.metrics import identification_errors
 from mosa.evaluation.uncertainty import determined
 from mosa.experiments.commits import commit
-from mosa.experiments.specification import SHARED, options_of, read_yaml
+from mosa.experiments.specification import SHARED, SPECIFICATIONS, options_of, read_yaml
 from mosa.modules.body.body import Start
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
@@ -65,9 +65,7 @@ COVERED = 2.0
 
 def overrides_of(name: str) -> list[str]:
     """Of a stand-in, as the table of system identification has them."""
-    stand_ins = options_of(
-        "stand-ins", "stand-ins", read_yaml(CONF / "experiment" / "paper" / f"{SHARED}.yaml")
-    )
+    stand_ins = options_of("stand-ins", "stand-ins", read_yaml(SPECIFICATIONS / f"{SHARED}.yaml"))
     return list(next(option.overrides for option in stand_ins if option.name == name))
 
 

@@ -118,6 +118,7 @@ def interrupt(*_) -> None:
 def run(options: argparse.Namespace) -> int:
     """Exit code: 1 where jobs failed. Errors: ConfigError naming argument or file."""
     from mosa.experiments.specification import (
+        SPECIFICATIONS,
         estimate,
         experiment_names,
         jobs_of,
@@ -127,7 +128,7 @@ def run(options: argparse.Namespace) -> int:
         total_minutes,
     )
 
-    folder = Path(configuration()) / "experiment" / "paper"
+    folder = SPECIFICATIONS
     if options.page and not options.names:
         print(write_the_page(folder, options))
         return 0

@@ -1,4 +1,4 @@
-"""The paper's tables and figures: each is a file in conf/experiment/paper, and one command runs its jobs and writes its results.
+"""The paper's tables and figures: each is a file in `specifications`, and one command runs its jobs and writes its results.
 
 python -m mosa.experiments table_generalisation --dry-run
 """

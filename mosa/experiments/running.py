@@ -1,22 +1,21 @@
-"""Jobs side by side: a process of train.py each, on CPU cores or on the GPUs named; what is complete is not run again."""
+"""Jobs side by side, each a run of train.py in a worker process, on CPU cores or on the GPUs named; complete ones are skipped."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Sequence
-from multiprocessing.process import BaseProcess
-from pathlib import Path
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 from mosa.experiments.commits import commit
-from mosa.experiments.processes import begun
 from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
+from mosa.experiments.workers import Worker
 from mosa.system.whole_files import write_whole
 from mosa.training.jobs import held_back
 
 PROGRAM = "mosa.cli.train:main"
 WAIT = 0.2
-"""Seconds between looks at the running jobs."""
+"""Seconds between looks at what the running jobs have made."""
 
 
 def words_of(job: Job) -> list[str]:
@@ -31,75 +30,81 @@ def run_jobs(
     side_by_side: int,
     ended: Callable[[Job, bool], None] = lambda job, failed: None,
 ) -> dict[str, str]:
-    """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU; ended: told of each
-    job whether it failed.
+    """Run the jobs that are not complete; {folder: reason} of those that failed. devices: GPUs, [None] for the CPU; ended: called
+    with each job and whether it failed.
 
-    Of jobs that share their films, or a reconstruction, the first runs without the others until these are made, and they find them
-    in the cache."""
+    Of jobs that share their films, or a reconstruction, the first runs without the others until these are made; the others find
+    them in the cache."""
     waiting = in_turn([job for job in jobs if not job.finished], devices)
-    known: set[str] = (
-        set()
-    )  # what was made in earlier goes is found in the cache, or made again where that is another machine
-    free = dict.fromkeys(devices, side_by_side)
-    running: dict[BaseProcess, tuple[Job, int | None, float]] = {}
+    # what earlier commands made is found in the cache, or made again where that is another machine
+    known: set[str] = set()
+    free = {d: [Worker(environment(d)) for _ in range(side_by_side)] for d in devices}
+    running: dict[Future[int], tuple[Job, int | None, list[Worker], float]] = {}
     failed: dict[str, str] = {}
     done, total = 0, len(waiting)
+
+    def next_job() -> Job | None:
+        """The first that shares nothing with what a running job is making."""
+        making = {what for job, *_ in running.values() for what in in_making(job)} - known
+        return next((job for job in waiting if not {job.film, job.first} & making), None)
+
     try:
         while waiting or running:
-            for process in [p for p in running if p.exitcode is not None]:
-                job, device, began = running.pop(process)
-                free[device] += side_by_side if job.alone else 1
-                known |= {job.film, job.first} - in_making(job)
-                done += 1
-                if process.exitcode != 0 or not job.finished:
-                    failed[job.folder.name] = reason(job, process.exitcode)
-                    write_whole(job.folder / FAILED, failed[job.folder.name] + "\n")
-                outcome = "failed" if job.folder.name in failed else "complete"
-                minutes = (time.perf_counter() - began) / 60
-                if outcome == "complete":
-                    write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
-                print(
-                    f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min",
-                    flush=True,
-                )
-                ended(job, outcome == "failed")
-            making = {what for job, _, _ in running.values() for what in in_making(job)} - known
-            ready = next((job for job in waiting if not {job.film, job.first} & making), None)
-            device = max(devices, key=free.get)  # of several the one with the fewest jobs
-            places = side_by_side if ready is not None and ready.alone else 1
-            if ready is not None and free[device] >= places:
-                waiting.remove(ready)
-                free[device] -= places
+            while (job := next_job()) is not None:
+                device = max(devices, key=lambda d: len(free[d]))  # the one with the fewest jobs
+                count = side_by_side if job.alone else 1
+                if len(free[device]) < count:
+                    break
+                waiting.remove(job)
+                # the worker that ended a job last has the libraries imported
+                places = [free[device].pop() for _ in range(count)]
                 with held_back():  # a stop that falls in here ends this job too
-                    running[begin(ready, device)] = (ready, device, time.perf_counter())
-            else:
-                time.sleep(WAIT)
+                    running[begin(job, places[0])] = (job, device, places, time.perf_counter())
+            for future in wait(running, WAIT, FIRST_COMPLETED).done:
+                job, device, places, began = running.pop(future)
+                known |= {job.film, job.first} - in_making(job)
+                minutes = (time.perf_counter() - began) / 60
+                done += 1
+                killed = future.exception() is not None
+                if job_failed := killed or future.result() != 0 or not job.finished:
+                    places[0].end()  # a GPU that has raised an error answers no further job
+                    failed[job.folder.name] = reason(job, future)
+                    write_whole(job.folder / FAILED, failed[job.folder.name] + "\n")
+                else:
+                    write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
+                free[device] += reversed(places)
+                outcome = "failed" if job_failed else "complete"
+                print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)  # fmt: skip
+                ended(job, job_failed)
     finally:
-        for process in running:  # Ctrl-C: each writes its checkpoint and ends
-            process.terminate()
+        at_work = [places[0] for _, _, places, _ in running.values()]
+        for worker in at_work:  # Ctrl-C: each job writes its checkpoint and ends
+            worker.stop()
         try:
-            for process in running:
-                process.join()
+            wait(running)
         except KeyboardInterrupt:  # a second one: at once
-            for process in running:
-                process.kill()
+            for worker in at_work:
+                worker.end(at_once=True)
             raise
+        for worker in [*at_work, *(worker for each in free.values() for worker in each)]:
+            worker.end()
     return failed
 
 
-def begin(job: Job, device: int | None) -> BaseProcess:
+def environment(device: int | None) -> dict[str, str]:
+    """Variables of a worker: of the GPUs that this process sees, the one of that number."""
+    if device is None:
+        return {}
+    listed = [part for part in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
+    return {"CUDA_VISIBLE_DEVICES": listed[device] if device < len(listed) else str(device)}
+
+
+def begin(job: Job, worker: Worker) -> Future[int]:
     job.folder.mkdir(parents=True, exist_ok=True)
     for name in (FAILED, PRESSED):  # of the run that was here before
         (job.folder / name).unlink(missing_ok=True)
     write_whole(job.folder / COMMIT, commit() + "\n")
-    environment = dict(os.environ)
-    environment.setdefault("OMP_NUM_THREADS", "1")
-    if device is not None:
-        listed = [part for part in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
-        environment["CUDA_VISIBLE_DEVICES"] = (
-            listed[device] if device < len(listed) else str(device)
-        )
-    return begun(PROGRAM, words_of(job), job.folder / "screen.log", environment)
+    return worker.begin(PROGRAM, words_of(job), job.folder / "screen.log")
 
 
 def in_making(job: Job) -> set[str]:
@@ -112,8 +117,13 @@ def in_making(job: Job) -> set[str]:
     }
 
 
-def reason(job: Job, code: int) -> str:
-    """The last line with a message of what a failed job had on the screen."""
+def reason(job: Job, future: Future[int]) -> str:
+    """Why a job failed: the last line of its output with an error, else how its process ended."""
     lines = (job.folder / "screen.log").read_text(errors="replace").splitlines()
-    said = [line.strip() for line in lines if "Error" in line or "Diverged" in line]
-    return said[-1][:300] if said else f"exit code {code}, see {Path(job.folder) / 'screen.log'}"
+    if said := [line.strip() for line in lines if "Error" in line or "Diverged" in line]:
+        return said[-1][:300]
+    if future.exception() is not None:
+        ended = "its process was killed, which the system does where memory runs out"
+    else:
+        ended = f"exit code {future.result()}"
+    return f"{ended}; see {job.folder / 'screen.log'}"

@@ -15,6 +15,8 @@ import yaml
 from mosa.errors import ConfigError, DataError
 
 PLOTS = ("bars", "lines", "map", None)
+SPECIFICATIONS = Path(__file__).with_name("specifications")
+"""Folder of the files of all experiments."""
 SHARED = "_shared"
 """File of axes that several experiments name."""
 MINUTES = "minutes.txt"

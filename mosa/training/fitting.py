@@ -25,6 +25,7 @@ from mosa.training.costs import Costs, duration, seconds_of_fit, speed_of_rollou
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa
 from mosa.training.loggers import DescribingLogger
+from mosa.training.run_folder import VALIDATION
 
 log = logging.getLogger(__name__)
 
@@ -108,14 +109,15 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
 
 
 def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
-    """Errors: ConfigError where a callback watches validation and nothing is held out."""
+    """Errors: ConfigError where a callback or a sweep's objective is of validation and nothing is held out."""
     if cfg.scene.get("holdout_cameras") or cfg.scene.get("holdout_frames"):
         return
-    for each in callbacks:
-        if str(getattr(each, "monitor", None)).startswith("val/"):
+    monitors = [(f"callbacks: {type(c).__name__}", getattr(c, "monitor", None)) for c in callbacks]
+    for where, figure in [*monitors, ("optimized_metric", cfg.optimized_metric)]:
+        if str(figure).startswith(VALIDATION):
             raise ConfigError(
-                f"callbacks: {type(each).__name__} watches {each.monitor}: expected something that is held out of "
-                "the training sequence, found nothing; scene.holdout_cameras=[0] or scene.holdout_frames=2"
+                f"{where} is {figure}: expected something that is held out of the training sequence, found nothing; "
+                "scene.holdout_cameras=[0] or scene.holdout_frames=2"
             )
 
 

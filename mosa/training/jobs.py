@@ -14,7 +14,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -242,22 +241,6 @@ class Failures(Callback):
             print(f"\n{len(files)} jobs of the sweep failed:\n{listed}", file=sys.stderr)
 
 
-IDLE = 60.0
-"""Seconds without a job after which a worker ends whose launcher is gone: it may still be writing what the job returned."""
-at_work = threading.Event()
-"""Whether a job is running in this process."""
-
-
-def leave_after(launcher: int, idle: float = IDLE) -> None:
-    """Ends this process once the one that launched it has been gone and no job has run for so many seconds. Workers of joblib whose
-    sweep was killed would wait for another job for ever, with a gigabyte each; a job that runs comes to its end first."""
-    waited, look = 0.0, min(idle / 10, 5.0)
-    while waited < idle:
-        time.sleep(look)
-        waited = 0.0 if at_work.is_set() or os.getppid() == launcher else waited + look
-    os._exit(1)
-
-
 signals: list[int] = []
 """Received. Lightning turns what stops a fit into an exit of its own, which no longer says which one it was."""
 
@@ -350,10 +333,6 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
 
 
 def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
-    if (
-        not begun and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-    ):  # a launcher's worker
-        threading.Thread(target=leave_after, args=(os.getppid(),), daemon=True).start()
     begun.append(True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
@@ -362,7 +341,6 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         if HydraConfig.initialized()
         else None
     )
-    at_work.set()
     try:
         with (
             held(folder, wait=(cfg or {}).get("resume") == "auto")
@@ -378,8 +356,6 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
     except Exception as error:
         if (message := explained(error, folder)) is None:
             raise
-    finally:
-        at_work.clear()
     fail(message)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)

@@ -33,7 +33,7 @@ from mosa.evaluation.uncertainty import determined, predicted_spread
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.whole_files import written_whole
-from mosa.training.run_folder import write_figures
+from mosa.training.run_folder import VALIDATION, write_figures
 from mosa.twin.rollout_file import save_rollout, save_spread, save_truth
 from mosa.types import Rollout, Scene
 
@@ -130,7 +130,10 @@ def write_outputs(
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:
-    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks; of image figures the negative."""
+    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks; of image figures the negative. A figure of
+    validation has no fallback: a sweep that is to choose by it is never given one of the test films."""
+    if wanted.startswith(VALIDATION):
+        return figures.get(wanted)
     for key in (wanted, "test/rms_m", "train/rms_m"):
         if key in figures:
             return figures[key]

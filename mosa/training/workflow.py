@@ -44,6 +44,7 @@ from mosa.training.preflight import (
     warn_of_little,
 )  # fmt: skip
 from mosa.training.run_folder import (
+    VALIDATION,
     begins_from,
     cost,
     finished,
@@ -174,7 +175,9 @@ def train(cfg: DictConfig) -> float | None:
         clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     )
     figures["geometry/cells_across"] = resolved.cells
-    figures |= {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+    figures |= {
+        k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith(VALIDATION)
+    }
     log_outcome(trainer.loggers, plain(cfg), figures)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, cfg.optimized_metric)

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from mosa.cli.experiment import arguments, run, run_counted, shown
 from mosa.config.build import rehearse
 from mosa.errors import ConfigError, DataError
-from mosa.experiments import processes, running, specimens
+from mosa.experiments import running, specimens, workers
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
 from mosa.experiments.goes import Clock, Go
@@ -225,6 +225,12 @@ def test_the_jobs_of_what_is_named_first_begin_first_and_those_of_one_word_the_l
 FAKE = """
 import json, os, pathlib, sys, time
 
+def until(log, word, count):
+    # so many jobs have written the word
+    last = time.monotonic() + 60
+    while log.read_text().count(word) < count and time.monotonic() < last:
+        time.sleep(0.02)
+
 def main():
     folder = pathlib.Path(sys.argv[-1].removeprefix("hydra.run.dir=").strip("'"))
     log = folder.parent / "log.txt"
@@ -248,7 +254,6 @@ def fake(tmp_path, monkeypatch):
         name = f"fake_job_{hashlib.sha256(code.encode()).hexdigest()[:8]}"
         (tmp_path / f"{name}.py").write_text(code)
         monkeypatch.syspath_prepend(str(tmp_path))
-        monkeypatch.setattr(processes, "PRELOADED", processes.PRELOADED[:1])
         monkeypatch.setattr(running, "PROGRAM", f"{name}:main")
 
     return made
@@ -256,10 +261,10 @@ def fake(tmp_path, monkeypatch):
 
 def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_path, fake, capsys):
     fake()
-    jobs = jobs_of(experiment(), tmp_path)
+    jobs = jobs_of(narrowed(experiment(), {}, (0,)), tmp_path)
     failed = running.run_jobs(jobs, [None], 4)
-    assert len(failed) == 4 and set(failed.values()) == {"ConfigError: it broke"}
-    assert capsys.readouterr().out.count("complete after") == 4
+    assert len(failed) == 2 and set(failed.values()) == {"ConfigError: it broke"}
+    assert capsys.readouterr().out.count("complete after") == 2
     firsts = {job.folder.name: job.first for job in jobs}
     done, now = set(), []
     for line in (tmp_path / "log.txt").read_text().splitlines():
@@ -273,20 +278,20 @@ def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_
             now.remove(name)
             done.add(firsts[name])
     (tmp_path / "log.txt").unlink()
-    assert len(running.run_jobs(jobs, [None], 4)) == 4
-    assert (tmp_path / "log.txt").read_text().count("begin") == 4  # those that failed, no other
+    assert len(running.run_jobs(jobs, [None], 4)) == 2
+    assert (tmp_path / "log.txt").read_text().count("begin") == 2  # those that failed, no other
 
 
 def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, fake):
     said = "print('data took 1 s\\nreconstruction took 1 s', flush=True)"
-    fake(FAKE.replace("time.sleep(0.3)", f"time.sleep(0.2); {said}; time.sleep(1.5)"))
+    fake(FAKE.replace("time.sleep(0.3)", f"time.sleep(0.2); {said}; until(log, 'begin', 2)"))
     jobs = jobs_of(narrowed(experiment(), {"scene": ["a"]}, (0,)), tmp_path)
     assert len(jobs) == 2
     running.run_jobs(jobs, [None], 2)
     words = [line.split()[0] for line in (tmp_path / "log.txt").read_text().splitlines()]
     assert words == ["begin", "begin", "end", "end"]
     taken = [float((job.folder / "minutes.txt").read_text()) for job in jobs if job.finished]
-    assert len(taken) == 1 and taken[0] > 1.5 / 60  # one of them fails
+    assert len(taken) == 1 and taken[0] > 0.2 / 60  # one of them fails
 
 
 def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, fake, monkeypatch):
@@ -294,12 +299,12 @@ def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, f
     started = []
 
     def stopped(*words):
-        started.append(begun(*words))
+        started.append(begin(*words))
         signal.raise_signal(signal.SIGINT)
         return started[-1]
 
-    begun = processes.begun
-    monkeypatch.setattr(running, "begun", stopped)
+    begin = workers.Worker.begin
+    monkeypatch.setattr(workers.Worker, "begin", stopped)
     before = signal.signal(
         signal.SIGINT, signal.default_int_handler
     )  # a shell that put pytest into the background had it ignored
@@ -308,7 +313,16 @@ def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, f
             running.run_jobs(jobs_of(experiment(), tmp_path), [None], 1)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert [process.exitcode for process in started] == [-15]
+    assert len(started) == 1 and started[0].done()
+    assert started[0].exception() is not None
+
+
+def test_a_job_that_is_killed_stops_no_other_and_is_named(tmp_path, fake):
+    fake(FAKE.replace("sys.exit(2)", "os.kill(os.getpid(), 9)").replace("ConfigError", "it was"))
+    jobs = jobs_of(narrowed(experiment(), {}, (0,)), tmp_path)
+    failed = running.run_jobs(jobs, [None], 1)
+    assert len(failed) == 2 and all("its process was killed" in each for each in failed.values())
+    assert sum(job.finished for job in jobs) == 2
 
 
 def test_what_is_held_out_or_learned_from_changes_no_film(tmp_path):
@@ -337,7 +351,7 @@ def test_what_shares_films_begins_when_these_are_made_and_reconstructs_for_itsel
             """time.sleep(0.6)
     open(log, "a").write("filmed it\\n")
     print("data took 1 s", flush=True)
-    time.sleep(1.5)""",
+    until(log, "filmed", 2)""",
         )
     )
     jobs = jobs_of(narrowed(experiment(), {"scene": ["a"], "method": ["ours"]}, (0, 1)), tmp_path)
@@ -389,7 +403,7 @@ def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path,
 
 
 def test_a_job_that_runs_alone_has_its_device_to_itself(tmp_path, fake):
-    fake()
+    fake(FAKE.replace("time.sleep(0.3)", "until(log, 'begin', 3); time.sleep(0.1)"))
     scenes = {
         "scene": tuple(Option(name, (f"scene={name}",)) for name in "abcd"),
         "method": (Option("ours", ()),),

@@ -8,12 +8,13 @@ import pytest
 from made_up import PAPER
 
 from mosa.errors import DataError
-from mosa.experiments import processes, running
+from mosa.experiments import running
 from mosa.experiments.analyses import directions, heterogeneity
 from mosa.experiments.collecting import records_of
 from mosa.experiments.parameters import parameters, verdict
 from mosa.experiments.specification import jobs_of, load_experiment, narrowed
 from mosa.experiments.specimens import ANGLES, compression, plane
+from mosa.experiments.workers import Worker
 
 
 def pressed(folder: Path, **models) -> None:
@@ -78,9 +79,10 @@ def test_a_run_that_is_made_again_is_pressed_again(tmp_path, monkeypatch):
     _, (job,) = cylinder(tmp_path, ("ours",))
     pressed(job.folder, **{"": ((1.0, 1.2, 1.0), 0.0)})
     (job.folder / "failed.txt").write_text("SimulationDiverged")
-    monkeypatch.setattr(processes, "PRELOADED", [])
     monkeypatch.setattr(running, "PROGRAM", "gc:collect")
-    running.begin(job, None).join()
+    worker = Worker({})
+    assert running.begin(job, worker).result(60) == 0
+    worker.end()
     assert sorted(file.name for file in job.folder.iterdir()) == [
         "commit.txt",
         "metrics.json",

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mosa.experiments.specification import (
+    SPECIFICATIONS,
     Experiment,
     Figure,
     Option,
@@ -13,7 +14,7 @@ from mosa.experiments.specification import (
 )
 
 CONF = Path(__file__).parents[2] / "conf"
-PAPER = CONF / "experiment" / "paper"
+PAPER = SPECIFICATIONS
 NAMES = experiment_names(PAPER)
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import textwrap
 import threading
-import time
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -22,7 +21,6 @@ from omegaconf import OmegaConf
 from mosa.errors import ConfigError
 from mosa.system import refused
 from mosa.system.npz import write_npz
-from mosa.training import jobs
 from mosa.training.jobs import (
     LONGEST,
     Failures,
@@ -115,57 +113,6 @@ def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_fol
         with caplog.at_level("INFO"), held(tmp_path, wait=True):
             assert other.stdout.readline() == "ended\n"
         assert "another process is at work in" in caplog.text
-
-
-def test_a_worker_ends_once_its_launcher_is_gone_and_its_job_is_over(tmp_path):
-    """Those of a killed sweep of joblib stayed, with a gigabyte each."""
-    worker = tmp_path / "worker.py"
-    worker.write_text(
-        textwrap.dedent(f"""
-        import os, pathlib, threading, time
-        from mosa.training.jobs import at_work, leave_after
-        here = pathlib.Path({str(tmp_path)!r})
-        at_work.set()
-        threading.Thread(target=leave_after, args=(os.getppid(), 0.3), daemon=True).start()
-        (here / "started").write_text(str(os.getpid()))
-        time.sleep(1.5)  # a job, which outlives the launcher
-        (here / "done").touch()
-        at_work.clear()
-        time.sleep(60)
-    """)
-    )
-    code = f"import subprocess, sys, time; subprocess.Popen([sys.executable, {str(worker)!r}]); time.sleep(60)"
-    with subprocess.Popen(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}
-    ) as launcher:
-        while not (tmp_path / "started").is_file() or not (tmp_path / "started").read_text():
-            time.sleep(0.05)
-        launcher.kill()
-    state, until = (
-        Path("/proc") / (tmp_path / "started").read_text() / "stat",
-        time.monotonic() + 20,
-    )
-    while (
-        state.is_file() and " Z " not in state.read_text() and time.monotonic() < until
-    ):  # Z: nobody asked how it ended
-        time.sleep(0.05)
-    assert time.monotonic() < until and (tmp_path / "done").is_file()
-
-
-@pytest.mark.parametrize(
-    "run, launched", [(RunMode.RUN, False), (RunMode.MULTIRUN, False), (RunMode.MULTIRUN, True)]
-)
-def test_who_launched_a_sweep_does_not_leave_with_its_own_launcher(
-    sweep, monkeypatch, run, launched
-):
-    """A shell, say, that nohup outlives: only a launcher's workers do, whose first act is a job of a sweep."""
-    HydraConfig.get().mode, left = run, []
-    monkeypatch.setattr(HydraConfig, "initialized", staticmethod(lambda: True))
-    monkeypatch.setattr(jobs, "leave_after", lambda launcher: left.append(launcher))
-    monkeypatch.setattr(jobs, "begun", [] if launched else [True])
-    attempt(lambda _: 0.0, sweep)
-    time.sleep(0.2)
-    assert left == ([os.getppid()] if launched else [])
 
 
 def test_runs_that_begin_in_the_same_second_have_a_folder_each():

@@ -39,7 +39,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
     },  # of the ablations: the same four networks with all of their parts
     "ours": {"color": "#d4111f", "linewidth": 2.6, "zorder": 3},
 }
-"""How a method is drawn in every picture, by its name in conf/experiment/paper/_shared.yaml."""
+"""How a method is drawn in every picture, by its name in specifications/_shared.yaml."""
 
 FURTHER = ("#17becf", "#e377c2", "#a3a21c", "#253494", "#b15928", "#66c2a5", "#c39bd3")
 """Colours of what STYLES does not name: none of them is a method's."""
