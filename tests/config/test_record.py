@@ -1,0 +1,45 @@
+"""The record of a run: plain data that comes back as it was written, with decisions beside the settings, never in them."""
+
+import pytest
+import torch
+from strangers import cube, saved
+
+from mosa.config.build import build_body, world_of
+from mosa.config.record import BodyRecord, RunRecord
+from mosa.errors import ConfigError
+from mosa.types import Ground
+
+
+def test_a_record_comes_back_as_it_was_written(tmp_path):
+    written = saved()["mosa"]
+    torch.save(written, tmp_path / "a.pt")
+    found = RunRecord.read(torch.load(tmp_path / "a.pt", weights_only=True))
+    assert found.plain() == written and found.body.plain() == {
+        key: written[key] for key in BodyRecord.model_fields
+    }
+
+
+def test_what_was_decided_stands_beside_the_settings():
+    given = saved("prior=auto", "world.walls={mode: separate}")["mosa"]
+    record = RunRecord.read(given).body.but(law="stvk").on(Ground(0.0, "touch", 0.3))
+    assert record.settings == given["settings"] and record.settings["prior"]["law"] == "auto"
+    body, world = build_body(record, cube()), world_of(record)
+    assert body.material.law == "stvk" and body.material.candidates == ()
+    assert world.ground == Ground(0.0, "touch", 0.3) and len(world.planes) == 6
+    assert build_body(RunRecord.read(given), cube()).material.candidates != ()
+
+
+def test_a_ground_that_is_sought_is_one_that_the_body_sticks_to():
+    record = RunRecord.read(saved()["mosa"]).body.on(Ground(0.0, "auto"))
+    assert record.ground_is_sought and world_of(record).ground == Ground(0.0, "sticky")
+
+
+@pytest.mark.parametrize(("key", "value", "message"), [
+    ("more", 1, r"mosa\.more: unknown key"), ("dx", "a", r"mosa\.dx: expected a number"), ("law", "jelly", "jelly"),
+    ("ground", {"height": 0.0, "mode": "glue"}, r"mosa\.ground\.mode: expected sticky or slip or separate or touch or auto"),
+    ("world", {"gravity": [0, 1, 0], "up": [0, 1, 0], "box": [[-1] * 3, [1] * 3]}, "expected a pull against up"),
+    ("starts", {"../x": {}}, "expected names like train"), ("version", 2, r"mosa\.version: expected 3"),
+])  # fmt: skip
+def test_what_is_no_record_is_named(key, value, message):
+    with pytest.raises(ConfigError, match=message):
+        RunRecord.read(saved()["mosa"] | {key: value})
