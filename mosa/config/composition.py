@@ -36,6 +36,13 @@ for command, model in COMMANDS.items():  # which conf/<command>.yaml begins with
 STORE.__deepcopy__ = lambda memo: STORE  # type: ignore[attr-defined]
 
 
+def with_defaults(cfg: DictConfig, name: str) -> DictConfig:
+    """A configuration of conf/<name>.yaml whose keys that were deleted (`~key`) have their defaults."""
+    found = OmegaConf.merge(node_of(COMMANDS[name]), cfg)
+    assert isinstance(found, DictConfig)
+    return found
+
+
 def configuration() -> str:
     """Folder of the configuration: inside of an installed package, beside it in a clone."""
     package = Path(__file__).parents[1]

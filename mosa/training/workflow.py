@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__
 from mosa.config.build import measured, plain, world_of
+from mosa.config.composition import with_defaults
 from mosa.config.extensions import load_extensions
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
@@ -82,6 +83,7 @@ def train(cfg: DictConfig) -> float | None:
     quiet()
     load_extensions(plain(cfg).get("extensions"))
     settings = check_configuration(plain(cfg))
+    cfg = with_defaults(cfg, "train")
     L.seed_everything(cfg.seed, verbose=False)
     exact_sums.use(cfg.deterministic)
     clock, folder = StageTimes(), run_folder()
@@ -193,6 +195,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         )
     load_extensions(plain(cfg).get("extensions"))
     settings = check_evaluation(plain(cfg))
+    cfg = with_defaults(cfg, "eval")
     exact_sums.use(cfg.deterministic)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))

@@ -13,7 +13,7 @@ from pydantic_core import PydanticUndefined
 
 from mosa.config.build import rehearse
 from mosa.config.command_settings import EvalSettings, TrainSettings
-from mosa.config.composition import CHOSEN
+from mosa.config.composition import CHOSEN, with_defaults
 from mosa.config.leaf_settings import COMMANDS
 from mosa.errors import ConfigError
 from mosa.settings import annotation_of, described, fits, model_in, node_of
@@ -87,6 +87,11 @@ def test_a_section_that_is_given_in_part_keeps_the_defaults_of_its_place():
     settings = TrainSettings.read(given)
     assert (settings.fit.joint.lr, settings.fit.joint.start) == (1.0, "prior")
     assert (settings.fit.prior.looks, settings.reconstruction.appearance.keep) == (3, 1.0)
+
+
+def test_a_deleted_key_has_its_default():
+    cfg = with_defaults(OmegaConf.create(composed("~world", "~fit.views", "seed=3")), "train")
+    assert (cfg.world.colliders, cfg.fit.views, cfg.seed) == ([], 2, 3)
 
 
 def fields_of(model, where=""):
