@@ -19,7 +19,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.config.build import build_body, build_world, plain
-from mosa.config.checkpoints import VERSION
 from mosa.config.extensions import load_extensions
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
@@ -33,6 +32,7 @@ from mosa.rendering.appearance.carried_splats import CarriedSplats
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
+from mosa.twin.saved import save_twin
 from mosa.twin.start import numbers
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
@@ -202,21 +202,6 @@ def take_law(body: Body, learned: Body) -> None:
         raise DataError(
             f"ckpt_path: expected a law that fits the object, found {unexpected or missing}"
         )
-
-
-def save_twin(twin: Twin, path: str | Path) -> Path:
-    """A checkpoint that `Twin.load` reads: nothing was fitted, so that no fit can go on from it."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    written = twin.training_start.written()
-    splats = twin.body.splats
-    torch.save({
-        "state_dict": {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()},
-        "mosa": {"version": VERSION, "config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [],
-                 "steps_done": 0, "particles": len(twin.body.rest), "start": written,
-                 "splats": None if splats is None else splats.written()},
-    }, path)  # fmt: skip
-    return path
 
 
 def drop(cfg: DictConfig) -> None:
