@@ -6,15 +6,15 @@ stiffness, each with a normal prior of one standard deviation that the evidence 
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 
 from mosa.errors import SimulationDiverged
+from mosa.evaluation.analysis.law_stress import in_double
 from mosa.material_tests.measurements import Measurements
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
@@ -50,7 +50,7 @@ class Law:
     symmetry: full | orthotropic, of the stiffness."""
 
     def __init__(self, material: Material, adapter: HyperelasticAdapter | None, symmetry: str) -> None:
-        self.material, self.adapter = material.double(), adapter
+        self.material, self.adapter = in_double(material), adapter
         self.count = 0
         if adapter is not None:
             self.count = ORTHOTROPIC if symmetry == "orthotropic" else len(adapter.numbers)
@@ -72,16 +72,6 @@ class Law:
             if self.adapter is not None:
                 own = torch.as_tensor(np.array(theta[len(theta) - self.count :]))
                 self.adapter.numbers[: self.count] = own
-        return self
-
-    def settled(self) -> Law:
-        """With the stiffness' unit at the law's modulus, as a run's calibration leaves it."""
-        if self.adapter is not None:
-            fresh = copy.deepcopy(self.adapter)
-            fresh.E_ref.fill_(float("nan"))
-            fresh.poisson.fill_(float("nan"))
-            fresh.switch_on(self.material.reference_modulus(), self.material.poisson())
-            self.adapter = fresh
         return self
 
 
@@ -161,8 +151,3 @@ class Fitting:
             rows = self.data.without(k)
             result[name] = self.fit(rows).predicted[~rows]
         return result
-
-
-def without_data(data: Measurements) -> Measurements:
-    """The same states with no measured stress."""
-    return replace(data, value=np.full_like(data.value, np.nan))

@@ -7,51 +7,17 @@ would shear by itself, as a strip at an angle to its fibres does.
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import torch
-import warp as wp
 
 from mosa.errors import SimulationDiverged
+from mosa.evaluation.analysis.law_stress import kirchhoff
 from mosa.material_tests.measurements import Measurements
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
-from mosa.physics.adapters.interface import MaterialState
-from mosa.physics.constitutive.laws import SLOTS, law_named
-from mosa.physics.constitutive.material_kernels import field_types, kernels_of
-from mosa.physics.engine.simulator import Simulator
-from mosa.physics.launching import launch
 
 ITERATIONS, STEP, LONGEST, PRECISE = 60, 1e-6, 0.3, 1e-11
 """Of Newton's method: logarithms of stretches move by at most `LONGEST`, until stresses are 0 to `PRECISE` of the largest."""
-
-
-@cache
-def simulator(law: str) -> Simulator:
-    """That packs the law's parameters."""
-    return Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64)
-
-
-def kirchhoff(material: Material, adapter: HyperelasticAdapter | None, F: np.ndarray) -> np.ndarray:
-    """tau (n, 3, 3) [Pa] of F (n, 3, 3) in float64, of the law with its learned stiffness if there is an adapter."""
-    law, n = law_named(material.law), len(F)
-    with torch.no_grad():
-        values = {k: v.double() for k, v in material.per_particle().items()}
-        packed = simulator(law.name).pack(values, 1, torch.eye(3).double()[None]).expand(n, SLOTS)
-        G, h = torch.zeros(1, 6, 6).double(), torch.zeros(1, 6).double()
-        if adapter is not None:
-            adapter.follow(material.poisson().double())
-            G, h = adapter(MaterialState(torch.zeros(1, 6).double(), torch.zeros(1, 6).double()))[:2]
-    gradients, tau = torch.from_numpy(np.ascontiguousarray(F)), torch.zeros(n, 3, 3).double()
-    strain = None if adapter is None else adapter.strain
-    kernel, _ = kernels_of(law, wp.float64, adapter is not None, False, strain)
-    mat33, vec6, mat66, vecp = field_types(wp.float64)
-    kinds = (mat33, mat33, vecp, mat66, vec6, mat33)
-    parts = (gradients, torch.zeros_like(gradients), packed, G, h, tau)
-    arrays = [wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in zip(parts[:-1], kinds)]
-    launch(kernel, n, [*arrays, wp.from_torch(tau, dtype=mat33)], arrays[0].device)
-    return tau.numpy()
 
 
 class Specimens:
@@ -101,7 +67,7 @@ class Specimens:
 
         def stress(rows: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             F = self.gradients(rows, moved)
-            return F, kirchhoff(material, adapter, F @ self.turn[rows])
+            return F, kirchhoff(material, adapter, torch.from_numpy(F @ self.turn[rows])).numpy()
 
         with np.errstate(all="ignore"):
             moved = np.zeros((len(self.data.test), 2))
