@@ -1,6 +1,6 @@
 """The measurements of real tissues as csv files for `mosa-material`: heart muscle, knitted fabric, rubber (MOSA_DATA, openpyxl).
 
-python benchmarks/tissue_tests.py FOLDER      writes heart.csv (kPa), fabric.csv and fabric_unloading.csv (unit as published), rubber.csv (MPa)
+python benchmarks/tissue_tests.py FOLDER    writes heart.csv (kPa), fabric.csv, fabric_unloading.csv (kPa), rubber.csv (MPa)
 
 Heart: six shear modes (face normal, then direction) and five biaxial ratios; x fibre, y sheet, z normal. Fabric: loading, mean and
 standard deviation of the repeats, along the courses (0) and at 45 degrees; every third row. Rubber: Treloar at 20 degrees.
@@ -16,7 +16,11 @@ from pathlib import Path
 AXES = {"f": "x", "s": "y", "n": "z"}
 SHEARS = {"fs": 0, "fn": 2, "sf": 5, "sn": 7, "nf": 10, "ns": 12}
 BIAXIAL = {"1:1": 15, "1:0.75": 20, "0.75:1": 25, "1:0.5": 30, "0.5:1": 35}
-RUBBER = {"uniaxial": ("uniaxial x", 0, 2), "equibiaxial": ("biaxial xy", 3, 5), "pure shear": ("biaxial xy", 6, 8)}
+RUBBER = {
+    "uniaxial": ("uniaxial x", 0, 2),
+    "equibiaxial": ("biaxial xy", 3, 5),
+    "pure shear": ("biaxial xy", 6, 8),
+}
 LEAST_SD = 0.05
 """Of a fabric's standard deviation, as a share of the largest: at the first rows all repeats begin at 0."""
 
@@ -41,12 +45,24 @@ def numbers(rows: list[tuple], *columns: int) -> list[list[float]]:
 def heart() -> list[dict]:
     rows = sheet("myocardium_CANNsHEARTdata_shear05", "Sheet1", 5)
     found = [
-        {"test": f"shear {name}", "mode": f"shear {AXES[name[0]]}{AXES[name[1]]}", "first": a, "stress_1": p}
+        {
+            "test": f"shear {name}",
+            "mode": f"shear {AXES[name[0]]}{AXES[name[1]]}",
+            "first": a,
+            "stress_1": p,
+        }
         for name, c in SHEARS.items()
         for a, p in numbers(rows, c, c + 1)
     ]
     return found + [
-        {"test": f"biaxial {name}", "mode": "biaxial xz", "first": a, "second": b, "stress_1": p, "stress_2": q}
+        {
+            "test": f"biaxial {name}",
+            "mode": "biaxial xz",
+            "first": a,
+            "second": b,
+            "stress_1": p,
+            "stress_2": q,
+        }
         for name, c in BIAXIAL.items()
         for a, p, b, q in numbers(rows, c, c + 1, c + 2, c + 3)
     ]
@@ -63,7 +79,13 @@ def fabric(branch: str = "load") -> list[dict]:
             read = numbers(rows, *columns)[::3]
             least = [LEAST_SD * max(r[c] for r in read) for c in range(3, len(columns), 2)]
             for a, b, *rest in read:
-                row = {"test": f"{title} {angle}", "mode": "biaxial xy", "angle": angle, "first": a, "second": b}
+                row = {
+                    "test": f"{title} {angle}",
+                    "mode": "biaxial xy",
+                    "angle": angle,
+                    "first": a,
+                    "second": b,
+                }
                 for k, (value, sd) in enumerate(zip(rest[::2], rest[1::2])):
                     row |= {f"stress_{k + 1}": value, f"sd_{k + 1}": max(sd, least[k])}
                 found.append(row)

@@ -14,8 +14,15 @@ def main(words: list[str] | None = None) -> None:
     settle_threads()
     parser = argparse.ArgumentParser(prog="mosa-export-law", description=__doc__)
     parser.add_argument("source", help="checkpoint of a run, or material.json of mosa-material")
-    parser.add_argument("folder", type=Path, help="where umat.f90, law_ufl.py, law_warp.py and law.json are written")
-    parser.add_argument("--check", type=int, default=1000, help="deformations at which every text is compared; 0: none")
+    parser.add_argument(
+        "folder", type=Path, help="where umat.f90, law_ufl.py, law_warp.py and law.json are written"
+    )
+    parser.add_argument(
+        "--check",
+        type=int,
+        default=1000,
+        help="deformations at which every text is compared; 0: none",
+    )
     given = parser.parse_args(words)
     from mosa.export.run import LARGEST, export
 

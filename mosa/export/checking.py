@@ -29,7 +29,9 @@ def deformations(count: int, seed: int = 0, strain: float = 0.2) -> Tensor:
     g = torch.Generator().manual_seed(seed)
     found = torch.empty(0, 3, 3, dtype=torch.float64)
     while len(found) < count:
-        F = torch.eye(3, dtype=torch.float64) + strain * torch.randn(2 * count, 3, 3, generator=g, dtype=torch.float64)
+        F = torch.eye(3, dtype=torch.float64) + strain * torch.randn(
+            2 * count, 3, 3, generator=g, dtype=torch.float64
+        )
         Q = torch.linalg.qr(torch.randn(2 * count, 3, 3, generator=g, dtype=torch.float64)).Q
         F = Q * torch.linalg.det(Q)[:, None, None] @ F
         J = torch.linalg.det(F)
@@ -62,7 +64,9 @@ def jaumann(derivative: Tensor, F: Tensor) -> Tensor:
     return torch.stack(columns, 2) / J[:, None, None]
 
 
-def check_umat(found: Source, text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float, float]:
+def check_umat(
+    found: Source, text: str, F: Tensor, truth: tuple[Tensor, Tensor]
+) -> tuple[float, float]:
     """Relative differences of stress and tangent, compiled by gfortran. Errors: DataError where it does not compile."""
     n, tau, derivative = len(F), *truth
     with tempfile.TemporaryDirectory() as folder:
@@ -113,8 +117,14 @@ def check_ufl(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float
     psi = scope["energy"](Entries(F))
     (P,) = torch.autograd.grad(psi.sum(), F, create_graph=True)
     found = P @ F.mT
-    rows = [torch.autograd.grad(found[:, i, j].sum(), F, retain_graph=True)[0] for i in range(3) for j in range(3)]
-    return relative(found.detach(), tau), relative(torch.stack(rows, 1).unflatten(1, (3, 3)), derivative)
+    rows = [
+        torch.autograd.grad(found[:, i, j].sum(), F, retain_graph=True)[0]
+        for i in range(3)
+        for j in range(3)
+    ]
+    return relative(found.detach(), tau), relative(
+        torch.stack(rows, 1).unflatten(1, (3, 3)), derivative
+    )
 
 
 def check_warp(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> float:
@@ -129,7 +139,7 @@ def check_warp(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> float:
         function = module.kirchhoff_stress
 
         @wp.kernel(module="unique", enable_backward=False)
-        def stress_of_text(F: wp.array(dtype=wp.mat33d), tau: wp.array(dtype=wp.mat33d)):
+        def stress_of_text(F: wp.array(dtype=wp.mat33d), tau: wp.array(dtype=wp.mat33d)):  # type: ignore[valid-type]
             i = wp.tid()
             tau[i] = function(F[i])
 
@@ -145,7 +155,9 @@ def check_all(found: Source, texts: dict[str, str], count: int) -> dict[str, flo
     truth = expected(found, F)
     result: dict[str, float] = {}
     if shutil.which("gfortran"):
-        result["umat stress"], result["umat tangent"] = check_umat(found, texts["umat.f90"], F, truth)
+        result["umat stress"], result["umat tangent"] = check_umat(
+            found, texts["umat.f90"], F, truth
+        )
     result["ufl stress"], result["ufl tangent"] = check_ufl(texts["law_ufl.py"], F, truth)
     result["warp stress"] = check_warp(texts["law_warp.py"], F, truth)
     return result

@@ -13,10 +13,16 @@ LARGEST = {"stress": 1e-10, "tangent": 1e-6}
 
 
 def export(path: str | Path, folder: Path, check: int) -> dict[str, float]:
-    """Write umat.f90, law_ufl.py, law_warp.py and law.json of a checkpoint or a material.json; returns relative differences at `check`
-    drawn deformations, none for 0. Errors: DataError, ConfigError."""
+    """Write umat.f90, law_ufl.py, law_warp.py and law.json of a checkpoint or a material.json.
+
+    Returns relative differences at `check` drawn deformations, none for 0. Errors: DataError, ConfigError."""
     found = read_source(path)
-    texts = {"umat.f90": umat(found), "law_ufl.py": ufl_text(found), "law_warp.py": warp_text(found), "law.json": as_json(found)}
+    texts = {
+        "umat.f90": umat(found),
+        "law_ufl.py": ufl_text(found),
+        "law_warp.py": warp_text(found),
+        "law.json": as_json(found),
+    }
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text)

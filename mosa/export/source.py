@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 
+from mosa.config.build import build_adapter
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation.analysis.law_stress import in_double, operator
+from mosa.evaluation.analysis.law_stress import described, in_double, operator
 from mosa.export.energies import ENERGIES, STIFFNESS, Energy, energy
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
-from mosa.modules.body.material import FORMS, Material
+from mosa.modules.body.material import Material
 from mosa.physics.constitutive.laws import law_named
 from mosa.twin.twin import Twin
 
@@ -29,7 +30,7 @@ class Source:
 
 
 def read_source(path: str | Path) -> Source:
-    """Of a run's checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without an energy."""
+    """Of a checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without energy."""
     path = Path(path)
     if path.suffix == ".json":
         return source(*read_material(path))
@@ -46,13 +47,25 @@ def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
             getattr(material, f"frame_{name}").data = getattr(material, f"frame_{name}").double()
         adapter = None
         if (stiffness := found["stiffness"]) is not None:
-            adapter = HyperelasticAdapter(strain=stiffness["strain"]).double()
+            built = build_adapter({"name": "hyperelastic", "strain": stiffness["strain"]})
+            assert isinstance(built, HyperelasticAdapter)
+            adapter = built.double()
             with torch.no_grad():
                 adapter.numbers.copy_(torch.tensor(stiffness["numbers"], dtype=torch.float64))
             adapter.switch_on(material.reference_modulus(), material.poisson())
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, MosaError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        MosaError,
+    ) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-        raise DataError(f"{path}: expected a material.json of mosa-material, found {reason}") from error
+        raise DataError(
+            f"{path}: expected a material.json of mosa-material, found {reason}"
+        ) from error
     return material, adapter
 
 
@@ -70,7 +83,7 @@ def source(material: Material, adapter: object) -> Source:
         raise ConfigError(
             f"export: expected adapter.strain=green, found {adapter.strain}: its energy is written in another strain"
         )
-    material = material.double()
+    material = in_double(material, configured=False)
     adapter = None if adapter is None else adapter.double()
     values: dict[str, float] = {}
     for name, value in material.per_particle().items():
@@ -80,7 +93,11 @@ def source(material: Material, adapter: object) -> Source:
         else:
             values[name] = float(value)
     law = law_named(material.law)
-    order = [n for name, size in law.parameters.items() for n in ([name] if size == 1 else [f"{name}_{k}" for k in (1, 2, 3)])]
+    order = [
+        n
+        for name, size in law.parameters.items()
+        for n in ([name] if size == 1 else [f"{name}_{k}" for k in (1, 2, 3)])
+    ]
     values = {name: values[name] for name in order}
     form = energy(material.law, tuple(values), adapter is not None)
     if adapter is not None:
@@ -91,12 +108,7 @@ def source(material: Material, adapter: object) -> Source:
 
 
 def as_json(found: Source) -> str:
-    """Parameters by name, SI units, with the law's own formula as the program documents it."""
-    law, stiffness = found.material.law, None
-    if found.adapter is not None:
-        stiffness = {"strain": found.adapter.strain, "numbers": found.adapter.numbers.tolist()}
-    document = law_named(law).stress.func.__doc__ or ""
-    physical = {name: v.item() for name, v in found.material.physical().items() if name in FORMS}
-    physical |= {name: found.material.direction(name).tolist() for name in found.material.directions}
-    return json.dumps({"format": "mosa material 1", "law": law, "parameters": physical, "stiffness": stiffness,
-                       "formula": " ".join(document.split()), "values": found.values}, indent=1)  # fmt: skip
+    """material.json with the formula as the program documents it, and the values that the exported texts hold."""
+    formula = vars(law_named(found.material.law).stress)["func"].__doc__ or ""
+    more = {"formula": " ".join(formula.split()), "values": found.values}
+    return json.dumps(described(found.material, found.adapter) | more, indent=1)

@@ -14,7 +14,9 @@ from mosa.export.source import Source
 Assignments = list[tuple[sp.Symbol, sp.Expr]]
 
 
-def derivatives(energy: Energy) -> tuple[list[sp.Expr], list[sp.Expr], list[sp.Expr], list[sp.Expr]]:
+def derivatives(
+    energy: Energy,
+) -> tuple[list[sp.Expr], list[sp.Expr], list[sp.Expr], list[sp.Expr]]:
     """S = 2 dpsi/dC (6) and 2 dS/dC (21, upper triangle row by row) of the part of C's entries, in vech order; of the stretches'
     part s_i = (1/l_i) dpsi/dl_i (3) and (1/l_j) ds_i/dl_j (9)."""
     weights = [2, 2, 2, 1, 1, 1]  # an entry off the diagonal is two of C's
@@ -111,9 +113,13 @@ def filled(name: str, found: Source, **parts: str) -> str:
 def umat(found: Source) -> str:
     """Fortran 95, free form: an Abaqus UMAT with its consistent tangent, and a check's entry that C can call."""
     printer = Fortran()
-    entries, principal = [], []
+    entries: list[str] = []
+    principal: list[str] = []
     stress, stiff, along, slopes = derivatives(found.energy)
-    names = [*(f"S({k + 1})" for k in range(6)), *(f"CC({i + 1},{j + 1})" for i in range(6) for j in range(i, 6))]
+    names = [
+        *(f"S({k + 1})" for k in range(6)),
+        *(f"CC({i + 1},{j + 1})" for i in range(6) for j in range(i, 6)),
+    ]
     for into, targets, expressions in (
         (entries, names, [*stress, *stiff]),
         (principal, [*(f"s({k + 1})" for k in range(3)), *(f"ds({i + 1},{j + 1})" for i in range(3) for j in range(3))],
@@ -122,7 +128,9 @@ def umat(found: Source) -> str:
         steps, rest = reduced(expressions)
         into += [f"double precision :: {name}" for name, _ in steps]
         lines = [(str(name), value) for name, value in steps] + list(zip(targets, rest))
-        into += [line for name, value in lines for line in wrap(f"{name} = {printer.doprint(value)}")]
+        into += [
+            line for name, value in lines for line in wrap(f"{name} = {printer.doprint(value)}")
+        ]
     props = [f"{name} = props({k + 1})" for k, name in enumerate(found.energy.names)]
     declared = [f"double precision :: {name}" for name in found.energy.names]
 
@@ -132,10 +140,18 @@ def umat(found: Source) -> str:
         return "\n  ".join([*declared, *first, *props, *later])
 
     listed = "\n".join(
-        f"!   {k + 1:2d}  {name} = {found.values[name]!r}" for k, name in enumerate(found.energy.names)
+        f"!   {k + 1:2d}  {name} = {found.values[name]!r}"
+        for k, name in enumerate(found.energy.names)
     )
     spectral = ".true." if found.energy.stretches != 0 else ".false."
-    return filled("umat.f90", found, props=listed, entries=block(entries), principal=block(principal), spectral=spectral)
+    return filled(
+        "umat.f90",
+        found,
+        props=listed,
+        entries=block(entries),
+        principal=block(principal),
+        spectral=spectral,
+    )
 
 
 def wrap(line: str) -> list[str]:
@@ -153,7 +169,7 @@ def ufl_text(found: Source) -> str:
     printer = Ufl()
     steps, (value,) = reduced([found.energy.entries + found.energy.stretches])
     lines = [f"{name} = {printer.doprint(part)}" for name, part in [*steps, ("psi", value)]]
-    return filled("law_ufl.py", found, values=named(found), names=unpacked(found), lines="\n    ".join(lines), stretched=(
+    return filled("law_ufl.txt", found, values=named(found), names=unpacked(found), lines="\n    ".join(lines), stretched=(
         "l1, l2, l3 = stretches(C)" if found.energy.stretches != 0 else "# no principal stretches"))  # fmt: skip
 
 
@@ -164,8 +180,10 @@ def warp_text(found: Source) -> str:
     steps, rest = reduced([*stress, *along])
     names = ["S11", "S22", "S33", "S23", "S13", "S12", "s1", "s2", "s3"]
     lines = [f"{name} = {printer.doprint(part)}" for name, part in [*steps, *zip(names, rest)]]
-    constants = "\n".join(f"{n} = wp.constant(wp.float64({found.values[n]!r}))" for n in found.energy.names)
-    return filled("law_warp.py", found, constants=constants, lines="\n    ".join(lines))
+    constants = "\n".join(
+        f"{n} = wp.constant(wp.float64({found.values[n]!r}))" for n in found.energy.names
+    )
+    return filled("law_warp.txt", found, constants=constants, lines="\n    ".join(lines))
 
 
 def named(found: Source) -> str:

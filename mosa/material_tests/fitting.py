@@ -6,7 +6,6 @@ stiffness, each with a normal prior of one standard deviation that the evidence 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +48,9 @@ class Law:
 
     symmetry: full | orthotropic, of the stiffness."""
 
-    def __init__(self, material: Material, adapter: HyperelasticAdapter | None, symmetry: str) -> None:
+    def __init__(
+        self, material: Material, adapter: HyperelasticAdapter | None, symmetry: str
+    ) -> None:
         self.material, self.adapter = in_double(material), adapter
         self.count = 0
         if adapter is not None:
@@ -64,13 +65,13 @@ class Law:
         own = [] if self.adapter is None else self.adapter.numbers[: self.count].tolist()
         return np.array([*raws, *own])
 
-    def set(self, theta: Sequence[float]) -> Law:
+    def set(self, theta: np.ndarray) -> Law:
         with torch.no_grad():
             for name, value in zip(self.names, theta):
                 if name in self.material.raw:
                     self.material.raw[name].fill_(float(value))
             if self.adapter is not None:
-                own = torch.as_tensor(np.array(theta[len(theta) - self.count :]))
+                own = torch.as_tensor(theta[len(theta) - self.count :])
                 self.adapter.numbers[: self.count] = own
         return self
 
@@ -78,7 +79,9 @@ class Law:
 class Fitting:
     """`law` against `data`. seed: of the starts. Errors: SimulationDiverged where no start can be evaluated."""
 
-    def __init__(self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int) -> None:
+    def __init__(
+        self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int
+    ) -> None:
         self.law, self.data, self.starts, self.seed = law, data, starts, seed
         self.begin = law.get()
         self.specimens = Specimens(data, incompressible)
@@ -106,7 +109,15 @@ class Fitting:
             return np.concatenate([misfit / noise, theta[self.own] / sigma])
 
         def solve(theta: np.ndarray, evaluations: int):
-            return least_squares(residuals, theta, args=(noise, sigma), diff_step=1e-6, ftol=1e-7, xtol=1e-7, max_nfev=evaluations)
+            return least_squares(
+                residuals,
+                theta,
+                args=(noise, sigma),
+                diff_step=1e-6,
+                ftol=1e-7,
+                xtol=1e-7,
+                max_nfev=evaluations,
+            )
 
         best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
         if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:
@@ -123,25 +134,38 @@ class Fitting:
             noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))
             if self.own.any():
                 own = best.x[self.own]
-                sigma = float(np.clip(np.sqrt((own**2).sum() / max(determined.sum(), 1e-3)), FEWEST, MOST))
+                sigma = float(
+                    np.clip(np.sqrt((own**2).sum() / max(determined.sum(), 1e-3)), FEWEST, MOST)
+                )
             best = solve(best.x, 100)
             if max(abs(np.log(np.array(before) / (noise, sigma)))) < 0.02:
                 break
         scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
-        return Fit(self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x))
+        return Fit(
+            self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
+        )
 
     def drawn(self, rows: np.ndarray) -> list[np.ndarray]:
         """Starts: the configured one with its stiffness scaled to the tests, and others about it."""
         theta = self.begin.copy()
-        stiff = [i for i, n in enumerate(self.law.names) if n in ("E", "mu", "kappa") or n.startswith("fibre_stiffness")]
+        stiff = [
+            i
+            for i, n in enumerate(self.law.names)
+            if n in ("E", "mu", "kappa") or n.startswith("fibre_stiffness")
+        ]
         try:
-            found, seen = self.predicted(theta)[rows] / self.sd[rows], (self.data.value / self.sd)[rows]
+            found, seen = (
+                self.predicted(theta)[rows] / self.sd[rows],
+                (self.data.value / self.sd)[rows],
+            )
             theta[stiff] += np.log(max((found @ seen) / (found @ found), 1e-6))
         except SimulationDiverged:
             pass
         generator = np.random.default_rng(self.seed)
         spread = np.where(self.own, 0.1, SPREAD)
-        others = [theta + spread * generator.standard_normal(len(theta)) for _ in range(self.starts - 1)]
+        others = [
+            theta + spread * generator.standard_normal(len(theta)) for _ in range(self.starts - 1)
+        ]
         return [theta, *others]
 
     def left_out(self) -> dict[str, np.ndarray]:

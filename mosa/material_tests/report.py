@@ -14,17 +14,18 @@ import numpy as np
 import torch
 
 from mosa.config.build import build_body, build_world
+from mosa.evaluation.analysis.law_stress import described
 from mosa.material_tests.fitting import Fit, Law
 from mosa.material_tests.measurements import UNITS, Measurements
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.body import Start
-from mosa.modules.body.material import FORMS, RELATIVE, Form, unit_of
+from mosa.modules.body.material import FORMS, Form, unit_of
 from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
-FORMAT = "mosa material 1"
 
 
 def curves(data: Measurements) -> dict[tuple[int, int], np.ndarray]:
@@ -44,9 +45,11 @@ def explained(value: np.ndarray, found: np.ndarray) -> float:
     return float(1 - ((found - value) ** 2).sum() / spread) if spread > 0 else math.nan
 
 
-def figures(data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray]) -> dict[str, float | str]:
-    """Of all stresses [Pa]: `rms`, `rms_curves` (mean over curves), R2 (mean over curves), `left_out` (mean over tests of the rms of
-    a test that the fit did not see); `rms_of_sd`: in units of the given standard deviations; numbers, noise [Pa], evidence."""
+def figures(
+    data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray]
+) -> dict[str, float | str]:
+    """Of all stresses [Pa]: `rms`, `rms_curves` (mean over curves), R2 (mean over curves), `left_out` (mean over tests of the rms
+    of a test that the fit did not see); `rms_of_sd`: in units of the given standard deviations; numbers, noise [Pa]."""
     away = fit.predicted - data.value
     parts = curves(data).values()
     found: dict[str, float | str] = {
@@ -71,23 +74,36 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float, str]]:
     for name, value, sd in zip(fit.names, fit.theta, np.sqrt(np.diag(fit.covariance))):
         form = FORMS.get(name)
         if isinstance(form, Form):
-            low, mid, high = form.physical(torch.tensor([value - sd, value, value + sd]).double()).tolist()
+            low, mid, high = form.physical(
+                torch.tensor([value - sd, value, value + sd]).double()
+            ).tolist()
             rows.append((name, mid, (high - low) / 2, unit_of(law.material.law, name)))
         else:
             rows.append((name, value, sd, "" if name.startswith("stiffness_") else "rad"))
     return rows
 
 
-def table(law: Law, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str) -> str:
+def table(
+    law: Law, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str
+) -> str:
     """Markdown: figures, the numbers with their standard deviations, a row for each test. Stresses in `unit`."""
     scale, totals = UNITS[unit], figures(data, fit, left_out)
-    lines = [f"# {law.material.law}{'' if law.adapter is None else ' with a learned stiffness'}", ""]
+    lines = [
+        f"# {law.material.law}{'' if law.adapter is None else ' with a learned stiffness'}",
+        "",
+    ]
     for name, value in totals.items():
         plain = name in ("R2", "numbers", "numbers_determined", "rms_of_sd")
-        lines.append(f"- {name}: {value:.4g}" if plain else f"- {name}: {float(value) / scale:.4g} {unit}")
+        lines.append(
+            f"- {name}: {value:.4g}" if plain else f"- {name}: {float(value) / scale:.4g} {unit}"
+        )
     lines += ["", "| number | value | standard deviation | unit |", "|---|---|---|---|"]
     lines += [f"| {n} | {v:.4g} | {sd:.2g} | {u} |" for n, v, sd, u in uncertain(law, fit)]
-    lines += ["", f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |", "|---|---|---|---|---|"]
+    lines += [
+        "",
+        f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |",
+        "|---|---|---|---|---|",
+    ]
     for k, name in enumerate(data.names):
         chosen = ~data.without(k)
         value, found = data.value[chosen], fit.predicted[chosen]
@@ -98,7 +114,9 @@ def table(law: Law, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndar
     return "\n".join(lines) + "\n"
 
 
-def plot(path: Path, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str) -> None:
+def plot(
+    path: Path, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str
+) -> None:
     """A panel for each test: measured (points, with standard deviations), fitted (line), predicted when left out (dashes)."""
     import matplotlib.pyplot as plt
 
@@ -115,7 +133,16 @@ def plot(path: Path, data: Measurements, fit: Fit, left_out: Mapping[str, np.nda
         order = np.argsort(x, kind="stable")
         sd = None if np.isnan(data.sd).any() else data.sd[chosen][order] / scale
         label = f"stress_{c + 1}"
-        panel.errorbar(x[order], data.value[chosen][order] / scale, sd, fmt="o", ms=3, lw=0.6, color=color, label=label)
+        panel.errorbar(
+            x[order],
+            data.value[chosen][order] / scale,
+            sd,
+            fmt="o",
+            ms=3,
+            lw=0.6,
+            color=color,
+            label=label,
+        )
         panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color)
         if data.names[k] in left_out:
             found = left_out[data.names[k]][chosen[own]]
@@ -125,24 +152,20 @@ def plot(path: Path, data: Measurements, fit: Fit, left_out: Mapping[str, np.nda
         panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
         panel.set_ylabel(f"P [{unit}]", fontsize=8)
         panel.tick_params(labelsize=7)
-    panels.flat[0].legend(fontsize=7)
+    panels.flat[len(data.names) - 1].legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
 def written(law: Law, fit: Fit) -> dict[str, Any]:
-    """The material as plain data: `read_material` of `mosa.export` and a person read it. SI units."""
-    material, adapter = law.material, law.adapter
-    parameters: dict[str, Any] = {k: v.item() for k, v in material.physical().items()}
-    for name in material.directions:
-        for axis in "xyz":
-            parameters.pop(f"{name}_{axis}")
-        parameters[name] = material.direction(name).tolist()
-    stiffness = None if adapter is None else {"strain": adapter.strain, "numbers": adapter.numbers.tolist()}
-    return {"format": FORMAT, "law": material.law, "parameters": parameters, "stiffness": stiffness,
-            "posterior": {"names": list(fit.names), "theta": fit.theta.tolist(), "covariance": fit.covariance.tolist(),
-                          "relative": [n for n in fit.names if n in RELATIVE]}}  # fmt: skip
+    """The material as plain data, which `mosa-export-law` and a person read, with the posterior of the unconstrained numbers."""
+    posterior = {
+        "names": list(fit.names),
+        "theta": fit.theta.tolist(),
+        "covariance": fit.covariance.tolist(),
+    }
+    return described(law.material, law.adapter) | {"posterior": posterior}
 
 
 def specimen_twin(law: Law, values: Mapping[str, Any], density: float) -> Twin:
@@ -154,17 +177,24 @@ def specimen_twin(law: Law, values: Mapping[str, Any], density: float) -> Twin:
     rest = torch.cartesian_prod(axis, axis, axis)
     n, eye = len(rest), torch.eye(3)
     tensors = {"rest": rest, "volume": torch.full((n,), spacing**3), "colors": torch.full((n, 3), 0.6),
-               "opacities": torch.full((n,), 0.8), "covariances": (0.35 * spacing) ** 2 * eye.expand(n, 3, 3).contiguous()}  # fmt: skip
+               "opacities": torch.full((n,), 0.8), "covariances": 0.1 * spacing**2 * eye.expand(n, 3, 3).contiguous()}  # fmt: skip
     world = {"ground": {"height": 0.0, "mode": "separate", "friction": 0.5}, "gravity": [0.0, -9.81, 0.0],
              "up": [0.0, 1.0, 0.0], "box": [[-1.0, -0.2, -1.0], [1.0, 2.0, 1.0]]}  # fmt: skip
     sections = ("seed", "prior", "simulation", "heterogeneity", "adapter")
     cfg = {name: values[name] for name in sections if name in values}
-    config = {"cfg": cfg, "world": world, "density": density, "dx": 2 * spacing, "frame_dt": 1 / 60, "starts": {}}
+    config: dict[str, Any] = {
+        "cfg": cfg,
+        "world": world,
+        "density": density,
+        "dx": 2 * spacing,
+        "frame_dt": 1 / 60,
+        "starts": {},
+    }
     body = build_body(config, tensors)
     with torch.no_grad():
         for name, raw in law.material.raw.items():
             body.material.raw[name].copy_(raw)
-        if law.adapter is not None:
+        if isinstance(body.adapter, HyperelasticAdapter) and law.adapter is not None:
             body.adapter.numbers.copy_(law.adapter.numbers)
             body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
     start = Start(eye, body.center, torch.zeros(3), torch.zeros(3))

@@ -30,10 +30,12 @@ def build_law(values: dict) -> Law:
     material, _ = build_prior(values["prior"])
     law = law_named(material.law)
     if material.candidates or values["prior"]["law"] == AUTO:
-        raise ConfigError("prior: expected one law, found prior=auto; fit its candidates one by one")
+        raise ConfigError(
+            "prior: expected one law, found prior=auto; fit its candidates one by one"
+        )
     if law.plastic or law.viscosity is not None or law.reference is not None:
         raise ConfigError(
-            f"prior: expected an elastic law that turns with the body, found {law.name}: tests are fitted as states, without a history"
+            f"prior: expected an elastic law that turns with the body, found {law.name}: tests are states without a history"
         )
     adapter = build_adapter(values["adapter"])
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
@@ -58,7 +60,13 @@ def fit_tests(cfg: DictConfig) -> float:
     load_extensions(values.get("extensions"))
     check(values, KEYS)
     data = read_tests(values["tests"], values["unit"])
-    fitting = Fitting(build_law(values), data, values["incompressible"], starts=values["starts"], seed=values["seed"])
+    fitting = Fitting(
+        build_law(values),
+        data,
+        values["incompressible"],
+        starts=values["starts"],
+        seed=values["seed"],
+    )
     if not fitting.law.names:
         raise ConfigError("prior.frozen: expected a parameter that is learned, found none")
     fit = fitting.fit()

@@ -17,16 +17,16 @@ from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 
 ITERATIONS, STEP, LONGEST, PRECISE = 60, 1e-6, 0.3, 1e-11
-"""Of Newton's method: logarithms of stretches move by at most `LONGEST`, until stresses are 0 to `PRECISE` of the largest."""
+"""Of Newton's method: logarithms of stretches move by at most `LONGEST`; it ends at stresses of `PRECISE` moduli."""
 
 
 class Specimens:
-    """Predicted stresses of `data` under any law. incompressible: volumes are kept, by a pressure; else free faces are solved for."""
+    """Predicted stresses of `data` under any law. incompressible: a pressure keeps volumes; else free faces are solved for."""
 
     def __init__(self, data: Measurements, incompressible: bool) -> None:
         self.data, self.incompressible = data, incompressible
         n = len(data.test)
-        self.sheared = data.kind == "shear"
+        self.sheared: np.ndarray = np.equal(data.kind, "shear")
         self.logs = np.zeros((n, 3))
         self.moves = np.zeros((n, 3, 2))
         """Directions in which the logarithms of the stretches are free."""
@@ -92,7 +92,7 @@ class Specimens:
         """(k, 2) of the states that are solved for: where the energy is stationary along `moves`."""
         rows = self.solved
         k, B = len(rows), self.moves[rows]
-        idle = np.eye(2) * ~B.any(1)[:, None, :]
+        idle = np.eye(2) * (np.abs(B).sum(1) == 0)[:, None, :]
         scale = float(material.max_modulus())
         x = self.last[rows].copy()
 

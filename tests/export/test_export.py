@@ -45,7 +45,11 @@ def test_the_symbolic_energy_is_the_law_s(law):
     """Against the torch function that the verification suite holds the kernels to."""
     found, F = exported(law, False), deformations(50, seed=3)
     form = energy(law, tuple(found.values), False)
-    f = sp.lambdify([*ENTRIES, *STRETCHES, *sp.symbols(form.names, real=True)], form.entries + form.stretches, [{"ramp": lambda e: e.clip(0)}, "numpy"])
+    f = sp.lambdify(
+        [*ENTRIES, *STRETCHES, *sp.symbols(form.names, real=True)],
+        form.entries + form.stretches,
+        [{"ramp": lambda e: e.clip(0)}, "numpy"],
+    )
     C, S = F.mT @ F, torch.linalg.svdvals(F)
     inputs = [C[:, i, j].numpy() for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))]
     psi = torch.as_tensor(f(*inputs, *S.T.numpy(), *found.values.values()))
@@ -94,7 +98,9 @@ def test_the_text_is_ufl():
     F = deformations(1, seed=5)
     gradient = ufl.variable(ufl.as_matrix(F[0].tolist()))
     P = apply_derivatives(apply_algebra_lowering(ufl.diff(scope["energy"](gradient), gradient)))
-    value = torch.tensor([[float(P[i, j](())) for j in range(3)] for i in range(3)], dtype=torch.float64)
+    value = torch.tensor(
+        [[float(P[i, j](())) for j in range(3)] for i in range(3)], dtype=torch.float64
+    )
     tau, _ = expected(found, F)
     assert (value @ F[0].T - tau[0]).abs().max() < 1e-10 * tau.abs().max()
 
@@ -107,7 +113,12 @@ def test_the_command_writes_reads_and_checks(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main([str(tmp_path / "material.json"), str(tmp_path / "law"), "--check", "20"])
     assert ended.value.code == 0 and "warp stress" in capsys.readouterr().out
-    assert sorted(p.name for p in (tmp_path / "law").iterdir()) == ["law.json", "law_ufl.py", "law_warp.py", "umat.f90"]
+    assert sorted(p.name for p in (tmp_path / "law").iterdir()) == [
+        "law.json",
+        "law_ufl.py",
+        "law_warp.py",
+        "umat.f90",
+    ]
     assert json.loads((tmp_path / "law" / "law.json").read_text())["values"]["kept"] < 1
 
 

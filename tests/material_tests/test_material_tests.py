@@ -24,7 +24,10 @@ MU = E / 2 / (1 + NU)
 
 def rows(mode, first, second=None, **more):
     seconds = first if second is None else np.broadcast_to(second, first.shape)
-    return [{"test": mode, "mode": mode, "first": a, "second": b, "stress_1": 0.0, **more} for a, b in zip(first, seconds)]
+    return [
+        {"test": mode, "mode": mode, "first": a, "second": b, "stress_1": 0.0, **more}
+        for a, b in zip(first, seconds)
+    ]
 
 
 def predicted(law, parameters, states, incompressible=True, adapter=None):
@@ -44,7 +47,12 @@ def test_incompressible_closed_forms():
     uniaxial = 2 * (l - l**-2) * (c1 + c2 / l)
     planar = 2 * (l - l**-3) * (c1 + c2)
     equibiaxial = 2 * (l - l**-5) * (c1 + c2 * l**2)
-    states = [*rows("uniaxial y", l), *rows("biaxial xz", l, 1.0), *rows("biaxial zy", l), *rows("shear zx", l, 0.0)]
+    states = [
+        *rows("uniaxial y", l),
+        *rows("biaxial xz", l, 1.0),
+        *rows("biaxial zy", l),
+        *rows("shear zx", l, 0.0),
+    ]
     found = predicted("mooney_rivlin", values, states)
     expected = np.concatenate([uniaxial, planar, equibiaxial, 2 * (c1 + c2) * l])
     assert np.abs(found - expected).max() < 1e-7 * MU
@@ -53,11 +61,18 @@ def test_incompressible_closed_forms():
 def test_free_faces_of_a_compressible_specimen_carry_nothing():
     """The stretch across solves tau = 0: of neo-Hooke's law mu (t^2 - 1) + lam log(l t^2) = 0, and P = mu (l^2 - t^2)/l."""
     lam = E * NU / (1 + NU) / (1 - 2 * NU)
-    found = predicted("neo_hookean", {"E": E, "nu": NU}, rows("uniaxial z", LENGTHS), incompressible=False)
+    found = predicted(
+        "neo_hookean", {"E": E, "nu": NU}, rows("uniaxial z", LENGTHS), incompressible=False
+    )
     for l, P in zip(LENGTHS, found):
         square = l**2 - P * l / MU
         assert abs(MU * (square - 1) + lam * np.log(l * square)) < 1e-8 * MU
-    small = predicted("neo_hookean", {"E": E, "nu": NU}, rows("uniaxial z", np.array([1 + 1e-6])), incompressible=False)
+    small = predicted(
+        "neo_hookean",
+        {"E": E, "nu": NU},
+        rows("uniaxial z", np.array([1 + 1e-6])),
+        incompressible=False,
+    )
     assert small[0] == pytest.approx(1e-6 * E, rel=1e-4)
 
 
@@ -74,10 +89,15 @@ def test_the_tangent_is_the_derivative_of_the_stress():
     g = torch.Generator().manual_seed(0)
     F = torch.eye(3).double() + 0.1 * torch.randn(5, 3, 3, generator=g, dtype=torch.float64)
     D, h = torch.randn(5, 3, 3, generator=g, dtype=torch.float64), 1e-5
-    material, adapter = Material("neo_hookean", {"E": E, "nu": NU}).double(), HyperelasticAdapter().double()
+    material, adapter = (
+        Material("neo_hookean", {"E": E, "nu": NU}).double(),
+        HyperelasticAdapter().double(),
+    )
     torch.nn.init.constant_(adapter.numbers, 0.1)
     adapter.switch_on(E, NU)
-    expected = (kirchhoff(material, adapter, F + h * D) - kirchhoff(material, adapter, F - h * D)) / (2 * h)
+    expected = (
+        kirchhoff(material, adapter, F + h * D) - kirchhoff(material, adapter, F - h * D)
+    ) / (2 * h)
     found = torch.einsum("nijkl,nkl->nij", tangent(material, adapter, F), D)
     assert (found - expected).abs().max() < 1e-8 * expected.abs().max()
 
@@ -91,7 +111,9 @@ def test_numbers_are_recovered_with_their_uncertainty():
     for state, P in zip(states, predicted("yeoh", truth, states) + noise):
         state["stress_1"] = P
     start = Material("yeoh", {"E": 1e5, "nu": 0.49, "yeoh_2": 0.5, "yeoh_3": 0.1}, ["nu"])
-    fitting = Fitting(Law(start, None, "full"), measurements(states, "Pa", "here"), True, starts=2, seed=0)
+    fitting = Fitting(
+        Law(start, None, "full"), measurements(states, "Pa", "here"), True, starts=2, seed=0
+    )
     fit = fitting.fit()
     assert fit.noise == pytest.approx(200, rel=0.2)
     known = Material("yeoh", truth).begins
@@ -132,7 +154,9 @@ def test_a_mistake_in_the_file_is_named(tmp_path, text, match):
 def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):
     l = np.linspace(1.05, 1.5, 6)
     states = [*rows("uniaxial x", l), *rows("shear xy", l - 1, 0.0)]
-    for state, P in zip(states, predicted("mooney_rivlin", {"E": E, "nu": NU, "second_share": 0.2}, states)):
+    for state, P in zip(
+        states, predicted("mooney_rivlin", {"E": E, "nu": NU, "second_share": 0.2}, states)
+    ):
         state["stress_1"] = P / 1e3
     path, folder = tmp_path / "tests.csv", tmp_path / "run"
     with path.open("w", newline="") as file:
@@ -143,9 +167,13 @@ def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):
                f"hydra.run.dir={folder}")  # fmt: skip
     assert run.returncode == 0, run.stdout + run.stderr
     found = json.loads((folder / "metrics.json").read_text())
-    assert found["rms"] < 1.0 and "left_out" in found and (folder / "tests.png").stat().st_size > 5000
+    assert (
+        found["rms"] < 1.0 and "left_out" in found and (folder / "tests.png").stat().st_size > 5000
+    )
     kept = json.loads((folder / "material.json").read_text())["parameters"]
-    assert kept["E"] * (1 + NU) / (1 + kept["nu"]) == pytest.approx(E, rel=1e-3)  # mu is what they tell
+    assert kept["E"] * (1 + NU) / (1 + kept["nu"]) == pytest.approx(
+        E, rel=1e-3
+    )  # mu is what they tell
     twin = Twin.load(folder / "checkpoints" / "specimen.ckpt")
     assert float(twin.body.material.physical()["E"]) == pytest.approx(kept["E"], rel=1e-5)
 
@@ -165,7 +193,14 @@ def test_heart_muscle(reference_data):
 
     heart = runpy.run_path("benchmarks/tissue_tests.py")["heart"]
     data = measurements(heart(), "kPa", "heart")
-    values = {"E": 2.5e3, "nu": 0.49, "fibre_stiffness": 5e3, "fibre_exponent": 30.0, "dispersion": 0.0, "fibre": [1, 0, 0]}
+    values = {
+        "E": 2.5e3,
+        "nu": 0.49,
+        "fibre_stiffness": 5e3,
+        "fibre_exponent": 30.0,
+        "dispersion": 0.0,
+        "fibre": [1, 0, 0],
+    }
     adapter = HyperelasticAdapter()
     adapter.switch_on(2.5e3, 0.49)
     law = Law(Material("hgo", values, ["fibre"]), adapter, "orthotropic")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
-from mosa.modules.body.material import Material
+from mosa.modules.body.material import FORMS, Form, Material
 from mosa.physics.adapters.interface import MaterialState
 from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import field_types, kernels_of
@@ -26,13 +27,35 @@ def simulator(law: str) -> Simulator:
     return Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64)
 
 
+FORMAT = "mosa material 1"
+
+
 @torch.no_grad()
-def in_double(material: Material) -> Material:
-    """The same module in float64, its numbers as they were configured: not rounded to float32 before."""
+def in_double(material: Material, configured: bool = True) -> Material:
+    """The same module in float64. Values that are held are on their bounds exactly; configured: what is learned is as it was
+    configured, without the rounding to float32."""
     material.double()
-    for name, value in material.begins.items():
+    for name in material.held:
+        buffer, form = getattr(material, f"held_{name}"), FORMS[name]
+        assert isinstance(form, Form)
+        buffer.fill_(min(form.held, key=lambda bound: abs(bound - float(buffer))))
+    for name, value in material.begins.items() if configured else ():
         material.raw[name].fill_(value)
     return material
+
+
+def described(material: Material, adapter: HyperelasticAdapter | None) -> dict[str, Any]:
+    """A law as plain data, SI units: what material.json holds, and `mosa.export.source` reads."""
+    parameters: dict[str, Any] = {}
+    for name in material.names:
+        whole = name in material.directions
+        parameters[name] = (
+            material.direction(name).tolist() if whole else material.physical()[name].item()
+        )
+    stiffness = None
+    if adapter is not None:
+        stiffness = {"strain": adapter.strain, "numbers": adapter.numbers.tolist()}
+    return {"format": FORMAT, "law": material.law, "parameters": parameters, "stiffness": stiffness}
 
 
 @torch.no_grad()
@@ -46,7 +69,9 @@ def operator(material: Material, adapter: HyperelasticAdapter | None) -> tuple[T
 
 
 @torch.no_grad()
-def evaluated(material: Material, adapter: HyperelasticAdapter | None, F: Tensor):  # type: ignore[no-untyped-def]
+def evaluated(
+    material: Material, adapter: HyperelasticAdapter | None, F: Tensor
+) -> tuple[wp.Kernel, list[Tensor]]:
     """(kernel, its six tensors with tau (n, 3, 3) [Pa] filled in) at F (n, 3, 3) float64."""
     law, n = law_named(material.law), len(F)
     values = {k: v.double() for k, v in material.per_particle().items()}
@@ -60,7 +85,7 @@ def evaluated(material: Material, adapter: HyperelasticAdapter | None, F: Tensor
     return kernel, parts
 
 
-def wrapped(parts: list[Tensor]) -> list[wp.array]:
+def wrapped(parts: list[Tensor]) -> list:
     return [wp.from_torch(part, dtype=kind) for part, kind in zip(parts, KINDS)]
 
 

@@ -95,8 +95,8 @@ FORMS: dict[str, Form | Direction] = {
     "share_3": _scaled_sigmoid(1.0, (0.0,)), "fibre_stiffness": LOG, "fibre_stiffness_2": LOG, "fibre_exponent": LOG,
     "dispersion": _scaled_sigmoid(1 / 3, (0.0, 1 / 3)), "fibre": Direction(), "fibre_2": Direction(),
 }  # fmt: skip
-"""Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain. The exponents of `ogden` stay where each
-term is polyconvex: at least 3/2, or at most -3 (Hartmann and Neff 2003)."""
+"""Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain. Exponents of `ogden` stay where
+each term is polyconvex: at least 3/2, or at most -3 (Hartmann and Neff 2003)."""
 UNITS = {
     "E": "Pa",
     "mu": "Pa",
@@ -108,7 +108,8 @@ UNITS = {
     "fibre_stiffness_2": "Pa",
 }
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
-RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "fibre_stiffness_2", "fibre_exponent")
+RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "fibre_stiffness_2",
+            "fibre_exponent")  # fmt: skip
 """Parameters whose standard deviation is said relative: it is one of their logarithm."""
 GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
 """What the simulator takes in place of a parameter; others are taken by their own name."""

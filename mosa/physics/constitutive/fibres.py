@@ -77,7 +77,9 @@ def hgo_two_energy(F: Tensor, mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, 
     return one + family_energy(F, fibre_2, fibre_stiffness_2, fibre_exponent, dispersion)
 
 
-def stretched_modulus(mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, dispersion: Tensor, **others: Tensor) -> Tensor:
+def stretched_modulus(
+    mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, dispersion: Tensor, **others: Tensor
+) -> Tensor:
     """Bound on the P wave modulus at rest [Pa]: lam + 2 mu + 4 k1 (1 - 2 d)^2, as if all families had one direction."""
     k1 = fibre_stiffness + others.get("fibre_stiffness_2", 0.0)
     return lam + 2 * mu + 4 * k1 * (1 - 2 * dispersion) ** 2
@@ -87,6 +89,19 @@ _ONE_FAMILY = dict.fromkeys(("mu", "lam", "fibre_stiffness", "fibre_exponent", "
 _TWO_FAMILIES = dict.fromkeys(
     ("mu", "lam", "fibre_stiffness", "fibre_stiffness_2", "fibre_exponent", "dispersion"), 1
 )
-register_law("hgo", hgo, _ONE_FAMILY | {"fibre": 3}, needs_positive_J=True, energy=hgo_energy, modulus=stretched_modulus)  # fmt: skip
-register_law("hgo_two", hgo_two, _TWO_FAMILIES | {"fibre": 3, "fibre_2": 3}, needs_positive_J=True, energy=hgo_two_energy,
-             modulus=stretched_modulus)  # fmt: skip
+register_law(
+    "hgo",
+    hgo,
+    _ONE_FAMILY | {"fibre": 3},
+    needs_positive_J=True,
+    energy=hgo_energy,
+    modulus=stretched_modulus,
+)
+register_law(
+    "hgo_two",
+    hgo_two,
+    _TWO_FAMILIES | {"fibre": 3, "fibre_2": 3},
+    needs_positive_J=True,
+    energy=hgo_two_energy,
+    modulus=stretched_modulus,
+)

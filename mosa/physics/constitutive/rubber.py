@@ -62,7 +62,9 @@ def yeoh(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
 
 
 @wp.func
-def ogden_term(F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, mu: wp.float64, a: wp.float64):
+def ogden_term(
+    F: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, mu: wp.float64, a: wp.float64
+):
     """2 mu/a dev(b_bar^(a/2)): `contract` gives det A = J and A A^T = J^(2/3) b_bar^(a/2)."""
     return _TWO * mu / a * deviator(isochoric_left(contract(F, U, S, V, _HALF * a)))
 
@@ -119,6 +121,14 @@ def ogden_energy(F: Tensor, mu: Tensor, lam: Tensor, alpha_1: Tensor, share_2: T
 
 _LAME = {"mu": 1, "lam": 1}
 _POWERS = dict.fromkeys(("alpha_1", "share_2", "alpha_2", "share_3", "alpha_3"), 1)
-register_law("mooney_rivlin", mooney_rivlin, _LAME | {"second_share": 1}, needs_positive_J=True, energy=mooney_rivlin_energy)  # fmt: skip
-register_law("yeoh", yeoh, _LAME | {"yeoh_2": 1, "yeoh_3": 1}, needs_positive_J=True, energy=yeoh_energy)  # fmt: skip
+register_law(
+    "mooney_rivlin",
+    mooney_rivlin,
+    _LAME | {"second_share": 1},
+    needs_positive_J=True,
+    energy=mooney_rivlin_energy,
+)
+register_law(
+    "yeoh", yeoh, _LAME | {"yeoh_2": 1, "yeoh_3": 1}, needs_positive_J=True, energy=yeoh_energy
+)
 register_law("ogden", ogden, _LAME | _POWERS, needs_positive_J=True, energy=ogden_energy)
