@@ -23,6 +23,8 @@ ORTHOTROPIC = 7
 """The first numbers of `anisotropic_basis` keep the planes of x, y and z as mirrors; the others do not."""
 SPREAD = 0.7
 """Of the starts, in unconstrained numbers."""
+UNKNOWN = 100.0
+"""Standard deviation of an unconstrained number that the tests do not determine."""
 HOPELESS = 1e3
 """Residual in units of the measured stresses' root mean square, where the law has no equilibrium."""
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
@@ -127,8 +129,8 @@ class Fitting:
         for _ in range(LOOKS):
             before = noise, sigma
             J, misfit = best.jac[: rows.sum()] * noise, best.fun[: rows.sum()] * noise
-            precision = J.T @ J / noise**2 + np.diag(self.own / sigma**2)
-            covariance = np.linalg.pinv(precision, hermitian=True)
+            precision = J.T @ J / noise**2 + np.diag(self.own / sigma**2 + UNKNOWN**-2)
+            covariance = np.linalg.inv(precision)
             determined = 1 - np.diag(covariance)[self.own] / sigma**2
             effective = float((~self.own).sum() + determined.sum())
             noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))

@@ -24,6 +24,8 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
+UNSURE = 3.0
+"""Standard deviation of an unconstrained number, which may be a logarithm, above which it is not determined."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -74,10 +76,13 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float, str]]:
     for name, value, sd in zip(fit.names, fit.theta, np.sqrt(np.diag(fit.covariance))):
         form = FORMS.get(name)
         if isinstance(form, Form):
-            low, mid, high = form.physical(
-                torch.tensor([value - sd, value, value + sd]).double()
-            ).tolist()
-            rows.append((name, mid, (high - low) / 2, unit_of(law.material.law, name)))
+            raw = torch.tensor(float(value), dtype=torch.float64, requires_grad=True)
+            physical = form.physical(raw)
+            (slope,) = torch.autograd.grad(physical, raw)
+            unit = unit_of(law.material.law, name)
+            rows.append(
+                (name, physical.item(), abs(slope.item()) * sd if sd < UNSURE else math.inf, unit)
+            )
         else:
             rows.append((name, value, sd, "" if name.startswith("stiffness_") else "rad"))
     return rows
@@ -98,7 +103,10 @@ def table(
             f"- {name}: {value:.4g}" if plain else f"- {name}: {float(value) / scale:.4g} {unit}"
         )
     lines += ["", "| number | value | standard deviation | unit |", "|---|---|---|---|"]
-    lines += [f"| {n} | {v:.4g} | {sd:.2g} | {u} |" for n, v, sd, u in uncertain(law, fit)]
+    lines += [
+        f"| {n} | {v:.4g} | {f'{sd:.2g}' if sd < math.inf else 'not determined'} | {u} |"
+        for n, v, sd, u in uncertain(law, fit)
+    ]
     lines += [
         "",
         f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |",
