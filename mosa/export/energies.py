@@ -87,9 +87,9 @@ def ogden() -> Parts:
     return VOLUMETRIC, stored
 
 
-def family(end: str) -> Expr:
-    a = sp.Matrix([p(f"fibre{end}_{k}") for k in (1, 2, 3)])
-    k1, k2, d = p(f"fibre_stiffness{end}"), p("fibre_exponent"), p("dispersion")
+def family(which: str) -> Expr:
+    a = sp.Matrix([p(f"{which}fibre_{k}") for k in (1, 2, 3)])
+    k1, k2, d = p(f"{which}fibre_stiffness"), p("fibre_exponent"), p("dispersion")
     e = d * I1 + (1 - 3 * d) * (a.T * C * a)[0] - 1
     return k1 / (2 * k2) * (sp.exp(k2 * ramp(e) ** 2) - 1)
 
@@ -99,7 +99,7 @@ def hgo() -> Parts:
 
 
 def hgo_two() -> Parts:
-    return mu / 2 * (J1 - 3) + VOLUMETRIC + family("") + family("_2"), ZERO
+    return mu / 2 * (J1 - 3) + VOLUMETRIC + family("") + family("second_"), ZERO
 
 
 ENERGIES: dict[str, Callable[[], Parts]] = {

@@ -22,7 +22,7 @@ LAWS = {
     "neo_hookean": {}, "corotated": {}, "stvk": {}, "mooney_rivlin": {"second_share": 0.3},
     "yeoh": {"yeoh_2": 0.1, "yeoh_3": 0.02}, "hgo": FIBRES,
     "ogden": {"alpha_1": 2.5, "share_2": 0.2, "alpha_2": -4.0, "share_3": 0.3, "alpha_3": 6.0},
-    "hgo_two": FIBRES | {"fibre_stiffness_2": 1e4, "fibre_2": [0.5, -1, 0]},
+    "hgo_two": FIBRES | {"second_fibre_stiffness": 1e4, "second_fibre": [0.5, -1, 0]},
 }  # fmt: skip
 
 

@@ -81,11 +81,9 @@ def moduli(law: str) -> tuple[float, float]:
     if "kappa" in values:
         return values["kappa"] + 4 * values["mu"] / 3, values["mu"]
     c11, d = values["lam"] + 2 * values["mu"], values.get("dispersion", 0.0)
-    for end in (
-        "",
-        "_2",
-    ):  # families in the plane of x and y, which the shear in yz does not stretch
-        if (a := values.get(f"fibre{end}")) is not None:
+    # families lie in the plane of x and y, which the shear in yz does not stretch
+    for which in ("", "second_"):
+        if (a := values.get(f"{which}fibre")) is not None:
             along = d + (1 - 3 * d) * float(a[0]) ** 2
-            c11 += 4 * values[f"fibre_stiffness{end}"] * along**2
+            c11 += 4 * values[f"{which}fibre_stiffness"] * along**2
     return c11, E / (2 * (1 + NU))

@@ -92,8 +92,8 @@ FORMS: dict[str, Form | Direction] = {
     "second_share": _scaled_sigmoid(1.0, (0.0, 1.0)), "yeoh_2": SOFTPLUS, "yeoh_3": SOFTPLUS,
     "alpha_1": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "alpha_2": _scaled_sigmoid(-3.0, (-30.0, -3.0), -30.0),
     "alpha_3": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "share_2": _scaled_sigmoid(1.0, (0.0,)),
-    "share_3": _scaled_sigmoid(1.0, (0.0,)), "fibre_stiffness": LOG, "fibre_stiffness_2": LOG, "fibre_exponent": LOG,
-    "dispersion": _scaled_sigmoid(1 / 3, (0.0, 1 / 3)), "fibre": Direction(), "fibre_2": Direction(),
+    "share_3": _scaled_sigmoid(1.0, (0.0,)), "fibre_stiffness": LOG, "second_fibre_stiffness": LOG, "fibre_exponent": LOG,
+    "dispersion": _scaled_sigmoid(1 / 3, (0.0, 1 / 3)), "fibre": Direction(), "second_fibre": Direction(),
 }  # fmt: skip
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain. Exponents of `ogden` stay where
 each term is polyconvex: at least 3/2, or at most -3 (Hartmann and Neff 2003)."""
@@ -105,10 +105,10 @@ UNITS = {
     "viscosity": "Pa s",
     "friction_angle": "degrees",
     "fibre_stiffness": "Pa",
-    "fibre_stiffness_2": "Pa",
+    "second_fibre_stiffness": "Pa",
 }
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
-RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "fibre_stiffness_2",
+RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "second_fibre_stiffness",
             "fibre_exponent")  # fmt: skip
 """Parameters whose standard deviation is said relative: it is one of their logarithm."""
 GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}

@@ -70,24 +70,24 @@ def hgo_energy(F: Tensor, mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, fibr
     return 0.5 * mu * (I1 - 3) + volumetric_energy(J, mu, lam) + fibres
 
 
-def hgo_two_energy(F: Tensor, mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, fibre_stiffness_2: Tensor,
-                   fibre_exponent: Tensor, dispersion: Tensor, fibre: Tensor, fibre_2: Tensor) -> Tensor:  # fmt: skip
+def hgo_two_energy(F: Tensor, mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, second_fibre_stiffness: Tensor,
+                   fibre_exponent: Tensor, dispersion: Tensor, fibre: Tensor, second_fibre: Tensor) -> Tensor:  # fmt: skip
     """Of the matrix and two families."""
     one = hgo_energy(F, mu, lam, fibre_stiffness, fibre_exponent, dispersion, fibre)
-    return one + family_energy(F, fibre_2, fibre_stiffness_2, fibre_exponent, dispersion)
+    return one + family_energy(F, second_fibre, second_fibre_stiffness, fibre_exponent, dispersion)
 
 
 def stretched_modulus(
     mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, dispersion: Tensor, **others: Tensor
 ) -> Tensor:
     """Bound on the P wave modulus at rest [Pa]: lam + 2 mu + 4 k1 (1 - 2 d)^2, as if all families had one direction."""
-    k1 = fibre_stiffness + others.get("fibre_stiffness_2", 0.0)
+    k1 = fibre_stiffness + others.get("second_fibre_stiffness", 0.0)
     return lam + 2 * mu + 4 * k1 * (1 - 2 * dispersion) ** 2
 
 
 _ONE_FAMILY = dict.fromkeys(("mu", "lam", "fibre_stiffness", "fibre_exponent", "dispersion"), 1)
 _TWO_FAMILIES = dict.fromkeys(
-    ("mu", "lam", "fibre_stiffness", "fibre_stiffness_2", "fibre_exponent", "dispersion"), 1
+    ("mu", "lam", "fibre_stiffness", "second_fibre_stiffness", "fibre_exponent", "dispersion"), 1
 )
 register_law(
     "hgo",
@@ -100,7 +100,7 @@ register_law(
 register_law(
     "hgo_two",
     hgo_two,
-    _TWO_FAMILIES | {"fibre": 3, "fibre_2": 3},
+    _TWO_FAMILIES | {"fibre": 3, "second_fibre": 3},
     needs_positive_J=True,
     energy=hgo_two_energy,
     modulus=stretched_modulus,
