@@ -1,4 +1,4 @@
-"""Settings of the commands whose packages nothing else needs: splats, capture, environments."""
+"""Settings of the commands whose packages nothing else needs: splats, capture, environments, material tests."""
 
 from __future__ import annotations
 
@@ -326,8 +326,30 @@ class EnvironmentsSettings(Settings):
     )
 
 
+class MaterialSettings(LawSections):
+    """mosa-material"""
+
+    extensions: Extensions = []
+    tests: Text = Field(
+        description="csv: test, mode, first, stress_1, ... (docs/material_tests.md)"
+    )
+    unit: Literal["Pa", "kPa", "MPa"] = Field("Pa", description="of the file's stresses")
+    incompressible: bool = Field(
+        True,
+        description="false: free faces carry no stress at the stretches that are solved for",
+    )
+    symmetry: Literal["full", "orthotropic"] = Field(
+        "full", description="of the learned stiffness; orthotropic: mirrors across x, y and z"
+    )
+    starts: int = Field(4, ge=1, le=100, description="of the least squares; the best is kept")
+    leave_out: bool = Field(
+        True, description="fit once more without each test, and predict that test"
+    )
+    density: Positive = Field(1000, description="kg/m^3, of the cube in checkpoints/specimen.ckpt")
+
+
 COMMANDS: dict[str, type[Settings]] = {
     "train": TrainSettings, "eval": EvalSettings, "splats": SplatsSettings, "capture": CaptureSettings,
-    "environments": EnvironmentsSettings,
+    "environments": EnvironmentsSettings, "material": MaterialSettings,
 }  # fmt: skip
 """By the name of the file in conf/."""

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mosa.config.build import build_body, plain, world_of
 from mosa.config.extensions import load_extensions
-from mosa.config.record import BodyRecord, RunRecord
+from mosa.config.record import BodyRecord
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
@@ -33,6 +33,7 @@ from mosa.rendering.appearance.carried_splats import CarriedSplats
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
+from mosa.twin.saved import save_twin
 from mosa.twin.start import numbers
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
@@ -202,22 +203,6 @@ def take_law(body: Body, learned: Body) -> None:
         raise DataError(
             f"ckpt_path: expected a law that fits the object, found {unexpected or missing}"
         )
-
-
-def save_twin(twin: Twin, path: str | Path) -> Path:
-    """A checkpoint that `Twin.load` reads: nothing was fitted, so that no fit can go on from it."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    written = twin.training_start.written()
-    splats = twin.body.splats
-    record = RunRecord(
-        **dict(twin.record.but(starts={"train": written})),
-        start=written,
-        splats=None if splats is None else splats.written(),
-    )
-    state = {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()}
-    torch.save({"state_dict": state, "mosa": record.plain()}, path)
-    return path
 
 
 def drop(cfg: DictConfig) -> None:

@@ -15,12 +15,16 @@ DENSITY = 1000.0
 
 VALUES = {
     "mu": MU, "lam": LAM, "kappa": LAM + 2 * MU / 3, "yield_stress": 800.0, "viscosity": 10.0, "friction_alpha": 0.35,
-    "cohesion": 0.002,
+    "cohesion": 0.002, "second_share": 0.3, "yeoh_2": 0.1, "yeoh_3": 0.02,
+    "alpha_1": 2.5, "share_2": 0.2, "alpha_2": -4.0, "share_3": 0.3, "alpha_3": 6.0,
+    "fibre_stiffness": 2e4, "second_fibre_stiffness": 1e4, "fibre_exponent": 0.5, "dispersion": 0.1,
+    "fibre": torch.tensor([0.8, 0.6, 0.0], dtype=torch.float64),
+    "second_fibre": torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64),
 }  # fmt: skip
-"""SI values of every scalar a prior law may take. A law joins the suite when it is registered and its parameters are here."""
+"""SI values of every parameter a prior law may take. A law joins the suite when it is registered and its parameters are here."""
 
 
-def parameters_of(law: str) -> dict[str, float]:
+def parameters_of(law: str) -> dict[str, float | Tensor]:
     """Values of the parameters a caller hands to the simulator."""
     registered = law_named(law)
     values = {name: VALUES[name] for name in registered.parameters if name != registered.reference}

@@ -25,7 +25,9 @@ from mosa.types import Ground
 
 DX, SPACING, DT = 0.04, 0.02, 2e-4
 STEPS = {"E": 20.0, "nu": 2e-4, "mu": 1e-3, "kappa": 50.0, "yield_stress": 0.2, "viscosity": 1e-2, "friction_alpha": 1e-4,
-         "cohesion": 1e-6, "v0": 1e-3, "weights": 2e-4}  # fmt: skip
+         "cohesion": 1e-6, "v0": 1e-3, "weights": 2e-4, "second_share": 1e-3, "yeoh_2": 1e-2, "yeoh_3": 1e-1, "alpha_1": 1e-3,
+         "alpha_2": 1e-3, "alpha_3": 1e-3, "share_2": 1e-3, "share_3": 1e-3, "fibre_stiffness": 5.0, "second_fibre_stiffness": 5.0,
+         "fibre_exponent": 2e-2, "dispersion": 1e-4, "fibre": 1e-4, "second_fibre": 1e-4}  # fmt: skip
 """Steps h of the fourth-order difference (8 (f(h) - f(-h)) - f(2h) + f(-2h))/(12 h): error h^4 f^(5)/30 + 1e-16 f/h."""
 
 
@@ -71,7 +73,7 @@ class Case:
         )
         values = {**elastic, **{name: VALUES[name] for name in names}, "v0": (0.0, 0.0, 0.0)}
         self.leaves = {
-            k: torch.tensor(v, dtype=dtype, requires_grad=True) for k, v in values.items()
+            k: torch.as_tensor(v).to(dtype, copy=True).requires_grad_() for k, v in values.items()
         }
         g = torch.Generator().manual_seed(9)
         n = len(self.state.x)

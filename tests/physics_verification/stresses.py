@@ -73,10 +73,17 @@ def energy_error(law: str) -> float:
 
 
 def moduli(law: str) -> tuple[float, float]:
-    """(C11, C44) [Pa] of the law at small strain: lam + 2 mu and mu; a fluid's are those of its pressure, 7 kappa and 0."""
+    """(C11, C44) [Pa] of the law at small strain: lam + 2 mu and mu; a fluid's are those of its pressure, 7 kappa and 0; a
+    family of fibres adds 4 k1 (d + (1 - 3 d) a_x^2)^2 in a stretch."""
     values = parameters_of(law)
     if is_fluid(law):
         return 7 * values["kappa"], 0.0
     if "kappa" in values:
         return values["kappa"] + 4 * values["mu"] / 3, values["mu"]
-    return values["lam"] + 2 * values["mu"], E / (2 * (1 + NU))
+    c11, d = values["lam"] + 2 * values["mu"], values.get("dispersion", 0.0)
+    # families lie in the plane of x and y, which the shear in yz does not stretch
+    for which in ("", "second_"):
+        if (a := values.get(f"{which}fibre")) is not None:
+            along = d + (1 - 3 * d) * float(a[0]) ** 2
+            c11 += 4 * values[f"{which}fibre_stiffness"] * along**2
+    return c11, E / (2 * (1 + NU))

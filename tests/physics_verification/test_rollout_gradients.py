@@ -11,6 +11,8 @@ import torch
 from bodies import ELASTIC, LAWS
 from gradients import Case, Comparison
 
+from mosa.physics.constitutive.laws import law_named
+
 
 def assert_agreement(found: dict[str, Comparison], smooth: bool) -> None:
     """1e-6 on a smooth path; else the larger of 1e-5 and ten times the disagreement of the differences at h and 10 h, 1e-3 at most.
@@ -38,8 +40,11 @@ def paths(laws: list[str]) -> list[tuple[str, int]]:
 
 @pytest.mark.parametrize("law, substeps", paths(ELASTIC))
 def test_18_smooth_laws(law, substeps):
-    """dL/dE, dL/dnu, dL/dv0 and dL/d(weights) of a vibrating block in flight."""
-    assert_agreement(Case(law, substeps).compare(both_steps=False), smooth=True)
+    """dL/d(every parameter), dL/dv0 and dL/d(weights) of a vibrating block in flight. Fibres that go slack have a kink: of such a
+    law the path is smooth but for the particles that cross it, so that the difference's step is small and its error measured."""
+    kinked = "fibre" in law_named(law).parameters
+    found = Case(law, substeps).compare(both_steps=kinked, scale=0.001 if kinked else 1.0)
+    assert_agreement(found, smooth=not kinked)
 
 
 @pytest.mark.parametrize("law, substeps", paths(YIELDING))

@@ -40,8 +40,12 @@ def _logit(p: float) -> float:
     return math.log(p) - math.log1p(-p)
 
 
-def _scaled_sigmoid(high: float, held: tuple[float, ...]) -> Form:
-    return Form(0.0, high, held, lambda v: _logit(v / high), lambda u: high * torch.sigmoid(u))
+def _scaled_sigmoid(high: float, held: tuple[float, ...], low: float = 0.0) -> Form:
+    """Between low and high; a number without a unit."""
+    span = high - low
+    return Form(
+        low, high, held, lambda v: _logit((v - low) / span), lambda u: low + span * torch.sigmoid(u)
+    )
 
 
 class Direction:
@@ -85,8 +89,14 @@ SOFTPLUS = Form(
 FORMS: dict[str, Form | Direction] = {
     "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": LOG_OR_ZERO, "cohesion": SOFTPLUS,
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
+    "second_share": _scaled_sigmoid(1.0, (0.0, 1.0)), "yeoh_2": SOFTPLUS, "yeoh_3": SOFTPLUS,
+    "alpha_1": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "alpha_2": _scaled_sigmoid(-3.0, (-30.0, -3.0), -30.0),
+    "alpha_3": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "share_2": _scaled_sigmoid(1.0, (0.0,)),
+    "share_3": _scaled_sigmoid(1.0, (0.0,)), "fibre_stiffness": LOG, "second_fibre_stiffness": LOG, "fibre_exponent": LOG,
+    "dispersion": _scaled_sigmoid(1 / 3, (0.0, 1 / 3)), "fibre": Direction(), "second_fibre": Direction(),
 }  # fmt: skip
-"""Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
+"""Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain. Exponents of `ogden` stay where
+each term is polyconvex: at least 3/2, or at most -3 (Hartmann and Neff 2003)."""
 UNITS = {
     "E": "Pa",
     "mu": "Pa",
@@ -94,9 +104,12 @@ UNITS = {
     "yield_stress": "Pa",
     "viscosity": "Pa s",
     "friction_angle": "degrees",
+    "fibre_stiffness": "Pa",
+    "second_fibre_stiffness": "Pa",
 }
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
-RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity")
+RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "second_fibre_stiffness",
+            "fibre_exponent")  # fmt: skip
 """Parameters whose standard deviation is said relative: it is one of their logarithm."""
 GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
 """What the simulator takes in place of a parameter; others are taken by their own name."""

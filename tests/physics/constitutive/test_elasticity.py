@@ -16,6 +16,8 @@ PARAMETERS = {
     **dict.fromkeys(["linear", "neo_hookean", "corotated", "stvk", "stvk_paper"], ELASTIC),
     "von_mises": {**ELASTIC, "yield_stress": 0.8}, "drucker_prager": {**ELASTIC, "friction_alpha": 0.3, "cohesion": 0.02},
     "herschel_bulkley": RATE, "herschel_bulkley_hencky": RATE, "newtonian": {"mu": MU, "kappa": KAPPA},
+    "mooney_rivlin": {**ELASTIC, "second_share": 0.3}, "yeoh": {**ELASTIC, "yeoh_2": 0.1, "yeoh_3": 0.02},
+    "ogden": {**ELASTIC, "alpha_1": 2.5, "share_2": 0.2, "alpha_2": -4.0, "share_3": 0.3, "alpha_3": 6.0},
 }  # fmt: skip
 LAWS = list(PARAMETERS)
 # (lam + 2 mu, lam, mu) at small strain

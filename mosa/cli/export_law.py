@@ -1,0 +1,38 @@
+"""A learned or fitted law as text for other programs:  mosa-export-law outputs/.../checkpoints/last.ckpt law/"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from mosa.errors import MosaError
+from mosa.system.threads import settle_threads
+
+
+def main(words: list[str] | None = None) -> None:
+    settle_threads()
+    parser = argparse.ArgumentParser(prog="mosa-export-law", description=__doc__)
+    parser.add_argument("source", help="checkpoint of a run, or material.json of mosa-material")
+    parser.add_argument(
+        "folder", type=Path, help="where umat.f90, law_ufl.py, law_warp.py and law.json are written"
+    )
+    parser.add_argument(
+        "--check",
+        type=int,
+        default=1000,
+        help="deformations at which every text is compared; 0: none",
+    )
+    given = parser.parse_args(words)
+    from mosa.export.run import LARGEST, export
+
+    try:
+        differences = export(given.source, given.folder, given.check)
+    except MosaError as error:
+        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(2)
+    for name, value in differences.items():
+        print(f"{name:14s} {value:.1e} relative difference at {given.check} deformations")
+    if "umat stress" not in differences and given.check:
+        print("umat.f90 was not checked: there is no gfortran here (apt install gfortran)")
+    sys.exit(int(any(v > LARGEST[name.split()[1]] for name, v in differences.items())))

@@ -1,0 +1,163 @@
+"""Each exported text against the program's own kernels, at drawn deformations."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from mosa.errors import DataError
+from mosa.evaluation.analysis.law_stress import kirchhoff, tangent
+from mosa.export.source import Source
+from mosa.physics.launching import launch
+
+PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+ABAQUS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def deformations(count: int, seed: int = 0, strain: float = 0.2) -> Tensor:
+    """(count, 3, 3) float64: I plus normal numbers of standard deviation `strain`, turned at random, 0.3 < det F < 3."""
+    g = torch.Generator().manual_seed(seed)
+    found = torch.empty(0, 3, 3, dtype=torch.float64)
+    while len(found) < count:
+        F = torch.eye(3, dtype=torch.float64) + strain * torch.randn(
+            2 * count, 3, 3, generator=g, dtype=torch.float64
+        )
+        Q = torch.linalg.qr(torch.randn(2 * count, 3, 3, generator=g, dtype=torch.float64)).Q
+        F = Q * torch.linalg.det(Q)[:, None, None] @ F
+        J = torch.linalg.det(F)
+        found = torch.cat([found, F[(J > 0.3) & (J < 3)]])
+    return found[:count]
+
+
+def relative(found: Tensor, expected: Tensor) -> float:
+    """Largest difference over the largest entry, of each deformation; the largest of all."""
+    away = (found - expected).abs().flatten(1).amax(1)
+    return float((away / expected.abs().flatten(1).amax(1)).max())
+
+
+def expected(found: Source, F: Tensor) -> tuple[Tensor, Tensor]:
+    """Kirchhoff stress (n, 3, 3) and its derivative d tau/dF (n, 3, 3, 3, 3) [Pa], by the kernels."""
+    parts = found.material, found.adapter, F
+    return kirchhoff(*parts), tangent(*parts)
+
+
+def jaumann(derivative: Tensor, F: Tensor) -> Tensor:
+    """(n, 6, 6) in Abaqus' order: d tau of the stretching D, for rates F' = D F without spin, over J."""
+    J = torch.linalg.det(F)
+    columns = []
+    for k, l in ABAQUS:
+        D = torch.zeros(3, 3, dtype=torch.float64)
+        D[k, l] += 0.5
+        D[l, k] += 0.5
+        moved = torch.einsum("nijkl,nkl->nij", derivative, D @ F)
+        columns.append(torch.stack([moved[:, i, j] for i, j in ABAQUS], 1))
+    return torch.stack(columns, 2) / J[:, None, None]
+
+
+def check_umat(
+    found: Source, text: str, F: Tensor, truth: tuple[Tensor, Tensor]
+) -> tuple[float, float]:
+    """Relative differences of stress and tangent, compiled by gfortran. Errors: DataError where it does not compile."""
+    n, tau, derivative = len(F), *truth
+    with tempfile.TemporaryDirectory() as folder:
+        source, library = Path(folder) / "umat.f90", Path(folder) / "umat.so"
+        source.write_text(text)
+        run = subprocess.run(
+            ["gfortran", "-O1", "-shared", "-fPIC", "-J", folder, "-o", str(library), str(source)],
+            capture_output=True, text=True,
+        )  # fmt: skip
+        if run.returncode:
+            raise DataError(f"export: gfortran does not compile umat.f90: {run.stderr[-500:]}")
+        call = ctypes.CDLL(str(library)).mosa_check
+        props = np.array([found.values[name] for name in found.energy.names])
+        stresses, tangents = np.empty((n, 6)), np.empty((n, 6, 6))
+        gradients = np.ascontiguousarray(F.mT.numpy())  # Fortran's columns
+        double = ctypes.POINTER(ctypes.c_double)
+        arrays = [a.ctypes.data_as(double) for a in (gradients, props, stresses, tangents)]
+        call(n, arrays[0], len(props), *arrays[1:])
+    sigma = tau / torch.linalg.det(F)[:, None, None]
+    asked = torch.stack([sigma[:, i, j] for i, j in ABAQUS], 1)
+    stiff = torch.from_numpy(tangents).mT
+    return relative(torch.from_numpy(stresses), asked), relative(stiff, jaumann(derivative, F))
+
+
+class Entries:
+    """A batch of 3 x 3 matrices as UFL writes one."""
+
+    def __init__(self, values: Tensor) -> None:
+        self.values = values
+
+    def __getitem__(self, place: tuple[int, int]) -> Tensor:
+        return self.values[:, place[0], place[1]]
+
+
+LIKE_UFL = SimpleNamespace(
+    ln=torch.log, exp=torch.exp, sqrt=torch.sqrt, cos=torch.cos, atan2=torch.atan2, conditional=torch.where, gt=torch.gt,
+    dot=lambda A, B: Entries(A.values @ B.values), transpose=lambda A: Entries(A.values.mT),
+)  # fmt: skip
+"""The functions of UFL that a text calls, on batches."""
+
+
+def check_ufl(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float, float]:
+    """Relative differences of stress and tangent: first and second derivatives of the text's energy."""
+    scope: dict = {"ufl": LIKE_UFL}
+    exec(compile(text.replace("\nimport ufl\n", "\n"), "law_ufl.py", "exec"), scope)
+    tau, derivative = truth
+    F = F.clone().requires_grad_()
+    psi = scope["energy"](Entries(F))
+    (P,) = torch.autograd.grad(psi.sum(), F, create_graph=True)
+    found = P @ F.mT
+    rows = [
+        torch.autograd.grad(found[:, i, j].sum(), F, retain_graph=True)[0]
+        for i in range(3)
+        for j in range(3)
+    ]
+    return relative(found.detach(), tau), relative(
+        torch.stack(rows, 1).unflatten(1, (3, 3)), derivative
+    )
+
+
+def check_warp(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> float:
+    """Relative difference of the stress, in a kernel."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "law_warp.py"
+        path.write_text(text)
+        specification = importlib.util.spec_from_file_location("law_warp", path)
+        assert specification is not None and specification.loader is not None
+        module = importlib.util.module_from_spec(specification)
+        specification.loader.exec_module(module)
+        function = module.kirchhoff_stress
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def stress_of_text(F: wp.array(dtype=wp.mat33d), tau: wp.array(dtype=wp.mat33d)):  # type: ignore[valid-type]
+            i = wp.tid()
+            tau[i] = function(F[i])
+
+        tau = torch.zeros_like(F)
+        arrays = [wp.from_torch(t, dtype=wp.mat33d) for t in (F.contiguous(), tau)]
+        launch(stress_of_text, len(F), arrays, arrays[0].device)
+    return relative(tau, truth[0])
+
+
+def check_all(found: Source, texts: dict[str, str], count: int) -> dict[str, float]:
+    """Relative differences at `count` deformations, by text; of the UMAT only where there is a gfortran."""
+    F = deformations(count)
+    truth = expected(found, F)
+    result: dict[str, float] = {}
+    if shutil.which("gfortran"):
+        result["umat stress"], result["umat tangent"] = check_umat(
+            found, texts["umat.f90"], F, truth
+        )
+    result["ufl stress"], result["ufl tangent"] = check_ufl(texts["law_ufl.py"], F, truth)
+    result["warp stress"] = check_warp(texts["law_warp.py"], F, truth)
+    return result

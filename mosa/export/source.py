@@ -1,0 +1,114 @@
+"""A law that is exported: which energy, with which values, from a checkpoint or from material.json."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mosa.config.build import build_adapter
+from mosa.errors import ConfigError, DataError, MosaError
+from mosa.evaluation.analysis.law_stress import described, in_double, operator
+from mosa.export.energies import ENERGIES, STIFFNESS, Energy, energy
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.body.material import Material
+from mosa.physics.constitutive.laws import law_named
+from mosa.twin.twin import Twin
+
+
+@dataclass(frozen=True)
+class Source:
+    """material, adapter (None: no learned stiffness), in float64; energy: as symbols; values: of its parameters, SI units."""
+
+    material: Material
+    adapter: HyperelasticAdapter | None
+    energy: Energy
+    values: dict[str, float]
+
+
+def read_source(path: str | Path) -> Source:
+    """Of a checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without energy."""
+    path = Path(path)
+    if path.suffix == ".json":
+        return source(*read_material(path))
+    body = Twin.load(path).body
+    return source(body.material, body.adapter)
+
+
+def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
+    """What `mosa-material` wrote. Errors: DataError naming the file and what is wrong."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+        material = in_double(Material(found["law"], found["parameters"]))
+        for name in material.directions:  # starts at its own value: the angles are 0
+            getattr(material, f"frame_{name}").data = getattr(material, f"frame_{name}").double()
+        adapter = None
+        if (stiffness := found["stiffness"]) is not None:
+            built = build_adapter({"name": "hyperelastic", "strain": stiffness["strain"]})
+            assert isinstance(built, HyperelasticAdapter)
+            adapter = built.double()
+            with torch.no_grad():
+                adapter.numbers.copy_(torch.tensor(stiffness["numbers"], dtype=torch.float64))
+            adapter.switch_on(material.reference_modulus(), material.poisson())
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        MosaError,
+    ) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+        raise DataError(
+            f"{path}: expected a material.json of mosa-material, found {reason}"
+        ) from error
+    return material, adapter
+
+
+def source(material: Material, adapter: object) -> Source:
+    """Errors: ConfigError naming the law or the adapter that has no energy as text."""
+    if material.law not in ENERGIES:
+        raise ConfigError(
+            f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow or have no energy"
+        )
+    if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
+        raise ConfigError(
+            "export: expected a run with adapter=operator or none, found another adapter: its law has no energy"
+        )
+    if adapter is not None and adapter.strain != "green":
+        raise ConfigError(
+            f"export: expected adapter.strain=green, found {adapter.strain}: its energy is written in another strain"
+        )
+    material = in_double(material, configured=False)
+    adapter = None if adapter is None else adapter.double()
+    values: dict[str, float] = {}
+    for name, value in material.per_particle().items():
+        value = value.detach()
+        if value.numel() == 3:
+            values |= {f"{name}_{k + 1}": float(v) for k, v in enumerate(value.flatten())}
+        else:
+            values[name] = float(value)
+    law = law_named(material.law)
+    order = [
+        n
+        for name, size in law.parameters.items()
+        for n in ([name] if size == 1 else [f"{name}_{k}" for k in (1, 2, 3)])
+    ]
+    values = {name: values[name] for name in order}
+    form = energy(material.law, tuple(values), adapter is not None)
+    if adapter is not None:
+        G, h = operator(material, adapter)
+        values["kept"] = 1 + float(h[0, 0])
+        values |= {name: float(G[0, int(name[1]) - 1, int(name[2]) - 1]) for name in STIFFNESS}
+    return Source(material, adapter, form, values)
+
+
+def as_json(found: Source) -> str:
+    """material.json with the formula as the program documents it, and the values that the exported texts hold."""
+    formula = vars(law_named(found.material.law).stress)["func"].__doc__ or ""
+    more = {"formula": " ".join(formula.split()), "values": found.values}
+    return json.dumps(described(found.material, found.adapter) | more, indent=1)

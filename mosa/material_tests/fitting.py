@@ -1,0 +1,179 @@
+"""Least squares of a law's numbers to stress-strain tests: starts, noise, posterior, tests left out.
+
+The numbers are the law's unconstrained parameters, as a fit to films learns them (`Material.raw`), and those of the learned
+stiffness, each with a normal prior of one standard deviation that the evidence chooses (MacKay 1992), as in `identification`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+
+from mosa.errors import SimulationDiverged
+from mosa.evaluation.analysis.law_stress import in_double
+from mosa.material_tests.measurements import Measurements
+from mosa.material_tests.specimen import Specimens
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.body.material import Material
+
+ORTHOTROPIC = 7
+"""The first numbers of `anisotropic_basis` keep the planes of x, y and z as mirrors; the others do not."""
+SPREAD = 0.7
+"""Of the starts, in unconstrained numbers."""
+UNKNOWN = 100.0
+"""Standard deviation of an unconstrained number that the tests do not determine."""
+HOPELESS = 1e3
+"""Residual in units of the measured stresses' root mean square, where the law has no equilibrium."""
+SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
+"""Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """theta: (k,) numbers by `names`, unconstrained; covariance (k, k); noise: factor on the given standard deviations, or [Pa];
+    sigma: of the stiffness' numbers; effective: how many numbers the tests determine; predicted: (m,) [Pa]."""
+
+    names: tuple[str, ...]
+    theta: np.ndarray
+    covariance: np.ndarray
+    noise: float
+    sigma: float
+    effective: float
+    predicted: np.ndarray
+
+
+class Law:
+    """A law whose numbers are fitted: `material`, and the learned stiffness `adapter` or None.
+
+    symmetry: full | orthotropic, of the stiffness."""
+
+    def __init__(
+        self, material: Material, adapter: HyperelasticAdapter | None, symmetry: str
+    ) -> None:
+        self.material, self.adapter = in_double(material), adapter
+        self.count = 0
+        if adapter is not None:
+            self.count = ORTHOTROPIC if symmetry == "orthotropic" else len(adapter.numbers)
+            adapter.double()
+        own = tuple(f"stiffness_{k + 1}" for k in range(self.count))
+        self.names = (*material.learned, *own)
+
+    def get(self) -> np.ndarray:
+        """(k,) numbers."""
+        raws = [float(self.material.raw[name].detach()) for name in self.material.learned]
+        own = [] if self.adapter is None else self.adapter.numbers[: self.count].tolist()
+        return np.array([*raws, *own])
+
+    def set(self, theta: np.ndarray) -> Law:
+        with torch.no_grad():
+            for name, value in zip(self.names, theta):
+                if name in self.material.raw:
+                    self.material.raw[name].fill_(float(value))
+            if self.adapter is not None:
+                own = torch.as_tensor(theta[len(theta) - self.count :])
+                self.adapter.numbers[: self.count] = own
+        return self
+
+
+class Fitting:
+    """`law` against `data`. seed: of the starts. Errors: SimulationDiverged where no start can be evaluated."""
+
+    def __init__(
+        self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int
+    ) -> None:
+        self.law, self.data, self.starts, self.seed = law, data, starts, seed
+        self.begin = law.get()
+        self.specimens = Specimens(data, incompressible)
+        self.unit = float(np.sqrt(np.mean(data.value**2)))
+        known = ~np.isnan(data.sd)
+        self.sd = np.where(known, data.sd, self.unit)
+        self.own = np.arange(len(law.names)) >= len(law.names) - law.count
+
+    def predicted(self, theta: np.ndarray) -> np.ndarray:
+        """(m,) [Pa]. Errors: SimulationDiverged."""
+        self.law.set(theta)
+        return self.specimens.predict(self.law.material, self.law.adapter)
+
+    def fit(self, rows: np.ndarray | None = None) -> Fit:
+        """The best of all starts on the stresses `rows` (m,) bool, or all; `predicted` is of all of them."""
+        rows = np.ones(len(self.data.value), bool) if rows is None else rows
+        noise, sigma = 0.1, SIGMA
+
+        def residuals(theta: np.ndarray, noise: float, sigma: float) -> np.ndarray:
+            try:
+                misfit = (self.predicted(theta) - self.data.value)[rows] / self.sd[rows]
+                misfit = np.clip(misfit, -HOPELESS, HOPELESS)
+            except SimulationDiverged:
+                misfit = np.full(int(rows.sum()), HOPELESS)
+            return np.concatenate([misfit / noise, theta[self.own] / sigma])
+
+        def solve(theta: np.ndarray, evaluations: int):
+            return least_squares(
+                residuals,
+                theta,
+                args=(noise, sigma),
+                diff_step=1e-6,
+                ftol=1e-7,
+                xtol=1e-7,
+                max_nfev=evaluations,
+            )
+
+        best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
+        if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:
+            raise SimulationDiverged(
+                "the law has no stress in these tests at any start; start prior.parameters elsewhere"
+            )
+        for _ in range(LOOKS):
+            before = noise, sigma
+            J, misfit = best.jac[: rows.sum()] * noise, best.fun[: rows.sum()] * noise
+            precision = J.T @ J / noise**2 + np.diag(self.own / sigma**2 + UNKNOWN**-2)
+            covariance = np.linalg.inv(precision)
+            determined = 1 - np.diag(covariance)[self.own] / sigma**2
+            effective = float((~self.own).sum() + determined.sum())
+            noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))
+            if self.own.any():
+                own = best.x[self.own]
+                sigma = float(
+                    np.clip(np.sqrt((own**2).sum() / max(determined.sum(), 1e-3)), FEWEST, MOST)
+                )
+            best = solve(best.x, 100)
+            if max(abs(np.log(np.array(before) / (noise, sigma)))) < 0.02:
+                break
+        scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
+        return Fit(
+            self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
+        )
+
+    def drawn(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Starts: the configured one with its stiffness scaled to the tests, and others about it."""
+        theta = self.begin.copy()
+        stiff = [
+            i
+            for i, n in enumerate(self.law.names)
+            if n in ("E", "mu", "kappa") or n.startswith("fibre_stiffness")
+        ]
+        try:
+            found, seen = (
+                self.predicted(theta)[rows] / self.sd[rows],
+                (self.data.value / self.sd)[rows],
+            )
+            theta[stiff] += np.log(max((found @ seen) / (found @ found), 1e-6))
+        except SimulationDiverged:
+            pass
+        generator = np.random.default_rng(self.seed)
+        spread = np.where(self.own, 0.1, SPREAD)
+        others = [
+            theta + spread * generator.standard_normal(len(theta)) for _ in range(self.starts - 1)
+        ]
+        return [theta, *others]
+
+    def left_out(self) -> dict[str, np.ndarray]:
+        """By test: its stresses (m_test,) [Pa] as predicted by a fit to all others."""
+        result = {}
+        for k, name in enumerate(self.data.names):
+            rows = self.data.without(k)
+            result[name] = self.fit(rows).predicted[~rows]
+        return result

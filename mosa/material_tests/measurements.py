@@ -1,0 +1,138 @@
+"""Stress-strain tests as csv: one row for each measured state, homogeneous deformation, first Piola-Kirchhoff stress.
+
+    test,mode,angle,first,second,stress_1,stress_2,sd_1,sd_2
+    tension,uniaxial x,0,1.05,,3.1,,,
+    strip,biaxial xy,0,1.05,1.0,3.4,1.2,0.2,0.1
+    block,shear xy,0,0.2,,0.5,,,
+
+test: any name, rows of one name are one curve (or two) and are left out together. mode: `uniaxial a` (first: the stretch along axis
+a, the other two faces free), `biaxial ab` (first and second: the stretches along a and b, the third face free; planar tension is
+second = 1, equibiaxial second = first), `shear ab` (first: gamma; the face of normal a slides along b). stress_1, stress_2: force
+over the undeformed area, along the first and the second axis, of shear along b; an empty cell was not measured. sd_1, sd_2: their
+standard deviations, of all rows or of none. angle [degrees]: of the specimen's x axis from the material's, about z. The columns
+angle, second, stress_2, sd_1 and sd_2 may be left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mosa.errors import DataError
+
+UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
+COLUMNS = ("test", "mode", "angle", "first", "second", "stress_1", "stress_2", "sd_1", "sd_2")
+NEEDED = ("test", "mode", "first", "stress_1")
+AXES = "xyz"
+KINDS = {"uniaxial": 1, "biaxial": 2, "shear": 2}
+"""Axes that a mode names."""
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """n states and m measured stresses. names: of the tests.
+
+    test: (n,) which test; kind: (n,) names of `KINDS`; axes: (n, 2), the second -1 of `uniaxial`; angle: (n,) [rad]; given: (n, 2)
+    stretches, or gamma and 0. row: (m,) the state of a stress; component: (m,) 0 or 1, the stress along the first or the second
+    axis; value, sd: (m,) [Pa], sd NaN where none was given."""
+
+    names: tuple[str, ...]
+    test: np.ndarray
+    kind: np.ndarray
+    axes: np.ndarray
+    angle: np.ndarray
+    given: np.ndarray
+    row: np.ndarray
+    component: np.ndarray
+    value: np.ndarray
+    sd: np.ndarray
+
+    def without(self, test: int) -> np.ndarray:
+        """(m,) bool: the stresses of the other tests."""
+        return self.test[self.row] != test
+
+
+def read_tests(path: str | Path, unit: str) -> Measurements:
+    """The tests of a csv file. unit: of its stresses, a name of `UNITS`. Errors: DataError naming file, line and column."""
+    path = Path(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            header, rows = tuple(reader.fieldnames or ()), list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"tests: {path}: expected a csv file of tests, found {error}") from error
+    missing = [name for name in NEEDED if name not in header]
+    if missing or (strange := [name for name in header if name not in COLUMNS]):
+        wrong = f"no {missing[0]}" if missing else f"an unknown column {strange[0]!r}"
+        raise DataError(
+            f"tests: {path}: expected the columns {', '.join(NEEDED)} and of "
+            f"{', '.join(COLUMNS)} any others, found {wrong}"
+        )
+    if not rows:
+        raise DataError(f"tests: {path}: expected rows below the header, found none")
+    return measurements(rows, unit, str(path))
+
+
+def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
+    """As `read_tests`, of rows by column. Errors: DataError naming `where`, row and column."""
+    names: list[str] = []
+    states, stresses = [], []
+    for i, row in enumerate(rows):
+        line = f"tests: {where}: row {i + 1}"
+        kind, _, axes = str(row["mode"]).strip().partition(" ")
+        fits = KINDS.get(kind) == len(axes) == len(set(axes)) and set(axes) <= set(AXES)
+        if not fits:
+            raise DataError(
+                f"{line}: mode: expected uniaxial x, biaxial xy, shear xy or other axes of xyz, found {row['mode']!r}"
+            )
+
+        def cell(name: str, row=row, line=line) -> float:
+            text = row.get(name)
+            if text is None or str(text).strip() == "":
+                return math.nan
+            try:
+                number = float(text)
+            except ValueError:
+                number = math.inf
+            if not math.isfinite(number):
+                raise DataError(f"{line}: {name}: expected a number, found {text!r}")
+            return number
+
+        first, second = cell("first"), cell("second")
+        if kind != "biaxial":
+            second = 1.0 if kind == "uniaxial" else 0.0
+        if math.isnan(first) or math.isnan(second) or (kind != "shear" and min(first, second) <= 0):
+            raise DataError(
+                f"{line}: first, second: expected {'a shear' if kind == 'shear' else 'positive stretches'}, "
+                f"found {row.get('first')!r}, {row.get('second')!r}"
+            )
+        name = str(row["test"]).strip()
+        if name not in names:
+            names.append(name)
+        places = [AXES.index(a) for a in axes] + [-1] * (2 - len(axes))
+        angle = cell("angle")
+        angle = 0.0 if math.isnan(angle) else math.radians(angle)
+        measured = [(k, cell(f"stress_{k + 1}"), cell(f"sd_{k + 1}")) for k in (0, 1)]
+        if math.isnan(measured[0][1]) and math.isnan(measured[1][1]):
+            raise DataError(f"{line}: stress_1: expected a number, found none")
+        if kind != "biaxial" and not math.isnan(measured[1][1]):
+            raise DataError(
+                f"{line}: stress_2: expected an empty cell in a {kind} test, found a number"
+            )
+        states.append((names.index(name), kind, places, angle, (first, second)))
+        stresses += [(i, k, v, sd) for k, v, sd in measured if not math.isnan(v)]
+    test, kinds, axis, angles, given = (np.array(part) for part in zip(*states))
+    row_of, component, value, sd = (np.array(part) for part in zip(*stresses))
+    if 0 < np.isnan(sd).sum() < len(sd) or (sd <= 0).any():
+        raise DataError(
+            f"tests: {where}: sd_1, sd_2: expected a positive number beside every stress, or none at all"
+        )
+    scale = UNITS[unit]
+    return Measurements(
+        tuple(names), test, kinds, axis, angles, given, row_of, component, scale * value, scale * sd
+    )

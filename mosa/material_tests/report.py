@@ -1,0 +1,215 @@
+"""What a fit to stress-strain tests leaves: figures, a table, a plot of every curve, the material as JSON and as a checkpoint."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+
+from mosa.config.build import build_body, world_of
+from mosa.config.record import BodyRecord
+from mosa.evaluation.analysis.law_stress import described
+from mosa.material_tests.fitting import Fit, Law
+from mosa.material_tests.measurements import UNITS, Measurements
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.body.body import Start
+from mosa.modules.body.material import FORMS, Form, unit_of
+from mosa.twin.saved import save_twin
+from mosa.twin.twin import Twin
+
+matplotlib.use("Agg")
+UNSURE = 3.0
+"""Standard deviation of an unconstrained number, which may be a logarithm, above which it is not determined."""
+SIDE, ACROSS = 0.05, 6
+"""Of the cube that a checkpoint holds [m], and its particles along an edge."""
+
+
+def curves(data: Measurements) -> dict[tuple[int, int], np.ndarray]:
+    """(m,) bool of every curve, by test and component."""
+    parts = itertools.product(range(len(data.names)), (0, 1))
+    found = {(k, c): ~data.without(k) & (data.component == c) for k, c in parts}
+    return {key: chosen for key, chosen in found.items() if chosen.any()}
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def explained(value: np.ndarray, found: np.ndarray) -> float:
+    """R2 about the mean; NaN of a constant."""
+    spread = ((value - value.mean()) ** 2).sum()
+    return float(1 - ((found - value) ** 2).sum() / spread) if spread > 0 else math.nan
+
+
+def figures(
+    data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray]
+) -> dict[str, float | str]:
+    """Of all stresses [Pa]: `rms`, `rms_curves` (mean over curves), R2 (mean over curves), `left_out` (mean over tests of the rms
+    of a test that the fit did not see); `rms_of_sd`: in units of the given standard deviations; numbers, noise [Pa]."""
+    away = fit.predicted - data.value
+    parts = curves(data).values()
+    found: dict[str, float | str] = {
+        "rms": rms(away),
+        "rms_curves": float(np.mean([rms(away[c]) for c in parts])),
+        "R2": float(np.nanmean([explained(data.value[c], fit.predicted[c]) for c in parts])),
+        "numbers": len(fit.names),
+        "numbers_determined": fit.effective,
+        "noise": fit.noise,
+    }
+    if not np.isnan(data.sd).any():
+        found["rms_of_sd"] = rms(away / data.sd)
+    if left_out:
+        seen = {name: data.value[~data.without(k)] for k, name in enumerate(data.names)}
+        found["left_out"] = float(np.mean([rms(left_out[n] - seen[n]) for n in left_out]))
+    return found
+
+
+def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float, str]]:
+    """(name, value, standard deviation, unit) of every number that was fitted, physical."""
+    rows = []
+    for name, value, sd in zip(fit.names, fit.theta, np.sqrt(np.diag(fit.covariance))):
+        form = FORMS.get(name)
+        if isinstance(form, Form):
+            raw = torch.tensor(float(value), dtype=torch.float64, requires_grad=True)
+            physical = form.physical(raw)
+            (slope,) = torch.autograd.grad(physical, raw)
+            unit = unit_of(law.material.law, name)
+            rows.append(
+                (name, physical.item(), abs(slope.item()) * sd if sd < UNSURE else math.inf, unit)
+            )
+        else:
+            rows.append((name, value, sd, "" if name.startswith("stiffness_") else "rad"))
+    return rows
+
+
+def table(
+    law: Law, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str
+) -> str:
+    """Markdown: figures, the numbers with their standard deviations, a row for each test. Stresses in `unit`."""
+    scale, totals = UNITS[unit], figures(data, fit, left_out)
+    lines = [
+        f"# {law.material.law}{'' if law.adapter is None else ' with a learned stiffness'}",
+        "",
+    ]
+    for name, value in totals.items():
+        plain = name in ("R2", "numbers", "numbers_determined", "rms_of_sd")
+        lines.append(
+            f"- {name}: {value:.4g}" if plain else f"- {name}: {float(value) / scale:.4g} {unit}"
+        )
+    lines += ["", "| number | value | standard deviation | unit |", "|---|---|---|---|"]
+    lines += [
+        f"| {n} | {v:.4g} | {f'{sd:.2g}' if sd < math.inf else 'not determined'} | {u} |"
+        for n, v, sd, u in uncertain(law, fit)
+    ]
+    lines += [
+        "",
+        f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |",
+        "|---|---|---|---|---|",
+    ]
+    for k, name in enumerate(data.names):
+        chosen = ~data.without(k)
+        value, found = data.value[chosen], fit.predicted[chosen]
+        out = f"{rms(left_out[name] - value) / scale:.3g}" if name in left_out else ""
+        lines.append(
+            f"| {name} | {chosen.sum()} | {rms(found - value) / scale:.3g} | {explained(value, found):.3f} | {out} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def plot(
+    path: Path, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str
+) -> None:
+    """A panel for each test: measured (points, with standard deviations), fitted (line), predicted when left out (dashes)."""
+    import matplotlib.pyplot as plt
+
+    scale, across = UNITS[unit], math.ceil(math.sqrt(len(data.names)))
+    down = math.ceil(len(data.names) / across)
+    figure, panels = plt.subplots(down, across, figsize=(3.2 * across, 2.7 * down), squeeze=False)
+    for panel in panels.flat[len(data.names) :]:
+        panel.axis("off")
+    for (k, c), chosen in curves(data).items():
+        panel, color = panels.flat[k], f"C{c}"
+        own = ~data.without(k)
+        given = data.given[data.row[chosen]]
+        x = given[:, c] if np.ptp(given[:, c]) > 0 else given[:, 1 - c]
+        order = np.argsort(x, kind="stable")
+        sd = None if np.isnan(data.sd).any() else data.sd[chosen][order] / scale
+        label = f"stress_{c + 1}"
+        panel.errorbar(
+            x[order],
+            data.value[chosen][order] / scale,
+            sd,
+            fmt="o",
+            ms=3,
+            lw=0.6,
+            color=color,
+            label=label,
+        )
+        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color)
+        if data.names[k] in left_out:
+            found = left_out[data.names[k]][chosen[own]]
+            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1)
+        panel.set_title(data.names[k], fontsize=9)
+        kind = data.kind[data.row[chosen][0]]
+        panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
+        panel.set_ylabel(f"P [{unit}]", fontsize=8)
+        panel.tick_params(labelsize=7)
+    panels.flat[len(data.names) - 1].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def written(law: Law, fit: Fit) -> dict[str, Any]:
+    """The material as plain data, which `mosa-export-law` and a person read, with the posterior of the unconstrained numbers."""
+    posterior = {
+        "names": list(fit.names),
+        "theta": fit.theta.tolist(),
+        "covariance": fit.covariance.tolist(),
+    }
+    return described(law.material, law.adapter) | {"posterior": posterior}
+
+
+def specimen_twin(law: Law, values: Mapping[str, Any], density: float) -> Twin:
+    """A cube of the material at rest on the ground: what `Twin.load` and `mosa-splats ckpt_path=` take the law from.
+
+    values: configuration with seed, prior, simulation, heterogeneity and adapter; density [kg/m^3]."""
+    spacing = SIDE / ACROSS
+    axis = (torch.arange(ACROSS) + 0.5) * spacing
+    rest = torch.cartesian_prod(axis, axis, axis)
+    n, eye = len(rest), torch.eye(3)
+    tensors = {"rest": rest, "volume": torch.full((n,), spacing**3), "colors": torch.full((n, 3), 0.6),
+               "opacities": torch.full((n,), 0.8), "covariances": 0.1 * spacing**2 * eye.expand(n, 3, 3).contiguous()}  # fmt: skip
+    sections = ("seed", "prior", "simulation", "heterogeneity", "adapter")
+    record = BodyRecord(
+        settings={name: values[name] for name in sections if name in values},
+        ground={"height": 0.0, "mode": "separate", "friction": 0.5},
+        world={"gravity": [0.0, -9.81, 0.0], "up": [0.0, 1.0, 0.0], "box": [[-1.0, -0.2, -1.0], [1.0, 2.0, 1.0]]},
+        density=float(density), dx=2 * spacing, frame_dt=1 / 60,
+    )  # fmt: skip
+    body = build_body(record, tensors)
+    with torch.no_grad():
+        for name, raw in law.material.raw.items():
+            body.material.raw[name].copy_(raw)
+        if isinstance(body.adapter, HyperelasticAdapter) and law.adapter is not None:
+            body.adapter.numbers.copy_(law.adapter.numbers)
+            body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
+    start = Start(eye, body.center, torch.zeros(3), torch.zeros(3))
+    return Twin(body.eval(), world_of(record), record.frame_dt, record, start)
+
+
+def write(folder: Path, law: Law, data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray], unit: str,
+          values: Mapping[str, Any], density: float) -> None:  # fmt: skip
+    """results.md, tests.png, material.json and checkpoints/specimen.ckpt in `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "results.md").write_text(table(law, data, fit, left_out, unit))
+    plot(folder / "tests.png", data, fit, left_out, unit)
+    (folder / "material.json").write_text(json.dumps(written(law, fit), indent=1, allow_nan=False))
+    save_twin(specimen_twin(law, values, density), folder / "checkpoints" / "specimen.ckpt")

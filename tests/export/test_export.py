@@ -1,0 +1,133 @@
+"""Laws as text: each against the program's own stress and tangent at drawn deformations (1,000 of them: docs/law_export.md)."""
+
+import json
+import shutil
+
+import pytest
+import sympy as sp
+import torch
+
+from mosa.cli.export_law import main
+from mosa.errors import ConfigError, DataError
+from mosa.export.checking import check_ufl, check_umat, check_warp, deformations, expected
+from mosa.export.energies import ENERGIES, ENTRIES, STRETCHES, energy
+from mosa.export.source import as_json, read_material, source
+from mosa.export.texts import ufl_text, umat, warp_text
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.body.material import Material
+from mosa.physics.constitutive.laws import law_named
+
+FIBRES = {"fibre_stiffness": 2e4, "fibre_exponent": 1.5, "dispersion": 0.1, "fibre": [1, 0.4, 0.2]}
+LAWS = {
+    "neo_hookean": {}, "corotated": {}, "stvk": {}, "mooney_rivlin": {"second_share": 0.3},
+    "yeoh": {"yeoh_2": 0.1, "yeoh_3": 0.02}, "hgo": FIBRES,
+    "ogden": {"alpha_1": 2.5, "share_2": 0.2, "alpha_2": -4.0, "share_3": 0.3, "alpha_3": 6.0},
+    "hgo_two": FIBRES | {"second_fibre_stiffness": 1e4, "second_fibre": [0.5, -1, 0]},
+}  # fmt: skip
+
+
+def exported(law: str, learned: bool):
+    adapter = None
+    if learned:
+        adapter = HyperelasticAdapter()
+        with torch.no_grad():
+            adapter.numbers.copy_(0.3 * torch.randn(19, generator=torch.Generator().manual_seed(1)))
+        adapter.switch_on(1e5, 0.4)
+    return source(Material(law, {"E": 1e5, "nu": 0.4} | LAWS[law]), adapter)
+
+
+def test_every_energy_that_is_exported_is_named():
+    assert set(ENERGIES) == set(LAWS)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_symbolic_energy_is_the_law_s(law):
+    """Against the torch function that the verification suite holds the kernels to."""
+    found, F = exported(law, False), deformations(50, seed=3)
+    form = energy(law, tuple(found.values), False)
+    f = sp.lambdify(
+        [*ENTRIES, *STRETCHES, *sp.symbols(form.names, real=True)],
+        form.entries + form.stretches,
+        [{"ramp": lambda e: e.clip(0)}, "numpy"],
+    )
+    C, S = F.mT @ F, torch.linalg.svdvals(F)
+    inputs = [C[:, i, j].numpy() for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))]
+    psi = torch.as_tensor(f(*inputs, *S.T.numpy(), *found.values.values()))
+    values = {k: v.detach().double() for k, v in found.material.per_particle().items()}
+    expected_psi = law_named(law).energy(F, **values)
+    assert (psi - expected_psi).abs().max() < 1e-12 * expected_psi.max()
+
+
+@pytest.mark.parametrize("law, learned", [("hgo", True), ("ogden", False)])
+def test_texts_agree_with_the_kernels(law, learned):
+    found, F = exported(law, learned), deformations(100)
+    truth = expected(found, F)
+    stress, tangent = check_ufl(ufl_text(found), F, truth)
+    assert stress < 1e-10 and tangent < 1e-6
+    assert check_warp(warp_text(found), F, truth) < 1e-10
+    other = expected(exported(law, not learned), F)  # the check can fail
+    assert check_ufl(ufl_text(found), F, other)[0] > 1e-3
+
+
+@pytest.mark.parametrize("law, learned", [("hgo", True), ("ogden", False)])
+def test_umat_agrees_with_the_kernels(law, learned):
+    if shutil.which("gfortran") is None:
+        pytest.skip("no gfortran here")
+    found, F = exported(law, learned), deformations(1000)
+    F[0] = torch.eye(3)  # equal stretches, at rest and away from it
+    F[1] = 1.1 * torch.eye(3)
+    truth = expected(found, F)
+    truth[0][0] = 0  # exactly
+    text = umat(found)
+    assert max(map(len, text.splitlines())) <= 132
+    stress, tangent = check_umat(found, text, F[1:], tuple(t[1:] for t in truth))
+    assert stress < 1e-10 and tangent < 1e-6
+    assert check_umat(found, text, F[:1], (torch.ones_like(truth[0][:1]), truth[1][:1]))[1] < 1e-6
+
+
+def test_the_text_is_ufl():
+    """UFL itself takes the energy, derives it and evaluates the stress of one deformation."""
+    ufl = pytest.importorskip("ufl")
+    from ufl.algorithms import compute_form_data  # noqa: F401  not every release has what follows
+    from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+    from ufl.algorithms.apply_derivatives import apply_derivatives
+
+    found = exported("mooney_rivlin", False)
+    scope: dict = {}
+    exec(compile(ufl_text(found), "law_ufl.py", "exec"), scope)
+    F = deformations(1, seed=5)
+    gradient = ufl.variable(ufl.as_matrix(F[0].tolist()))
+    P = apply_derivatives(apply_algebra_lowering(ufl.diff(scope["energy"](gradient), gradient)))
+    value = torch.tensor(
+        [[float(P[i, j](())) for j in range(3)] for i in range(3)], dtype=torch.float64
+    )
+    tau, _ = expected(found, F)
+    assert (value @ F[0].T - tau[0]).abs().max() < 1e-10 * tau.abs().max()
+
+
+def test_the_command_writes_reads_and_checks(tmp_path, capsys):
+    found = exported("neo_hookean", True)
+    (tmp_path / "material.json").write_text(as_json(found))
+    material, adapter = read_material(tmp_path / "material.json")
+    assert source(material, adapter).values == pytest.approx(found.values, rel=1e-6)
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path / "material.json"), str(tmp_path / "law"), "--check", "20"])
+    assert ended.value.code == 0 and "warp stress" in capsys.readouterr().out
+    assert sorted(p.name for p in (tmp_path / "law").iterdir()) == [
+        "law.json",
+        "law_ufl.py",
+        "law_warp.py",
+        "umat.f90",
+    ]
+    assert json.loads((tmp_path / "law" / "law.json").read_text())["values"]["kept"] < 1
+
+
+def test_a_law_without_an_energy_is_refused(tmp_path):
+    yielding = Material("von_mises", {"E": 1e5, "nu": 0.3, "yield_stress": 1e3})
+    with pytest.raises(ConfigError, match="found von_mises"):
+        source(yielding, None)
+    with pytest.raises(ConfigError, match="found hencky"):
+        source(Material("stvk", {"E": 1e5, "nu": 0.3}), HyperelasticAdapter(strain="hencky"))
+    (tmp_path / "material.json").write_text('{"law": "stvk"}')
+    with pytest.raises(DataError, match=r"material\.json: expected a material\.json"):
+        read_material(tmp_path / "material.json")
