@@ -60,14 +60,24 @@ class Box:
     size: tuple[float, float, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """No solid: particles of the body itself, which the motion holds (`driven`). indices: (n,), None where the simulator is told
+    them with each rollout. Such colliders come after all solids."""
+
+    indices: Tensor | None = None
+
+
 STIFFER = 2.4
 """Springs of solids that squeeze, over those of mode `touch`: plates then press with the force of the body's own law, to 1 %."""
 HOLD = 1.75
 """Share of its sliding velocity that a particle loses in a substep on a solid of mode `sticky`. No friction coefficient bounds the
 force there, and from 2 on a particle that is alone in its cells would go back as fast as it came, or faster."""
-Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField
+Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField | Particles
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
-         Box: packing.BOX, SignedDistanceField: packing.FIELD}  # fmt: skip
+         Box: packing.BOX, SignedDistanceField: packing.FIELD, Particles: packing.SPHERE}  # fmt: skip
+NOWHERE = -1e30
+"""Radius [m] of the ball that stands for driven particles among the solids: nothing ever meets it."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +133,8 @@ def pack_colliders(
             raise ConfigError(
                 f"{where}: friction acts on modes {' and '.join(RUBBING)} only, found mode {collider.mode!r}"
             )
+        if isinstance(shape, Particles):
+            shapes[i, packing.SIZE] = NOWHERE
         for j, value in enumerate(_sizes(shape)):
             if not 0 < value < math.inf:
                 raise ConfigError(
