@@ -26,6 +26,7 @@ from mosa.modules.fitting.stages import STAGES, Stage, recalibrations
 from mosa.modules.fitting.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.colliders import colliders_from_config, domain_walls
+from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
@@ -58,7 +59,8 @@ def world_config(scene: Scene) -> dict[str, Any]:
 
 
 def build_world(config: Mapping[str, Any]) -> World:
-    """walls: {mode, friction} of the box's six sides, or None; colliders: list, see `colliders_from_config`; both may be absent."""
+    """walls: {mode, friction} of the box's six sides, or None; colliders, driven: lists, see `colliders_from_config` and
+    `driven_from_config`; all may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
     if (
         ground is not None and ground.mode == AUTO
@@ -74,6 +76,7 @@ def build_world(config: Mapping[str, Any]) -> World:
         box,
         build_walls(config.get("walls"), box),
         colliders_from_config(config.get("colliders") or ()),
+        driven_from_config(config.get("driven") or ()),
     )
 
 
@@ -195,6 +198,7 @@ def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
+    driven_from_config(cfg["world"].get("driven") or ())
     return stages
 
 

@@ -110,6 +110,7 @@ TRAINING: dict[str, Kind] = {
     "rendering.margin": whole(0, 256),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
+    "world.driven": or_null(ENTRIES),
     "rendering.backend": TEXT,
     "rendering.appearance": one_of("splats", "particles"),
     "ckpt_path": or_null(TEXT),
@@ -134,6 +135,7 @@ SIMULATION: dict[str, Kind] = {
     "simulate.position": or_null(PLACE),
     "simulate.height": or_null(Kind("a number", is_number)),
     "simulate.colliders": or_null(ENTRIES),
+    "simulate.driven": or_null(ENTRIES),
     "simulate.frames": COUNT,
 }
 SPLATS: dict[str, Kind] = {

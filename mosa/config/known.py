@@ -19,7 +19,8 @@ from hydra.core.hydra_config import HydraConfig
 from mosa.errors import ConfigError
 
 ELSEWHERE = ("hydra", "trainer", "callbacks", "logger", "scene", "prior", "reconstruction", "fit.prior", "fit.prior_eta",
-             "fit.joint", "world.walls", "phones", "world.colliders", "simulate.colliders")  # fmt: skip
+             "fit.joint", "world.walls", "phones", "world.colliders", "simulate.colliders",
+             "world.driven", "simulate.driven")  # fmt: skip
 """Sections that are the arguments of what is built from them, or whose keys depend on a kind: there they are named."""
 LOOSE = ("losses", "reconstruction", "prior", "adapter")
 """Sections of which any key may be left out: each has a default where it is read."""

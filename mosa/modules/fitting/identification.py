@@ -208,7 +208,7 @@ class Identification:
                     parts.append(self.ready(self.body, i, self.substeps[i]).answered())
                 rollout = Ready.stack(parts).simulate(
                     len(take.cues.positions),
-                    self.world.colliders,
+                    self.world.solids,
                     observed=take.cues.positions if gain else None,
                     gain=gain,
                     unseen=self.unseen(take),

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +23,9 @@ from mosa.physics.contact.planes import MODES, Plane
 from mosa.physics.contact.touch import GRIP
 from mosa.schema import is_number
 from mosa.types import RUBBING
+
+if TYPE_CHECKING:
+    from mosa.physics.contact.driven import Points
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ class Collider:
     shape: Shape
     mode: str = "sticky"
     friction: float = 0.0
-    motion: Motion | Trajectory = field(default_factory=Motion)
+    motion: "Motion | Trajectory | Points" = field(default_factory=Motion)
     name: str = ""
 
 
@@ -237,12 +240,13 @@ def colliders_from_config(
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
         raise ConfigError(f"{field_name}: expected a list of colliders, found {items!r}")
     return tuple(
-        item if isinstance(item, Collider) else _collider(item, f"{field_name}[{i}]")
+        item if isinstance(item, Collider) else collider_of(item, f"{field_name}[{i}]")
         for i, item in enumerate(items)
     )
 
 
-def _collider(item: Mapping, where: str) -> Collider:
+def collider_of(item: Mapping, where: str) -> Collider:
+    """Of one entry of `colliders_from_config`; where: it, for messages. Errors: ConfigError."""
     if not isinstance(item, Mapping):
         raise ConfigError(f"{where}: expected type and the keys of that type, found {item!r}")
     kind = item.get("type")

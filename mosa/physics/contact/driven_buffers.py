@@ -10,9 +10,11 @@ from mosa.physics.contact.driven_kernels import HEAVIER, driven_kernels
 
 
 class DrivenBuffers:
-    """Sets among the columns of `colliders`, the `ColliderBuffers` of the workspace `work`, whose poses and reactions are theirs.
+    """Sets among the columns of `colliders`, the `ColliderBuffers` of the workspace `work`, whose
+    poses and reactions are theirs.
 
-    mass_wp: (N,) [kg] with which particles go to the grid; paths, adj_paths: (S, W P, 3) places [m] and rates [m/s] of the P points of W worlds, [] where P = 0.
+    mass_wp: (N,) [kg] with which particles go to the grid; paths, adj_paths: (S, W P, 3) places [m]
+    and rates [m/s] of the P points of W worlds.
     """
 
     def __init__(self, colliders, scalar, substeps: int, points: int, work) -> None:
@@ -53,8 +55,8 @@ class DrivenBuffers:
         return [self._work.size, self.colliders.count]
 
     def hold(self, step: int, x, v, time: float) -> wp.array:
-        """Velocities that go to the grid in substep `step`, of particles that have velocities v before. time [s]: as of
-        `ColliderBuffers.strike`."""
+        """Velocities that go to the grid in substep `step`, of particles that have velocities v
+        before. time [s]: as of `ColliderBuffers.strike`."""
         work = self._work
         work.run(self.kernels.hold, work.particles, [
             x, v, work.springs_wp, self._sets_wp, self._local_wp, self._points_wp, time, *self._columns(), self.count, step,

@@ -1,11 +1,12 @@
 """Velocities of driven particles before they go to the grid, the reaction, and the exact adjoint of both.
 
-A driven particle belongs at y = position + Q local (+ path), and moves with w = linear + angular x Q local (+ rate). It goes to the
-grid with
+A driven particle belongs at y = position + Q local (+ path), and moves with
+w = linear + angular x Q local (+ rate). It goes to the grid with
     v' = w + dt k (y - x),   m' = HEAVIER m
-k: the spring of `contact.touch`, as stiff as a cell of the material. Its own velocity is dropped: what holds it says how it moves.
-Stress and affine velocity are its own. The mass that is added makes the spring HEAVIER times as stiff at the same time step; no
-node is treated apart, so that a set may move across the grid at any angle. With u the velocity before and v'' that after the grid,
+k: the spring of `contact.touch`, as stiff as a cell of the material. Its own velocity is dropped:
+what holds it says how it moves. Stress and affine velocity are its own. The mass that is added
+makes the spring HEAVIER times as stiff at the same time step; no node is treated apart, so that a
+set may move across the grid at any angle. With u the velocity before and v'' that after the grid,
 the set's holder feels the momentum that the particles lose,
     f = (m (u - v') + (m' - m) (v'' - v' - dt g))/dt,   torque (x - position) x f,
 in which the added mass has neither weight nor inertia.
@@ -19,12 +20,14 @@ import warp as wp
 from mosa.physics.contact.collider_kernels import collider_kernels
 
 HEAVIER = 50.0
-"""Mass with which driven particles go to the grid, over their own: see docs/driven.md, "How stiff a clamp is"."""
+"""Mass with which driven particles go to the grid, over their own: docs/driven.md, "How stiff a
+clamp is"."""
 
 
 @cache
 def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
-    """Kernels hold, feel, adj_feel, adj_hold for wp.float32 or wp.float64 fields. exact: as `collider_kernels`."""
+    """Kernels hold, feel, adj_feel, adj_hold for wp.float32 or wp.float64 fields. exact: as
+    `collider_kernels`."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     adding = collider_kernels(scalar, exact)
@@ -64,10 +67,11 @@ def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def feel(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), v_held: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3),
-        mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), sets: wp.array(dtype=int), dt: scalar, size: int, columns: int,
-        substep: int, position: wp.array2d(dtype=vec3), force: vectors, torque: vectors,
+        mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), sets: wp.array(dtype=int), dt: scalar, size: int,
+        columns: int, substep: int, position: wp.array2d(dtype=vec3), force: vectors, torque: vectors,
     ):  # fmt: skip
-        """Adds to force and torque of the substep. v, v_new: velocities before `hold` and after the grid; impulses: dt g of worlds."""
+        """Adds to force and torque of the substep. v, v_new: velocities before `hold` and after
+        the grid; impulses: dt g of worlds."""
         p = wp.tid()
         if sets[p] >= 0:
             world = p / size
@@ -78,8 +82,9 @@ def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_feel(
-        x: wp.array(dtype=vec3), mass: wp.array(dtype=scalar), sets: wp.array(dtype=int), dt: scalar, size: int, columns: int,
-        substep: int, position: wp.array2d(dtype=vec3), adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3),
+        x: wp.array(dtype=vec3), mass: wp.array(dtype=scalar), sets: wp.array(dtype=int), dt: scalar, size: int,
+        columns: int, substep: int, position: wp.array2d(dtype=vec3), adj_force: wp.array2d(dtype=vec3),
+        adj_torque: wp.array2d(dtype=vec3),
         adj_v_new: wp.array(dtype=vec3),
     ):  # fmt: skip
         """Adds to the adjoint of the velocities after the grid; those of all else `adj_hold` has."""
@@ -95,10 +100,11 @@ def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     def adj_hold(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3), springs: wp.array(dtype=scalar),
         mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), sets: wp.array(dtype=int), local: wp.array(dtype=vec3),
-        points: wp.array(dtype=int), dt: scalar, size: int, columns: int, count: int, substep: int, position: wp.array2d(dtype=vec3),
-        rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3),
-        paths: wp.array2d(dtype=vec3), rates: wp.array2d(dtype=vec3), adj_force: wp.array2d(dtype=vec3),
-        adj_torque: wp.array2d(dtype=vec3), adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3),
+        points: wp.array(dtype=int), dt: scalar, size: int, columns: int, count: int, substep: int,
+        position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3),
+        angular: wp.array2d(dtype=vec3), paths: wp.array2d(dtype=vec3), rates: wp.array2d(dtype=vec3),
+        adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_x: wp.array(dtype=vec3),
+        adj_v: wp.array(dtype=vec3),
         adj_springs: wp.array(dtype=scalar), adj_position: vectors, adj_rotation: matrices, adj_linear: vectors,
         adj_angular: vectors, adj_paths: vectors, adj_rates: vectors,
     ):  # fmt: skip

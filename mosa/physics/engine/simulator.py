@@ -21,7 +21,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, reach
-from mosa.physics.contact.driven import Held, Points, hold
+from mosa.physics.contact.driven import Held, Points, hold, stack_held
 from mosa.physics.contact.motion import sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.axes import Axes, shift_to, turn_along
@@ -197,7 +197,8 @@ class Simulator:
         parameters of an adapter that is a torch module, not other tensors that it may use.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
-        held: particles that the last colliders, sets of `Particles`, drive; None: their own indices, from where they are in `state`.
+        held: particles that the last colliders, sets of `Particles`, drive; None: their own
+        indices, from where they are in `state`.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
 
         Worlds: copies of the body that never meet, with the fixed time step. state: x (B, N, 3) and so on; parameters: the same in
@@ -409,7 +410,7 @@ class Simulator:
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         if worlds is None:
-            solvers = [SegmentSolver(self.numerics, volume, density, cutoff, driven=held)]
+            solvers = [SegmentSolver(self.numerics, volume, density, cutoff, None, None, held)]
         else:
             size = together or (worlds if self.device.type == "cuda" else 1)
             volume, density = (
@@ -423,8 +424,8 @@ class Simulator:
                     cutoff,
                     gravities[i : i + size],
                     i,
-                    None if held is None else Held(*(t[i : i + size].flatten(0, 1) for t in held)),
-                )  # fmt: skip
+                    held and Held(*(t[i : i + size].flatten(0, 1) for t in held)),
+                )
                 for i in range(0, worlds, size)
             ]
         if isinstance(adapter, Sequence):
@@ -447,7 +448,7 @@ class Simulator:
                 hold(indices, each[solids:], place, solids, start)
                 for each, place in zip(own, places, strict=True)
             ]
-            held = found[0] if x.ndim == 2 else Held(*map(torch.stack, zip(*found)))
+            held = found[0] if x.ndim == 2 else stack_held(found)
         if tuple(held.local.shape) != tuple(x.shape):
             raise ConfigError(
                 f"held: expected places of shape {tuple(x.shape)}, found {tuple(held.local.shape)}"
