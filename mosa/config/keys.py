@@ -111,6 +111,7 @@ TRAINING: dict[str, Kind] = {
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
     "world.driven": or_null(ENTRIES),
+    "world.forces": or_null(ENTRIES),
     "rendering.backend": TEXT,
     "rendering.appearance": one_of("splats", "particles"),
     "ckpt_path": or_null(TEXT),

@@ -20,7 +20,7 @@ from mosa.errors import ConfigError
 
 ELSEWHERE = ("hydra", "trainer", "callbacks", "logger", "scene", "prior", "reconstruction", "fit.prior", "fit.prior_eta",
              "fit.joint", "world.walls", "phones", "world.colliders", "simulate.colliders",
-             "world.driven", "simulate.driven")  # fmt: skip
+             "world.driven", "simulate.driven", "world.forces")  # fmt: skip
 """Sections that are the arguments of what is built from them, or whose keys depend on a kind: there they are named."""
 LOOSE = ("losses", "reconstruction", "prior", "adapter")
 """Sections of which any key may be left out: each has a default where it is read."""

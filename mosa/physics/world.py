@@ -45,7 +45,8 @@ class Start:
 @dataclass(frozen=True)
 class World:
     """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground; colliders: moving rigid solids;
-    driven: sets of the body's own particles that are held, moved or loaded."""
+    driven: sets of the body's own particles that are held, moved or loaded; forces: what was measured on
+    these (`modules.fitting.forces`), which moves nothing."""
 
     ground: Ground | None
     gravity: Tensor
@@ -54,6 +55,7 @@ class World:
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
     driven: tuple[Driven, ...] = ()
+    forces: tuple = ()
 
     @property
     def solids(self) -> tuple[Collider, ...]:

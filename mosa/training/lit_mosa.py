@@ -51,6 +51,7 @@ from mosa.modules.body.material import material_states
 from mosa.modules.fitting import losses
 from mosa.modules.fitting.adam_steps import GradientSteps
 from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.forces import forces_from_config
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import IdentificationSettings
@@ -94,7 +95,10 @@ def parts_of(config: Mapping[str, Any], body: Body) -> dict[str, Any]:
     if not (cfg["reconstruction"].get("informed") or {}).get("iterations", 0):
         stages = [stage for stage in stages if not stage.looks_again]
     return {
-        "world": build_world(config["world"]),
+        "world": replace(
+            build_world(config["world"]),
+            forces=forces_from_config(config["world"].get("forces")),
+        ),
         "stages": stages,
         "weights": cfg["losses"],
         "clip": cfg["fit"]["clip"],

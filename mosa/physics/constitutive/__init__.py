@@ -2,4 +2,4 @@
 
 Importing it registers the built-in laws."""
 
-from mosa.physics.constitutive import elasticity, mixture, plasticity, viscosity  # noqa: F401  each registers its laws
+from mosa.physics.constitutive import damping, elasticity, mixture, plasticity, viscosity  # noqa: F401  each registers its laws

@@ -89,9 +89,7 @@ class Simulator:
                 raise ConfigError(
                     f"{name}: expected a positive number of at most {most:g}, found {value}"
                 )
-        if strain is not None and (
-            strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None
-        ):
+        if strain is not None and (strain not in STRAINS or not self.law.sheared):
             if strain not in STRAINS:
                 raise ConfigError(
                     f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}"
