@@ -20,6 +20,7 @@ from mosa.modules.body.heterogeneity import HeterogeneityField, HeterogeneitySet
 from mosa.modules.body.material import Material
 from mosa.modules.body.stiffness_modes import StiffnessModes
 from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.forces import columns_of, forces_from_config
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import few_numbers
 from mosa.modules.fitting.stages import STAGES, Stage, recalibrations
@@ -198,8 +199,18 @@ def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
-    driven_from_config(cfg["world"].get("driven") or ())
+    check_forces(cfg["world"])
     return stages
+
+
+def check_forces(world: Mapping[str, Any]) -> None:
+    """Driven sets and measured forces, before anything takes long. Errors: ConfigError naming the key, DataError the file."""
+    solids = colliders_from_config(world.get("colliders") or ())
+    sets = driven_from_config(world.get("driven") or ())
+    none = torch.zeros(3)
+    columns_of(
+        forces_from_config(world.get("forces")), World(None, none, none, none, (), solids, sets)
+    )
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:

@@ -55,7 +55,7 @@ class World:
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
     driven: tuple[Driven, ...] = ()
-    forces: tuple = ()
+    forces: tuple[Any, ...] = ()
 
     @property
     def solids(self) -> tuple[Collider, ...]:

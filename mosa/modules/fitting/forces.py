@@ -123,7 +123,11 @@ def force_residuals(
     rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
 ) -> Tensor:
     """(M,) differences from the mean forces of all frame intervals that were measured, over their standard deviations."""
-    parts = []
+    parts: list[Tensor] = []
+    if rollout.reactions is None:
+        raise ConfigError(
+            "world.forces: expected a law on a grid, found an adapter without reactions"
+        )
     for curve, column in zip(curves, columns_of(curves, world)):
         mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
         felt = rollout.reactions.mean(1)[:, column, :3].double()

@@ -1,6 +1,8 @@
 """Driven particles in rollouts: they follow their motion, the body loses what the holder feels, exact gradients, many worlds."""
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -178,6 +180,16 @@ def test_sets_that_hold_nothing_or_the_same_are_refused():
         hold([LEFT, LEFT], [Motion(), Motion()], X)
     with pytest.raises(ConfigError, match="after all solids"):
         rollout(sets(NUMBERS)[::-1])
+
+
+def test_the_example_of_the_page_runs():
+    """docs/driven.md: what is pulled pulls back, and the clamp takes the beam's weight beside."""
+    page = (Path(__file__).parents[3] / "docs" / "driven.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict = {}
+    exec(example, names)
+    clamp, grip = names["force"][-1]
+    assert grip[0] < -0.1 and clamp[0] > 0.1 and clamp[1] + grip[1] < 0
 
 
 @pytest.mark.gpu
