@@ -29,9 +29,9 @@ LOAD = {
 STEPS = 4
 
 
-def twin(**options):
+def twin(precision=64, **options):
     made = Twin(
-        small_body(precision=64, contact=True, **options),
+        small_body(precision=precision, contact=True, **options),
         FREE,
         FRAME_DT,
         {},

@@ -50,6 +50,10 @@ from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
 
 
+NEAR = 8
+"""Cells from the origin within which driven particles of float32 may move before the origin follows them, with new buffers."""
+
+
 class Simulator:
     """MLS-MPM of one law on one grid and time step. Rollouts are differentiable in state, parameters and adapter outputs.
 
@@ -297,7 +301,7 @@ class Simulator:
         each = motions_of_worlds(motions, self.colliders, worlds)
         if self.numerics.driven:
             held = self._held(held, state.x, each, start_time)
-        if (shift := shift_to(state.x, self._axes.turn, self.numerics.dx)) != self._axes.shift:
+        if (shift := self._origin(state.x, held)) != self._axes.shift:
             self._move(shift)
         axes = self._axes
         state = axes.state(state, self.dtype)
@@ -432,6 +436,18 @@ class Simulator:
         return Prepared(
             self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers
         )
+
+    def _origin(self, x: Tensor, held: Held | None) -> tuple[float, ...] | None:
+        """Of the axes for particles at x. In float32 it is near driven particles: what they give way by under load is
+        little more than the last digit of a place far away, and what is rounded off would let them creep."""
+        axes, dx = self._axes, self.numerics.dx
+        if held is None or not self.numerics.driven or self.dtype == torch.float64:
+            return shift_to(x, axes.turn, dx)
+        center = Axes(axes.turn).vectors(x.detach()[held.sets >= 0].double().mean(0).cpu())
+        now = torch.tensor(axes.shift or (0.0, 0.0, 0.0), dtype=torch.float64)
+        if float((center - now).abs().max()) <= NEAR * dx:
+            return axes.shift
+        return tuple((dx * torch.round(center / dx)).tolist())
 
     def _held(self, held: Held | None, x: Tensor, motions: Sequence, start: float) -> Held:
         """Of all particles, in the simulator's type and on its device. Errors: ConfigError."""
