@@ -49,7 +49,6 @@ from mosa.physics.time.time_step import MOST_SUBSTEPS
 from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
 
-
 NEAR = 8
 """Cells from the origin within which driven particles of float32 may move before the origin follows them, with new buffers."""
 
