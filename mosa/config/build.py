@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import mosa.config.composition  # noqa: F401  registers the resolvers that conf/ uses
+from mosa.data.io.forces import columns_of, forces_from_config
 from mosa.errors import ConfigError
 from mosa.evaluation.settings import EvaluationSettings
 from mosa.modules.adapters.registry import adapter_class
@@ -20,7 +21,6 @@ from mosa.modules.body.heterogeneity import HeterogeneityField, HeterogeneitySet
 from mosa.modules.body.material import Material
 from mosa.modules.body.stiffness_modes import StiffnessModes
 from mosa.modules.fitting.criteria import Criterion
-from mosa.modules.fitting.forces import columns_of, forces_from_config
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import few_numbers
 from mosa.modules.fitting.stages import STAGES, Stage, recalibrations
@@ -60,8 +60,8 @@ def world_config(scene: Scene) -> dict[str, Any]:
 
 
 def build_world(config: Mapping[str, Any]) -> World:
-    """walls: {mode, friction} of the box's six sides, or None; colliders, driven: lists, see `colliders_from_config` and
-    `driven_from_config`; all may be absent."""
+    """walls: {mode, friction} of the box's six sides, or None; colliders, driven: lists, see
+    `colliders_from_config` and `driven_from_config`; all may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
     if (
         ground is not None and ground.mode == AUTO
@@ -204,7 +204,8 @@ def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
 
 
 def check_forces(world: Mapping[str, Any]) -> None:
-    """Driven sets and measured forces, before anything takes long. Errors: ConfigError naming the key, DataError the file."""
+    """Driven sets and measured forces, before anything takes long. Errors: ConfigError naming the
+    key, DataError the file."""
     solids = colliders_from_config(world.get("colliders") or ())
     sets = driven_from_config(world.get("driven") or ())
     none = torch.zeros(3)

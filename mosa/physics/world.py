@@ -44,9 +44,9 @@ class Start:
 
 @dataclass(frozen=True)
 class World:
-    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground; colliders: moving rigid solids;
-    driven: sets of the body's own particles that are held, moved or loaded; forces: what was measured on
-    these (`modules.fitting.forces`), which moves nothing."""
+    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground;
+    colliders: moving rigid solids; driven: sets of the body's own particles that are held, moved or
+    loaded; forces: what was measured on these (`data.io.forces`), which moves nothing."""
 
     ground: Ground | None
     gravity: Tensor
@@ -59,8 +59,8 @@ class World:
 
     @property
     def solids(self) -> tuple[Collider, ...]:
-        """All that has a motion and takes a reaction, in the order of a rollout's reactions: the colliders, then what holds driven
-        particles."""
+        """All that has a motion and takes a reaction, in the order of a rollout's reactions: the
+        colliders, then what holds driven particles."""
         return (*self.colliders, *(each.solid for each in self.driven if each.held))
 
     def fastest(self, start: Start, size: float, time: float) -> float:

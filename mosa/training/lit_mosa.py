@@ -42,6 +42,7 @@ from mosa.config.build import (
 from mosa.config.checkpoints import VERSION, read_checkpoint
 from mosa.config.composition import composed
 from mosa.data.batches import MotionBatch
+from mosa.data.io.forces import forces_from_config
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
 from mosa.evaluation.evaluate import evaluate, run_sequences
@@ -51,7 +52,6 @@ from mosa.modules.body.material import material_states
 from mosa.modules.fitting import losses
 from mosa.modules.fitting.adam_steps import GradientSteps
 from mosa.modules.fitting.criteria import Criterion
-from mosa.modules.fitting.forces import forces_from_config
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import IdentificationSettings

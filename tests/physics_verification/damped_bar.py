@@ -23,10 +23,12 @@ GRIDS, RATIOS = (12, 16, 32), (0.002, 0.02, 0.2)
 
 
 def decay(cells: int, ratio: float, law: str = "neo_hookean", periods: float = 3.0) -> float:
-    """Rate [1/s] at which the first standing wave of a free rod, `cells` long, decays: exp(-rate t).
+    """Rate [1/s] at which the first standing wave of a free rod, `cells` long, decays: exp(-rate
+    t).
 
-    ratio: rate/frequency of the closed form, eta K/(density c): the rate is (4 eta/3 + zeta) K^2/(2 density), and with nu = 0
-    and zeta = 2 eta/3 one dimension is exact. ratio 0: what the scheme damps by itself.
+    ratio: rate/frequency of the closed form, eta K/(density c): the rate is (4 eta/3 + zeta) K^2/(2
+    density), and with nu = 0 and zeta = 2 eta/3 one dimension is exact. ratio 0: what the scheme
+    damps by itself.
     """
     dx = LENGTH / cells
     x = lattice((2 * cells, 2, 2), dx / 2)

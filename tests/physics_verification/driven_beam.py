@@ -57,8 +57,8 @@ def frequency(nu: float, terms: int = 8) -> float:
 
 
 class Beam(NamedTuple):
-    """Over theory: sag and frequency; reaction and torque at the clamp, over weight and its moment; drift of the held
-    particles [cells]."""
+    """Over theory: sag and frequency; reaction and torque at the clamp, over weight and its moment;
+    drift of the held particles [cells]."""
 
     sag: float
     frequency: float
@@ -69,8 +69,9 @@ class Beam(NamedTuple):
 
 def beam(cells: int, nu: float = 0.0, offset: float = 0.3, courant: float = 0.5, dtype: torch.dtype = torch.float64,
          periods: float = 1.1, frames: int = 61, law: str = "neo_hookean") -> Beam:  # fmt: skip
-    """cells: along the beam; offset [cells]: of the clamp's face from a node. It is released straight, swings about its
-    static form by its weight (0.3 % of its length), and is held by three cells of its own."""
+    """cells: along the beam; offset [cells]: of the clamp's face from a node. It is released
+    straight, swings about its static form by its weight (0.3 % of its length), and is held by three
+    cells of its own."""
     dx = LENGTH / cells
     spacing = dx / 2
     axes = [(torch.arange(-6, 2 * cells).double() + 0.5) * spacing]

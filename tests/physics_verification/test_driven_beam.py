@@ -16,7 +16,7 @@ def test_31_a_clamp_is_stiff_wherever_its_face_is_in_a_cell(offset):
 
 
 def test_31_single_precision_does_not_let_a_clamp_creep():
-    """Under a load that bends the beam by 0.3 % alone: a clamp gives way by 3e-6 cells then, and a beam that is 30 cells from the
-    origin of the numbers that round it sagged by 21 % too much."""
+    """Under a load that bends the beam by 0.3 % alone: a clamp gives way by 3e-6 cells then, and a
+    beam that is 30 cells from the origin of the numbers that round it sagged by 21 % too much."""
     found = beam(20, dtype=torch.float32, frames=41)
     assert found.sag == pytest.approx(1, abs=0.05) and found.reaction == pytest.approx(1, abs=0.01)

@@ -1,4 +1,5 @@
-"""Driven sets of a twin: simulated, stepped to the same bits, driven by actions, with loads, in many worlds."""
+"""Driven sets of a twin: simulated, stepped to the same bits, driven by actions, with loads, in
+many worlds."""
 
 from dataclasses import replace
 

@@ -294,7 +294,8 @@ class Body(nn.Module):
         return Ready(simulator, state, lift, arguments, timing)
 
     def driven(self, world: World, x: Tensor) -> dict[str, Any]:
-        """What `Simulator.rollout` takes for the driven sets of a world, of the body's particles that start at x (N, 3) [m]."""
+        """What `Simulator.rollout` takes for the driven sets of a world, of the body's particles
+        that start at x (N, 3) [m]."""
         held = held_in(world.driven, x, len(world.colliders))
         added = loads(world.driven, x, self.volume)
         given = {} if held is None else {"held": held}

@@ -135,12 +135,12 @@ def unit_of(law: str, name: str) -> str:
 class Material(nn.Module):
     """Parameters of one prior law.
 
-    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees; of a direction three numbers of
-    any length); frozen: names that are not
-    learned; modulated: names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa together).
-    damping, bulk_damping among the parameters: with a viscous branch of the law (`constitutive.damping`).
-    candidates: laws among which a calibration chooses, with law=auto; until then it is the first.
-    A parameter that starts on a bound of its range is held there.
+    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees;
+    of a direction three numbers of any length); frozen: names that are not learned; modulated:
+    names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa
+    together). damping, bulk_damping among the parameters: with a viscous branch of the law
+    (`constitutive.damping`). candidates: laws among which a calibration chooses, with law=auto;
+    until then it is the first. A parameter that starts on a bound of its range is held there.
     Errors: ConfigError naming the parameter, what was expected and what was found.
     """
 

@@ -14,12 +14,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mosa.data.io.forces import columns_of, force_residuals
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules.body.body import Body, Ready, World
 from mosa.modules.body.material import RIVALS
 from mosa.modules.fitting import residuals
 from mosa.modules.fitting.criteria import Criterion
-from mosa.modules.fitting.forces import columns_of, force_residuals
 from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of

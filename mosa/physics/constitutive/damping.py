@@ -2,9 +2,10 @@
 
     tau = tau_a + 2 eta dev(D) + zeta tr(D) I,   D = sym(C_affine)
 
-with the shear viscosity eta (`damping`) and the bulk viscosity zeta (`bulk_damping`) [Pa s], per rest volume. It is objective: D
-turns with the body, and a rigid motion has none. It is passive: tau_v : D = 2 eta |dev D|^2 + zeta tr(D)^2 >= 0. The rate is that
-of the last substep, which bounds the time step as the viscosity of a fluid does (`time_step`).
+with the shear viscosity eta (`damping`) and the bulk viscosity zeta (`bulk_damping`) [Pa s], per
+rest volume. It is objective: D turns with the body, and a rigid motion has none. It is passive:
+tau_v : D = 2 eta |dev D|^2 + zeta tr(D)^2 >= 0. The rate is that of the last substep, which bounds
+the time step as the viscosity of a fluid does (`time_step`).
 """
 
 from collections.abc import Callable, Sequence
@@ -41,7 +42,8 @@ def register_damped(name: str, laws: Sequence[Law]) -> Law:
 
 
 def viscosity(damping: Tensor, bulk_damping: Tensor, **unused: Tensor) -> Tensor:
-    """[Pa s] of the stress mu sym(C_affine) that bounds the time step as much: 2 eta for shear, 4 eta/3 + zeta along a wave."""
+    """[Pa s] of the stress mu sym(C_affine) that bounds the time step as much: 2 eta for shear, 4
+    eta/3 + zeta along a wave."""
     damping, bulk_damping = torch.as_tensor(damping), torch.as_tensor(bulk_damping)
     return torch.maximum(2 * damping, 4 / 3 * damping + bulk_damping)
 

@@ -127,8 +127,8 @@ def register_law(
 
 
 def law_named(name: str) -> Law:
-    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`), `a~damped` the law a with a viscous branch
-    (see `damping`). Errors: ConfigError naming the known ones."""
+    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`), `a~damped`
+    the law a with a viscous branch (see `damping`). Errors: ConfigError naming the known ones."""
     for sign, make in _COMPOSED.items():
         if sign in name and name not in _LAWS:
             make(name, [law_named(part) for part in name.split(sign) if part])

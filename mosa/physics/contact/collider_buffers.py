@@ -54,7 +54,8 @@ class ColliderBuffers:
         return [tensor for tensor, _ in made], [array for _, array in made]
 
     def sums(self, tensors: list[Tensor]) -> list | None:
-        """What particles add to, of which `tensors` are made: exact sums, or the tensors themselves (None)."""
+        """What particles add to, of which `tensors` are made: exact sums, or the tensors themselves
+        (None)."""
         if not self._work.exact:
             return None
         shapes = [(*t.shape[:2], prod(t.shape[2:]), COLUMNS) for t in tensors]

@@ -65,8 +65,9 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """No solid: particles of the body itself, which the motion holds (`driven`). indices: (n,), None where the simulator is told
-    them with each rollout. Such colliders come after all solids."""
+    """No solid: particles of the body itself, which the motion holds (`driven`). indices: (n,),
+    None where the simulator is told them with each rollout. Such colliders come after all solids.
+    """
 
     indices: Tensor | None = None
 
@@ -80,7 +81,8 @@ Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField | Pa
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
          Box: packing.BOX, SignedDistanceField: packing.FIELD, Particles: packing.SPHERE}  # fmt: skip
 NOWHERE = -1e30
-"""Radius [m] of the ball that stands for driven particles among the solids: nothing ever meets it."""
+"""Radius [m] of the ball that stands for driven particles among the solids: nothing ever meets it.
+"""
 
 
 @dataclass(frozen=True)

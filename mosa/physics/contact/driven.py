@@ -126,7 +126,8 @@ class Driven:
     place: Motion | Trajectory | Points | None = None
 
     def chosen(self, x: Tensor) -> Tensor:
-        """(n,) indices of the particles x (N, 3) [m] where the body starts. Errors: ConfigError where there are none."""
+        """(n,) indices of the particles x (N, 3) [m] where the body starts. Errors: ConfigError
+        where there are none."""
         place, where = x.detach().double().cpu(), f"driven set {self.name!r}"
         region = self.region
         if region is None:
@@ -193,9 +194,9 @@ def _pose(motion, start: float = 0.0) -> tuple[Tensor, ...]:
 def hold(
     indices: Sequence[Tensor], motions: Sequence, x: Tensor, solids: int = 0, start: float = 0.0
 ) -> Held:
-    """The sets `indices`, one for each of `motions`, of particles at x (N, 3) [m] at time `start` of
-    the motions, behind `solids` solids. Without gradient: places in the motions' axes are those of
-    the start. Errors: ConfigError where sets share a particle."""
+    """The sets `indices`, one for each of `motions`, of particles at x (N, 3) [m] at time `start`
+    of the motions, behind `solids` solids. Without gradient: places in the motions' axes are those
+    of the start. Errors: ConfigError where sets share a particle."""
     place = x.detach().double().cpu()
     sets, points = (torch.full((len(x),), -1, dtype=torch.int32) for _ in range(2))
     local, passed = torch.zeros_like(place), 0

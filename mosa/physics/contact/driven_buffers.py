@@ -1,4 +1,5 @@
-"""Device buffers of driven particles: which they are, their points' paths by substep, and the launches on them."""
+"""Device buffers of driven particles: which they are, their points' paths by substep, and the
+launches on them."""
 
 import weakref
 

@@ -1,7 +1,8 @@
-"""Velocities of driven particles before they go to the grid, the reaction, and the exact adjoint of both.
+"""Velocities of driven particles before they go to the grid, the reaction, and the exact adjoint of
+both.
 
-A driven particle belongs at y = position + Q local (+ path), and moves with
-w = linear + angular x Q local (+ rate). It goes to the grid with
+A driven particle belongs at y = position + Q local (+ path), and moves with w = linear + angular x
+Q local (+ rate). It goes to the grid with
     v' = w + dt k (y - x),   m' = HEAVIER m
 k: the spring of `contact.touch`, as stiff as a cell of the material. Its own velocity is dropped:
 what holds it says how it moves. Stress and affine velocity are its own. The mass that is added

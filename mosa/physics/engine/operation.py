@@ -40,10 +40,11 @@ class Kept:
 class Stretch(ABC):
     """Some substeps that are advanced, and differentiated, as a whole.
 
-    Besides the state a stretch depends on other tensors: what acts, as a kind of stretch has it (None for one there is not), then,
-    where there are colliders, their poses at its substeps, as `contact.motion.Poses`, and the paths of points that
-    lead driven particles. Besides the state it leaves the colliders'
-    force [N] and torque about each collider's origin [N m], (S, W K, 3) each, then the `statistics` of its kind.
+    Besides the state a stretch depends on other tensors: what acts, as a kind of stretch has it
+    (None for one there is not), then, where there are colliders, their poses at its substeps, as
+    `contact.motion.Poses`, and the paths of points that lead driven particles. Besides the state it
+    leaves the colliders' force [N] and torque about each collider's origin [N m], (S, W K, 3) each,
+    then the `statistics` of its kind.
 
     first: number of its first substep, for messages; steps: times of the substeps."""
 

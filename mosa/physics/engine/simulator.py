@@ -50,7 +50,8 @@ from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
 
 NEAR = 8
-"""Cells from the origin within which driven particles of float32 may move before the origin follows them, with new buffers."""
+"""Cells from the origin within which driven particles of float32 may move before the origin follows
+them, with new buffers."""
 
 
 class Simulator:
@@ -437,8 +438,9 @@ class Simulator:
         )
 
     def _origin(self, x: Tensor, held: Held | None) -> tuple[float, ...] | None:
-        """Of the axes for particles at x. In float32 it is near driven particles: what they give way by under load is
-        little more than the last digit of a place far away, and what is rounded off would let them creep."""
+        """Of the axes for particles at x. In float32 it is near driven particles: what they give
+        way by under load is little more than the last digit of a place far away, and what is
+        rounded off would let them creep."""
         axes, dx = self._axes, self.numerics.dx
         if held is None or not self.numerics.driven or self.dtype == torch.float64:
             return shift_to(x, axes.turn, dx)

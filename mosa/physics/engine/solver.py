@@ -39,13 +39,14 @@ class _Shared:
 
 
 class SegmentSolver:
-    """Runs the segments of one rollout, of one world or of several in the same launches. volume: (N,) [m^3]; density: number or
-    (N,) [kg/m^3]; cutoff: node mass [kg].
+    """Runs the segments of one rollout, of one world or of several in the same launches. volume:
+    (N,) [m^3]; density: number or (N,) [kg/m^3]; cutoff: node mass [kg].
 
-    workspaces: by shape, those that it has while it runs (`Buffers.take`).
-    budget: for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
-    gravities: of every world [m/s^2], among which the particles are shared in equal parts; None: one world with the numerics' own.
-    first_world: number of the first one, for messages, None where there is but one. driven: particles of all worlds, None for none.
+    workspaces: by shape, those that it has while it runs (`Buffers.take`). budget: for the states
+    of all substeps, between the passes; segments that do not fit are run again in the backward
+    pass. gravities: of every world [m/s^2], among which the particles are shared in equal parts;
+    None: one world with the numerics' own. first_world: number of the first one, for messages, None
+    where there is but one. driven: particles of all worlds, None for none.
     """
 
     def __init__(

@@ -89,7 +89,8 @@ class Prepared:
         return state._replace(F=mapped, F_tot=F_tot + dt * (C @ F_tot))
 
     def reaches(self, columns: int) -> Tensor:
-        """(K,) distance [m] of the farthest driven particle from the origin of its pose, 0 of solids."""
+        """(K,) distance [m] of the farthest driven particle from the origin of its pose, 0 of
+        solids."""
         far = torch.zeros(columns, dtype=torch.float64)
         for solver in self.lanes.solvers if self.numerics.driven else ():
             on = solver.driven.sets >= 0
@@ -341,7 +342,8 @@ class Stepper:
         return (*poses, *self._paths(moment, frame))
 
     def _paths(self, moment: Moment, frame: Frame) -> tuple[Tensor, ...]:
-        """(S, W P, 3) each: paths and rates of the points that lead driven particles, () where there are none."""
+        """(S, W P, 3) each: paths and rates of the points that lead driven particles, () where
+        there are none."""
         first, start = self._times(moment)
         return self.led(frame.count, frame.dt, start, first)
 

@@ -256,9 +256,11 @@ class Workspace:
         poses: tuple[Tensor, ...] | None = None, steps: Steps | None = None,
         gravities: tuple[tuple[float, float, float], ...] | None = None, driven: Held | None = None,
     ) -> None:  # fmt: skip
-        """Copy the start of a segment in: the state, the parameters, the adapter's operator, colliders' poses, driven particles.
+        """Copy the start of a segment in: the state, the parameters, the adapter's operator,
+        colliders' poses, driven particles.
 
-        steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by default."""
+        steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by
+        default."""
         self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         pulled = (*self.steps, gravities or (self.numerics.gravity,) * self.worlds)
         if pulled != self._pulled:
@@ -419,7 +421,8 @@ class Workspace:
         return [self.x_wp[state], v, self.volume_wp, self.springs_wp, self.mass_wp]
 
     def _found(self, state: int) -> wp.array:
-        """Velocities of a state as driven sets find them, once `_met` has run: after planes and solids."""
+        """Velocities of a state as driven sets find them, once `_met` has run: after planes and
+        solids."""
         return self.colliders.struck if self.struck else self._struck(state)[1]
 
     def _stress_arguments(self, state: int, slot: int) -> list:

@@ -1,4 +1,5 @@
-"""A viscous branch: its stress, objectivity, passivity, exact gradients, and what a material and a body make of it."""
+"""A viscous branch: its stress, objectivity, passivity, exact gradients, and what a material and a
+body make of it."""
 
 import pytest
 import torch
@@ -49,8 +50,8 @@ def test_the_stress_is_objective_and_that_of_the_formula(law):
 
 @pytest.mark.parametrize("law", ELASTIC)
 def test_a_closed_loop_costs_energy(law):
-    """Work of stress along a loop of deformations, per rest volume: nothing where it is elastic, else what the viscosities say,
-    and never less than nothing, for any loop."""
+    """Work of stress along a loop of deformations, per rest volume: nothing where it is elastic,
+    else what the viscosities say, and never less than nothing, for any loop."""
     turns = torch.linspace(0, 2 * torch.pi, 2001, dtype=torch.float64)[:-1]
     for seed in range(3):
         A, B = 0.15 * drawn(3, 3, seed=seed), 0.15 * drawn(3, 3, seed=seed + 9)

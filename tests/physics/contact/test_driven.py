@@ -1,4 +1,5 @@
-"""Driven particles in rollouts: they follow their motion, the body loses what the holder feels, exact gradients, many worlds."""
+"""Driven particles in rollouts: they follow their motion, the body loses what the holder feels,
+exact gradients, many worlds."""
 
 import math
 import re
@@ -87,7 +88,8 @@ def test_gradients_are_those_of_differences():
 
 
 def test_driven_particles_follow_their_motion():
-    """To a two hundredth of a cell, however the set turns and moves over the grid, and points lead theirs."""
+    """To a two hundredth of a cell, however the set turns and moves over the grid, and points lead
+    theirs."""
     numbers = torch.cat([NUMBERS[:15], NUMBERS[12:15]])
     out = rollout(sets(numbers), frames=6)
     moved = exponential(5 * FRAME_DT * NUMBERS[3:6])
@@ -98,8 +100,8 @@ def test_driven_particles_follow_their_motion():
 
 
 def test_the_holder_feels_what_the_body_loses():
-    """The impulse of all reactions and gravity is the change of momentum, to rounding; a free body is not changed by a solid or a
-    set that are not there."""
+    """The impulse of all reactions and gravity is the change of momentum, to rounding; a free body
+    is not changed by a solid or a set that are not there."""
     out = rollout(sets(NUMBERS), frames=4)
     mass = DENSITY * SPACING**3
     gained = mass * out.v[-1].sum(0)

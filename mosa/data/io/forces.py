@@ -1,4 +1,5 @@
-"""Measured forces as observations: a load cell's curve, compared with what a solid or a driven set takes in a rollout."""
+"""Measured forces as observations: a load cell's curve, compared with what a solid or a driven set
+takes in a rollout."""
 
 from __future__ import annotations
 
@@ -19,14 +20,15 @@ from mosa.types import Rollout
 
 COLUMNS = ("time", "fx", "fy", "fz")
 MODEL_ERROR = 0.01
-"""Of the largest force: what a grid gets wrong of plates that press and of clamps (docs/driven.md)."""
+"""Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
 KEYS = {"of": TEXT, "file": TEXT, "sd": POSITIVE}
 
 
 @dataclass(frozen=True, eq=False)
 class ForceCurve:
-    """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on, ascending; forces: (n, 3) [N],
-    NaN for a component that was not measured; sd [N]: noise of one sample, None: found from the samples' roughness."""
+    """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on,
+    ascending; forces: (n, 3) [N], NaN for a component that was not measured; sd [N]: noise of one
+    sample, None: found from the samples' roughness."""
 
     of: str
     times: Tensor
@@ -34,7 +36,8 @@ class ForceCurve:
     sd: float | None = None
 
     def noise(self) -> float:
-        """Standard deviation of one sample [N]: of white noise the second differences have six times its variance."""
+        """Standard deviation of one sample [N]: of white noise the second differences have six
+        times its variance."""
         if self.sd is not None:
             return self.sd
         rough = self.forces.diff(n=2, dim=0)
@@ -42,12 +45,15 @@ class ForceCurve:
         return float((rough.square().mean() / 6).sqrt()) if len(rough) else 0.0
 
     def means(self, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
-        """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its standard deviation (T - 1, 3) [N],
-        with what a grid gets wrong). The samples are joined by straight lines."""
+        """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its
+        standard deviation (T - 1, 3) [N], with what a grid gets wrong). The samples are joined by
+        straight lines."""
         ends = frame_dt * torch.arange(frames, dtype=torch.float64)
         whole = torch.zeros(1, 3, dtype=torch.float64)
         steps = 0.5 * (self.forces[1:] + self.forces[:-1]) * self.times.diff()[:, None]
-        passed = torch.cat([whole, steps.cumsum(0)])
+        blank = torch.isnan(steps)
+        passed = torch.cat([whole, torch.where(blank, 0.0, steps).cumsum(0)])
+        blanks = torch.cat([whole, blank.double().cumsum(0)])
         place = ends.clamp(float(self.times[0]), float(self.times[-1]))
         at = torch.searchsorted(self.times, place, right=True).clamp(1, len(self.times) - 1)
         since = (place - self.times[at - 1])[:, None]
@@ -59,6 +65,7 @@ class ForceCurve:
         slack = 1e-6 * frame_dt
         covered = (ends[:-1] >= self.times[0] - slack) & (ends[1:] <= self.times[-1] + slack)
         mean[~covered] = torch.nan
+        mean[blanks[at][1:] > blanks[at - 1][:-1]] = torch.nan
         inside = (self.times[:, None] > ends[:-1]) & (self.times[:, None] <= ends[1:])
         count = inside.sum(0).clamp_min(1)[:, None]
         largest = float(self.forces[torch.isfinite(self.forces)].abs().max())
@@ -69,9 +76,11 @@ class ForceCurve:
 def forces_from_config(
     items: Sequence[Mapping[str, Any]] | None, field_name: str = "world.forces"
 ) -> tuple[ForceCurve, ...]:
-    """Of entries {of: name of a collider or driven set, file: csv with columns time, fx, fy, fz [s, N], sd [N]}.
+    """Of entries {of: name of a collider or driven set, file: csv, sd [N]}.
 
-    A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the entry, DataError the file."""
+    Columns of the file: time [s], fx, fy, fz [N].
+    A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
+    entry, DataError the file."""
     curves = []
     for i, item in enumerate(items or ()):
         where = f"{field_name}[{i}]"
@@ -108,7 +117,8 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
 
 
 def columns_of(curves: Sequence[ForceCurve], world: World) -> list[int]:
-    """The reactions' columns that the curves are of. Errors: ConfigError naming a curve of nothing that is there."""
+    """The reactions' columns that the curves are of. Errors: ConfigError naming a curve of nothing
+    that is there."""
     names = [solid.name or str(i) for i, solid in enumerate(world.solids)]
     for curve in curves:
         if names.count(curve.of) != 1:
@@ -122,7 +132,8 @@ def columns_of(curves: Sequence[ForceCurve], world: World) -> list[int]:
 def force_residuals(
     rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
 ) -> Tensor:
-    """(M,) differences from the mean forces of all frame intervals that were measured, over their standard deviations."""
+    """(M,) differences from the mean forces of all frame intervals that were measured, over their
+    standard deviations."""
     parts: list[Tensor] = []
     if rollout.reactions is None:
         raise ConfigError(

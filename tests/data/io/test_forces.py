@@ -1,4 +1,5 @@
-"""Measured forces in a fit: what a curve says of a frame interval, and the stiffness of a block from a press alone."""
+"""Measured forces in a fit: what a curve says of a frame interval, and the stiffness of a block
+from a press alone."""
 
 from dataclasses import replace
 
@@ -7,9 +8,9 @@ import pytest
 import torch
 from small_bodies import FREE, NU, E, cues_of, small_body, start, take_of
 
+from mosa.data.io.forces import ForceCurve, force_residuals, forces_from_config
 from mosa.errors import ConfigError, DataError
 from mosa.modules.fitting.criteria import Criterion
-from mosa.modules.fitting.forces import ForceCurve, force_residuals, forces_from_config
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.stages import Stage
@@ -46,15 +47,19 @@ def test_a_curve_says_the_mean_of_each_interval():
     torch.testing.assert_close(mean[:5, :2], torch.stack([expected, 2 * expected], 1))
     assert bool(torch.isnan(mean[5:]).all()) and bool(torch.isnan(mean[:, 2]).all())
     assert float(sd[0, 0]) == pytest.approx((0.01**2 / 100 + 0.01**2) ** 0.5, rel=0.01)
+    line[250] = torch.nan  # a sample that failed, at 0.25 s
+    gap = ForceCurve("a", times, line, 0.01).means(8, 0.1)[0]
+    assert torch.isnan(gap[:5, 0]).tolist() == [False, False, True, False, False]
+    torch.testing.assert_close(gap[3:5, 0], expected[3:])
+    line = torch.stack([times, 2 * times, times], 1)
     noisy = 0.03 * torch.randn(501, 3, generator=torch.Generator().manual_seed(0)).double()
-    assert ForceCurve("a", times, line[:, :2].repeat(1, 2)[:, :3] + noisy).noise() == pytest.approx(
-        0.03, rel=0.1
-    )
+    assert ForceCurve("a", times, line + noisy).noise() == pytest.approx(0.03, rel=0.1)
 
 
 @torch.no_grad()
 def test_the_stiffness_of_a_block_from_a_press_alone(tmp_path):
-    """Both ends are driven, so that positions hardly tell it, and no cue counts; the load cell has noise of 2 %."""
+    """Both ends are driven, so that positions hardly tell it, and no cue counts; the load cell has
+    noise of 2 %."""
     _, begins, truth = pressed()
     felt = truth.reactions.mean(1)[:, 1, :3]
     assert float(felt[-1, 1]) > 1.0  # the block presses the upper end up
