@@ -200,6 +200,11 @@ def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
     check_forces(cfg["world"])
+    if cfg["world"].get("forces") and not all(stage.newton for stage in stages):
+        raise ConfigError(
+            "world.forces: expected stages that run Gauss-Newton, which compares forces, found Adam "
+            "(fit.<stage>.optimizer); leave the forces out, or choose an adapter of few numbers"
+        )
     return stages
 
 

@@ -202,6 +202,21 @@ def test_a_part_that_cannot_be_built_is_named_before_anything_is_computed(overri
         rehearse(composed(*overrides))
 
 
+def test_forces_need_a_fit_that_compares_them(tmp_path):
+    (tmp_path / "cell.csv").write_text("time,fy\n0,1\n1,2\n")
+    world = [
+        "world.driven=[{name:grip,type:sphere,radius:1}]",
+        f"world.forces=[{{of:grip,file:{tmp_path}/cell.csv}}]",
+    ]
+    rehearse(composed(*world))
+    with pytest.raises(ConfigError, match=r"world\.forces: expected stages that run Gauss-Newton"):
+        rehearse(composed(*world, "fit=adam"))
+    with pytest.raises(
+        ConfigError, match=r"name of one collider or driven set \(there are none\), found 'grip'"
+    ):
+        rehearse(composed(world[1]))
+
+
 def test_a_rehearsal_draws_no_random_number():
     before = torch.get_rng_state()
     rehearse(composed("adapter=mosa"))
