@@ -242,7 +242,8 @@ class Rollout:
     """Simulated frames, frame 0 first. x, v: (T, N, 3); F, F_tot: (T, N, 3, 3); times: (T,) [s]; final: state to go on from.
 
     inverted: number of (particle, frame) pairs with det F <= 0. reactions: (T - 1, substeps, K, 6) force [N] and torque about the
-    collider's origin [N m] that the body exerts on each of K colliders, None without colliders; a frame's mean is `.mean(1)`.
+    collider's origin [N m] that the body exerts on each of K colliders, driven sets after the
+    solids, None without any; a frame's mean is `.mean(1)`.
     Where the substeps vary by frame they are (T - 1, 1, K, 6), that mean. counts: substeps of each of the T - 1 frame intervals.
     Of B worlds: x (T, B, N, 3) and so on, final (B, N, ...), reactions (T - 1, substeps, B, K, 6), see `worlds`.
     """

@@ -25,9 +25,9 @@ class Interactions:
     """Nodes under their pair forces, gravity and a ground; symplectic Euler. `substeps` of each frame of frame_dt [s]."""
 
     def __init__(self, network, density: float, world, frame_dt: float) -> None:
-        if world.planes or world.colliders:
+        if world.planes or world.colliders or world.driven:
             raise ConfigError(
-                "adapter=interaction: expected a world with a ground alone, found world.walls or world.colliders"
+                "adapter=interaction: expected a world with a ground alone, found world.walls, world.colliders or world.driven"
             )
         fastest = (
             network.fastest

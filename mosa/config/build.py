@@ -14,6 +14,7 @@ from torch import Tensor
 import mosa.config.composition  # noqa: F401  registers what conf/ refers to
 from mosa.config.command_settings import TrainSettings
 from mosa.config.record import BodyRecord
+from mosa.data.io.forces import columns_of, forces_from_config
 from mosa.errors import ConfigError
 from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.body import Body, SimulationSettings, Start, World
@@ -27,6 +28,7 @@ from mosa.modules.fitting.stages import STAGES, FitSection, Stage, recalibration
 from mosa.modules.fitting.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.colliders import colliders_from_config, domain_walls
+from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
@@ -56,7 +58,8 @@ def world_config(scene: Scene) -> dict[str, Any]:
 
 
 def build_world(config: Mapping[str, Any]) -> World:
-    """walls: {mode, friction} of the box's six sides, or None; colliders: list, see `colliders_from_config`; both may be absent."""
+    """walls: {mode, friction} of the box's six sides, or None; colliders, driven: lists, see
+    `colliders_from_config` and `driven_from_config`; all may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
     if (
         ground is not None and ground.mode == AUTO
@@ -72,6 +75,7 @@ def build_world(config: Mapping[str, Any]) -> World:
         box,
         build_walls(config.get("walls"), box),
         colliders_from_config(config.get("colliders") or ()),
+        driven_from_config(config.get("driven") or ()),
     )
 
 
@@ -92,7 +96,12 @@ def world_of(record: BodyRecord) -> World:
     ground = None if record.ground is None else record.ground.plain()
     return build_world(
         record.world.plain()
-        | {"ground": ground, "walls": given.walls, "colliders": given.colliders}
+        | {
+            "ground": ground,
+            "walls": given.walls,
+            "colliders": given.colliders,
+            "driven": given.driven,
+        }
     )
 
 
@@ -195,7 +204,24 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
     for collider in colliders_from_config(settings.world.colliders or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
+    check_forces(settings.world.plain())
+    if settings.world.forces and not all(stage.newton for stage in stages):
+        raise ConfigError(
+            "world.forces: expected stages that run Gauss-Newton, which compares forces, found Adam "
+            "(fit.<stage>.optimizer); leave the forces out, or choose an adapter of few numbers"
+        )
     return stages
+
+
+def check_forces(world: Mapping[str, Any]) -> None:
+    """Driven sets and measured forces, before anything takes long. Errors: ConfigError naming the
+    key, DataError the file."""
+    solids = colliders_from_config(world.get("colliders") or ())
+    sets = driven_from_config(world.get("driven") or ())
+    none = torch.zeros(3)
+    columns_of(
+        forces_from_config(world.get("forces")), World(None, none, none, none, (), solids, sets)
+    )
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:

@@ -183,6 +183,9 @@ class SimulateSection(Settings):
     colliders: Entries | None = Field(
         None, description="in place of the world's: a list as world.colliders of train.py"
     )
+    driven: Entries | None = Field(
+        None, description="in place of the world's: a list as world.driven of train.py"
+    )
     frames: Count = Field(
         30, description="frames; this and variant count with one of the six above"
     )

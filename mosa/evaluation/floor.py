@@ -8,6 +8,7 @@ from torch import Tensor
 from mosa.data.synthetic.bodies.objects import object_named
 from mosa.data.synthetic.materials.hidden import Hidden
 from mosa.errors import ConfigError
+from mosa.physics.contact.driven import held_in, loads
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.time_step import required_substeps
 from mosa.physics.world import Start
@@ -60,7 +61,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         up=world.up,
         ground=world.ground,
         planes=world.planes,
-        colliders=world.colliders,
+        colliders=world.solids,
         device=device,
         options=hidden.options,
     )
@@ -75,8 +76,11 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         (start + lift).to(device), velocity.to(device), torch.zeros(n, 3, 3, device=device), F, F
     )
     parameters = {name: value.to(device) for name, value in hidden.parameters(rest).items()}
+    volume = body.volume.float().to(device)
+    added = loads(world.driven, start, volume)
     rollout = simulator.rollout(
-        state, parameters, body.volume.float().to(device), hidden.density, scene.frames,
-        motions=[c.motion.shifted(lift) for c in world.colliders],  # the lift is the ground's: they keep their place
+        state, parameters, volume, hidden.density if added is None else hidden.density + added, scene.frames,
+        held=held_in(world.driven, start, len(world.colliders)),
+        motions=[c.motion.shifted(lift) for c in world.solids],  # the lift is the ground's: they keep their place
     )  # fmt: skip
     return rollout.x.cpu() - lift

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mosa.physics.contact.colliders import Collider, reach
+from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.planes import Plane
 from mosa.types import Ground
 
@@ -43,7 +44,9 @@ class Start:
 
 @dataclass(frozen=True)
 class World:
-    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground; colliders: moving rigid solids."""
+    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground;
+    colliders: moving rigid solids; driven: sets of the body's own particles that are held, moved or
+    loaded; forces: what was measured on these (`data.io.forces`), which moves nothing."""
 
     ground: Ground | None
     gravity: Tensor
@@ -51,6 +54,14 @@ class World:
     box: Tensor
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
+    driven: tuple[Driven, ...] = ()
+    forces: tuple[Any, ...] = ()
+
+    @property
+    def solids(self) -> tuple[Collider, ...]:
+        """All that has a motion and takes a reaction, in the order of a rollout's reactions: the
+        colliders, then what holds driven particles."""
+        return (*self.colliders, *(each.solid for each in self.driven if each.held))
 
     def fastest(self, start: Start, size: float, time: float) -> float:
         """Bound of the speeds [m/s] of a body of this size [m] within `time` [s] from `start`: as far as it can fall, and what
@@ -69,6 +80,9 @@ class World:
             fastest = min(
                 fastest, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding
             )
-        return fastest + max(
-            (c.motion.max_speed(reach(c.shape)) for c in self.colliders), default=0.0
+        moved = [each.motion.max_speed(size) for each in self.driven if each.held]
+        return (
+            fastest
+            + max((c.motion.max_speed(reach(c.shape)) for c in self.colliders), default=0.0)
+            + max(moved, default=0.0)
         )

@@ -36,6 +36,7 @@ from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
+from mosa.data.io.forces import forces_from_config
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
 from mosa.evaluation.evaluate import evaluate, run_sequences
@@ -88,7 +89,7 @@ def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
     if not settings.reconstruction.informed.iterations:
         stages = [stage for stage in stages if not stage.looks_again]
     return {
-        "world": world_of(record),
+        "world": replace(world_of(record), forces=forces_from_config(settings.world.forces or ())),
         "stages": stages,
         "weights": settings.losses.weights(),
         "clip": settings.fit.clip,

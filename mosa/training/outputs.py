@@ -106,7 +106,7 @@ def write_outputs(
         motions = {
             prefix: variants[variant] for prefix, variants in kept.items() if variant in variants
         }
-        save_rollout(folder / name, motions, world.colliders)
+        save_rollout(folder / name, motions, world.solids)
     if known := {
         s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None
     }:

@@ -144,7 +144,7 @@ def warn_of_little(
 ) -> None:
     """A warning for a film that is learned from and ends when the object has hardly begun to deform. found: starts by prefix;
     scenes: theirs, in this order. Silent where something else than the ground may deform it."""
-    if world.colliders or world.planes:
+    if world.colliders or world.planes or world.driven:
         return
     for (prefix, start), scene in zip(found.items(), scenes):
         if not prefix.startswith("train") or scene.ground is None:

@@ -23,6 +23,7 @@ from mosa.evaluation.likeness import warn_of_others
 from mosa.modules.body.body import Body, Start
 from mosa.physics import exact_sums
 from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.driven import driven_from_config
 from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.rendering.rasterizer import use_backend
@@ -212,16 +213,25 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     simulate = plain(cfg.simulate)
     if any(
         simulate[k] is not None
-        for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")
+        for k in (
+            "velocity",
+            "rotation",
+            "position",
+            "height",
+            "angular_velocity",
+            "colliders",
+            "driven",
+        )
     ):
         rollout = twin.simulate(**simulate, progress=True)
-        given = simulate["colliders"]
-        solids = (
-            twin.world.colliders
-            if given is None
-            else colliders_from_config(given, "simulate.colliders")
-        )
-        written = twin.export(rollout, folder, colliders=solids, video=cfg.evaluation.video)
+        readers = {"colliders": colliders_from_config, "driven": driven_from_config}
+        given = {
+            k: read(simulate[k], f"simulate.{k}")
+            for k, read in readers.items()
+            if simulate[k] is not None
+        }
+        world = replace(twin.world, **given)
+        written = twin.export(rollout, folder, colliders=world.solids, video=cfg.evaluation.video)
         log.info("simulated %d frames into %s", len(rollout.x), written)
         return None
     scene, held_out = scenes(evaluated_scene(cfg, twin))

@@ -12,6 +12,7 @@ from mosa.errors import ConfigError
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.driven import Driven
 from mosa.system.limits import counted
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.start import (
@@ -68,7 +69,7 @@ class TwinWorlds:
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
         variant: str = "adapted", control_dt: float | None = None,
         substeps: int | None = None, frames: int = 30, differentiable: bool = False,
-        box: Sequence[Sequence[float]] | Tensor | None = None,
+        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
     ) -> TwinState:  # fmt: skip
         """Begin a motion in every world; returns the state (count, ...).
 
@@ -79,8 +80,10 @@ class TwinWorlds:
         check_variant(variant)
         check_differentiable(differentiable)
         if not differentiable:
-            check_wants_no_gradients(starts=starts, colliders=colliders, gravity=gravity, box=box)
-        found = self._found(starts, range(self.count), colliders, box)
+            check_wants_no_gradients(
+                starts=starts, colliders=colliders, gravity=gravity, box=box, driven=driven
+            )
+        found = self._found(starts, range(self.count), colliders, box, driven)
         if gravity is not None:
             gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
             if gravity.shape != (self.count, 3):
@@ -111,7 +114,7 @@ class TwinWorlds:
         given = (
             None
             if starts is None
-            else [start for start, _ in self._found(starts, which, (), self._box)]
+            else [start for start, _ in self._found(starts, which, (), self._box, ())]
         )
         return episode.restart(which, given)
 
@@ -121,6 +124,7 @@ class TwinWorlds:
         which: Sequence[int],
         colliders: Any,
         box: Any,
+        driven: Any = None,
     ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
         listed = isinstance(starts, (list, tuple)) and all(
@@ -156,6 +160,7 @@ class TwinWorlds:
                         self.training_start,
                         colliders=colliders,
                         box=box,
+                        driven=driven,
                         **given,
                     )
                 )

@@ -19,6 +19,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Ready, Start, World
 from mosa.modules.fitting.parameters import each_law
 from mosa.physics.contact.colliders import reach
+from mosa.physics.contact.driven import held_in, stack_held
 from mosa.physics.contact.motion import (
     Poses,
     exponential,
@@ -104,12 +105,12 @@ class Episode:
     ) -> None:  # fmt: skip
         self.world, self.colliders, self.frame_dt, self.differentiable = (
             world,
-            world.colliders,
+            world.solids,
             frame_dt,
             differentiable,
         )
         self.worlds = None if isinstance(starts, Start) else len(starts)
-        self.names = [collider.name or str(i) for i, collider in enumerate(world.colliders)]
+        self.names = [collider.name or str(i) for i, collider in enumerate(world.solids)]
         if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ConfigError(
                 f"colliders: expected names of their own, found {', '.join(twice)} more than once"
@@ -514,4 +515,11 @@ def _worlds(
         found[0] if laws is None else Ready.stack(found),
         [begin(b, start) for b, start in enumerate(starts)],
     )
-    return replace(ready, simulator=simulator, state=ParticleState.stack(states)), begin
+    arguments = ready.arguments
+    if "held" in arguments:  # places of its own in each world, which may start elsewhere
+        places = [state.x - found[b % len(found)].lift for b, state in enumerate(states)]
+        held = [held_in(world.driven, x, len(world.colliders)) for x in places]
+        arguments = {**arguments, "held": stack_held(held)}
+    return replace(
+        ready, simulator=simulator, state=ParticleState.stack(states), arguments=arguments
+    ), begin

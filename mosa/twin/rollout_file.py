@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.driven import Points
 from mosa.physics.contact.motion import Motion, Trajectory, rotation_matrices
 from mosa.system.npz import write_npz
 from mosa.types import MotionCues, Rollout
@@ -48,7 +49,9 @@ def poses(colliders: Sequence[Collider], times: Tensor) -> tuple[Tensor, Tensor]
     )
 
 
-def pose(motion: Motion | Trajectory, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
+def pose(
+    motion: Motion | Trajectory | Points, frames: int, frame_dt: float
+) -> tuple[Tensor, Tensor]:
     """(position (T, 3), rotation (T, 3, 3)) of one collider at its frames; of a trajectory, which ends before the last one, the
     last pose it has."""
     if isinstance(motion, Trajectory):

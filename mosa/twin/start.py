@@ -14,6 +14,7 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.modules.body.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.overlap import check_clear
 from mosa.physics.time.time_step import MOST_SUBSTEPS
 from mosa.settings import is_number
@@ -170,7 +171,7 @@ def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
 
 def start_in(
     body: Body, world: World, first: Start, *, rotation=None, height=None, position=None, velocity=None, angular_velocity=None,
-    colliders=None, box=None,
+    colliders=None, box=None, driven=None,
 ) -> tuple[Start, World]:  # fmt: skip
     """(the start, the world with its colliders and box) of arguments as `Twin.simulate` takes them, None for those of `first`.
 
@@ -206,6 +207,8 @@ def start_in(
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
     if colliders is not None:
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
+    if driven is not None:
+        world = replace(world, driven=driven_from_config(driven, "driven"))
     if box is not None:
         world = replace(world, box=box_around(box).to(world.box))
         x, (low, high) = (center + arms).detach(), world.box.to(arms)

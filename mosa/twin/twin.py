@@ -41,6 +41,7 @@ from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
+from mosa.physics.contact.driven import Driven
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
 from mosa.system.limits import named_device
@@ -147,6 +148,7 @@ class Twin:
         progress: bool = False,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         box: Sequence[Sequence[float]] | Tensor | None = None,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
     ) -> Rollout:
         """Roll the learned law out from a new start.
 
@@ -154,15 +156,19 @@ class Twin:
         of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
         of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
         sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
-        holds the forces on them. box: (2, 3) [m] the lower and the upper corner of what no particle may leave, None for the
-        scene's; walls of the world stay where they are. No gradients: `reset(differentiable=True)` and `step` have them, and a
-        tensor that requires them is refused. Errors: ConfigError naming the argument (also a solid that the body starts in),
-        SimulationDiverged (the body leaves the box).
+        holds the forces on them.
+        driven: sets of particles that are held, moved or loaded, instead of the world's
+        (docs/driven.md); their reactions come after those of the colliders. box: (2, 3) [m] the
+        lower and the upper corner of what no particle may leave, None for the scene's; walls of
+        the world stay where they are. No gradients: `reset(differentiable=True)` and `step` have
+        them, and a tensor that requires them is refused. Errors: ConfigError naming the argument
+        (also a solid that the body starts in), SimulationDiverged (the body leaves the box).
         """
         check_frames(frames, len(self.body.rest))
         check_variant(variant)
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
-                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
+                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
+                 "driven": driven}  # fmt: skip
         check_wants_no_gradients(**given)
         with (
             torch.no_grad(),
@@ -189,10 +195,12 @@ class Twin:
         frames: int = 30,
         differentiable: bool = False,
         box: Sequence[Sequence[float]] | Tensor | None = None,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
     ) -> TwinState:
         """Begin a motion that `step` goes on with; returns its state at time 0.
 
-        rotation, height, position, velocity, angular_velocity, colliders, variant, box: as `simulate`. control_dt [s]: of a step,
+        rotation, height, position, velocity, angular_velocity, colliders, variant, box, driven: as
+        `simulate`. control_dt [s]: of a step,
         the `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
         motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
         (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
@@ -202,7 +210,8 @@ class Twin:
         check_variant(variant)
         check_differentiable(differentiable)
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
-                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
+                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
+                 "driven": driven}  # fmt: skip
         if not differentiable:
             check_wants_no_gradients(**given)
         start, world = start_in(self.body, self.world, self.training_start, **given)
@@ -302,10 +311,14 @@ class Twin:
         """The solids of a rollout, None for the world's. Errors: ConfigError where they are not as many as it has reactions of."""
         met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         solids = (
-            self.world.colliders
+            self.world.solids
             if met and colliders is None
             else colliders_from_config(colliders or (), "colliders")
         )
+        if colliders is not None and met > len(
+            solids
+        ):  # driven sets have reactions, and nothing to draw
+            solids += self.world.solids[len(self.world.colliders) :]
         if met != len(solids):
             raise ConfigError(
                 f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "

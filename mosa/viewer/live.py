@@ -72,7 +72,8 @@ class Live:
         self.ground = 0.0 if world.ground is None else float(world.ground.height)
         # at least two cells thick, that no material on both sides of it touches
         self.radius = max(0.12 * self.size, 1.25 * body.settings.dx)
-        self.names = [collider.name or str(i) for i, collider in enumerate(world.colliders)]
+        self.names = [solid.name or str(i) for i, solid in enumerate(world.solids)]
+        self.column = len(world.colliders)  # of the ball: driven sets come after it
         self.hand = "hand"
         while self.hand in self.names:
             self.hand += "_"
@@ -183,7 +184,10 @@ class Live:
             state, reactions = self.twin.step(action)
         except (MosaError, RuntimeError) as error:
             return self.fail(error)
-        self.state, self.force = state, reactions[:, -1, :3].mean(0).detach().double().cpu().numpy()
+        self.state, self.force = (
+            state,
+            reactions[:, self.column, :3].mean(0).detach().double().cpu().numpy(),
+        )
         if self.others is not None:
             try:
                 x = self.others.step(action).state.positions
@@ -230,7 +234,7 @@ class Live:
         return (
             np.asarray(self.target, np.float64)
             if self.state is None
-            else self.state.position[-1].numpy()
+            else self.state.position[self.column].numpy()
         )
 
     def poses(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -239,7 +243,7 @@ class Live:
             return []
         return [
             (x.numpy(), R.numpy())
-            for x, R in zip(self.state.position[:-1], self.state.rotation[:-1])
+            for x, R in zip(self.state.position[: self.column], self.state.rotation)
         ]
 
     @property

@@ -175,10 +175,29 @@ def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override
     (["world.walls={friction:abc}"], r"world\.walls\.friction"),
     (["world.walls={mode:sticky,friction:0.1}"], r"world\.walls\.friction"),
     (["world.colliders=[{type:cone}]"], r"world\.colliders\[0\]\.type"),
+    (["world.driven=[{type:sphere}]"], r"world\.driven\[0\]: a sphere needs radius"),
+    (["world.driven=[{indices:[0],mass:-1}]"], r"world\.driven\[0\]\.mass"),
+    (["world.forces=[{of:grip}]"], r"world\.forces\[0\]: expected of and file"),
+    (["+prior.parameters.damping=-1"], r"prior\.parameters\.damping"),
 ])  # fmt: skip
 def test_a_part_that_cannot_be_built_is_named_before_anything_is_computed(overrides, message):
     with pytest.raises(ConfigError, match=message):
         rehearse(composed(*overrides))
+
+
+def test_forces_need_a_fit_that_compares_them(tmp_path):
+    (tmp_path / "cell.csv").write_text("time,fy\n0,1\n1,2\n")
+    world = [
+        "world.driven=[{name:grip,type:sphere,radius:1}]",
+        f"world.forces=[{{of:grip,file:{tmp_path}/cell.csv}}]",
+    ]
+    rehearse(composed(*world))
+    with pytest.raises(ConfigError, match=r"world\.forces: expected stages that run Gauss-Newton"):
+        rehearse(composed(*world, "fit=adam"))
+    with pytest.raises(
+        ConfigError, match=r"name of one collider or driven set \(there are none\), found 'grip'"
+    ):
+        rehearse(composed(world[1]))
 
 
 def test_a_rehearsal_draws_no_random_number():

@@ -106,7 +106,7 @@ class HyperelasticAdapter(Adapter):
         return True
 
     def unsuited(self, law: Law) -> str | None:
-        if "mu" in law.offsets and law.viscosity is None:
+        if law.sheared:
             return None
         return (
             f"{law.name} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness modes "

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.adapters.interface import MaterialState
+from mosa.physics.constitutive.damping import DAMPED, DAMPING
 from mosa.physics.constitutive.elasticity import lame, wave_modulus
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import friction_alpha
@@ -88,6 +89,7 @@ SOFTPLUS = Form(
 )
 FORMS: dict[str, Form | Direction] = {
     "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": LOG_OR_ZERO, "cohesion": SOFTPLUS,
+    "damping": LOG_OR_ZERO, "bulk_damping": LOG_OR_ZERO,
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
     "second_share": _scaled_sigmoid(1.0, (0.0, 1.0)), "yeoh_2": SOFTPLUS, "yeoh_3": SOFTPLUS,
     "alpha_1": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "alpha_2": _scaled_sigmoid(-3.0, (-30.0, -3.0), -30.0),
@@ -103,13 +105,15 @@ UNITS = {
     "kappa": "Pa",
     "yield_stress": "Pa",
     "viscosity": "Pa s",
+    "damping": "Pa s",
+    "bulk_damping": "Pa s",
     "friction_angle": "degrees",
     "fibre_stiffness": "Pa",
     "second_fibre_stiffness": "Pa",
 }
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
 RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "second_fibre_stiffness",
-            "fibre_exponent")  # fmt: skip
+            "fibre_exponent", *DAMPING)  # fmt: skip
 """Parameters whose standard deviation is said relative: it is one of their logarithm."""
 GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
 """What the simulator takes in place of a parameter; others are taken by their own name."""
@@ -144,11 +148,12 @@ def unit_of(law: str, name: str) -> str:
 class Material(nn.Module):
     """Parameters of one prior law.
 
-    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees; of a direction three numbers of
-    any length); frozen: names that are not
-    learned; modulated: names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa together).
-    candidates: laws among which a calibration chooses, with law=auto; until then it is the first.
-    A parameter that starts on a bound of its range is held there.
+    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees;
+    of a direction three numbers of any length); frozen: names that are not learned; modulated:
+    names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa
+    together). damping, bulk_damping among the parameters: with a viscous branch of the law
+    (`constitutive.damping`). candidates: laws among which a calibration chooses, with law=auto;
+    until then it is the first. A parameter that starts on a bound of its range is held there.
     Errors: ConfigError naming the parameter, what was expected and what was found.
     """
 
@@ -165,6 +170,12 @@ class Material(nn.Module):
             raise ConfigError(
                 f"prior.candidates: expected a list of laws with prior.law=auto and none otherwise, found "
                 f"{list(candidates)} with law {law!r}"
+            )
+        if any(name in parameters for name in DAMPING):
+            parameters = dict.fromkeys(DAMPING, 0.0) | dict(parameters)
+            law, *candidates = (
+                each if each == AUTO or each.endswith(DAMPED) else each + DAMPED
+                for each in (law, *candidates)
             )
         for each in candidates or (law,):
             self._check_names(each, parameters, frozen, modulated)

@@ -13,6 +13,7 @@ from mosa.errors import ConfigError
 from mosa.modules.fitting.criteria import corrected_rollout
 from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.driven import stack_held
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.clock import Adaptive, Replay
 from mosa.types import ParticleState, Rollout
@@ -104,7 +105,10 @@ class Ready:
             for name in each[0]["parameters"]
         }  # fmt: skip
         adapters = None if each[0]["adapter"] is None else [own["adapter"] for own in each]
+        arguments = {**each[0], "parameters": parameters, "adapter": adapters}
+        if "held" in arguments:
+            arguments["held"] = stack_held([own["held"] for own in each])
         return replace(
             first, state=ParticleState.stack([part.state for part in parts]), lift=torch.stack([part.lift for part in parts]),
-            arguments={**each[0], "parameters": parameters, "adapter": adapters},
+            arguments=arguments,
         )  # fmt: skip

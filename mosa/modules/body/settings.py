@@ -92,6 +92,21 @@ class WorldSection(Settings):
             "(docs/colliders.md)"
         ),
     )
+    driven: Entries | None = Field(
+        [],
+        description=(
+            "sets of the body's particles that are held, moved or loaded, such as "
+            "{name: clamp, type: box, size: [0.1, 0.1, 0.1], position: [0, 0, 0]} "
+            "(docs/driven.md)"
+        ),
+    )
+    forces: Entries | None = Field(
+        [],
+        description=(
+            "measured on colliders and driven sets, such as {of: clamp, file: force.csv, "
+            "sd: 0.02} (docs/driven.md)"
+        ),
+    )
 
 
 def names(values: Any) -> tuple[str, ...]:

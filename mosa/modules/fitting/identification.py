@@ -14,6 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mosa.data.io.forces import columns_of, force_residuals
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules.body.body import Body, Ready, World
 from mosa.modules.body.material import RIVALS
@@ -25,6 +26,7 @@ from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of
 from mosa.modules.fitting.search.backbone import search
 from mosa.modules.fitting.stages import Stage
 from mosa.reconstruction.motion.response import Response
+from mosa.types import Rollout
 
 COUNTED_AT_FIRST = 100 / 30
 """Of a calibration's data over a later stage's, frame by frame: it has few numbers, and no model of its own error in its noise."""
@@ -77,11 +79,12 @@ class Identification:
         self.heterogeneity = not self.calibrating and is_learned(body.heterogeneity)
         self.gains = (0.0,) if self.calibrating else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
-        if not any(self.kinds):
+        if not any(self.kinds) and not world.forces:
             raise ConfigError(
                 "losses: identification compares motion cues, and the weights of position, rotation and stretch are "
                 "all 0; use fit=adam, which learns from images too"
             )
+        columns_of(world.forces, world)
         self.chosen = residuals.sampled(len(body.rest), body.rest.device)
         blocks = blocks_of(
             body,
@@ -208,17 +211,13 @@ class Identification:
                     parts.append(self.ready(self.body, i, self.substeps[i]).answered())
                 rollout = Ready.stack(parts).simulate(
                     len(take.cues.positions),
-                    self.world.colliders,
+                    self.world.solids,
                     observed=take.cues.positions if gain else None,
                     gain=gain,
                     unseen=self.unseen(take),
                 )
                 for k, own in enumerate(rollout.worlds()):
-                    found[first + k].append(
-                        residuals.fields(
-                            own, take.cues, take.start.rotation, self.chosen, self.response(take)
-                        )
-                    )
+                    found[first + k].append(self._differences(own, i))
         multiples = rows[:, -1].tolist() if self.knows_grid else [0.0] * len(rows)
         return torch.stack(
             [self._compared(own, multiple) for own, multiple in zip(found, multiples)]
@@ -226,15 +225,20 @@ class Identification:
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
         return [
-            residuals.fields(
-                self.rollout(body, i, gain, self.substeps[i]),
-                self.takes[i].cues,
-                self.takes[i].start.rotation,
-                self.chosen,
-                self.response(self.takes[i]),
-            )
+            self._differences(self.rollout(body, i, gain, self.substeps[i]), i)
             for i, gain in self.pairs
         ]
+
+    def _differences(self, rollout: Rollout, index: int) -> residuals.Fields:
+        """Of a rollout from what was seen of take `index`; forces are those of the first."""
+        take, curves = self.takes[index], self.world.forces if index == 0 else ()
+        found = residuals.fields(
+            rollout, take.cues, take.start.rotation, self.chosen, self.response(take)
+        )
+        if not curves:
+            return found
+        force = force_residuals(rollout, curves, self.world, take.frame_dt)
+        return replace(found, force=force)
 
     def _whitened(self, body: Body, multiple: float) -> Tensor:
         # torch's switch is a thread's own, and these may be other threads than the one that switched it
@@ -245,11 +249,14 @@ class Identification:
         share = (
             self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
         )
-        if self.iteration < len(self.softly):
-            share *= self.softly[self.iteration]
+        soft = self.softly[self.iteration] if self.iteration < len(self.softly) else 1.0
+        share *= soft
         counts = tuple(share * on for on in self.kinds)
         return residuals.whitened(
-            self._along(found, multiple), self.noise, [counts] * len(self.pairs)
+            self._along(found, multiple),
+            self.noise,
+            [counts] * len(self.pairs),
+            soft / len(self.gains),
         )
 
     def _along(self, found: list[residuals.Fields], multiple: float) -> list[residuals.Fields]:

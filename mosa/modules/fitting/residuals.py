@@ -28,11 +28,13 @@ SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Fields:
-    """position, rotation, stretch: (T - 1, M, 3) each, frames after the first of M particles."""
+    """position, rotation, stretch: (T - 1, M, 3) each, frames after the first of M particles.
+    force: (R,) of measured forces, whitened (`forces`); None where there are none."""
 
     position: Tensor
     rotation: Tensor
     stretch: Tensor
+    force: Tensor | None = None
 
     def __iter__(self):
         return iter((self.position, self.rotation, self.stretch))
@@ -100,12 +102,17 @@ def patterns(found: list[Fields]) -> float:
 
 def difference(one: list[Fields], other: list[Fields]) -> list[Fields]:
     """Field by field."""
-    return [Fields(*(x - y for x, y in zip(a, b))) for a, b in zip(one, other)]
+    return [
+        Fields(*(x - y for x, y in zip(a, b)), None if a.force is None else a.force - b.force)
+        for a, b in zip(one, other)
+    ]
 
 
 def along(found: list[Fields], direction: list[Fields], amount: float) -> list[Fields]:
-    """found + amount direction."""
-    return [Fields(*(x + amount * y for x, y in zip(a, b))) for a, b in zip(found, direction)]
+    """found + amount direction; forces as they are."""
+    return [
+        Fields(*(x + amount * y for x, y in zip(a, b)), a.force) for a, b in zip(found, direction)
+    ]
 
 
 def spread(
@@ -133,12 +140,16 @@ def whitened(
     found: list[Fields],
     noise: list[tuple[Tensor, Tensor, Tensor]],
     counts: list[tuple[float, float, float]],
+    forces: float = 1.0,
 ) -> Tensor:
-    """One vector whose squared length is minus twice the log likelihood, up to a constant."""
+    """One vector whose squared length is minus twice the log likelihood, up to a constant.
+    forces: how often a measured force counts."""
     parts = []
     for each, scales, numbers in zip(found, noise, counts):
         for field, scale, count in zip(each, scales, numbers):
             parts.append(
                 (field * ((count / field.shape[1]) ** 0.5 / scale)[:, None, None]).flatten()
             )
+        if each.force is not None:
+            parts.append((each.force * forces**0.5).to(parts[-1]))
     return torch.cat(parts)

@@ -3,6 +3,7 @@
 Importing it registers the built-in laws."""
 
 from mosa.physics.constitutive import (  # noqa: F401  each registers its laws
+    damping,
     elasticity,
     fibres,
     mixture,

@@ -61,6 +61,16 @@ class Law:
         object.__setattr__(self, "offsets", offsets)
 
     @property
+    def sheared(self) -> bool:
+        """Whether mu is a shear modulus: of a fluid it is a viscosity."""
+        return "mu" in self.offsets and (self.viscosity is None or self.damped)
+
+    @property
+    def damped(self) -> bool:
+        """Whether the law has a viscous branch (`damping`), whose stress is per rest volume."""
+        return "damping" in self.parameters
+
+    @property
     def plastic(self) -> bool:
         """Whether the law has a return mapping, so that F and F_tot differ."""
         return self.return_map is not None
@@ -117,10 +127,11 @@ def register_law(
 
 
 def law_named(name: str) -> Law:
-    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`). Errors: ConfigError naming the known ones."""
+    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`), `a~damped`
+    the law a with a viscous branch (see `damping`). Errors: ConfigError naming the known ones."""
     for sign, make in _COMPOSED.items():
         if sign in name and name not in _LAWS:
-            make(name, [law_named(part) for part in name.split(sign)])
+            make(name, [law_named(part) for part in name.split(sign) if part])
     if name not in _LAWS:
         raise ConfigError(
             f"law: expected one of {', '.join(law_names())}, found {name!r}; one of another package is known once "
@@ -130,5 +141,5 @@ def law_named(name: str) -> Law:
 
 
 def law_names() -> list[str]:
-    """Names of all registered laws, without the mixtures of them."""
-    return sorted(name for name in _LAWS if "+" not in name)
+    """Names of all registered laws, without those that are composed of them."""
+    return sorted(name for name in _LAWS if not any(sign in name for sign in _COMPOSED))

@@ -25,7 +25,7 @@ class ColliderBuffers:
     ) -> None:
         self.count = len(packed)
         self.kernels = collider_kernels(scalar, work.exact)
-        self._scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
+        self.scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
         self._packed = [
             wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
             wp.from_torch(packed.fields, dtype=scalar),
@@ -41,20 +41,47 @@ class ColliderBuffers:
 
         self.poses, self._poses = buffers(pose)
         _, self._v_struck = work.array((work.particles, 3), vec3)
-
-        def sums(tensors):
-            """What particles add to, of which `tensors` are made: exact sums, or the tensors themselves (None)."""
-            if not work.exact:
-                return None
-            shapes = [(*t.shape[:2], prod(t.shape[2:]), COLUMNS) for t in tensors]
-            return [work.array(shape, wp.int64, torch.int64) for shape in shapes]
-
         self.reaction, self._reaction = buffers(pose[2:])
-        self._reaction_sums = sums(self.reaction)
+        self._reaction_sums = self.sums(self.reaction)
         if with_adjoint:
             self.adj_poses, self._adj_poses = buffers(pose)
-            self._adj_sums = sums(self.adj_poses)
+            self._adj_sums = self.sums(self.adj_poses)
             self.adj_reaction, self._adj_reaction = buffers(pose[2:])
+
+    def vectors(self, substeps: int, columns: int, count: int) -> tuple[list[Tensor], list]:
+        """`count` times (substeps, columns, 3) zeros, and the same memory as Warp's arrays."""
+        made = [self._work.array((substeps, columns, 3), self.kernels.vec3) for _ in range(count)]
+        return [tensor for tensor, _ in made], [array for _, array in made]
+
+    def sums(self, tensors: list[Tensor]) -> list | None:
+        """What particles add to, of which `tensors` are made: exact sums, or the tensors themselves
+        (None)."""
+        if not self._work.exact:
+            return None
+        shapes = [(*t.shape[:2], prod(t.shape[2:]), COLUMNS) for t in tensors]
+        return [self._work.array(shape, wp.int64, torch.int64) for shape in shapes]
+
+    @property
+    def struck(self) -> wp.array:
+        """Velocities after `strike`."""
+        return self._v_struck
+
+    @property
+    def pose_arrays(self) -> list:
+        return self._poses
+
+    @property
+    def reaction_arrays(self) -> list:
+        """What particles add their forces and torques to."""
+        return self.added_to(self._reaction, self._reaction_sums)
+
+    @property
+    def adj_reaction_arrays(self) -> list:
+        return self._adj_reaction
+
+    @property
+    def adj_pose_arrays(self) -> list:
+        return self.added_to(self._adj_poses, self._adj_sums)
 
     def load(self, poses: tuple[Tensor, ...]) -> None:
         """Copy the poses of a segment's substeps in."""
@@ -62,32 +89,32 @@ class ColliderBuffers:
 
     def reset(self) -> None:
         """Before a segment: no reaction yet."""
-        for array in self._added_to(self._reaction, self._reaction_sums):
+        for array in self.reaction_arrays:
             array.zero_()
 
     def reset_adjoint(self) -> None:
-        for array in self._added_to(self._adj_poses, self._adj_sums):
+        for array in self.adj_pose_arrays:
             array.zero_()
 
     def settle(self) -> None:
         """After a segment: the reactions are what was added up."""
-        self._settle(self.reaction, self._reaction_sums)
+        self.settle_sums(self.reaction, self._reaction_sums)
 
     def settle_adjoint(self) -> None:
-        self._settle(self.adj_poses, self._adj_sums)
+        self.settle_sums(self.adj_poses, self._adj_sums)
 
     @staticmethod
-    def _added_to(arrays: list, sums: list | None) -> list:
+    def added_to(arrays: list, sums: list | None) -> list:
         return arrays if sums is None else [array for _, array in sums]
 
-    def _settle(self, tensors: list[Tensor], sums: list | None) -> None:
+    def settle_sums(self, tensors: list[Tensor], sums: list | None) -> None:
         if sums is None:
             return
-        settle = sum_functions(self._scalar).settle
+        settle = sum_functions(self.scalar).settle
         for target, (added, _) in zip(tensors, sums, strict=True):
             flat = [
                 wp.from_torch(added.view(-1, COLUMNS)),
-                wp.from_torch(target.view(-1), dtype=self._scalar),
+                wp.from_torch(target.view(-1), dtype=self.scalar),
             ]
             self._work.run(settle, target.numel(), flat)
 
@@ -97,7 +124,7 @@ class ColliderBuffers:
     def strike(self, step: int, met: list, time: float, again: bool) -> wp.array:
         """Velocities of particles after contact in substep `step`. met: x, v, volume, springs, mass; time [s]: for which the
         substep's forces act; again: the reaction is known already."""
-        reaction = [None, None] if again else self._added_to(self._reaction, self._reaction_sums)
+        reaction = [None, None] if again else self.reaction_arrays
         self._work.run(self.kernels.strike, self._work.particles, [
             *self._arguments(met, step, time), self._v_struck, *reaction,
         ])  # fmt: skip
@@ -107,5 +134,5 @@ class ColliderBuffers:
         """Turns the adjoint of velocities after contact into that before it; adds to the others."""
         self._work.run(self.kernels.adj_strike, self._work.particles, [
             *self._arguments(met, step, time), *self._adj_reaction, adj_x, adj_v, adj_springs,
-            *self._added_to(self._adj_poses, self._adj_sums),
+            *self.adj_pose_arrays,
         ])  # fmt: skip

@@ -193,4 +193,6 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         adj_x[p] = ax
         adj_springs[p] = adj_springs[p] + spring
 
-    return SimpleNamespace(strike=strike, adj_strike=adj_strike, vec3=vec3, mat33=mat33)
+    return SimpleNamespace(
+        strike=strike, adj_strike=adj_strike, add_vector=add_vector, add_matrix=add_matrix, vec3=vec3, mat33=mat33
+    )  # fmt: skip

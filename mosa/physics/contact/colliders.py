@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +23,9 @@ from mosa.physics.contact.planes import MODES, Plane
 from mosa.physics.contact.touch import GRIP
 from mosa.settings import is_number
 from mosa.types import RUBBING
+
+if TYPE_CHECKING:
+    from mosa.physics.contact.driven import Points
 
 
 @dataclass(frozen=True)
@@ -60,14 +63,26 @@ class Box:
     size: tuple[float, float, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """No solid: particles of the body itself, which the motion holds (`driven`). indices: (n,),
+    None where the simulator is told them with each rollout. Such colliders come after all solids.
+    """
+
+    indices: Tensor | None = None
+
+
 STIFFER = 2.4
 """Springs of solids that squeeze, over those of mode `touch`: plates then press with the force of the body's own law, to 1 %."""
 HOLD = 1.75
 """Share of its sliding velocity that a particle loses in a substep on a solid of mode `sticky`. No friction coefficient bounds the
 force there, and from 2 on a particle that is alone in its cells would go back as fast as it came, or faster."""
-Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField
+Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField | Particles
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
-         Box: packing.BOX, SignedDistanceField: packing.FIELD}  # fmt: skip
+         Box: packing.BOX, SignedDistanceField: packing.FIELD, Particles: packing.SPHERE}  # fmt: skip
+NOWHERE = -1e30
+"""Radius [m] of the ball that stands for driven particles among the solids: nothing ever meets it.
+"""
 
 
 @dataclass(frozen=True)
@@ -82,7 +97,7 @@ class Collider:
     shape: Shape
     mode: str = "sticky"
     friction: float = 0.0
-    motion: Motion | Trajectory = field(default_factory=Motion)
+    motion: "Motion | Trajectory | Points" = field(default_factory=Motion)
     name: str = ""
 
 
@@ -123,6 +138,8 @@ def pack_colliders(
             raise ConfigError(
                 f"{where}: friction acts on modes {' and '.join(RUBBING)} only, found mode {collider.mode!r}"
             )
+        if isinstance(shape, Particles):
+            shapes[i, packing.SIZE] = NOWHERE
         for j, value in enumerate(_sizes(shape)):
             if not 0 < value < math.inf:
                 raise ConfigError(
@@ -225,12 +242,13 @@ def colliders_from_config(
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
         raise ConfigError(f"{field_name}: expected a list of colliders, found {items!r}")
     return tuple(
-        item if isinstance(item, Collider) else _collider(item, f"{field_name}[{i}]")
+        item if isinstance(item, Collider) else collider_of(item, f"{field_name}[{i}]")
         for i, item in enumerate(items)
     )
 
 
-def _collider(item: Mapping, where: str) -> Collider:
+def collider_of(item: Mapping, where: str) -> Collider:
+    """Of one entry of `colliders_from_config`; where: it, for messages. Errors: ConfigError."""
     if not isinstance(item, Mapping):
         raise ConfigError(f"{where}: expected type and the keys of that type, found {item!r}")
     kind = item.get("type")

@@ -335,7 +335,7 @@ def sample_frame(
     """
     dt, sampled = frame_dt / count, []
     for motion in motions:
-        if isinstance(motion, Motion):
+        if not isinstance(motion, Trajectory):
             sampled.append(
                 motion.timed(frames, frame_dt).sample(1, count, dt, start + frame * frame_dt)
             )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import Collider, half_width
+from mosa.physics.contact.colliders import Collider, Particles, half_width
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.reference import signed_distance
 
@@ -24,6 +24,7 @@ def check_clear(
     """x: (N, 3) [m] of particles where the body starts, and their spacing [m]; where: what starts, for the message; poses: position
     (K, 3) [m] and rotation (K, 3, 3) of the colliders now, () for theirs at t = 0. Errors: ConfigError naming the colliders."""
     deep, places = [], []
+    colliders = [each for each in colliders if not isinstance(each.shape, Particles)]
     for k, collider in enumerate(colliders):
         motion = (
             collider.motion.timed(None, 1.0)

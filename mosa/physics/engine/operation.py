@@ -40,9 +40,11 @@ class Kept:
 class Stretch(ABC):
     """Some substeps that are advanced, and differentiated, as a whole.
 
-    Besides the state a stretch depends on other tensors: what acts, as a kind of stretch has it (None for one there is not), then,
-    where there are colliders, their poses at its substeps, as `contact.motion.Poses`. Besides the state it leaves the colliders'
-    force [N] and torque about each collider's origin [N m], (S, W K, 3) each, then the `statistics` of its kind.
+    Besides the state a stretch depends on other tensors: what acts, as a kind of stretch has it
+    (None for one there is not), then, where there are colliders, their poses at its substeps, as
+    `contact.motion.Poses`, and the paths of points that lead driven particles. Besides the state it
+    leaves the colliders' force [N] and torque about each collider's origin [N m], (S, W K, 3) each,
+    then the `statistics` of its kind.
 
     first: number of its first substep, for messages; steps: times of the substeps."""
 
@@ -96,10 +98,9 @@ class Stretch(ABC):
 
     def _parts(self, state: State, others: Sequence[Tensor | None]) -> tuple[list, list, list]:
         """(states, what acts, poses) of each solver."""
-        split, posed = (
-            self.lanes.split,
-            len(Poses._fields) if self.lanes.numerics.colliders is not None else 0,
-        )
+        split, numerics = self.lanes.split, self.lanes.numerics
+        posed = len(Poses._fields) if numerics.colliders is not None else 0
+        posed += 2 if numerics.points else 0  # paths and rates of driven points
         acting = len(others) - posed
         return (
             [State(*part) for part in split(state)],
@@ -126,6 +127,7 @@ class Stretch(ABC):
             poses,
             self.steps,
             solver.gravities,
+            solver.driven,
         )
         return work
 
@@ -195,6 +197,8 @@ class Stretch(ABC):
                 if work.colliders is None
                 else (work.colliders.adj_reaction, work.colliders.adj_poses)
             )
+            if work.driven is not None and work.driven.count:
+                of_poses = [*of_poses, *work.driven.adj_paths]
             targets = [*(target[slot] for target in slots), *reaction, *statistics]
             seeded = list(zip(targets, (*seeds, *other_seeds), strict=True))
             if unseeded := [target for target, seed in seeded if seed is None]:

@@ -20,7 +20,8 @@ from mosa.physics.adapters.interface import AdapterOperator, MaterialState, Seve
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
-from mosa.physics.contact.colliders import Collider, pack_colliders, reach
+from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, reach
+from mosa.physics.contact.driven import Held, Points, hold, stack_held
 from mosa.physics.contact.motion import sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.axes import Axes, shift_to, turn_along
@@ -47,6 +48,10 @@ from mosa.physics.time.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.time.time_step import MOST_SUBSTEPS
 from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
+
+NEAR = 8
+"""Cells from the origin within which driven particles of float32 may move before the origin follows
+them, with new buffers."""
 
 
 class Simulator:
@@ -88,9 +93,7 @@ class Simulator:
                 raise ConfigError(
                     f"{name}: expected a positive number of at most {most:g}, found {value}"
                 )
-        if strain is not None and (
-            strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None
-        ):
+        if strain is not None and (strain not in STRAINS or not self.law.sheared):
             if strain not in STRAINS:
                 raise ConfigError(
                     f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}"
@@ -117,6 +120,9 @@ class Simulator:
         packed_colliders = (
             pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
         )
+        sets = [c for c in self.colliders if isinstance(c.shape, Particles)]
+        if list(self.colliders[len(self.colliders) - len(sets) :]) != sets:
+            raise ConfigError("colliders: expected sets of driven particles after all solids")
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
         box = corners(box, float(dx) if touching else 0.0)
@@ -128,7 +134,8 @@ class Simulator:
             gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes, plane_count=len(all_planes),
             touching=touching, low=low, high=high, box=box, norm_eps=float(options.norm_eps), rebuild=options.rebuild,
             check_J=self.law.needs_positive_J or options.on_inversion == "error",
-            colliders=packed_colliders, strain=strain,
+            colliders=packed_colliders, strain=strain, driven=len(sets),
+            points=sum(c.motion.points.shape[1] for c in sets if isinstance(c.motion, Points)),
         )  # fmt: skip
         values[:, :3] = axes.vectors(values[:, :3])
         self._planes, self._limits = values, torch.tensor((low, high), dtype=torch.float64)
@@ -177,6 +184,7 @@ class Simulator:
         collect: Callable[[Any], None] | None = None,
         gravity: Tensor | Sequence | None = None,
         together: int | None = None,
+        held: Held | None = None,
     ) -> Rollout:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated), of a body, or of B worlds at once.
 
@@ -191,6 +199,8 @@ class Simulator:
         parameters of an adapter that is a torch module, not other tensors that it may use.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
+        held: particles that the last colliders, sets of `Particles`, drive; None: their own
+        indices, from where they are in `state`.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
 
         Worlds: copies of the body that never meet, with the fixed time step. state: x (B, N, 3) and so on; parameters: the same in
@@ -203,7 +213,7 @@ class Simulator:
         SimulationDiverged names the world: none of the others is returned.
         """
         given = parameters, volume, density, adapter, stride, motions, gravity, together, timing
-        stepper, start = self._stepper(state, *given, frames, started, collect)
+        stepper, start = self._stepper(state, *given, frames, started, collect, held, start_time)
         poses, all_known = self._poses(stepper, frames, start_time, isinstance(timing, Replay))
         prepared, moment, varies = stepper.prepared, start, stepper.clock.varies
         current, frame = stepper.enter(start, not started)
@@ -260,6 +270,7 @@ class Simulator:
         together: int | None = None,
         timing: Adaptive | None = None,
         steps: int = 30,
+        held: Held | None = None,
     ) -> tuple[Stepper, Moment]:
         """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout`.
 
@@ -267,13 +278,14 @@ class Simulator:
         wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError.
         """
         given = parameters, volume, density, adapter, stride, motions, gravity, together, timing
-        stepper, moment = self._stepper(state, *given, None, started)
+        stepper, moment = self._stepper(state, *given, None, started, None, held)
         stepper.prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
         return stepper, moment._replace(substeps=self.substeps if started else 0)
 
     def _stepper(
         self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
         motions, gravity, together: int | None, timing: Adaptive | Replay | None, frames: int | None, started: bool, collect=None,
+        held: Held | None = None, start_time: float = 0.0,
     ) -> tuple[Stepper, Moment]:  # fmt: skip
         """frames: None where there may be any number of them. Errors: ConfigError."""
         worlds = None if state.x.ndim == 2 else count_of_worlds(state, together)
@@ -286,7 +298,10 @@ class Simulator:
                 "gravity and together: expected None without worlds; gravity is the simulator's"
             )
         check_state(self.numerics, state, volume)
-        if (shift := shift_to(state.x, self._axes.turn, self.numerics.dx)) != self._axes.shift:
+        each = motions_of_worlds(motions, self.colliders, worlds)
+        if self.numerics.driven:
+            held = self._held(held, state.x, each, start_time)
+        if (shift := self._origin(state.x, held)) != self._axes.shift:
             self._move(shift)
         axes = self._axes
         state = axes.state(state, self.dtype)
@@ -309,8 +324,8 @@ class Simulator:
             worlds,
             gravities,
             together,
+            held,
         )
-        each = motions_of_worlds(motions, self.colliders, worlds)
         choose = None
         if isinstance(timing, Replay):
             counts = check_counts(timing.counts, frames)
@@ -353,24 +368,20 @@ class Simulator:
         if not self.colliders:
             return lambda *_: (), ()
         if stepper.clock.varies:
-            return lambda number, frame: stepper.taken(
-                sample_frame(
-                    each[0],
-                    number,
-                    frames - 1,
-                    frame.first,
-                    frame.count,
-                    self.frame_dt,
-                    start_time,
-                    replayed,
-                ),
-                frame.dt,
-            ), ()
+
+            def chosen(number: int, frame: Frame) -> tuple[Tensor, ...]:
+                sampled = sample_frame(each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time,
+                                       replayed)  # fmt: skip
+                led = stepper.led(frame.count, frame.dt, start_time + number * self.frame_dt)
+                return (*stepper.taken(sampled, frame.dt), *led)
+
+            return chosen, ()
         found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time) for own in each]
         found = stepper.taken(
             tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)),
             self.dt,
         )
+        found = (*found, *stepper.led((frames - 1) * self.substeps, self.dt, start_time))
         return lambda _, frame: tuple(
             part[frame.first : frame.first + frame.count] for part in found
         ), found
@@ -378,6 +389,7 @@ class Simulator:
     def _prepare(
         self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
         collect, frames: int | None, worlds: int | None, gravities: Sequence[tuple] | None, together: int | None,
+        held: Held | None = None,
     ) -> Prepared:  # fmt: skip
         """What a rollout needs besides its state. Errors: ConfigError."""
         if (frames is not None and frames < 1) or (stride is not None and stride < 1):
@@ -400,14 +412,22 @@ class Simulator:
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         if worlds is None:
-            solvers = [SegmentSolver(self.numerics, volume, density, cutoff)]
+            solvers = [SegmentSolver(self.numerics, volume, density, cutoff, None, None, held)]
         else:
             size = together or (worlds if self.device.type == "cuda" else 1)
             volume, density = (
                 t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density)
             )
             solvers = [
-                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i)
+                SegmentSolver(
+                    self.numerics,
+                    volume,
+                    density,
+                    cutoff,
+                    gravities[i : i + size],
+                    i,
+                    held and Held(*(t[i : i + size].flatten(0, 1) for t in held)),
+                )
                 for i in range(0, worlds, size)
             ]
         if isinstance(adapter, Sequence):
@@ -416,6 +436,40 @@ class Simulator:
         return Prepared(
             self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers
         )
+
+    def _origin(self, x: Tensor, held: Held | None) -> tuple[float, ...] | None:
+        """Of the axes for particles at x. In float32 it is near driven particles: what they give
+        way by under load is little more than the last digit of a place far away, and what is
+        rounded off would let them creep."""
+        axes, dx = self._axes, self.numerics.dx
+        if held is None or not self.numerics.driven or self.dtype == torch.float64:
+            return shift_to(x, axes.turn, dx)
+        center = Axes(axes.turn).vectors(x.detach()[held.sets >= 0].double().mean(0).cpu())
+        now = torch.tensor(axes.shift or (0.0, 0.0, 0.0), dtype=torch.float64)
+        if float((center - now).abs().max()) <= NEAR * dx:
+            return axes.shift
+        return tuple((dx * torch.round(center / dx)).tolist())
+
+    def _held(self, held: Held | None, x: Tensor, motions: Sequence, start: float) -> Held:
+        """Of all particles, in the simulator's type and on its device. Errors: ConfigError."""
+        solids = len(self.colliders) - self.numerics.driven
+        if held is None:
+            indices = [collider.shape.indices for collider in self.colliders[solids:]]
+            if any(each is None for each in indices):
+                raise ConfigError("held: expected the particles of the driven sets, found None")
+            places = [x] if x.ndim == 2 else list(x)
+            own = motions if len(motions) == len(places) else list(motions) * len(places)
+            found = [
+                hold(indices, each[solids:], place, solids, start)
+                for each, place in zip(own, places, strict=True)
+            ]
+            held = found[0] if x.ndim == 2 else stack_held(found)
+        if tuple(held.local.shape) != tuple(x.shape):
+            raise ConfigError(
+                f"held: expected places of shape {tuple(x.shape)}, found {tuple(held.local.shape)}"
+            )
+        kinds = torch.int32, self.dtype, torch.int32
+        return Held(*(t.to(self.device, kind) for t, kind in zip(held, kinds)))
 
     def _begun(self, state: ParticleState, started: bool) -> ParticleState:
         """The state that is advanced: F_tot is F itself where the law does not yield."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import SimulationDiverged
+from mosa.physics.contact.driven import Held
 from mosa.physics.engine.budget import Budget, substep_bytes
 from mosa.physics.engine.numerics import Numerics, State
 from mosa.physics.engine.workspace import Workspace
@@ -38,21 +39,23 @@ class _Shared:
 
 
 class SegmentSolver:
-    """Runs the segments of one rollout, of one world or of several in the same launches. volume: (N,) [m^3]; density: number or
-    (N,) [kg/m^3]; cutoff: node mass [kg].
+    """Runs the segments of one rollout, of one world or of several in the same launches. volume:
+    (N,) [m^3]; density: number or (N,) [kg/m^3]; cutoff: node mass [kg].
 
-    workspaces: by shape, those that it has while it runs (`Buffers.take`).
-    budget: for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
-    gravities: of every world [m/s^2], among which the particles are shared in equal parts; None: one world with the numerics' own.
-    first_world: number of the first one, for messages, None where there is but one.
+    workspaces: by shape, those that it has while it runs (`Buffers.take`). budget: for the states
+    of all substeps, between the passes; segments that do not fit are run again in the backward
+    pass. gravities: of every world [m/s^2], among which the particles are shared in equal parts;
+    None: one world with the numerics' own. first_world: number of the first one, for messages, None
+    where there is but one. driven: particles of all worlds, None for none.
     """
 
     def __init__(
         self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float,
         gravities: Sequence[tuple[float, float, float]] | None = None, first_world: int | None = None,
+        driven: Held | None = None,
     ) -> None:  # fmt: skip
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
-        self.mass = density * volume
+        self.mass, self.driven = density * volume, driven
         self.workspaces: dict[tuple, Workspace] = {}
         self.budget = Budget()
         self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)

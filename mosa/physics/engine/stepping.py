@@ -19,6 +19,7 @@ from mosa.physics.adapters.chain import ChainOfSegments
 from mosa.physics.adapters.chain_schedule import SEGMENT, Chains
 from mosa.physics.adapters.interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.contact.colliders import Collider, reach
+from mosa.physics.contact.driven import sample_paths
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.axes import Axes
 from mosa.physics.engine.budget import room, substep_bytes
@@ -86,6 +87,16 @@ class Prepared:
             numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"]
         )
         return state._replace(F=mapped, F_tot=F_tot + dt * (C @ F_tot))
+
+    def reaches(self, columns: int) -> Tensor:
+        """(K,) distance [m] of the farthest driven particle from the origin of its pose, 0 of
+        solids."""
+        far = torch.zeros(columns, dtype=torch.float64)
+        for solver in self.lanes.solvers if self.numerics.driven else ():
+            on = solver.driven.sets >= 0
+            chosen, away = solver.driven.sets[on].long(), solver.driven.local[on].norm(dim=-1)
+            far.scatter_reduce_(0, chosen.cpu(), away.double().cpu(), "amax")
+        return far
 
     def settle(self, state: State) -> None:
         """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts segments then."""
@@ -317,7 +328,8 @@ class Stepper:
             return ()
         if poses is None:
             each = [self.sample(moment, count, frame.dt, motions) for motions in self.motions]
-            return self.taken([torch.cat(parts, 1) for parts in zip(*each)], frame.dt)
+            found = self.taken([torch.cat(parts, 1) for parts in zip(*each)], frame.dt)
+            return (*found, *self._paths(moment, frame))
         poses = poses(count, frame.dt) if callable(poses) else poses
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
@@ -326,7 +338,23 @@ class Stepper:
                     f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}"
                 )
         poses = self.taken(poses, frame.dt)
-        return poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
+        poses = poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
+        return (*poses, *self._paths(moment, frame))
+
+    def _paths(self, moment: Moment, frame: Frame) -> tuple[Tensor, ...]:
+        """(S, W P, 3) each: paths and rates of the points that lead driven particles, () where
+        there are none."""
+        first, start = self._times(moment)
+        return self.led(frame.count, frame.dt, start, first)
+
+    def led(self, count: int, dt: float, start: float, first: int = 0) -> tuple[Tensor, ...]:
+        """As `_paths`, from the `first` substep after time `start` of the motions on."""
+        if not self.prepared.numerics.points:
+            return ()
+        each = [sample_paths(motions, count, dt, start, first) for motions in self.motions]
+        if self.worlds is not None and len(each) == 1:
+            each *= self.worlds
+        return tuple(self._moved(self.axes.vectors(torch.cat(part, 1))) for part in zip(*each))
 
     def taken(self, poses: Sequence[Tensor], dt: float) -> tuple[Tensor, ...]:
         """Poses (S, ..., K, ...) at substeps of dt [s] in the simulator's axes and type. Errors: ConfigError for a solid that would
@@ -338,6 +366,7 @@ class Stepper:
             for part, size in zip(poses, (3, 9, 3, 3))
         )
         far = v.new_tensor([reach(solid.shape) for solid in self.solids])
+        far = torch.maximum(far, self.prepared.reaches(K).to(far))
         moved = (x.diff(dim=0).norm(dim=-1), far * R.diff(dim=0).norm(dim=-1) / math.sqrt(2))
         fastest = torch.cat(
             [v.norm(dim=-1) + w.norm(dim=-1) * far, *(part / dt for part in moved)]
@@ -383,7 +412,10 @@ class Stepper:
             motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion
             for motion in motions
         ]
-        first, start = (
-            (0, moment.frames * frame_dt) if self.clock.varies else (moment.substeps, 0.0)
-        )
+        first, start = self._times(moment)
         return sample_poses(motions, 1, count, dt, start, first + after)
+
+    def _times(self, moment: Moment) -> tuple[int, float]:
+        """(substeps, seconds before them) of the motions until `moment`."""
+        varies = self.clock.varies
+        return (0, moment.frames * self.clock.frame_dt) if varies else (moment.substeps, 0.0)

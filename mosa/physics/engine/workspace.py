@@ -17,6 +17,8 @@ from mosa.errors import SimulationDiverged
 from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
 from mosa.physics.contact.collider_buffers import ColliderBuffers
+from mosa.physics.contact.driven import Held
+from mosa.physics.contact.driven_buffers import DrivenBuffers
 from mosa.physics.contact.grid_update import update_kernels
 from mosa.physics.contact.touch import springs, touch_kernels
 from mosa.physics.engine.capture import Graphs, WarpCapture
@@ -129,7 +131,7 @@ class Workspace:
         self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
-        self.colliders, self.springs = None, None
+        self.colliders, self.springs, self.driven = None, None, None
         if numerics.touching or numerics.colliders is not None:
             self.touch = touch_kernels(self.scalar)
             self.v_met, self.v_met_wp = self.array((n, 3), self.kernels.vec3)
@@ -143,6 +145,12 @@ class Workspace:
             self.colliders = ColliderBuffers(
                 numerics.colliders, self.scalar, substeps, self, with_adjoint
             )
+        if numerics.driven:
+            self.driven = DrivenBuffers(
+                self.colliders, self.scalar, substeps, numerics.points, self
+            )
+        # solids are before the driven sets among the colliders
+        self.struck = numerics.colliders is not None and len(numerics.colliders) > numerics.driven
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
         self._placed: np.ndarray | None = None
@@ -246,11 +254,13 @@ class Workspace:
     def load(
         self, state: State, held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
         poses: tuple[Tensor, ...] | None = None, steps: Steps | None = None,
-        gravities: tuple[tuple[float, float, float], ...] | None = None,
+        gravities: tuple[tuple[float, float, float], ...] | None = None, driven: Held | None = None,
     ) -> None:  # fmt: skip
-        """Copy the start of a segment in: the state, the parameters, the adapter's operator, colliders' poses.
+        """Copy the start of a segment in: the state, the parameters, the adapter's operator,
+        colliders' poses, driven particles.
 
-        steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by default."""
+        steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by
+        default."""
         self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         pulled = (*self.steps, gravities or (self.numerics.gravity,) * self.worlds)
         if pulled != self._pulled:
@@ -259,10 +269,12 @@ class Workspace:
             self.impulses[0]._base.copy_(rows.to(self.numerics.dtype), non_blocking=True)
             self._pulled = pulled
         if self.colliders is not None:
-            self.colliders.load(poses)
+            self.colliders.load(poses[: len(self.colliders.poses)])
         slots = (self.x, self.v, self.C_affine, self.F) + ((self.F_tot,) if self.plastic else ())
         targets = [*(slot[0] for slot in slots), self.volume, self.mass]
         torch._foreach_copy_(targets, [*state[: len(slots)], volume, mass])
+        if self.driven is not None:
+            self.driven.load(driven, poses[len(self.colliders.poses) :])
         self.hold(held)
         if cutoff != self.cutoff:
             self.cutoff = cutoff
@@ -397,14 +409,21 @@ class Workspace:
                 [*self._touch_arguments(state, step), self.v_met_wp],
             )
             v = self.v_met_wp
-        if self.colliders is not None:
+        if self.struck:
             v = self.colliders.strike(step, self._struck(state), self._kick(step), again)
+        if self.driven is not None:
+            v = self.driven.hold(step, self.x_wp[state], v, self._kick(step))
         return v
 
     def _struck(self, state: int) -> list:
         """What solids act on: particles after the planes that they meet."""
         v = self.v_met_wp if self.numerics.touching else self.v_wp[state]
         return [self.x_wp[state], v, self.volume_wp, self.springs_wp, self.mass_wp]
+
+    def _found(self, state: int) -> wp.array:
+        """Velocities of a state as driven sets find them, once `_met` has run: after planes and
+        solids."""
+        return self.colliders.struck if self.struck else self._struck(state)[1]
 
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
@@ -430,6 +449,7 @@ class Workspace:
         states, grids = len(self.x), len(self.grid_wp)
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
+        mass = self.mass_wp if self.driven is None else self.driven.mass_wp
         if self.colliders is not None and first == 0:
             self.colliders.reset()
         for step in range(first, first + count):
@@ -443,7 +463,7 @@ class Workspace:
             )
             self.run(self.stress, n, self._stress_arguments(a, s))
             self.run(kernels.p2g, n, [
-                self.x_wp[a], self._met(a, step), self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], self.mass_wp, self.volume_wp,
+                self.x_wp[a], self._met(a, step), self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], mass, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
@@ -457,6 +477,11 @@ class Workspace:
             ])  # fmt: skip
             if self.plastic:
                 self.run(self.mapping, n, self._mapping_arguments(a, b))
+            if self.driven is not None:
+                impulses = self.impulses_wp[min(step, 1)]
+                self.driven.feel(
+                    step, self.x_wp[a], self._found(a), self.v_wp[b], self._kick(step), impulses
+                )
         if self.colliders is not None and first + count == self.substeps:
             self.colliders.settle()
 
@@ -466,11 +491,14 @@ class Workspace:
         adj_held is of these substeps alone; more: but the parameters' part is added to what is there."""
         kernels, numerics, n, held = self.kernels, self.numerics, self.particles, self.adj_held_wp
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
+        mass = self.mass_wp if self.driven is None else self.driven.mass_wp
         (self.adj_operator_wp if more else self.all_adj_wp).zero_()
         if self.springs is not None:
             self.adj_springs_wp.zero_()
         if self.colliders is not None and first + count == self.substeps:
             self.colliders.reset_adjoint()
+            if self.driven is not None:
+                self.driven.reset_adjoint()
         for step in reversed(range(first, first + count)):
             a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
             if self.plastic:
@@ -479,6 +507,8 @@ class Workspace:
                     self.adj_F_wp[a], self.adj_C_affine_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"],
                     0.0, 0.0, 0, self.adj_F_wp[b],
                 ])  # fmt: skip
+            if self.driven is not None:
+                self.driven.adj_feel(step, self.x_wp[step], self._kick(step), self.adj_v_wp[b])
             adj_velocity = self.adj_velocity_wp[a]
             if step == self.substeps - 1 and not self.exact:
                 self.over_nodes(kernels.clear, [adj_velocity])
@@ -494,12 +524,19 @@ class Workspace:
                 [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared],
             )
             self.run(kernels.adj_p2g, n, [
-                self.x_wp[step], self._met(step, step, True), self.C_affine_wp[step], self.tau_wp[step], self.mass_wp,
+                self.x_wp[step], self._met(step, step, True), self.C_affine_wp[step], self.tau_wp[step], mass,
                 self.volume_wp, *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a],
                 self.adj_C_affine_wp[a], self.adj_tau_wp,
             ])  # fmt: skip
-            if self.colliders is not None:
-                of_met = self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp
+            of_met = (
+                self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp
+            ) if self.colliders is not None else ()  # fmt: skip
+            if self.driven is not None:
+                self.driven.adjoint(
+                    step, self.x_wp[step], self._found(step), self.v_wp[step + 1], self._kick(step),
+                    self.impulses_wp[min(step, 1)], *of_met,
+                )  # fmt: skip
+            if self.struck:
                 self.colliders.adjoint(step, self._struck(step), self._kick(step), *of_met)
             if numerics.touching:
                 self.run(self.touch.adj_meet, n, [
@@ -512,3 +549,5 @@ class Workspace:
             self.run(self.touch.loosen, n, [self.adj_springs_wp, self.slopes_wp, self.adj_slots_wp])
         if self.colliders is not None and first == 0:
             self.colliders.settle_adjoint()
+            if self.driven is not None:
+                self.driven.settle_adjoint()

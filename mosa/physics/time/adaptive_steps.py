@@ -134,7 +134,8 @@ class StepChooser:
             else modulus
         )
         speed = (control.factor * modulus / self.density).sqrt()
-        viscosity = self.viscosity * J.clamp_min(0)  # per current volume, as the mass is
+        # of a fluid per current volume, as the mass is
+        viscosity = self.viscosity * (1.0 if self.numerics.law.damped else J.clamp_min(0))
         rate = speed / (control.courant * dx) + viscosity / (
             VISCOUS_NUMBER * self.density * dx * dx
         )

@@ -26,6 +26,8 @@ STRIDES = {
     "kappa": 1.1,
     "yield_stress": 1.1,
     "viscosity": 1.6,
+    "damping": 1.6,
+    "bulk_damping": 1.6,
     "cohesion": 0.5,
     "nu": 0.8,
     "friction_angle": 0.8,

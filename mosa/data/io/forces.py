@@ -1,0 +1,146 @@
+"""Measured forces as observations: a load cell's curve, compared with what a solid or a driven set
+takes in a rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, DataError
+from mosa.physics.contact.keys import fits
+from mosa.physics.world import World
+from mosa.settings import Positive, Text
+from mosa.types import Rollout
+
+COLUMNS = ("time", "fx", "fy", "fz")
+MODEL_ERROR = 0.01
+"""Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
+KEYS = {"of": Text, "file": Text, "sd": Positive}
+
+
+@dataclass(frozen=True, eq=False)
+class ForceCurve:
+    """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on,
+    ascending; forces: (n, 3) [N], NaN for a component that was not measured; sd [N]: noise of one
+    sample, None: found from the samples' roughness."""
+
+    of: str
+    times: Tensor
+    forces: Tensor
+    sd: float | None = None
+
+    def noise(self) -> float:
+        """Standard deviation of one sample [N]: of white noise the second differences have six
+        times its variance."""
+        if self.sd is not None:
+            return self.sd
+        rough = self.forces.diff(n=2, dim=0)
+        rough = rough[torch.isfinite(rough)]
+        return float((rough.square().mean() / 6).sqrt()) if len(rough) else 0.0
+
+    def means(self, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
+        """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its
+        standard deviation (T - 1, 3) [N], with what a grid gets wrong). The samples are joined by
+        straight lines."""
+        ends = frame_dt * torch.arange(frames, dtype=torch.float64)
+        whole = torch.zeros(1, 3, dtype=torch.float64)
+        steps = 0.5 * (self.forces[1:] + self.forces[:-1]) * self.times.diff()[:, None]
+        blank = torch.isnan(steps)
+        passed = torch.cat([whole, torch.where(blank, 0.0, steps).cumsum(0)])
+        blanks = torch.cat([whole, blank.double().cumsum(0)])
+        place = ends.clamp(float(self.times[0]), float(self.times[-1]))
+        at = torch.searchsorted(self.times, place, right=True).clamp(1, len(self.times) - 1)
+        since = (place - self.times[at - 1])[:, None]
+        slope = (self.forces[at] - self.forces[at - 1]) / (self.times[at] - self.times[at - 1])[
+            :, None
+        ]
+        impulse = passed[at - 1] + since * (self.forces[at - 1] + 0.5 * since * slope)
+        mean = impulse.diff(dim=0) / frame_dt
+        slack = 1e-6 * frame_dt
+        covered = (ends[:-1] >= self.times[0] - slack) & (ends[1:] <= self.times[-1] + slack)
+        mean[~covered] = torch.nan
+        mean[blanks[at][1:] > blanks[at - 1][:-1]] = torch.nan
+        inside = (self.times[:, None] > ends[:-1]) & (self.times[:, None] <= ends[1:])
+        count = inside.sum(0).clamp_min(1)[:, None]
+        largest = float(self.forces[torch.isfinite(self.forces)].abs().max())
+        sd = (self.noise() ** 2 / count + (MODEL_ERROR * largest) ** 2).sqrt().expand_as(mean)
+        return mean, sd
+
+
+def forces_from_config(
+    items: Sequence[Mapping[str, Any]] | None, field_name: str = "world.forces"
+) -> tuple[ForceCurve, ...]:
+    """Of entries {of: name of a collider or driven set, file: csv, sd [N]}.
+
+    Columns of the file: time [s], fx, fy, fz [N].
+    A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
+    entry, DataError the file."""
+    curves = []
+    for i, item in enumerate(items or ()):
+        where = f"{field_name}[{i}]"
+        if unknown := [key for key in item if key not in KEYS]:
+            raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected {', '.join(KEYS)}")
+        if missing := [key for key in ("of", "file") if item.get(key) is None]:
+            raise ConfigError(f"{where}: expected of and file, found no {missing[0]}")
+        fits(item, KEYS, where)
+        curves.append(read_forces(Path(item["file"]), item["of"], item.get("sd")))
+    return tuple(curves)
+
+
+def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
+    """Errors: DataError naming the file, what was expected and found."""
+    try:
+        found = np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: expected a csv of {', '.join(COLUMNS)}, found {error}") from error
+    names = found.dtype.names or ()
+    if "time" not in names or not set(names) & set(COLUMNS[1:]):
+        raise DataError(
+            f"{path}: expected columns {', '.join(COLUMNS)} (SI units), found {', '.join(names) or 'none'}"
+        )
+    found = np.atleast_1d(found)
+    blank = np.full(len(found), np.nan)
+    times = torch.from_numpy(np.array(found["time"]))
+    columns = [found[name] if name in names else blank for name in COLUMNS[1:]]
+    forces = torch.from_numpy(np.stack(columns, 1))
+    if len(times) < 2 or not bool((times.diff() > 0).all()):
+        raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
+    if not bool(torch.isfinite(forces).any()):
+        raise DataError(f"{path}: expected forces [N], found no number")
+    return ForceCurve(of, times, forces, sd)
+
+
+def columns_of(curves: Sequence[ForceCurve], world: World) -> list[int]:
+    """The reactions' columns that the curves are of. Errors: ConfigError naming a curve of nothing
+    that is there."""
+    names = [solid.name or str(i) for i, solid in enumerate(world.solids)]
+    for curve in curves:
+        if names.count(curve.of) != 1:
+            raise ConfigError(
+                f"world.forces: of: expected the name of one collider or driven set ({', '.join(names) or 'there are none'}), "
+                f"found {curve.of!r}"
+            )
+    return [names.index(curve.of) for curve in curves]
+
+
+def force_residuals(
+    rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
+) -> Tensor:
+    """(M,) differences from the mean forces of all frame intervals that were measured, over their
+    standard deviations."""
+    parts: list[Tensor] = []
+    if rollout.reactions is None:
+        raise ConfigError(
+            "world.forces: expected a law on a grid, found an adapter without reactions"
+        )
+    for curve, column in zip(curves, columns_of(curves, world)):
+        mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
+        felt = rollout.reactions.mean(1)[:, column, :3].double()
+        parts.append(((felt - mean) / sd)[torch.isfinite(mean)])
+    return torch.cat(parts)

@@ -1,0 +1,313 @@
+"""Driven particles: parts of the body that a motion holds, rigidly or point by point, and loads.
+
+A set of driven particles stands among the colliders, after the solids: it has a motion, a pose at
+every substep, and takes a force and a torque, as they have. What acts on its particles is in
+`driven_kernels`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, DataError
+from mosa.physics.contact.colliders import Collider, Particles, Shape, collider_of
+from mosa.physics.contact.keys import fits, rows, three, told
+from mosa.physics.contact.motion import Motion, Trajectory
+from mosa.physics.contact.reference import signed_distance
+from mosa.settings import Expected, Section, Text, Weight, Whole
+from mosa.system.npz import read_npz
+
+
+@dataclass(frozen=True)
+class Points:
+    """A motion that is given point by point: points (T, n, 3) [m] at times (T,) [s], linear between
+    them, at rest before and after.
+
+    Each driven particle keeps its place relative to the point that is nearest to it at the start.
+    Differentiable in the points. The pose is that of their mean, without rotation: torques are
+    about it. Errors: ConfigError naming the field.
+    """
+
+    times: Tensor
+    points: Tensor
+
+    def __post_init__(self) -> None:
+        times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
+        points = torch.as_tensor(self.points, dtype=torch.float64).cpu()
+        if times.ndim != 1 or len(times) < 2 or not bool((times.diff() > 0).all()):
+            raise ConfigError(
+                f"motion: times: expected at least two ascending numbers, found shape {tuple(times.shape)}"
+            )
+        if (
+            points.ndim != 3
+            or len(points) != len(times)
+            or not points.shape[1]
+            or points.shape[-1] != 3
+        ):
+            raise ConfigError(
+                f"motion: points: expected shape ({len(times)}, n, 3), found {tuple(points.shape)}"
+            )
+        if not bool(torch.isfinite(points.detach()).all()):
+            raise ConfigError("motion: points: expected finite numbers, found others")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "points", points)
+
+    def at(self, times: Tensor) -> Tensor:
+        """(S, n, 3) points at times (S,) [s]."""
+        place = times.clamp(float(self.times[0]), float(self.times[-1]))
+        after = torch.searchsorted(self.times, place, right=True).clamp(1, len(self.times) - 1)
+        share = (place - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
+        return torch.lerp(self.points[after - 1], self.points[after], share[:, None, None])
+
+    def paths(self, ends: Tensor) -> tuple[Tensor, Tensor]:
+        """(how far each point has moved relative to the mean of all (S, n, 3) [m], its mean rate
+        (S, n, 3) [m/s]) in the substeps between `ends` (S + 1,) [s]."""
+        points = self.at(ends)
+        beside = points - points.mean(1, keepdim=True)
+        first = self.at(torch.zeros(1, dtype=torch.float64))
+        moved = beside - (first - first.mean(1, keepdim=True))
+        return moved[:-1], moved.diff(dim=0) / ends.diff()[:, None, None]
+
+    def sample(
+        self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `Motion.sample`."""
+        mean = self.at(_ends(frames * substeps, dt, start, first)).mean(1)
+        eye = torch.eye(3, dtype=torch.float64).expand(len(mean) - 1, 3, 3)
+        return mean[:-1], eye, mean.diff(dim=0) / dt, torch.zeros_like(mean[:-1])
+
+    def timed(self, frames: int | None, frame_dt: float) -> Points:
+        return self
+
+    def shifted(self, offset: Tensor) -> Points:
+        return replace(self, points=self.points + offset.double().cpu())
+
+    def max_speed(self, reach: float) -> float:
+        steps = self.points.detach().diff(dim=0).norm(dim=-1).amax(1)
+        return float((steps / self.times.diff()).max())
+
+
+def _ends(count: int, dt: float, start: float, first: int) -> Tensor:
+    return start + dt * torch.arange(first, first + count + 1, dtype=torch.float64)
+
+
+def sample_paths(
+    motions: Sequence, count: int, dt: float, start: float, first: int = 0
+) -> tuple[Tensor, ...]:
+    """(paths, rates), (S, P, 3) float64 each, of all points of the motions at S = count substeps;
+    () where there are no points."""
+    found = [m.paths(_ends(count, dt, start, first)) for m in motions if isinstance(m, Points)]
+    return tuple(torch.cat(parts, 1) for parts in zip(*found))
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """Particles of a body, by the place where they start, and the motion that holds them.
+
+    region: a shape in the pose that the motion has at t = 0; indices (n,) of particles; or places
+    (n, 3) [m], each of which means the particle nearest to it. None with `Points`: those places
+    are the points. held: False for a load alone, which goes with its particles. mass [kg]: fixed
+    to them, each has its share by volume. place: motion whose pose at t = 0 is the region's, None
+    for `motion`. Errors: ConfigError.
+    """
+
+    region: Shape | Tensor | Sequence[int] | None
+    motion: Motion | Trajectory | Points = field(default_factory=Motion)
+    mass: float = 0.0
+    held: bool = True
+    name: str = ""
+    place: Motion | Trajectory | Points | None = None
+
+    def chosen(self, x: Tensor) -> Tensor:
+        """(n,) indices of the particles x (N, 3) [m] where the body starts. Errors: ConfigError
+        where there are none."""
+        place, where = x.detach().double().cpu(), f"driven set {self.name!r}"
+        region = self.region
+        if region is None:
+            if not isinstance(self.motion, Points):
+                raise ConfigError(f"{where}: expected a region, or points that move, found neither")
+            region = self.motion.at(torch.zeros(1, dtype=torch.float64))[0].detach()
+        if isinstance(region, Tensor) and region.ndim == 2:
+            return torch.cdist(region.double().cpu(), place).argmin(1).unique()
+        if isinstance(region, Tensor | Sequence):
+            found = torch.as_tensor(region, dtype=torch.int64).cpu().unique()
+            if len(found) and not 0 <= int(found[0]) <= int(found[-1]) < len(x):
+                raise ConfigError(
+                    f"{where}: indices: expected numbers of particles below {len(x)}, found {int(found[-1])}"
+                )
+        else:
+            position, rotation = _pose(self.motion if self.place is None else self.place)
+            inside = signed_distance(region, (place - position) @ rotation) <= 0
+            found = inside.nonzero()[:, 0]
+        if not len(found):
+            raise ConfigError(
+                f"{where}: expected particles of the body inside of it where the body starts, found none; the body is "
+                f"between {[round(v, 4) for v in place.amin(0).tolist()]} and "
+                f"{[round(v, 4) for v in place.amax(0).tolist()]} m"
+            )
+        return found
+
+    @property
+    def solid(self) -> Collider:
+        """As it stands among the colliders."""
+        return Collider(Particles(), motion=self.motion, name=self.name)
+
+
+def held_in(driven: Sequence[Driven], x: Tensor, solids: int = 0) -> Held | None:
+    """What the sets hold of a body whose particles start at x (N, 3) [m], behind `solids` solids;
+    None where nothing is held."""
+    if not (holding := [each for each in driven if each.held]):
+        return None
+    return hold([each.chosen(x) for each in holding], [each.motion for each in holding], x, solids)
+
+
+class Held(NamedTuple):
+    """Which particles are driven, and from where.
+
+    sets: (N,) int32 number of the column of poses, -1 for free particles; local: (N, 3) [m] places
+    in the axes of their motions; points: (N,) int32 number of the point that each follows, -1 for
+    none. Of W worlds: (W, N, ...)."""
+
+    sets: Tensor
+    local: Tensor
+    points: Tensor
+
+
+def stack_held(each: Sequence[Held]) -> Held:
+    """Of so many worlds."""
+    return Held(*map(torch.stack, zip(*each)))
+
+
+def _pose(motion, start: float = 0.0) -> tuple[Tensor, ...]:
+    """(position (3,), rotation (3, 3)) float64 at a time [s], without gradient."""
+    motion = motion.timed(None, 1.0) if isinstance(motion, Motion) else motion
+    return tuple(part[0].detach() for part in motion.sample(1, 1, 1e-9, start)[:2])
+
+
+def hold(
+    indices: Sequence[Tensor], motions: Sequence, x: Tensor, solids: int = 0, start: float = 0.0
+) -> Held:
+    """The sets `indices`, one for each of `motions`, of particles at x (N, 3) [m] at time `start`
+    of the motions, behind `solids` solids. Without gradient: places in the motions' axes are those
+    of the start. Errors: ConfigError where sets share a particle."""
+    place = x.detach().double().cpu()
+    sets, points = (torch.full((len(x),), -1, dtype=torch.int32) for _ in range(2))
+    local, passed = torch.zeros_like(place), 0
+    for k, (chosen, motion) in enumerate(zip(indices, motions, strict=True)):
+        if bool((sets[chosen] >= 0).any()):
+            raise ConfigError(
+                f"driven sets: expected sets without a common particle, found particle "
+                f"{int(chosen[sets[chosen] >= 0][0])} in two of them"
+            )
+        position, rotation = _pose(motion, start)
+        sets[chosen], local[chosen] = solids + k, (place[chosen] - position) @ rotation
+        if isinstance(motion, Points):
+            first = motion.at(torch.zeros(1, dtype=torch.float64))[0].detach()
+            now = motion.at(torch.full((1,), start, dtype=torch.float64))[0].detach()
+            nearest = torch.cdist(place[chosen], now).argmin(1)
+            points[chosen] = (passed + nearest).int()
+            moved = (now - now.mean(0)) - (first - first.mean(0))
+            local[chosen] -= moved[nearest]
+            passed += len(first)
+    return Held(sets, local, points)
+
+
+def loads(driven: Sequence[Driven], x: Tensor, volume: Tensor) -> Tensor | None:
+    """(N,) density [kg/m^3] that the sets' masses add to their particles, which start at x (N, 3)
+    [m] with volumes (N,) [m^3]; None where there are none. Errors: ConfigError."""
+    if not any(each.mass for each in driven):
+        return None
+    added = torch.zeros_like(volume)
+    for each in driven:
+        if not 0 <= each.mass < math.inf:
+            raise ConfigError(
+                f"driven set {each.name!r}: mass: expected a number of at least 0 [kg], found {each.mass}"
+            )
+        chosen = each.chosen(x).to(volume.device)
+        added[chosen] += each.mass / volume[chosen].sum()
+    return added
+
+
+KEYS = {
+    "indices": Annotated[list[Whole], Expected("a list of numbers of particles")],
+    "points": told("a list of places (x, y, z) [m]", rows(three)), "name": Text, "mass": Weight, "held": bool, "motion": Section,
+}  # fmt: skip
+
+
+def driven_from_config(
+    items: Sequence[Mapping[str, Any] | Driven], field_name: str = "world.driven"
+) -> tuple[Driven, ...]:
+    """Driven sets of plain containers, as a YAML file has them; a `Driven` is passed on.
+
+    Each: the region as a collider's shape (type with its keys, position, rotation or normal),
+    `indices`, or `points`; motion as a collider's, or {path: an npz with times (T,) [s] and points
+    (T, n, 3) [m]}; mass [kg]; held; name. Errors: ConfigError naming the entry and the field,
+    DataError naming the file.
+    """
+    if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
+        raise ConfigError(f"{field_name}: expected a list of driven sets, found {items!r}")
+    return tuple(
+        item if isinstance(item, Driven) else _driven(item, f"{field_name}[{i}]", i)
+        for i, item in enumerate(items)
+    )
+
+
+def _driven(item: Mapping, where: str, number: int) -> Driven:
+    if not isinstance(item, Mapping):
+        raise ConfigError(f"{where}: expected type, indices or points and a motion, found {item!r}")
+    item = {key: value for key, value in item.items() if value is not None}
+    fits(item, KEYS, where)
+    name = item.pop("name", f"driven{number}")
+    more = {key: item.pop(key) for key in ("mass", "held") if key in item}
+    own = {key: item.pop(key) for key in ("indices", "points") if key in item}
+    path = (item.get("motion") or {}).get("path")
+    moved = None if path is None else _points(path, where)
+    if moved is not None:
+        if set(item.pop("motion")) != {"path"}:
+            raise ConfigError(f"{where}.motion: path stands alone")
+        if own:
+            raise ConfigError(
+                f"{where}: {next(iter(own))} and motion.path: expected a type, or none"
+            )
+    if unknown := [key for key in ("mode", "friction") if key in item]:
+        raise ConfigError(f"{where}: unknown: {unknown[0]}; particles that are held do not slide")
+    if len(own) + ("type" in item) > 1 or not (own or "type" in item or moved):
+        raise ConfigError(
+            f"{where}: expected one of type (a shape), indices, points or motion.path, found {', '.join(item) or 'none'}"
+        )
+    region: Shape | Tensor | None = None
+    solid = (
+        collider_of({"type": "plane"} | item if own else item, where)
+        if own or "type" in item
+        else None
+    )
+    if own:
+        key, value = next(iter(own.items()))
+        kind = torch.int64 if key == "indices" else torch.float64
+        region = torch.tensor(value, dtype=kind)
+    elif solid is not None:
+        region = solid.shape
+    place = None if solid is None else solid.motion
+    motion = moved or (solid.motion if solid is not None else Motion())
+    return Driven(region, motion, place=place, name=name, **more)
+
+
+def _points(path: Any, where: str) -> Points:
+    if not isinstance(path, str):
+        raise ConfigError(f"{where}.motion.path: expected an npz file, found {path!r}")
+    arrays = read_npz(Path(path))
+    if missing := [key for key in ("times", "points") if key not in arrays]:
+        raise DataError(
+            f"{path}: expected arrays times (T,) and points (T, n, 3), found no {missing[0]}"
+        )
+    try:
+        return Points(*(torch.as_tensor(arrays[key]).double() for key in ("times", "points")))
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from error

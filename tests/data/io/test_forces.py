@@ -1,0 +1,107 @@
+"""Measured forces in a fit: what a curve says of a frame interval, and the stiffness of a block
+from a press alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from small_bodies import FREE, NU, E, cues_of, small_body, start, take_of
+
+from mosa.data.io.forces import ForceCurve, force_residuals, forces_from_config
+from mosa.errors import ConfigError, DataError
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.stages import Stage
+from mosa.physics.contact.driven import driven_from_config
+
+FRAMES, FRAME_DT = 8, 1 / 60
+LOW = {"name": "low", "type": "plane", "normal": [0, 1, 0], "position": [0, 0.065, 0]}
+HIGH = {
+    "name": "high",
+    "type": "plane",
+    "normal": [0, -1, 0],
+    "position": [0, 0.115, 0],
+    "motion": {"velocity": [0, -0.05, 0]},
+}
+PRESS = replace(FREE, driven=driven_from_config([LOW, HIGH]))
+
+
+def pressed(world=PRESS, E=E, height=0.09):
+    body = small_body(adapter=False, E=E, law="neo_hookean")
+    begins = replace(start(height, speed=0.0), velocity=torch.zeros(3).double())
+    return body, begins, body.simulate(begins, world, FRAMES, FRAME_DT)
+
+
+def write(path, times, forces):
+    rows = np.column_stack([times, forces])
+    np.savetxt(path, rows, delimiter=",", header="time,fx,fy,fz", comments="")
+
+
+def test_a_curve_says_the_mean_of_each_interval():
+    times = torch.linspace(0, 0.5, 501, dtype=torch.float64)
+    line = torch.stack([times, 2 * times, torch.full_like(times, torch.nan)], 1)
+    mean, sd = ForceCurve("a", times, line, 0.01).means(8, 0.1)
+    expected = torch.arange(5).double() * 0.1 + 0.05
+    torch.testing.assert_close(mean[:5, :2], torch.stack([expected, 2 * expected], 1))
+    assert bool(torch.isnan(mean[5:]).all()) and bool(torch.isnan(mean[:, 2]).all())
+    assert float(sd[0, 0]) == pytest.approx((0.01**2 / 100 + 0.01**2) ** 0.5, rel=0.01)
+    line[250] = torch.nan  # a sample that failed, at 0.25 s
+    gap = ForceCurve("a", times, line, 0.01).means(8, 0.1)[0]
+    assert torch.isnan(gap[:5, 0]).tolist() == [False, False, True, False, False]
+    torch.testing.assert_close(gap[3:5, 0], expected[3:])
+    line = torch.stack([times, 2 * times, times], 1)
+    noisy = 0.03 * torch.randn(501, 3, generator=torch.Generator().manual_seed(0)).double()
+    assert ForceCurve("a", times, line + noisy).noise() == pytest.approx(0.03, rel=0.1)
+
+
+@torch.no_grad()
+def test_the_stiffness_of_a_block_from_a_press_alone(tmp_path):
+    """Both ends are driven, so that positions hardly tell it, and no cue counts; the load cell has
+    noise of 2 %."""
+    _, begins, truth = pressed()
+    felt = truth.reactions.mean(1)[:, 1, :3]
+    assert float(felt[-1, 1]) > 1.0  # the block presses the upper end up
+    middle = FRAME_DT * (np.arange(FRAMES - 1) + 0.5)
+    noise = 0.02 * float(felt.abs().max()) * np.random.default_rng(1).normal(size=felt.shape)
+    path = tmp_path / "cell.csv"
+    ends = np.concatenate([[0.0], middle, [FRAME_DT * (FRAMES - 1)]])
+    values = felt.numpy() + noise
+    write(path, ends, np.concatenate([values[:1], values, values[-1:]]))
+    curves = forces_from_config(
+        [{"of": "high", "file": str(path), "sd": 0.02 * float(felt.abs().max())}]
+    )
+    world = replace(PRESS, forces=curves)
+    body, _, first = pressed(E=0.5 * E)
+    take = take_of(body, begins, FRAMES, PRESS)
+    take.cues = cues_of(first, begins.rotation)
+    settings = IdentificationSettings(grid_error=0.0, threads=1)
+    body.material.raw["nu"].requires_grad_(False)
+    found = Identification(
+        body, [take], world, Stage("prior", 10, 0.1), Criterion("free"), settings, (False,) * 3
+    )
+    for _ in range(6):
+        found.iterate()
+        if found.converged:
+            break
+    values = {k: float(v) for k, v in body.material.physical().items()}
+    assert values["nu"] == pytest.approx(NU) and values["E"] == pytest.approx(E, rel=0.03)
+    spread = float(found.posterior().covariance[0, 0].sqrt())
+    assert abs(values["E"] / E - 1) < 3 * spread < 0.1
+
+
+def test_a_force_of_nothing_is_refused(tmp_path):
+    curve = ForceCurve("wall", torch.tensor([0.0, 1.0]).double(), torch.ones(2, 3).double())
+    _, _, rollout = pressed()
+    with pytest.raises(
+        ConfigError, match=r"one collider or driven set \(low, high\), found 'wall'"
+    ):
+        force_residuals(rollout, [curve], PRESS, FRAME_DT)
+    with pytest.raises(ConfigError, match=r"world.forces\[0\].sd: expected a number above 0"):
+        forces_from_config([{"of": "low", "file": "a.csv", "sd": -1.0}])
+    with pytest.raises(DataError, match=r"none.csv: expected a csv of time, fx, fy, fz"):
+        forces_from_config([{"of": "low", "file": str(tmp_path / "none.csv")}])
+    (tmp_path / "bad.csv").write_text("t,force\n0,1\n1,2\n")
+    with pytest.raises(DataError, match=r"bad.csv: expected columns time, fx, fy, fz"):
+        forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
