@@ -89,7 +89,7 @@ class WorldSection(Settings):
         description=(
             "rigid solids, such as {type: sphere, radius: 0.1, position: [0, 0, 0], "
             "mode: separate, friction: 0.3, motion: {velocity: [1, 0, 0]}} "
-            "(docs/colliders.md)"
+            "(docs/twin.md)"
         ),
     )
     driven: Entries | None = Field(
