@@ -73,7 +73,7 @@ GOING_ON: dict[str, Kind] = {
     "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE, "stage_over": FLAG,
     "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
     "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
-    "grounds": BY_CONTACT, "ground_gains": BY_CONTACT,
+    "grounds": BY_CONTACT, "ground_gains": BY_CONTACT, "parts": BY_CONTACT,
 }  # fmt: skip
 """Of `mosa`, what a fit goes on from."""
 NODES, DEPTH = 2_000_000, 40
@@ -100,7 +100,7 @@ STORED: dict[str, Kind] = {
     "density": number(0.1, 1e5), "dx": number(1e-6, 100), "frame_dt": number(1e-6, 100), "world.gravity": THREE, "world.box": BOX,
     "world.up": Kind("a direction", lambda v: THREE.fits(v) and any(v)),
     "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of(*GROUND_MODES),
-    "world.ground.friction": WEIGHT,
+    "world.ground.friction": WEIGHT, "world.ground.accuracy": or_null(WEIGHT),
     **{f"starts.*.{name}": kind for name, kind in START.items()},
 }  # fmt: skip
 """Beside the configuration itself, what a run measured."""

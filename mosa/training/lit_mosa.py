@@ -165,6 +165,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.compared: dict[
             str, float
         ] = {}  # mean distance [m] of the calibrated candidates for the backbone
+        self.parts: dict[str, float] = {}  # error [m] of held-back frames, by what the law has
         self.ground_gains: dict[
             str, float
         ] = {}  # of other contacts about the learned law, once it has been asked
@@ -298,6 +299,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             "compared": self.compared,
             "grounds": self.grounds,
             "ground_gains": self.ground_gains,
+            "parts": self.parts,
             "retreat": self.retreat.written(),
             "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
             "responses": [take.response and take.response.written() for take in self.takes]
@@ -344,6 +346,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             dict(saved.get("grounds") or {}),
             dict(saved.get("ground_gains") or {}),
         )
+        self.parts = dict(saved.get("parts") or {})
         if self.ground_is_sought and (written := saved["config"]["world"]["ground"]) is not None:
             self.settle_ground(Ground(**written))
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None

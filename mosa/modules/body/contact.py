@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -15,10 +17,12 @@ class ContactOffset(nn.Module):
     place; without this one number the stiffness absorbs it, differently on every grid.
     """
 
-    START = 0.3
-    """Cells the fit starts from; seen on balls, the bird and the rabbit: 0.2 to 0.5. From 0 the fit ends in another valley."""
-    LIMITS = (0.15, 0.55)
-    """What a grid can do; beyond, the number would absorb what the law gets wrong, and so end in that other valley."""
+    START, GRID = 0.3, 0.15
+    """Cells: what a grid does to balls, the bird and the rabbit, and the standard deviation of that."""
+    LIMITS = (-0.5, 1.0)
+    """Cells. Where the ground is 10 mm off, or another simulator made the motion, it is outside of what a grid alone does."""
+    UNKNOWN = 0.4
+    """Standard deviation [cells] of the height of contact where nobody says how well the ground's height is known."""
 
     def __init__(self, dx: float, enabled: bool = True) -> None:
         super().__init__()
@@ -35,6 +39,12 @@ class ContactOffset(nn.Module):
         number, from its start on, is what is not known of the ground's height."""
         touched = ground is not None and ground.mode == "touch" and self.enabled
         return self.dx * (self.cells - self.START) if touched else self()
+
+    def deviation(self, ground: Ground | None) -> float:
+        """Standard deviation [cells] of the prior about `START`, from how well the ground's height is known."""
+        if ground is None or ground.accuracy is None:
+            return self.UNKNOWN
+        return math.hypot(self.GRID, ground.accuracy / self.dx)
 
     @torch.no_grad()
     def project(self) -> None:

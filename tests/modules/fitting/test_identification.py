@@ -119,9 +119,9 @@ def test_a_calibration_finds_modulus_and_poisson_number_from_the_coarse_grid(beg
     truth = small_body(adapter=False)
     body = small_body(adapter=False, E=begins["E"], nu=begins["nu"])
     found = identification(body, [take_and_turn(truth, 0.5)], "prior")
-    before = found.distance()
-    distance = found.search()
-    assert distance == found.distance() < before
+    before = found.score()
+    score = found.search()
+    assert score == found.score() < before
     assert (
         body.material.begins["E"] == small_body(adapter=False, **begins).material.begins["E"]
     )  # the prior's mean stays

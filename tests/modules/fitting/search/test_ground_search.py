@@ -47,7 +47,7 @@ def search(body, take):
     )
     return choose_ground(
         body,
-        0.0,
+        Ground(0.0),
         lambda g: Identification(body, [take], world(g), stage, criterion, settings, seats=1),
     )
 
@@ -98,7 +98,7 @@ def test_a_contact_that_cannot_be_simulated_is_left_out(monkeypatch):
         def distance(self):
             return 1 + self.ground.friction if self.ground.mode == "separate" else 2.0
 
-    found, costs = choose_ground(body, 0.1, Calibration)
+    found, costs = choose_ground(body, Ground(0.1), Calibration)
     assert (
         found.height == 0.1
         and found.mode == "separate"
@@ -115,7 +115,7 @@ def test_a_contact_that_cannot_be_simulated_is_left_out(monkeypatch):
         Calibration, "iterate", lambda self: (_ for _ in ()).throw(SimulationDiverged("nowhere"))
     )
     with pytest.raises(SimulationDiverged):  # not even the body that sticks
-        choose_ground(body, 0.1, Calibration)
+        choose_ground(body, Ground(0.1), Calibration)
 
 
 def test_a_body_sticks_unless_another_contact_is_clearly_nearer():
