@@ -19,10 +19,12 @@ class ContactOffset(nn.Module):
 
     START, GRID = 0.3, 0.15
     """Cells: what a grid does to balls, the bird and the rabbit, and the standard deviation of that."""
-    LIMITS = (-0.5, 1.0)
-    """Cells. Where the ground is 10 mm off, or another simulator made the motion, it is outside of what a grid alone does."""
-    UNKNOWN = 0.4
-    """Standard deviation [cells] of the height of contact where nobody says how well the ground's height is known."""
+    UNKNOWN, LIMITS = 0.4, (-0.5, 1.0)
+    """Cells: standard deviation and bounds where nobody says how well the height of the ground is known. Another simulator's contact,
+    or a ground that is 10 mm off, lies outside of what a grid alone does."""
+    NARROW, WITHIN = 0.05, (0.15, 0.55)
+    """The same where only free rollouts or images are compared: beyond, E has a second valley there, and the number absorbs what the
+    law gets wrong."""
 
     def __init__(self, dx: float, enabled: bool = True) -> None:
         super().__init__()
@@ -40,14 +42,15 @@ class ContactOffset(nn.Module):
         touched = ground is not None and ground.mode == "touch" and self.enabled
         return self.dx * (self.cells - self.START) if touched else self()
 
-    def deviation(self, ground: Ground | None) -> float:
-        """Standard deviation [cells] of the prior about `START`, from how well the ground's height is known."""
-        if ground is None or ground.accuracy is None:
-            return self.UNKNOWN
-        return math.hypot(self.GRID, ground.accuracy / self.dx)
+    def prior(self, ground: Ground | None, free: bool) -> tuple[float, tuple[float, float]]:
+        """(standard deviation about `START`, bounds) [cells]. ground: whose accuracy counts where it is known; free: whether only
+        free rollouts are compared."""
+        if ground is not None and ground.accuracy is not None:
+            return math.hypot(self.GRID, ground.accuracy / self.dx), self.LIMITS
+        return (self.NARROW, self.WITHIN) if free else (self.UNKNOWN, self.LIMITS)
 
     @torch.no_grad()
     def project(self) -> None:
-        """Back within `LIMITS`, after an optimiser's step."""
+        """Back within `WITHIN`, after a step of Adam."""
         if self.enabled:
-            self.cells.clamp_(*self.LIMITS)
+            self.cells.clamp_(*self.WITHIN)

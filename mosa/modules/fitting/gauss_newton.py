@@ -120,7 +120,12 @@ class Posterior:
         covariance[torch.tensor(place)[:, None], torch.tensor(place)] = self.covariance
         rivals = {name: spread(numbers) for name, numbers in self.rivals.items()}
         return Posterior(
-            list(names), spread(self.mean), covariance, spread(self.determined), self.model_error, rivals
+            list(names),
+            spread(self.mean),
+            covariance,
+            spread(self.determined),
+            self.model_error,
+            rivals,
         )
 
     def draws(self, count: int, generator: torch.Generator | None = None) -> Tensor:

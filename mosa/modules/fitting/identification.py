@@ -23,7 +23,7 @@ from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of
-from mosa.modules.fitting.search.backbone import search
+from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
 from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.constitutive.laws import law_named
@@ -95,6 +95,7 @@ class Identification:
             heterogeneity=self.heterogeneity,
             settings=settings,
             ground=world.ground,
+            free=not any(self.gains),
             calibrating=self.calibrating,
         )
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
@@ -304,6 +305,16 @@ class Identification:
         )
         self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
 
+    @property
+    def offsets(self) -> tuple[float | None, ...]:
+        """Contact offsets [cells] at which a search looks: one that is known to within a grid's doing stays where it is."""
+        known = (
+            not self.body.contact.enabled
+            or self.body.contact.prior(self.world.ground, free=not any(self.gains))[0]
+            <= self.body.contact.GRID
+        )
+        return (None,) if known else OFFSET_STEPS
+
     def search(self) -> float:
         """Start a calibration near its end (`search.backbone`); the score [m] there. Errors: SimulationDiverged."""
         return search(self)
@@ -314,7 +325,10 @@ class Identification:
         mean square distance over particles, above the floor of the noise.
 
         It is the likelihood of the positions where every frame has a noise of its own that is not known, and what Gauss-Newton
-        lowers while it finds that noise: a frame that no law predicts counts as little as one that every law predicts."""
+        lowers while it finds that noise: a frame that no law predicts counts as little as one that every law predicts. Of free
+        rollouts, whose late frames hold the errors of all before them, it is `distance`."""
+        if not any(self.gains):
+            return self.distance()
         least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
         logarithms = []
         for i, gain in self.pairs:

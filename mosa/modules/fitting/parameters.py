@@ -46,9 +46,11 @@ def blocks_of(
     heterogeneity: bool,
     settings: IdentificationSettings,
     ground: Ground | None = None,
+    free: bool = False,
     calibrating: bool = False,
 ) -> list[Block]:
-    """The numbers that are learned, in the order of `tensors_of`. ground: what the body falls on."""
+    """The numbers that are learned, in the order of `tensors_of`. ground: what the body falls on; free: whether only free rollouts
+    are compared."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER
     for name in body.material.learned:
         start = body.material.begins[name]
@@ -63,15 +65,9 @@ def blocks_of(
             )
         )
     if body.contact.enabled:
-        blocks.append(
-            Block(
-                "contact",
-                torch.tensor([ContactOffset.START]),
-                torch.tensor([body.contact.deviation(ground)]),
-                step,
-                bounds=ContactOffset.LIMITS,
-            )
-        )
+        sd, bounds = body.contact.prior(ground, free)
+        mean = torch.tensor([ContactOffset.START])
+        blocks.append(Block("contact", mean, torch.tensor([sd]), step, bounds=bounds))
     if adapter:
         zero = torch.zeros(body.adapter.numbers.numel())
         blocks.append(

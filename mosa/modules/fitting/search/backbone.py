@@ -56,6 +56,7 @@ class Calibration(Protocol):
     """What is asked of the identification (`identification.py`) whose start is sought."""
 
     body: Body
+    offsets: tuple[float | None, ...]
 
     def search(self) -> float:
         """`search` of it."""
@@ -96,9 +97,10 @@ def compass(
     return row
 
 
-def rollouts_of_search(learned: Sequence[str], each: float) -> float:
-    """About how many rollouts `search` takes for a law with these learned numbers; each: of an iteration."""
-    count = len(STIFFNESS_STEPS) * len(OFFSET_STEPS) + 2 * NEAREST * ("nu" in learned)
+def rollouts_of_search(learned: Sequence[str], offsets: int, each: float) -> float:
+    """About how many rollouts `search` takes for a law with these learned numbers; offsets: of the contact, that it looks at; each: of
+    an iteration."""
+    count = len(STIFFNESS_STEPS) * offsets + 2 * NEAREST * ("nu" in learned)
     count += COMPASS * bool(set(learned) - {"E", "nu"})
     if len(learned) < MANY:
         return count
@@ -157,7 +159,7 @@ def search(calibration: Calibration) -> float:
         return row if cells is None else row | {CONTACT: cells}
 
     middle, *others = POISSON_STEPS if "nu" in learned else (None,)
-    offsets: tuple[float | None, ...] = OFFSET_STEPS if body.contact.enabled else (None,)
+    offsets = calibration.offsets
     multiples = {i: m for i, m in enumerate(STIFFNESS_STEPS)} if modulated else {0: 1.0}
     grid: dict[tuple[int, int], float] = {}
 
