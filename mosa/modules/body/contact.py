@@ -18,13 +18,15 @@ class ContactOffset(nn.Module):
     """
 
     START, GRID = 0.3, 0.15
-    """Cells: what a grid does to balls, the bird and the rabbit, and the standard deviation of that."""
+    """What a grid does to balls, the bird and the rabbit, and its standard deviation [cells]."""
     UNKNOWN, LIMITS = 0.4, (-0.5, 1.0)
-    """Cells: standard deviation and bounds where nobody says how well the height of the ground is known. Another simulator's contact,
-    or a ground that is 10 mm off, lies outside of what a grid alone does."""
+    """Standard deviation and bounds [cells] where the accuracy of the ground's height is unknown.
+
+    The contact of another simulator, or a ground that is 10 mm off, lies outside of what a grid does."""
     NARROW, WITHIN = 0.05, (0.15, 0.55)
-    """The same where only free rollouts or images are compared: beyond, E has a second valley there, and the number absorbs what the
-    law gets wrong."""
+    """The same where only free rollouts or images are compared.
+
+    E then has a second valley beyond these bounds, and the number absorbs errors of the law."""
 
     def __init__(self, dx: float, enabled: bool = True) -> None:
         super().__init__()
@@ -43,10 +45,14 @@ class ContactOffset(nn.Module):
         return self.dx * (self.cells - self.START) if touched else self()
 
     def prior(self, ground: Ground | None, free: bool) -> tuple[float, tuple[float, float]]:
-        """(standard deviation about `START`, bounds) [cells]. ground: whose accuracy counts where it is known; free: whether only
-        free rollouts are compared."""
+        """(standard deviation about `START`, bounds) [cells].
+
+        ground: where its accuracy is known, the bounds are two deviations; free: whether only free
+        rollouts are compared."""
         if ground is not None and ground.accuracy is not None:
-            return math.hypot(self.GRID, ground.accuracy / self.dx), self.LIMITS
+            sd = math.hypot(self.GRID, ground.accuracy / self.dx)
+            low, high = self.LIMITS
+            return sd, (max(low, self.START - 2 * sd), min(high, self.START + 2 * sd))
         return (self.NARROW, self.WITHIN) if free else (self.UNKNOWN, self.LIMITS)
 
     @torch.no_grad()

@@ -59,14 +59,17 @@ IMPLAUSIBLE = 3.0
 class Identification:
     """One stage's. takes: with start, cues, frame_dt; kinds: which of position, rotation, stretch are compared.
 
-    The stage `prior` learns the backbone alone from positions, `prior_eta` also the stiffness modes, `joint` the adapter too; all
-    under the criterion, but the calibration of a law that flows or yields, or with adaptive substeps, from free rollouts.
+    The stage `prior` learns the backbone alone from positions, `prior_eta` also the stiffness
+    modes, `joint` the adapter too. All compare predictions of the criterion; the calibration of a
+    law that flows or yields, or with adaptive substeps, compares free rollouts.
 
-    What the grid gets wrong must not be taken for the law's. The two later stages roll the same numbers out on a grid `COARSER` times as
-    coarse too. The difference, frame by frame, is noise that no frame is trusted beyond, and its direction is free: a multiple of
-    it, known to within `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
+    Errors of the grid must not be taken for the law's. The two later stages roll the same numbers
+    out on a grid `COARSER` times as coarse too. The difference, frame by frame, is noise that no
+    frame is trusted beyond, and its direction is free: a multiple of it, known to within
+    `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
 
-    parts: those of `search.parts` that the law may have. progress: called after every column of a Jacobian. seats: rollouts side by side; None: as many as the machine has room for.
+    parts: those of `search.parts` that the law may have; progress: called after every column of
+    a Jacobian; seats: rollouts side by side; None: as many as the machine has room for.
     """
 
     def __init__(
@@ -307,13 +310,12 @@ class Identification:
 
     @property
     def offsets(self) -> tuple[float | None, ...]:
-        """Contact offsets [cells] at which a search looks: one that is known to within a grid's doing stays where it is."""
-        known = (
-            not self.body.contact.enabled
-            or self.body.contact.prior(self.world.ground, free=not any(self.gains))[0]
-            <= self.body.contact.GRID
-        )
-        return (None,) if known else OFFSET_STEPS
+        """Contact offsets [cells] of the search's grid; None: keep it, as its prior is narrow."""
+        contact = self.body.contact
+        sd, (low, high) = contact.prior(self.world.ground, free=not any(self.gains))
+        if not contact.enabled or sd <= contact.NARROW:
+            return (None,)
+        return tuple(cells for cells in OFFSET_STEPS if low <= cells <= high)
 
     def search(self) -> float:
         """Start a calibration near its end (`search.backbone`); the score [m] there. Errors: SimulationDiverged."""
@@ -321,12 +323,11 @@ class Identification:
 
     @torch.no_grad()
     def score(self) -> float:
-        """How far the criterion's predictions are from the cues [m]: the geometric mean over the frames after the first of the root
-        mean square distance over particles, above the floor of the noise.
+        """Error of the criterion's predictions [m]: the geometric mean over the frames after the
+        first of the root mean square distance over particles, above the floor of the noise.
 
-        It is the likelihood of the positions where every frame has a noise of its own that is not known, and what Gauss-Newton
-        lowers while it finds that noise: a frame that no law predicts counts as little as one that every law predicts. Of free
-        rollouts, whose late frames hold the errors of all before them, it is `distance`."""
+        This is the likelihood of the positions where each frame has an unknown noise of its own,
+        so that frames which no law predicts do not decide. Of free rollouts it is `distance`."""
         if not any(self.gains):
             return self.distance()
         least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
@@ -467,8 +468,8 @@ class Identification:
 
     @torch.no_grad()
     def held_back(self) -> dict[str, float]:
-        """How far the law and each model with fewer of its parts predict frames that were held back [m], see `search.parts`.
-        Empty before the first iteration."""
+        """Error of held-back frames [m] of the law and of each law with fewer of its parts, see
+        `search.parts`. Empty before the first iteration."""
         newton, seat = self.newton, self.newton.seats[0]
         if newton.columns is None or self.noise is None:
             return {}

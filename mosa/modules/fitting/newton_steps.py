@@ -147,7 +147,7 @@ class NewtonSteps:
         return cost, other
 
     def keep_posterior(self, stage: Stage) -> None:
-        """Of the running identification, where it is the last one; without the parts of the law that are not worth their while."""
+        """Of the running identification, where it is the last one, after `settle_parts`."""
         alone = (
             self.body.adapter is None and self.body.heterogeneity is None
         )  # then the calibration is all there is
@@ -158,8 +158,8 @@ class NewtonSteps:
             self.posterior = self.identification.posterior()
 
     def settle_parts(self, stage: Stage) -> Identification:
-        """The running identification, or that of the model with fewer parts which predicts held-back frames about as well, and
-        which the body then is: the calibrated prior where nothing is left beside it."""
+        """The running identification, or that of a law with fewer parts where `search.parts` takes
+        it, which the body then is: without parts, the prior, calibrated once more."""
         body, own = self.body, self.identification
         self.parts = own.held_back()
         if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):

@@ -18,8 +18,8 @@ from mosa.system.progress import tqdm
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 OFFSET_STEPS = (-0.2, 0.05, 0.3, 0.55, 0.8)
 POISSON_STEPS = (0.32, 0.2, 0.42)
-"""Where a calibration looks first: multiples of the stiffness that the configuration starts from, contact offsets [cells], and
-Poisson numbers, the middle one first."""
+"""Grid of the search: multiples of the configured stiffness, contact offsets [cells], and Poisson
+numbers, the middle one first."""
 NEAREST, ENTERED = 6, 3
 """Places of that grid at which all Poisson numbers are tried; its valleys in which Gauss-Newton begins."""
 CONTACT = "contact"
@@ -98,8 +98,9 @@ def compass(
 
 
 def rollouts_of_search(learned: Sequence[str], offsets: int, each: float) -> float:
-    """About how many rollouts `search` takes for a law with these learned numbers; offsets: of the contact, that it looks at; each: of
-    an iteration."""
+    """About how many rollouts `search` takes for a law with these learned numbers.
+
+    offsets: of the contact on its grid; each: rollouts of an iteration."""
     count = len(STIFFNESS_STEPS) * offsets + 2 * NEAREST * ("nu" in learned)
     count += COMPASS * bool(set(learned) - {"E", "nu"})
     if len(learned) < MANY:
@@ -116,7 +117,7 @@ def moved(learned: Sequence[str]) -> list[dict[str, float]]:
 
 
 def valleys(found: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
-    """Places of a grid of two numbers that lie no higher than their eight neighbours, the lowest first; infinite ones left out."""
+    """Finite places of a grid that are no higher than their eight neighbours, the lowest first."""
     beside = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     low = [place for place, value in found.items() if math.isfinite(value)
            and all(value <= found.get((place[0] + i, place[1] + j), math.inf) for i, j in beside)]  # fmt: skip
@@ -126,12 +127,13 @@ def valleys(found: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
 def search(calibration: Calibration) -> float:
     """Start a calibration near the smallest score [m], which is returned.
 
-    A coarse grid of stiffness and contact offset, which goes on where its best is at an end of the stiffness, at a middle Poisson
-    number; the others at the places of the `NEAREST` best. Where that grid has several valleys, Gauss-Newton begins in each of the
-    deepest, and the one that is deepest after a few iterations is entered. Then, for laws with parameters beside these, a compass
-    search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003); of laws of `MANY` numbers, Gauss-Newton from its end and
-    from other starts (`nearest_end`). Errors: SimulationDiverged where no start of the grid can be simulated; those of
-    `nearest_end`."""
+    A coarse grid of stiffness and contact offset is searched at a middle Poisson number, further
+    where its best is at an end of the stiffness; the other Poisson numbers at the `NEAREST` best
+    places. Where the grid has several valleys, Gauss-Newton begins in each of the deepest, and the
+    deepest after a few iterations is entered. Laws with further parameters go on by a compass
+    search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003), laws of `MANY` numbers by
+    Gauss-Newton from its end and from other starts (`nearest_end`). Errors: SimulationDiverged
+    where no start of the grid can be simulated; those of `nearest_end`."""
     body, material = calibration.body, calibration.body.material
     starts, learned = material.begins, material.learned
     modulated = [n for n in STIFFNESS if n in learned and n in material.modulated]
@@ -216,9 +218,11 @@ def nearest_end(
     rows: Sequence[dict[str, float]],
     kept: int = KEPT,
 ) -> float:
-    """Gauss-Newton from several starts, the nearest `kept` of which after a few iterations go on; the calibration is left at the nearest
-    end, as if it had not begun, and its score [m] is returned. Starts that cannot be simulated are left out, but the first,
-    whose error is raised where none of them can."""
+    """Gauss-Newton from several starts, the nearest `kept` of which after a few iterations go on.
+
+    The calibration is left at the nearest end, as if it had not begun, and its score [m] is
+    returned. Starts that cannot be simulated are left out; the error of the first is raised where
+    none of them can."""
     body = calibration.body
     begun, here = calibration.state(), calibrated(body)
     ends: list[tuple[float, dict[str, dict], dict]] = []

@@ -63,9 +63,9 @@ def choose_ground(
     """(ground, mean distance [m] of every contact that was tried by `named`, infinite where it cannot be simulated); `body` is left
     calibrated on it.
 
-    known: its height and how well that is known; calibration: of the body on a ground. The body that sticks is calibrated first, with the search of a
-    calibration; it is what is taken unless another contact is clearly nearer (`taken_of`). Errors: SimulationDiverged where it
-    cannot be.
+    known: height of the ground and its accuracy; calibration: of the body on a ground. The body that
+    sticks is calibrated first, with the search of a calibration; it is taken unless another contact
+    is clearly nearer (`taken_of`). Errors: SimulationDiverged where it cannot be simulated.
     """
     distances: dict[str, float] = {}
     grounds: dict[str, Ground] = {}

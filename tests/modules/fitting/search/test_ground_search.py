@@ -8,7 +8,8 @@ import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
 from mosa.config.checkpoints import check_resumed
-from mosa.errors import DataError, SimulationDiverged
+from mosa.data.scene import ground_from
+from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.evaluation.analysis.tables import (
     determined_text,
     ground_table,
@@ -483,6 +484,26 @@ def test_a_fit_that_cannot_go_on_is_compared_as_it_stands(monkeypatch):
     assert (
         set(module.ground_gains.values()) == {-2.0} and named(module.world.ground) == "separate_0.6"
     )
+
+
+def test_a_ground_of_known_accuracy_bounds_the_contact():
+    """Two deviations about what a grid does, of grid and accuracy together; narrow where rollouts are free."""
+    offset, ground = ContactOffset(0.02), Ground(0.0)
+    assert offset.prior(ground, free=False) == (offset.UNKNOWN, offset.LIMITS)
+    assert offset.prior(None, free=True) == (offset.NARROW, offset.WITHIN)
+    sd, bounds = offset.prior(replace(ground, accuracy=0.004), free=True)
+    assert sd == pytest.approx(0.25) and bounds == pytest.approx((-0.2, 0.8))
+
+
+def test_the_accuracy_of_a_ground_is_read_and_checked():
+    keys = {"height": 0.1, "mode": "sticky"}
+    assert ground_from(keys).accuracy is None
+    assert ground_from(keys | {"accuracy": 0.003}) == Ground(0.1, accuracy=0.003)
+    for wrong in (-1.0, "low", True):
+        with pytest.raises(
+            ConfigError, match=r"scene\.ground\.accuracy: expected the standard deviation"
+        ):
+            ground_from(keys | {"accuracy": wrong})
 
 
 def test_particles_that_meet_the_ground_themselves_need_no_lift():

@@ -1,13 +1,20 @@
 """Which parts a law has: nested models predict frames that were held back from them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from small_bodies import WORLD, E, small_body, start, take_of
 
+from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import KNOWN, Posterior
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.search.backbone import valleys
 from mosa.modules.fitting.search.parts import WORTH, chosen, held_back
+from mosa.modules.fitting.stages import Stage
+from mosa.training.lit_mosa import LitMosa
 
 OWNERS = ["E", "operator", "operator", "stiffness"]
 FRAMES, ROWS = 8, 40
@@ -76,3 +83,39 @@ def test_a_posterior_of_fewer_numbers_is_one_of_all():
     assert float(whole.covariance[1, 1]) == pytest.approx(KNOWN**2)
     assert whole.rivals["stvk"].tolist() == [5, 0, 6]
     assert float(whole.draws(50)[:, 1].abs().max()) < 1e-5
+
+
+def fitted(monkeypatch, errors: dict[str, float] | None) -> LitMosa:
+    """A fit of an anisotropic body. errors: of held-back frames in place of its own."""
+    numbers = torch.linspace(-0.3, 0.4, 19, dtype=torch.float64)
+    take = take_of(small_body(numbers=numbers), start(turn=0.5, speed=-2.0), 7)
+    take.again = None
+    if errors is not None:
+        monkeypatch.setattr(Identification, "held_back", lambda self: errors)
+    stages = [Stage(name, 3, 0.1, optimizer="gauss_newton") for name in ("prior", "joint")]
+    stages = [replace(stages[0], iterations=1), stages[1]]
+    module = LitMosa.of_parts(small_body(E=1.1 * E, on=False), takes=[take], world=WORLD,
+                              background=torch.ones(3), weights={"position": 1.0}, stages=stages,
+                              criterion=Criterion("corrected"),
+                              settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
+    module.identify()
+    return module
+
+
+def test_a_law_without_the_operator_is_the_calibrated_prior(monkeypatch):
+    """Its numbers are 0, and the posterior knows them to be."""
+    module = fitted(monkeypatch, {"isotropic": 1e-3, "operator": 0.9e-3})
+    assert module.parts == {"isotropic": 1e-3, "operator": 0.9e-3}
+    assert not bool(module.body.adapter.numbers.any())
+    posterior = module.posterior
+    assert posterior.names == ["E", "nu", *(f"operator[{i}]" for i in range(19))]
+    assert float(posterior.determined[0]) > 0.5 and not bool(posterior.determined[2:].any())
+    moved = float((module.body.material.raw["E"].detach() - module.body.material.begins["E"]).abs())
+    assert moved > 0.01
+
+
+def test_an_operator_that_predicts_held_back_frames_is_kept(monkeypatch):
+    """By its own errors: the truth is anisotropic and there is no noise."""
+    module = fitted(monkeypatch, None)
+    assert module.parts["operator"] < WORTH * module.parts["isotropic"]
+    assert bool(module.body.adapter.numbers.any()) and len(module.posterior.names) == 21
