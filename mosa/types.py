@@ -49,13 +49,14 @@ RUBBING = ("separate", "touch")
 @dataclass(frozen=True)
 class Ground:
     """The half space below `height` [m] along the up axis. mode: sticky | slip | separate | touch; friction: Coulomb, separate
-    and touch only.
+    and touch only; accuracy: standard deviation [m] of the height, None where nobody knows it.
 
     In a scene the mode may be `AUTO`; a world that is simulated has one of the four."""
 
     height: float
     mode: str = "sticky"
     friction: float = 0.0
+    accuracy: float | None = None
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,7 @@ class GroundRecord(Settings):
     height: Number
     mode: Literal["sticky", "slip", "separate", "touch", "auto"] = "sticky"
     friction: Weight = 0.0
+    accuracy: Weight | None = None
 
 
 class WorldRecord(Settings):
@@ -249,7 +250,7 @@ class FitRecord(Settings):
     """How far a fit is: what it goes on from.
 
     compared, grounds: mean distances [m] of the candidates for law and contact; ground_gains: of other contacts about the learned
-    law; cues, responses: of the motion that was found once more."""
+    law; parts: of laws with some of their parts; cues, responses: of the motion that was found once more."""
 
     stage: Whole
     steps_done: Whole
@@ -260,6 +261,7 @@ class FitRecord(Settings):
     compared: Distances = {}
     grounds: Distances = {}
     ground_gains: Distances = {}
+    parts: Distances = {}
     identification: IdentificationRecord | None = None
     retreat: RetreatRecord | None = None
     cues: Positions = None

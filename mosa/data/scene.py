@@ -168,10 +168,10 @@ def ground_from(keys) -> Ground | None:
         raise ConfigError(
             f"scene.ground: expected the keys height, mode and friction, or null, found {keys!r}"
         )
-    unknown = set(keys) - {"height", "mode", "friction"}
+    unknown = set(keys) - {"height", "mode", "friction", "accuracy"}
     if unknown:
         raise ConfigError(
-            f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only"
+            f"scene.ground.{min(unknown)}: expected the keys height, mode, friction and accuracy only"
         )
     mode, friction = keys.get("mode", "sticky"), keys.get("friction") or 0.0
     if not isinstance(mode, str) or mode not in (AUTO, *GROUND_MODES):
@@ -191,4 +191,12 @@ def ground_from(keys) -> Ground | None:
         raise ConfigError(
             f"scene.ground.friction: acts with modes {modes} only, found {friction} with mode {mode!r}"
         )
-    return Ground(float(keys["height"]), mode, float(friction))
+    accuracy = keys.get("accuracy")
+    if accuracy is not None and not (is_number(accuracy) and accuracy >= 0):
+        raise ConfigError(
+            "scene.ground.accuracy: expected the standard deviation of the height in metres, or null, "
+            f"found {accuracy!r}"
+        )
+    return Ground(
+        float(keys["height"]), mode, float(friction), None if accuracy is None else float(accuracy)
+    )

@@ -326,7 +326,8 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     contacts += (
         ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
     )
-    searched = rollouts_of_search(module.body.material.learned, each) if begun else 0
+    learned = module.body.material.learned
+    searched = rollouts_of_search(learned, len(planned.offsets), each) if begun else 0
     return len(planned.pairs) * (stage.iterations * each + contacts + searched)
 
 

@@ -162,6 +162,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.compared: dict[
             str, float
         ] = {}  # mean distance [m] of the calibrated candidates for the backbone
+        self.parts: dict[str, float] = {}  # error [m] of held-back frames, by what the law has
         self.ground_gains: dict[
             str, float
         ] = {}  # of other contacts about the learned law, once it has been asked
@@ -295,6 +296,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             compared=self.compared,
             grounds=self.grounds,
             ground_gains=self.ground_gains,
+            parts=self.parts,
             identification=self.identification.state() if self.identification else None,
             retreat=self.retreat.written(),
             cues=[take.cues.positions.cpu() for take in self.takes] if self.informed else None,
@@ -347,6 +349,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 material.choose(law)
             self.settle_law()
         self.grounds, self.ground_gains = dict(saved.grounds), dict(saved.ground_gains)
+        self.parts = dict(saved.parts)
         if self.ground_is_sought and record.ground is not None and not record.ground_is_sought:
             self.settle_ground(Ground(**record.ground.plain()))
         self.posterior = Posterior.read(record.posterior.plain()) if record.posterior else None

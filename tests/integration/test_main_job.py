@@ -271,7 +271,7 @@ def test_the_contact_offset_stays_where_a_grid_can_put_it(stepped):
     assert (
         min(
             abs(figures["id/contact_offset_m"] / figures["dx_m"] - limit)
-            for limit in ContactOffset.LIMITS
+            for limit in ContactOffset.WITHIN
         )
         < 1e-5
     )

@@ -15,6 +15,7 @@ from mosa.modules.fitting.search.ground_choice import (
     learned_on,
     taken_of,
 )
+from mosa.modules.fitting.search.parts import WORTH, chosen, named
 from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
@@ -154,6 +155,22 @@ def _asked(gains: Mapping[str, float]) -> str:
     return said
 
 
+def form_text(errors: Mapping[str, float]) -> str:
+    """Which parts the learned law has, and why. errors: [m] of held-back frames, by `parts.named`."""
+    words = {"isotropic": "isotropic and the same everywhere", "operator": "anisotropic",
+             "stiffness": "of a stiffness that varies over the body",
+             "operator+stiffness": "anisotropic, of a stiffness that varies over the body"}  # fmt: skip
+    listed = "; ".join(f"{words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
+    taken = chosen(errors)
+    said = f"The learned law is {words[taken]}. Error of frames that were held back from the fit: {listed}."
+    if taken == named(()) and len(errors) > 1:
+        said += (
+            f" A richer law is only learned where this error is below {WORTH:g} of the isotropic one, as errors of "
+            "grid and contact alone look like a little of it."
+        )
+    return said
+
+
 def _words(name: str) -> str:
     """A contact by `named` in words; both modes with friction leave the ground freely, so the mode is said as well."""
     mode, friction = contact(name)
@@ -186,7 +203,7 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             for law, distance in sorted(compared.items(), key=lambda each: each[1])
         )
         lines = [
-            f"Backbone: {taken}, which is nearest to the training motion (mean distance after calibration: {listed}).",
+            f"Backbone: {taken}, which predicts the training motion best (error after calibration: {listed}).",
             "",
         ]
     touched, gains = ({k.removeprefix("id_prior/ground/").removesuffix(end): v for k, v in figures.items()
@@ -194,6 +211,13 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     if touched:
         for part in filter(None, (ground_text(touched, gains), ground_table(touched, gains))):
             lines += [part, ""]
+    held_back = {
+        k.removeprefix("held_back/").removesuffix("_m"): v
+        for k, v in figures.items()
+        if k.startswith("held_back/")
+    }
+    if held_back:
+        lines += [form_text(held_back), ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]

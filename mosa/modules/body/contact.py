@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -15,10 +17,16 @@ class ContactOffset(nn.Module):
     place; without this one number the stiffness absorbs it, differently on every grid.
     """
 
-    START = 0.3
-    """Cells the fit starts from; seen on balls, the bird and the rabbit: 0.2 to 0.5. From 0 the fit ends in another valley."""
-    LIMITS = (0.15, 0.55)
-    """What a grid can do; beyond, the number would absorb what the law gets wrong, and so end in that other valley."""
+    START, GRID = 0.3, 0.15
+    """What a grid does to balls, the bird and the rabbit, and its standard deviation [cells]."""
+    UNKNOWN, LIMITS = 0.4, (-0.5, 1.0)
+    """Standard deviation and bounds [cells] where the accuracy of the ground's height is unknown.
+
+    The contact of another simulator, or a ground that is 10 mm off, lies outside of what a grid does."""
+    NARROW, WITHIN = 0.05, (0.15, 0.55)
+    """The same where only free rollouts or images are compared.
+
+    E then has a second valley beyond these bounds, and the number absorbs errors of the law."""
 
     def __init__(self, dx: float, enabled: bool = True) -> None:
         super().__init__()
@@ -36,8 +44,19 @@ class ContactOffset(nn.Module):
         touched = ground is not None and ground.mode == "touch" and self.enabled
         return self.dx * (self.cells - self.START) if touched else self()
 
+    def prior(self, ground: Ground | None, free: bool) -> tuple[float, tuple[float, float]]:
+        """(standard deviation about `START`, bounds) [cells].
+
+        ground: where its accuracy is known, the bounds are two deviations; free: whether only free
+        rollouts are compared."""
+        if ground is not None and ground.accuracy is not None:
+            sd = math.hypot(self.GRID, ground.accuracy / self.dx)
+            low, high = self.LIMITS
+            return sd, (max(low, self.START - 2 * sd), min(high, self.START + 2 * sd))
+        return (self.NARROW, self.WITHIN) if free else (self.UNKNOWN, self.LIMITS)
+
     @torch.no_grad()
     def project(self) -> None:
-        """Back within `LIMITS`, after an optimiser's step."""
+        """Back within `WITHIN`, after a step of Adam."""
         if self.enabled:
-            self.cells.clamp_(*self.LIMITS)
+            self.cells.clamp_(*self.WITHIN)

@@ -25,6 +25,8 @@ from mosa.system.limits import counted
 
 SHORTER, SHORTEST = 0.4, 0.05
 """A step that does not improve is tried again so much shorter; one of fewer standard deviations of the posterior is not tried."""
+KNOWN = 1e-6
+"""Standard deviation of numbers that a model does without, which draws of a posterior need."""
 EVIDENCE_PASSES = 20
 """Of the fixed point for the sizes of the blocks: each costs one inverse of a matrix of all numbers."""
 
@@ -104,6 +106,27 @@ class Posterior:
         tensors = (written[name].double() for name in ("mean", "covariance", "determined"))
         rivals = {name: numbers.double() for name, numbers in written.get("rivals", {}).items()}
         return cls(list(written["names"]), *tensors, float(written["model_error"]), rivals)
+
+    def among(self, names: Sequence[str]) -> Posterior:
+        """The same numbers among `names`, of which the others are 0 and not learned."""
+        place = [names.index(name) for name in self.names]
+
+        def spread(numbers: Tensor) -> Tensor:
+            whole = torch.zeros(len(names), dtype=numbers.dtype)
+            whole[place] = numbers
+            return whole
+
+        covariance = torch.diag(torch.full((len(names),), KNOWN**2, dtype=torch.float64))
+        covariance[torch.tensor(place)[:, None], torch.tensor(place)] = self.covariance
+        rivals = {name: spread(numbers) for name, numbers in self.rivals.items()}
+        return Posterior(
+            list(names),
+            spread(self.mean),
+            covariance,
+            spread(self.determined),
+            self.model_error,
+            rivals,
+        )
 
     def draws(self, count: int, generator: torch.Generator | None = None) -> Tensor:
         """(count, D) float64. generator: of the random numbers; None: one with seed 0, so that the same draws come every time."""
@@ -319,15 +342,17 @@ class GaussNewton:
                 if b.learned and determined > 1e-6 and size > 0:
                     b.factor = min(max((size / determined) ** 0.5, b.limits[0]), b.limits[1])
 
+    def names(self) -> list[str]:
+        """Of the numbers of a posterior, which has no nuisances."""
+        return [f"{b.name}[{i}]" if b.size > 1 else b.name
+                for b in self.blocks if not b.nuisance for i in range(b.size)]  # fmt: skip
+
     def posterior(self, share: float = 1.0, wrong: Tensor | None = None) -> Posterior:
         """Laplace's, from the last iteration's matrix. share: of the data's precision, where they are fewer than they were counted;
         wrong: residuals (R,) that model and truth may differ by whatever the numbers are, and that they were found without: how far
         it would have moved them is one more standard deviation along that way. Errors: ValueError before the first iteration."""
         if self.matrix is None or self.data is None or self.columns is None:
             raise ValueError("posterior: expected an iteration before it is asked for")
-        names = [
-            f"{b.name}[{i}]" if b.size > 1 else b.name for b in self.blocks for i in range(b.size)
-        ]
         covariance = torch.linalg.inv(self.matrix - (1 - share) * self.data)
         covariance = 0.5 * (covariance + covariance.T)
         determined = (1 - covariance.diagonal() * self.precision()).clamp(0, 1)
@@ -340,7 +365,7 @@ class GaussNewton:
             if not nuisance
         ]
         return Posterior(
-            [names[i] for i in kept],
+            self.names(),
             self.seats[0].read()[kept],
             covariance[kept][:, kept],
             determined[kept],

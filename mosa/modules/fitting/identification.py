@@ -7,6 +7,7 @@ asks for (`criteria`).
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,8 +24,10 @@ from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of
-from mosa.modules.fitting.search.backbone import search
+from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
+from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
+from mosa.physics.constitutive.laws import law_named
 from mosa.reconstruction.motion.response import Response
 from mosa.types import Rollout
 
@@ -58,26 +61,32 @@ IMPLAUSIBLE = 3.0
 class Identification:
     """One stage's. takes: with start, cues, frame_dt; kinds: which of position, rotation, stretch are compared.
 
-    The stage `prior` learns the backbone alone from positions in free rollouts, `prior_eta` also the stiffness modes, `joint` the
-    adapter too; both under the criterion.
+    The stage `prior` learns the backbone alone from positions, `prior_eta` also the stiffness
+    modes, `joint` the adapter too. All compare predictions of the criterion; the calibration of a
+    law that flows or yields, or with adaptive substeps, compares free rollouts.
 
-    What the grid gets wrong must not be taken for the law's. The two stages roll the same numbers out on a grid `COARSER` times as
-    coarse too. The difference, frame by frame, is noise that no frame is trusted beyond, and its direction is free: a multiple of
-    it, known to within `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
+    Errors of the grid must not be taken for the law's. The two later stages roll the same numbers
+    out on a grid `COARSER` times as coarse too. The difference, frame by frame, is noise that no
+    frame is trusted beyond, and its direction is free: a multiple of it, known to within
+    `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
 
-    progress: called after every column of a Jacobian. seats: rollouts side by side; None: as many as the machine has room for.
+    parts: those of `search.parts` that the law may have; progress: called after every column of
+    a Jacobian; seats: rollouts side by side; None: as many as the machine has room for.
     """
 
     def __init__(
         self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,
         kinds: tuple[bool, bool, bool] = (True, True, True), progress: Callable[[], None] | None = None,
-        seats: int | None = None,
+        seats: int | None = None, parts: Sequence[str] = PARTS,
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
         self.calibrating, self.iterations = stage.calibrates, stage.iterations
-        self.adapter = stage.learns_adapter and is_learned(body.adapter)
-        self.heterogeneity = not self.calibrating and is_learned(body.heterogeneity)
-        self.gains = (0.0,) if self.calibrating else criterion.gains
+        self.adapter = stage.learns_adapter and is_learned(body.adapter) and "operator" in parts
+        self.heterogeneity = (
+            not self.calibrating and is_learned(body.heterogeneity) and "stiffness" in parts
+        )
+        free = self.calibrating and (law_named(body.material.law).plastic or body.settings.adaptive)
+        self.gains = (0.0,) if free else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
         if not any(self.kinds) and not world.forces:
             raise ConfigError(
@@ -91,6 +100,8 @@ class Identification:
             adapter=self.adapter,
             heterogeneity=self.heterogeneity,
             settings=settings,
+            ground=world.ground,
+            free=not any(self.gains),
             calibrating=self.calibrating,
         )
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
@@ -146,6 +157,11 @@ class Identification:
                 self.ready(body, i)
 
     @property
+    def parts(self) -> list[str]:
+        """Those of `search.parts` that are learned here."""
+        return [part for part, on in zip(PARTS, (self.adapter, self.heterogeneity)) if on]
+
+    @property
     def knows_grid(self) -> bool:
         """Whether there is a second grid, and with it a last number: the multiple of the difference."""
         return self.settings.grid_error > 0 and not self.calibrating
@@ -190,8 +206,8 @@ class Identification:
         )  # fmt: skip
 
     def response(self, take) -> Response | None:
-        """What the take's cues keep of the calibrated backbone's prediction, which is not what a calibration shall find again."""
-        return None if self.calibrating else take.response
+        """What the take's cues keep of the prediction that they were found about; None where that is not known."""
+        return take.response
 
     def unseen(self, take) -> Callable[[Tensor, int], Tensor] | None:
         response = self.response(take)
@@ -245,18 +261,24 @@ class Identification:
         with torch.no_grad():
             return self._compared(self._fields(body), multiple)
 
-    def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
+    def _share(self) -> float:
+        """Independent data that a frame counts as, of each kind."""
         share = (
             self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
         )
-        soft = self.softly[self.iteration] if self.iteration < len(self.softly) else 1.0
-        share *= soft
-        counts = tuple(share * on for on in self.kinds)
+        return share * self._soft()
+
+    def _soft(self) -> float:
+        """Share of the data that this iteration counts."""
+        return self.softly[self.iteration] if self.iteration < len(self.softly) else 1.0
+
+    def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
+        counts = tuple(self._share() * on for on in self.kinds)
         return residuals.whitened(
             self._along(found, multiple),
             self.noise,
             [counts] * len(self.pairs),
-            soft / len(self.gains),
+            self._soft() / len(self.gains),
         )
 
     def _along(self, found: list[residuals.Fields], multiple: float) -> list[residuals.Fields]:
@@ -297,9 +319,35 @@ class Identification:
         )
         self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
 
+    @property
+    def offsets(self) -> tuple[float | None, ...]:
+        """Contact offsets [cells] of the search's grid; None: keep it, as its prior is narrow."""
+        contact = self.body.contact
+        sd, (low, high) = contact.prior(self.world.ground, free=not any(self.gains))
+        if not contact.enabled or sd <= contact.NARROW:
+            return (None,)
+        return tuple(cells for cells in OFFSET_STEPS if low <= cells <= high)
+
     def search(self) -> float:
-        """Start a calibration near its end (`backbone_search`); the mean distance [m] there. Errors: SimulationDiverged."""
+        """Start a calibration near its end (`search.backbone`); the score [m] there. Errors: SimulationDiverged."""
         return search(self)
+
+    @torch.no_grad()
+    def score(self) -> float:
+        """Error of the criterion's predictions [m]: the geometric mean over the frames after the
+        first of the root mean square distance over particles, above the floor of the noise.
+
+        This is the likelihood of the positions where each frame has an unknown noise of its own,
+        so that frames which no law predicts do not decide. Of free rollouts it is `distance`."""
+        if not any(self.gains):
+            return self.distance()
+        least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
+        logarithms = []
+        for i, gain in self.pairs:
+            away = self.rollout(self.body, i, gain).x - self.takes[i].cues.positions
+            square = away[1:].square().sum(-1).mean(-1).double() + least
+            logarithms.append(0.5 * float(square.log().mean()))
+        return math.exp(sum(logarithms) / len(logarithms))
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues after frame 0."""
@@ -429,6 +477,39 @@ class Identification:
                 found[law] = numbers[:kept]
         return found
 
+    @torch.no_grad()
+    def held_back(self) -> dict[str, float]:
+        """Error of held-back frames [m] of the law and of each law with fewer of its parts, see
+        `search.parts`. Empty before the first iteration."""
+        newton, seat = self.newton, self.newton.seats[0]
+        if newton.columns is None or self.noise is None:
+            return {}
+        table = torch.cat([newton.columns, seat.residuals()[:, None].to(newton.columns)], 1)
+        squares: list[Tensor] = []
+        positions: list[tuple[Tensor, float]] = []
+        stretches: list[list[int]] = [[] for _ in range(FOLDS * len(self.takes))]
+        rows, first = table.split(3 * len(self.chosen)), 0
+        kind = 0 if self.kinds[0] else self.kinds.index(True)
+        for (i, _), scales in zip(self.pairs, self.noise):
+            frames = len(scales[0])
+            for frame in range(frames):
+                own = [rows[first + k * frames + frame].double() for k in range(3)]
+                grams = [(part.mT @ part).cpu() for part in own]
+                after = frame - (self.takes[i].first_contact - 1)
+                if after >= 0:
+                    late = frames - self.takes[i].first_contact + 1
+                    stretches[FOLDS * i + FOLDS * after // late].append(len(squares))
+                count = self._share() * self.kinds[kind]
+                positions.append((grams[kind], float(scales[kind][frame]) / count**0.5))
+                squares.append(grams[0] + grams[1] + grams[2])
+            first += 3 * frames
+        compared = {k: (len(squares) + k, scale) for k, (_, scale) in enumerate(positions)}
+        owners = [block.name for block in newton.blocks for _ in range(block.size)]
+        return held_back(
+            squares + [gram for gram, _ in positions], owners, seat.read(), newton.mean(), newton.precision(),
+            [stretch for stretch in stretches if stretch], compared,
+        )  # fmt: skip
+
     def cost(self) -> float:
         """Minus the logarithm of the posterior at the numbers in use, but for a constant, under the noise in use."""
         seat = self.newton.seats[0]
@@ -445,9 +526,11 @@ class Identification:
             3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2,
         )
         counted, wrong, late = 0.0, 0.0, []
-        for take, scales, found in zip(self.takes, self.noise, there or self._fields(self.body)):
-            frames = slice(min(take.first_contact, len(scales[0])) - 1, None)
-            wrong += (1 - cues / float(scales[0][frames].square().mean())) / len(self.takes)
+        share = 1 / len(self.pairs)
+        each = each / len(self.gains)
+        for (i, _), scales, found in zip(self.pairs, self.noise, there or self._fields(self.body)):
+            frames = slice(min(self.takes[i].first_contact, len(scales[0])) - 1, None)
+            wrong += share * (1 - cues / float(scales[0][frames].square().mean()))
             counted += each * len(scales[0][frames])
             late.append(residuals.Fields(*(field[frames] for field in found)))
         borne = len(late) * max(1.0, residuals.patterns(late))

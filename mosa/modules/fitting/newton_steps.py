@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,6 +19,8 @@ from mosa.modules.fitting.residuals import SAMPLES
 from mosa.modules.fitting.search.backbone import choose_law
 from mosa.modules.fitting.search.ground import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.fitting.search.ground_choice import EXPLAINED, alike, learned_on, named, rivals_of
+from mosa.modules.fitting.search.parts import PARTS, chosen
+from mosa.modules.fitting.search.parts import named as named_parts
 from mosa.modules.fitting.stages import Stage
 from mosa.system.progress import tqdm
 from mosa.types import RUBBING, Ground
@@ -64,7 +66,7 @@ class NewtonSteps:
     def find_ground(self, stage: Stage) -> None:
         """How the body touches the ground, by a calibration on each that may be."""
         ground, self.grounds = choose_ground(
-            self.body, self.world.ground.height, lambda each: self.identifying(stage, each)
+            self.body, self.world.ground, lambda each: self.identifying(stage, each)
         )
         self.settle_ground(ground)
 
@@ -145,12 +147,39 @@ class NewtonSteps:
         return cost, other
 
     def keep_posterior(self, stage: Stage) -> None:
-        """Of the running identification, where it is the last one."""
+        """Of the running identification, where it is the last one, after `settle_parts`."""
         alone = (
             self.body.adapter is None and self.body.heterogeneity is None
         )  # then the calibration is all there is
-        if stage.learns_adapter or (stage.calibrates and alone):
+        if stage.learns_adapter:
+            names = self.identification.newton.names()
+            self.posterior = self.settle_parts(stage).posterior().among(names)
+        elif stage.calibrates and alone:
             self.posterior = self.identification.posterior()
+
+    def settle_parts(self, stage: Stage) -> Identification:
+        """The running identification, or that of a law with fewer parts where `search.parts` takes
+        it, which the body then is: without parts, the prior, calibrated once more."""
+        body, own = self.body, self.identification
+        self.parts = own.held_back()
+        if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):
+            return own
+        log.info("the law is %s: error of held-back frames %s", best, ", ".join(
+            f"{name} {1e3 * error:.2f} mm" for name, error in self.parts.items()))  # fmt: skip
+        kept = [part for part in PARTS if part in best.split("+")]
+        with torch.no_grad():
+            if "operator" in own.parts and "operator" not in kept:
+                body.adapter.numbers.zero_()
+            if "stiffness" in own.parts and "stiffness" not in kept:
+                body.heterogeneity.coefficients.zero_()
+        if not kept:
+            body.thaw("prior")
+        fewer = self.identifying(stage if kept else self.stages[0], parts=kept)
+        for _ in range(stage.iterations):
+            fewer.iterate()
+            if fewer.converged:
+                break
+        return fewer
 
     def identify(self) -> None:
         """All stages by Gauss-Newton without a trainer: nothing is logged or kept. Errors: those of an iteration."""
@@ -167,14 +196,17 @@ class NewtonSteps:
             self.keep_posterior(stage)
             self.end(stage)
 
-    def identifying(self, stage: Stage, ground: Ground | None = None) -> Identification:
-        """A stage's identification on the takes, from where the body stands. ground: another one than the world's."""
+    def identifying(
+        self, stage: Stage, ground: Ground | None = None, parts: Sequence[str] = PARTS
+    ) -> Identification:
+        """A stage's identification on the takes, from where the body stands. ground: another one than the world's; parts: those
+        that the law may have."""
         world = self.world if ground is None else replace(self.world, ground=ground)
         kinds = tuple(
             self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch")
         )
         return Identification(
-            self.body, self.takes, world, stage, self.criterion, self.settings, kinds
+            self.body, self.takes, world, stage, self.criterion, self.settings, kinds, parts=parts
         )
 
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:

@@ -16,6 +16,7 @@ from mosa.modules.body.body import Body, ContactOffset
 from mosa.modules.body.material import FORMS, NU_MAX
 from mosa.modules.fitting.gauss_newton import Block, Seat
 from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.types import Ground
 
 FINER = 0.25
 """Steps of the joint stage's differences over those of a calibration, which begins further from its end. What one-sided differences
@@ -44,9 +45,12 @@ def blocks_of(
     adapter: bool,
     heterogeneity: bool,
     settings: IdentificationSettings,
+    ground: Ground | None = None,
+    free: bool = False,
     calibrating: bool = False,
 ) -> list[Block]:
-    """The numbers that are learned, in the order of `tensors_of`."""
+    """The numbers that are learned, in the order of `tensors_of`. ground: what the body falls on; free: whether only free rollouts
+    are compared."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER
     for name in body.material.learned:
         start = body.material.begins[name]
@@ -61,16 +65,9 @@ def blocks_of(
             )
         )
     if body.contact.enabled:
-        sd = 0.05 if calibrating else 0.03
-        blocks.append(
-            Block(
-                "contact",
-                torch.tensor([ContactOffset.START]),
-                torch.tensor([sd]),
-                step,
-                bounds=ContactOffset.LIMITS,
-            )
-        )
+        sd, bounds = body.contact.prior(ground, free)
+        mean = torch.tensor([ContactOffset.START])
+        blocks.append(Block("contact", mean, torch.tensor([sd]), step, bounds=bounds))
     if adapter:
         zero = torch.zeros(body.adapter.numbers.numel())
         blocks.append(

@@ -119,9 +119,9 @@ def test_a_calibration_finds_modulus_and_poisson_number_from_the_coarse_grid(beg
     truth = small_body(adapter=False)
     body = small_body(adapter=False, E=begins["E"], nu=begins["nu"])
     found = identification(body, [take_and_turn(truth, 0.5)], "prior")
-    before = found.distance()
-    distance = found.search()
-    assert distance == found.distance() < before
+    before = found.score()
+    score = found.search()
+    assert score == found.score() < before
     assert (
         body.material.begins["E"] == small_body(adapter=False, **begins).material.begins["E"]
     )  # the prior's mean stays
@@ -144,7 +144,7 @@ def test_a_calibration_stays_where_the_time_step_allows_it():
     substeps and did not see the bound; the next one ended the run with all that was found."""
     stiff = 100 * E
     truth, body = small_body(adapter=False, E=stiff), small_body(adapter=False, E=stiff / 12)
-    found = identification(body, [take_and_turn(truth, 0.5)], "prior")
+    found = identification(body, [take_and_turn(truth, 0.5)], "prior", Criterion(name="free"))
     body.settings = body.settings.but(max_substeps=32)
 
     def allowed(share: float) -> bool:
@@ -434,7 +434,8 @@ def test_a_calibration_knows_what_a_grid_may_have_done_to_it():
     """A law that is seen on a grid 1.25 times as coarse is found off by more than two deviations of the noise, and by about one of
     those that know of the grid."""
     body = small_body(adapter=False)
-    found = identification(body, [seen_on_a_coarser_grid(small_body(adapter=False))], "prior")
+    take = seen_on_a_coarser_grid(small_body(adapter=False))
+    found = identification(body, [take], "prior", Criterion("free"))
     run(found)
     found.independent = lambda _: (
         1.0

@@ -16,8 +16,14 @@ from mosa.modules.body.material import FORMS, STIFFNESS
 from mosa.system.progress import tqdm
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
-POISSON_STEPS = (0.2, 0.32, 0.42)
-"""Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
+OFFSET_STEPS = (-0.2, 0.05, 0.3, 0.55, 0.8)
+POISSON_STEPS = (0.32, 0.2, 0.42)
+"""Grid of the search: multiples of the configured stiffness, contact offsets [cells], and Poisson
+numbers, the middle one first."""
+NEAREST, ENTERED = 6, 3
+"""Places of that grid at which all Poisson numbers are tried; its valleys in which Gauss-Newton begins."""
+CONTACT = "contact"
+"""Name of the contact offset among the numbers of a start."""
 FURTHER, FURTHEST = 1.5, 100.0
 """Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
 STRIDES = {
@@ -31,6 +37,7 @@ STRIDES = {
     "cohesion": 0.5,
     "nu": 0.8,
     "friction_angle": 0.8,
+    CONTACT: 0.15,
 }
 """First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
 range and 17 degrees in that of the angle's."""
@@ -51,12 +58,16 @@ class Calibration(Protocol):
     """What is asked of the identification (`identification.py`) whose start is sought."""
 
     body: Body
+    offsets: tuple[float | None, ...]
 
     def search(self) -> float:
         """`search` of it."""
 
     def iterate(self) -> dict[str, float]:
         """One iteration of Gauss-Newton."""
+
+    def score(self) -> float:
+        """How far the predictions are from the cues [m]."""
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues."""
@@ -88,9 +99,11 @@ def compass(
     return row
 
 
-def rollouts_of_search(learned: Sequence[str], each: float) -> float:
-    """About how many rollouts `search` takes for a law with these learned numbers; each: of an iteration."""
-    count = len(STIFFNESS_STEPS) * (len(POISSON_STEPS) if "nu" in learned else 1)
+def rollouts_of_search(learned: Sequence[str], offsets: int, each: float) -> float:
+    """About how many rollouts `search` takes for a law with these learned numbers.
+
+    offsets: of the contact on its grid; each: rollouts of an iteration."""
+    count = len(STIFFNESS_STEPS) * offsets + 2 * NEAREST * ("nu" in learned)
     count += COMPASS * bool(set(learned) - {"E", "nu"})
     if len(learned) < MANY:
         return count
@@ -105,14 +118,25 @@ def moved(learned: Sequence[str]) -> list[dict[str, float]]:
             for some in itertools.combinations(others, count) for signs in itertools.product((-1, 1), repeat=count)]  # fmt: skip
 
 
-def search(calibration: Calibration) -> float:
-    """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
+def valleys(found: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
+    """Finite places of a grid that are no higher than their eight neighbours, the lowest first."""
+    beside = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    low = [place for place, value in found.items() if math.isfinite(value)
+           and all(value <= found.get((place[0] + i, place[1] + j), math.inf) for i, j in beside)]  # fmt: skip
+    return sorted(low, key=lambda place: found[place])
 
-    The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
-    for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003); of laws
-    of `MANY` numbers, Gauss-Newton from its end and from other starts (`nearest_end`).
-    Errors: SimulationDiverged where no start of the grid can be simulated; those of `nearest_end`."""
-    material = calibration.body.material
+
+def search(calibration: Calibration) -> float:
+    """Start a calibration near the smallest score [m], which is returned.
+
+    A coarse grid of stiffness and contact offset is searched at a middle Poisson number, further
+    where its best is at an end of the stiffness; the other Poisson numbers at the `NEAREST` best
+    places. Where the grid has several valleys, Gauss-Newton begins in each of the deepest, and the
+    deepest after a few iterations is entered. Laws with further parameters go on by a compass
+    search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003), laws of `MANY` numbers by
+    Gauss-Newton from its end and from other starts (`nearest_end`). Errors: SimulationDiverged
+    where no start of the grid can be simulated; those of `nearest_end`."""
+    body, material = calibration.body, calibration.body.material
     starts, learned = material.begins, material.learned
     modulated = [n for n in STIFFNESS if n in learned and n in material.modulated]
     tried: dict[tuple[float, ...], float] = {}
@@ -120,7 +144,7 @@ def search(calibration: Calibration) -> float:
     @torch.no_grad()
     def start_at(row: dict[str, float]) -> None:
         for name, value in row.items():
-            material.raw[name].fill_(value)
+            (body.contact.cells if name == CONTACT else material.raw[name]).fill_(value)
 
     def at(row: dict[str, float]) -> float:
         """Of these unconstrained parameters, infinite where they cannot be simulated."""
@@ -128,51 +152,64 @@ def search(calibration: Calibration) -> float:
         if key not in tried:
             start_at(row)
             try:
-                tried[key] = calibration.distance()
+                tried[key] = calibration.score()
             except (SimulationDiverged, ConfigError):
                 tried[key] = math.inf
         return tried[key]
 
-    def row_of(multiple: float, nu: float | None) -> dict[str, float]:
+    def row_of(multiple: float, nu: float | None, cells: float | None) -> dict[str, float]:
         row = {n: starts[n] + math.log(multiple) * (n in modulated) for n in learned}
-        return row if nu is None else row | {"nu": FORMS["nu"].inverse(nu)}
+        row |= {} if nu is None else {"nu": FORMS["nu"].inverse(nu)}
+        return row if cells is None else row | {CONTACT: cells}
 
-    numbers: tuple[float | None, ...] = POISSON_STEPS if "nu" in learned else (None,)
-    multiples = list(STIFFNESS_STEPS) if modulated else [1.0]
-    best = min(
-        ((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers),
-        key=lambda found: found[0],
-    )
-    for end, factor in ((multiples[0], 1 / FURTHER), (multiples[-1], FURTHER)):
-        multiple = end
+    middle, *others = POISSON_STEPS if "nu" in learned else (None,)
+    offsets = calibration.offsets
+    multiples = {i: m for i, m in enumerate(STIFFNESS_STEPS)} if modulated else {0: 1.0}
+    grid: dict[tuple[int, int], float] = {}
+
+    def add(i: int) -> None:
+        for j, cells in enumerate(offsets):
+            grid[i, j] = at(row_of(multiples[i], middle, cells))
+
+    def best() -> tuple[int, int]:
+        return min(grid, key=grid.__getitem__)
+
+    for i in multiples:
+        add(i)
+    for end, step in ((min, -1), (max, 1)):
         while (
             modulated
-            and best[1] == multiple
-            and math.isfinite(best[0])
-            and 1 / FURTHEST < multiple * factor < FURTHEST
+            and best()[0] == (i := end(multiples))
+            and math.isfinite(grid[best()])
+            and 1 / FURTHEST < multiples[i] * FURTHER**step < FURTHEST
         ):
-            multiple *= factor
-            found = min(
-                ((at(row_of(multiple, nu)), multiple, nu) for nu in numbers),
-                key=lambda found: found[0],
-            )
-            best = min(best, found, key=lambda found: found[0])
-    if not math.isfinite(best[0]):
+            multiples[i + step] = multiples[i] * FURTHER**step
+            add(i + step)
+    if not math.isfinite(grid[best()]):
         raise SimulationDiverged(
             "fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
             "nearer to the body's, or raise simulation.max_substeps"
         )
-    row = row_of(*best[1:])
+    numbers: dict[tuple[int, int], float | None] = {place: middle for place in grid}
+    for place in sorted(grid, key=grid.__getitem__)[:NEAREST]:
+        for nu in others:
+            found = at(row_of(multiples[place[0]], nu, offsets[place[1]]))
+            if found < grid[place]:
+                grid[place], numbers[place] = found, nu
+    rows = [row_of(multiples[i], numbers[i, j], offsets[j]) for i, j in valleys(grid)[:ENTERED]]
+    row = rows[0]
     if set(learned) - {"E", "nu"}:
-        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
+        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in row})
     if len(learned) >= MANY:
-        stiffnesses = [row_of(m, None) for m in (WIDE if modulated else (1.0,))]
+        stiffnesses = [row_of(m, None, row.get(CONTACT)) for m in (WIDE if modulated else (1.0,))]
         wide = [
             each | {n: each[n] + step for n, step in steps.items()}
             for each in stiffnesses
             for steps in moved(learned)
         ]
         return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
+    if len(rows) > 1 and not set(learned) - {"E", "nu"}:
+        return nearest_end(calibration, start_at, rows, kept=0)
     start_at(row)
     return at(row)
 
@@ -181,10 +218,13 @@ def nearest_end(
     calibration: Calibration,
     start_at: Callable[[dict[str, float]], None],
     rows: Sequence[dict[str, float]],
+    kept: int = KEPT,
 ) -> float:
-    """Gauss-Newton from several starts, the nearest of which after a few iterations go on; the calibration is left at the nearest
-    end, as if it had not begun, and its mean distance [m] is returned. Starts that cannot be simulated are left out, but the first,
-    whose error is raised where none of them can."""
+    """Gauss-Newton from several starts, the nearest `kept` of which after a few iterations go on.
+
+    The calibration is left at the nearest end, as if it had not begun, and its score [m] is
+    returned. Starts that cannot be simulated are left out; the error of the first is raised where
+    none of them can."""
     body = calibration.body
     begun, here = calibration.state(), calibrated(body)
     ends: list[tuple[float, dict[str, dict], dict]] = []
@@ -199,7 +239,7 @@ def nearest_end(
     if not ends and failed is not None:
         raise failed
     ends.sort(key=lambda end: end[0])
-    for end in tqdm(ends[:KEPT], "the nearest of them", leave=False):
+    for end in tqdm(ends[:kept], "the nearest of them", leave=False):
         calibrate_as(body, end[1])
         try:
             ends.append(went_on(calibration, end[2], LAST))
@@ -214,11 +254,11 @@ def nearest_end(
 def went_on(
     calibration: Calibration, state: dict, iterations: int
 ) -> tuple[float, dict[str, dict], dict]:
-    """(mean distance [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
+    """(score [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
     calibration.restore(state)
     for _ in range(iterations):
         calibration.iterate()
-    return calibration.distance(), calibrated(calibration.body), calibration.state()
+    return calibration.score(), calibrated(calibration.body), calibration.state()
 
 
 def calibrated(body: Body) -> dict[str, dict]:
@@ -241,7 +281,7 @@ TRIED = 4
 def choose_law(
     body: Body, candidates: Sequence[str], build: Callable[[], Calibration]
 ) -> dict[str, float]:
-    """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
+    """Calibrate every candidate and leave `body` at the one with the smallest score, which is returned for
     each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
     """
     found: dict[str, float] = {}
@@ -253,7 +293,7 @@ def choose_law(
             calibration.search()
             for _ in range(TRIED):
                 calibration.iterate()
-            found[law] = calibration.distance()
+            found[law] = calibration.score()
         except SimulationDiverged:
             found[law] = math.inf
             continue

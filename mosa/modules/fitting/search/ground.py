@@ -58,14 +58,14 @@ def better_friction(own: float, gain: Callable[[float], float]) -> tuple[float, 
 
 
 def choose_ground(
-    body: Body, height: float, calibration: Callable[[Ground], Calibration]
+    body: Body, known: Ground, calibration: Callable[[Ground], Calibration]
 ) -> tuple[Ground, dict[str, float]]:
     """(ground, mean distance [m] of every contact that was tried by `named`, infinite where it cannot be simulated); `body` is left
     calibrated on it.
 
-    height [m]: of the ground; calibration: of the body on a ground. The body that sticks is calibrated first, with the search of a
-    calibration; it is what is taken unless another contact is clearly nearer (`taken_of`). Errors: SimulationDiverged where it
-    cannot be.
+    known: height of the ground and its accuracy; calibration: of the body on a ground. The body that
+    sticks is calibrated first, with the search of a calibration; it is taken unless another contact
+    is clearly nearer (`taken_of`). Errors: SimulationDiverged where it cannot be simulated.
     """
     distances: dict[str, float] = {}
     grounds: dict[str, Ground] = {}
@@ -87,11 +87,11 @@ def choose_ground(
         except SimulationDiverged:
             pass  # its distance says so
 
-    attempt(Ground(height, "sticky"), searching=True)
+    attempt(replace(known, mode="sticky", friction=0.0), searching=True)
     for mode, friction in tqdm(
         list(itertools.product(RUBBING, FRICTIONS)), "contact with the ground", leave=False
     ):
-        slide(Ground(height, mode, friction))
+        slide(replace(known, mode=mode, friction=friction))
     if (nearest := taken_of(distances)) != "sticky":
         for factor in (1 / BETWEEN, BETWEEN):
             slide(replace(grounds[nearest], friction=grounds[nearest].friction * factor))

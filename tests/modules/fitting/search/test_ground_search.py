@@ -9,7 +9,8 @@ from small_bodies import NU, WORLD, E, small_body, start, take_of
 
 from mosa.config.checkpoints import check_resumed
 from mosa.config.record import BodyRecord
-from mosa.errors import DataError, SimulationDiverged
+from mosa.data.scene import ground_from
+from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.evaluation.analysis.tables import (
     determined_text,
     ground_table,
@@ -48,7 +49,7 @@ def search(body, take):
     )
     return choose_ground(
         body,
-        0.0,
+        Ground(0.0),
         lambda g: Identification(body, [take], world(g), stage, criterion, settings, seats=1),
     )
 
@@ -99,7 +100,7 @@ def test_a_contact_that_cannot_be_simulated_is_left_out(monkeypatch):
         def distance(self):
             return 1 + self.ground.friction if self.ground.mode == "separate" else 2.0
 
-    found, costs = choose_ground(body, 0.1, Calibration)
+    found, costs = choose_ground(body, Ground(0.1), Calibration)
     assert (
         found.height == 0.1
         and found.mode == "separate"
@@ -116,7 +117,7 @@ def test_a_contact_that_cannot_be_simulated_is_left_out(monkeypatch):
         Calibration, "iterate", lambda self: (_ for _ in ()).throw(SimulationDiverged("nowhere"))
     )
     with pytest.raises(SimulationDiverged):  # not even the body that sticks
-        choose_ground(body, 0.1, Calibration)
+        choose_ground(body, Ground(0.1), Calibration)
 
 
 def test_a_body_sticks_unless_another_contact_is_clearly_nearer():
@@ -493,6 +494,26 @@ def test_a_fit_that_cannot_go_on_is_compared_as_it_stands(monkeypatch):
     assert (
         set(module.ground_gains.values()) == {-2.0} and named(module.world.ground) == "separate_0.6"
     )
+
+
+def test_a_ground_of_known_accuracy_bounds_the_contact():
+    """Two deviations about what a grid does, of grid and accuracy together; narrow where rollouts are free."""
+    offset, ground = ContactOffset(0.02), Ground(0.0)
+    assert offset.prior(ground, free=False) == (offset.UNKNOWN, offset.LIMITS)
+    assert offset.prior(None, free=True) == (offset.NARROW, offset.WITHIN)
+    sd, bounds = offset.prior(replace(ground, accuracy=0.004), free=True)
+    assert sd == pytest.approx(0.25) and bounds == pytest.approx((-0.2, 0.8))
+
+
+def test_the_accuracy_of_a_ground_is_read_and_checked():
+    keys = {"height": 0.1, "mode": "sticky"}
+    assert ground_from(keys).accuracy is None
+    assert ground_from(keys | {"accuracy": 0.003}) == Ground(0.1, accuracy=0.003)
+    for wrong in (-1.0, "low", True):
+        with pytest.raises(
+            ConfigError, match=r"scene\.ground\.accuracy: expected the standard deviation"
+        ):
+            ground_from(keys | {"accuracy": wrong})
 
 
 def test_particles_that_meet_the_ground_themselves_need_no_lift():

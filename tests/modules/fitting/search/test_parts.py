@@ -1,0 +1,121 @@
+"""Which parts a law has: nested models predict frames that were held back from them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from small_bodies import WORLD, E, small_body, start, take_of
+
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.gauss_newton import KNOWN, Posterior
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.search.backbone import valleys
+from mosa.modules.fitting.search.parts import WORTH, chosen, held_back
+from mosa.modules.fitting.stages import Stage
+from mosa.training.lit_mosa import LitMosa
+
+OWNERS = ["E", "operator", "operator", "stiffness"]
+FRAMES, ROWS = 8, 40
+
+
+def errors_of(truth: torch.Tensor, noise: float = 0.01) -> dict[str, float]:
+    """Of linear data of numbers `truth` (4,), where the fit stands at 0; the rows are positions in units of 2 mm."""
+    generator = torch.Generator().manual_seed(0)
+    J = torch.randn(FRAMES, ROWS, 4, generator=generator, dtype=torch.float64)
+    r = -J @ truth + noise * torch.randn(FRAMES, ROWS, generator=generator, dtype=torch.float64)
+    table = torch.cat([J, r[..., None]], -1)
+    squares = list(table.mT @ table)
+    zero, one = torch.zeros(4, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    stretches = [[0, 1], [2, 3], [4, 5], [6, 7]]
+    compared = {k: (FRAMES + k, 2e-3) for k in range(FRAMES)}
+    return held_back(squares + squares, OWNERS, zero, zero, one, stretches, compared)
+
+
+def test_the_parts_that_the_truth_has_are_found():
+    """Left out, a part of size 1 leaves an error of sqrt(ROWS) rows of 2 mm, within the scatter of the draws."""
+    assert chosen(errors_of(torch.tensor([1.0, 0, 0, 0]).double())) == "isotropic"
+    assert chosen(errors_of(torch.tensor([1.0, 1, 1, 0]).double())).startswith("operator")
+    both = errors_of(torch.tensor([1.0, 1, 1, 1]).double())
+    assert set(both) == {"isotropic", "operator", "stiffness", "operator+stiffness"}
+    assert chosen(both) == "operator+stiffness"
+    missed = errors_of(torch.tensor([0.0, 0, 0, 1]).double())
+    assert missed["operator"] == pytest.approx(2e-3 * math.sqrt(ROWS), rel=0.2)
+
+
+def test_a_part_that_gains_little_is_left_out():
+    errors = {"isotropic": 1e-3, "operator": 1.01 * WORTH * 1e-3}
+    assert chosen(errors) == "isotropic"
+    assert chosen(errors | {"operator+stiffness": 0.99 * WORTH * 1e-3}) == "operator+stiffness"
+
+
+def test_a_held_back_frame_is_not_learned_from():
+    """One frame says something else than the others: it is predicted as wrongly as it differs, and they are not."""
+    J = torch.ones(3, 1, 1, dtype=torch.float64)
+    r = torch.tensor([0.0, 0.0, -2.0], dtype=torch.float64)[:, None, None]
+    table = torch.cat([J, r], -1)
+    squares = list(table.mT @ table)
+    zero, loose = torch.zeros(1, dtype=torch.float64), torch.full((1,), 1e-9).double()
+    found = held_back(
+        squares * 2, ["E"], zero, zero, loose, [[2]], {k: (3 + k, 1.0) for k in range(3)}
+    )
+    assert found == {"isotropic": pytest.approx(2.0)}
+
+
+def test_valleys_of_a_grid_are_found_the_lowest_first():
+    heights = [[5, 4, 5, 6], [4, 3, 5, 2], [5, 4, math.inf, 6]]
+    grid = {(i, j): float(h) for i, row in enumerate(heights) for j, h in enumerate(row)}
+    assert valleys(grid) == [(1, 3), (1, 1)]
+    assert valleys({(0, 0): math.inf}) == []
+
+
+def test_a_posterior_of_fewer_numbers_is_one_of_all():
+    """What the model does without is 0, and known to be."""
+    covariance = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    own = Posterior(["E", "contact"], torch.tensor([3.0, 4.0]).double(), covariance, torch.tensor([0.9, 0.8]).double(),
+                    rivals={"stvk": torch.tensor([5.0, 6.0]).double()})  # fmt: skip
+    whole = own.among(["E", "nu", "contact"])
+    assert whole.mean.tolist() == [3, 0, 4] and whole.determined.tolist() == pytest.approx(
+        [0.9, 0, 0.8]
+    )
+    assert torch.equal(whole.covariance[::2, ::2], covariance)
+    assert float(whole.covariance[1, 1]) == pytest.approx(KNOWN**2)
+    assert whole.rivals["stvk"].tolist() == [5, 0, 6]
+    assert float(whole.draws(50)[:, 1].abs().max()) < 1e-5
+
+
+def fitted(monkeypatch, errors: dict[str, float] | None) -> LitMosa:
+    """A fit of an anisotropic body. errors: of held-back frames in place of its own."""
+    numbers = torch.linspace(-0.3, 0.4, 19, dtype=torch.float64)
+    take = take_of(small_body(numbers=numbers), start(turn=0.5, speed=-2.0), 7)
+    take.again = None
+    if errors is not None:
+        monkeypatch.setattr(Identification, "held_back", lambda self: errors)
+    stages = [Stage(name, 3, 0.1, optimizer="gauss_newton") for name in ("prior", "joint")]
+    stages = [replace(stages[0], iterations=1), stages[1]]
+    module = LitMosa.of_parts(small_body(E=1.1 * E, on=False), takes=[take], world=WORLD,
+                              background=torch.ones(3), weights={"position": 1.0}, stages=stages,
+                              criterion=Criterion("corrected"),
+                              settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
+    module.identify()
+    return module
+
+
+def test_a_law_without_the_operator_is_the_calibrated_prior(monkeypatch):
+    """Its numbers are 0, and the posterior knows them to be."""
+    module = fitted(monkeypatch, {"isotropic": 1e-3, "operator": 0.9e-3})
+    assert module.parts == {"isotropic": 1e-3, "operator": 0.9e-3}
+    assert not bool(module.body.adapter.numbers.any())
+    posterior = module.posterior
+    assert posterior.names == ["E", "nu", *(f"operator[{i}]" for i in range(19))]
+    assert float(posterior.determined[0]) > 0.5 and not bool(posterior.determined[2:].any())
+    moved = float((module.body.material.raw["E"].detach() - module.body.material.begins["E"]).abs())
+    assert moved > 0.01
+
+
+def test_an_operator_that_predicts_held_back_frames_is_kept(monkeypatch):
+    """By its own errors: the truth is anisotropic and there is no noise."""
+    module = fitted(monkeypatch, None)
+    assert module.parts["operator"] < WORTH * module.parts["isotropic"]
+    assert bool(module.body.adapter.numbers.any()) and len(module.posterior.names) == 21
