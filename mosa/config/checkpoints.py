@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mosa.config.record import VERSION, BodyRecord, RunRecord, SplatsRecord
 from mosa.errors import ConfigError, DataError
+from mosa.modules.adapters.registry import adapter_class
 from mosa.system.limits import machine_memory
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
@@ -165,7 +166,7 @@ def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     """The record in a read checkpoint; its settings of the body are checked with it. Errors: DataError naming file and part."""
     try:
         record = RunRecord.read(checkpoint["mosa"])
-        _ = record.sections
+        adapter_class(record.sections.adapter.plain())
     except ConfigError as error:
         raise DataError(f"ckpt_path: {path}: stored record: {error}") from error
     return record
