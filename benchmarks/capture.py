@@ -31,7 +31,6 @@ STEP = 0.02
 def settings(folder: Path, truth: dict, **changes) -> dict:
     """The keys of conf/capture.yaml for a filmed folder."""
     values = node_of(CaptureSettings)
-    values.pop("defaults")
     return values | {"videos": str(folder / "videos"), "poses": str(folder / "sparse"), "output": str(folder / "scene"),
                      "gravity": truth["gravity"]} | changes  # fmt: skip
 

@@ -378,6 +378,10 @@ def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     if not (isinstance(state, Mapping) and all(isinstance(name, str) for name in state)):
         raise DataError(f"ckpt_path: {path}: state_dict: expected tensors by name{again}")
     record = record_of(checkpoint, path)
+    if record.ground_is_sought:
+        raise DataError(
+            f"ckpt_path: {path}: mosa.ground.mode: expected sticky or slip or separate or touch, found 'auto'{again}"
+        )
     if record.fit is None:
         raise DataError(f"ckpt_path: {path}: mosa.fit: expected this key, found none{again}")
     return record

@@ -24,7 +24,6 @@ ROOT = Path(__file__).parents[2]
 
 def keys(folder, **changes) -> dict:
     values = node_of(CaptureSettings)
-    values.pop("defaults")
     return values | {"videos": str(folder / "videos"), "poses": str(folder / "sparse"), "output": str(folder / "scene"),
                      "max_offset": 0.5} | changes  # fmt: skip
 

@@ -311,7 +311,7 @@ def test_the_jaws_of_the_tower_close_about_what_is_between_them():
 
 
 def test_a_model_of_what_was_tried_leads():
-    search = Search(iterations=2, batch=12, every=2, validation=4, candidates=2, spread=0.5)
+    search = Search(iterations=2, batch=6, every=2, validation=4, candidates=4, spread=0.5)
     train, check = arena("hanging", 24), arena("hanging", 4)
     found = by_model(train, check, search, seed=0)
     losses = [entry["loss"] for entry in found.history]
