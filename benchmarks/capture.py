@@ -17,12 +17,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from capture_film import Faults, film, perfect
-from omegaconf import OmegaConf
 
 from mosa.capture.making import capture
 from mosa.capture.resampling import KINDS
 from mosa.capture.world import World
-from mosa.config.composition import configuration
+from mosa.config.leaf_settings import CaptureSettings
+from mosa.settings import node_of
 
 STEP = 0.02
 """[s] between frames of held-out drops: as the built-in scenes'."""
@@ -30,8 +30,7 @@ STEP = 0.02
 
 def settings(folder: Path, truth: dict, **changes) -> dict:
     """The keys of conf/capture.yaml for a filmed folder."""
-    values = OmegaConf.to_container(OmegaConf.load(Path(configuration()) / "capture.yaml"))
-    values.pop("defaults")
+    values = node_of(CaptureSettings)
     return values | {"videos": str(folder / "videos"), "poses": str(folder / "sparse"), "output": str(folder / "scene"),
                      "gravity": truth["gravity"]} | changes  # fmt: skip
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mosa.config.record import VERSION, BodyRecord, RunRecord, SplatsRecord
 from mosa.errors import ConfigError, DataError
+from mosa.modules.adapters.registry import adapter_class
 from mosa.system.limits import machine_memory
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
@@ -165,7 +166,7 @@ def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     """The record in a read checkpoint; its settings of the body are checked with it. Errors: DataError naming file and part."""
     try:
         record = RunRecord.read(checkpoint["mosa"])
-        _ = record.sections
+        adapter_class(record.sections.adapter.plain())
     except ConfigError as error:
         raise DataError(f"ckpt_path: {path}: stored record: {error}") from error
     return record
@@ -377,6 +378,10 @@ def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     if not (isinstance(state, Mapping) and all(isinstance(name, str) for name in state)):
         raise DataError(f"ckpt_path: {path}: state_dict: expected tensors by name{again}")
     record = record_of(checkpoint, path)
+    if record.ground_is_sought:
+        raise DataError(
+            f"ckpt_path: {path}: mosa.ground.mode: expected sticky or slip or separate or touch, found 'auto'{again}"
+        )
     if record.fit is None:
         raise DataError(f"ckpt_path: {path}: mosa.fit: expected this key, found none{again}")
     return record

@@ -281,7 +281,9 @@ def _plain(setting: Setting) -> dict[str, Any]:
         if setting.checkpoint is None
         else hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
     )
-    return json.loads(json.dumps(asdict(setting) | {"checkpoint": content}))
+    return json.loads(
+        json.dumps(asdict(setting) | {"checkpoint": content, "search": setting.search.plain()})
+    )
 
 
 FREE = ("device", "worlds")
@@ -407,7 +409,7 @@ def write_table(
         markdown(header, lines),
         *([about] if about else []),
         "Setting: " + _listed({k: v for k, v in _plain(setting).items() if k not in UNSAID}) + "; search "
-        + _listed(asdict(setting.search)) + ".",
+        + _listed(setting.search.plain()) + ".",
         "Task: " + _listed(asdict(task)) + ".",
     ]  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)

@@ -14,16 +14,16 @@ from omegaconf import OmegaConf
 
 from mosa.capture.making import capture, make
 from mosa.capture.world import floor_of_points, ground_height, read_world
-from mosa.config.composition import configuration
+from mosa.config.leaf_settings import CaptureSettings
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
+from mosa.settings import node_of
 
 ROOT = Path(__file__).parents[2]
 
 
 def keys(folder, **changes) -> dict:
-    values = OmegaConf.to_container(OmegaConf.load(Path(configuration()) / "capture.yaml"))
-    values.pop("defaults")
+    values = node_of(CaptureSettings)
     return values | {"videos": str(folder / "videos"), "poses": str(folder / "sparse"), "output": str(folder / "scene"),
                      "max_offset": 0.5} | changes  # fmt: skip
 

@@ -9,9 +9,9 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from small_bodies import small_body, start
 
+from mosa.config.leaf_settings import EnvironmentsSettings
 from mosa.data.synthetic.bodies.objects import object_named
 from mosa.data.synthetic.drop import simulate
 from mosa.data.synthetic.films import built
@@ -42,6 +42,7 @@ from mosa.environments.tasks import CLEARANCE, TASKS, task_named
 from mosa.environments.truth import true_twin
 from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.physics.world import World
+from mosa.settings import node_of
 from mosa.twin.twin import Twin
 from mosa.types import Ground
 
@@ -310,7 +311,7 @@ def test_the_jaws_of_the_tower_close_about_what_is_between_them():
 
 
 def test_a_model_of_what_was_tried_leads():
-    search = Search(iterations=2, batch=12, every=2, validation=4, candidates=2, spread=0.5)
+    search = Search(iterations=2, batch=6, every=2, validation=4, candidates=4, spread=0.5)
     train, check = arena("hanging", 24), arena("hanging", 4)
     found = by_model(train, check, search, seed=0)
     losses = [entry["loss"] for entry in found.history]
@@ -450,10 +451,7 @@ def test_the_table_is_made_once_and_resumed(tmp_path, monkeypatch):
 
 
 def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
-    values = OmegaConf.to_container(
-        OmegaConf.load(study.Path(command.__file__).parents[2] / "conf" / "environments.yaml")
-    )
-    values.pop("defaults")
+    values = node_of(EnvironmentsSettings)
     setting = command.setting_of(values)
     assert (
         setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100

@@ -229,7 +229,7 @@ def test_gaussian_cues_come_from_free_shapes(squashed):
 
 @pytest.mark.parametrize("name", ["fast", "paper"])
 def test_presets_build(name):
-    settings = build_settings(**yaml.safe_load((CONF / f"{name}.yaml").read_text()))
+    settings = build_settings(**(yaml.safe_load((CONF / f"{name}.yaml").read_text()) or {}))
     assert settings.cue == ("neighbourhood" if name == "fast" else "gaussian")
 
 
