@@ -306,7 +306,7 @@ class Body(nn.Module):
                 frame_dt=frame_dt,
                 gravity=world.gravity,
                 up=world.up,
-                ground=world.ground,
+                ground=self.contact.at_nodes(world.ground),
                 planes=world.planes,
                 colliders=world.colliders,
                 box=world.box,
