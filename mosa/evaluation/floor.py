@@ -59,7 +59,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         frame_dt=frame_dt,
         gravity=world.gravity,
         up=world.up,
-        ground=world.ground,
+        ground=body.contact.at_nodes(world.ground),
         planes=world.planes,
         colliders=world.solids,
         device=device,

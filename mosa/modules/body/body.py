@@ -317,7 +317,7 @@ class Body(nn.Module):
                 frame_dt=frame_dt,
                 gravity=world.gravity,
                 up=world.up,
-                ground=world.ground,
+                ground=self.contact.at_nodes(world.ground),
                 planes=world.planes,
                 colliders=world.solids,
                 box=world.box,

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
+from mosa.physics.contact.planes import NODE_MODES
 from mosa.types import Ground
+
+ROUNDED = 1e-3
+"""Cells: a ground so near below a layer of nodes is at it."""
 
 
 class ContactOffset(nn.Module):
@@ -38,11 +43,25 @@ class ContactOffset(nn.Module):
     def forward(self) -> Tensor:
         return self.dx * self.cells
 
-    def lift(self, ground: Ground | None) -> Tensor:
-        """Height [m] by which a body is simulated above where it is. Particles that meet the ground themselves need none: there the
-        number, from its start on, is what is not known of the ground's height."""
+    def height(self, ground: Ground | None) -> Tensor:
+        """Height [m] above the ground at which the grid stops a body. Particles that meet the ground
+        themselves need none: there the change from `START` is the error of the stated height."""
         touched = ground is not None and ground.mode == "touch" and self.enabled
         return self.dx * (self.cells - self.START) if touched else self()
+
+    def lift(self, ground: Ground | None) -> Tensor:
+        """Height [m] by which a body is simulated above where it is, over the ground `at_nodes`."""
+        moved = self.at_nodes(ground)
+        gap = 0.0 if moved is None or ground is None else moved.height - ground.height
+        return self.height(ground) + gap
+
+    def at_nodes(self, ground: Ground | None) -> Ground | None:
+        """The ground as it is simulated: at the highest layer of nodes below it, where nodes meet it.
+
+        Otherwise what a body does would depend on where within a cell the ground lies."""
+        if ground is None or ground.mode not in NODE_MODES or not self.enabled:
+            return ground
+        return replace(ground, height=self.dx * math.floor(ground.height / self.dx + ROUNDED))
 
     def prior(self, ground: Ground | None, free: bool) -> tuple[float, tuple[float, float]]:
         """(standard deviation about `START`, bounds) [cells].

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import pytest
 import strangers
 import torch
-from small_bodies import NU, WORLD, E, small_body, start, take_of
+from small_bodies import FRAME_DT, NU, WORLD, E, small_body, start, take_of
 
 from mosa.config.checkpoints import check_resumed
 from mosa.config.record import BodyRecord
@@ -494,6 +494,25 @@ def test_a_fit_that_cannot_go_on_is_compared_as_it_stands(monkeypatch):
     assert module.better_ground(module.stages[0].but(name="joint")) is None
     assert (
         set(module.ground_gains.values()) == {-2.0} and named(module.world.ground) == "separate_0.6"
+    )
+
+
+@pytest.mark.parametrize("mode, friction", [("sticky", 0.0), ("separate", 0.4)])
+@pytest.mark.parametrize("cells", [-0.2, 0.37, 1.8])
+def test_a_ground_acts_alike_wherever_in_a_cell_it_lies(mode, friction, cells):
+    """Body and ground are higher by a part of a cell: the motion is the same, that much higher."""
+    body = small_body(adapter=False, contact=True)
+    raised, begins = cells * body.settings.dx, start(turn=0.5, speed=-2.0)
+    moved = replace(begins, center=begins.center + raised * WORLD.up.to(begins.center))
+    low, high = (
+        body.simulate(each, world(Ground(height, mode, friction)), FRAMES, FRAME_DT, substeps=40).x
+        for each, height in ((begins, 0.0), (moved, raised))
+    )
+    low, high = low.detach(), high.detach()
+    assert float((low - low[0]).abs().max()) > 0.1 * body.size
+    assert float((high - low - raised * WORLD.up.to(low)).abs().max()) < 1e-9
+    assert float(body.contact.height(Ground(raised, mode)).detach()) == pytest.approx(
+        0.3 * body.settings.dx
     )
 
 
