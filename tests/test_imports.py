@@ -92,13 +92,14 @@ def test_there_is_no_import_circle():
 
 def test_the_physics_knows_nothing_of_learning():
     everything = imports("mosa.physics.")
-    # ply: which files of points are safe to read; settings: models of what a user may set; threads, limits: of the
+    # ply, npz: which files of points are safe to read; settings: models of what a user may set; threads, limits: of the
     # machine; exact_sums: of kernels
     allowed = (
         "mosa.physics",
         "mosa.errors",
         "mosa.types",
         "mosa.system.ply",
+        "mosa.system.npz",
         "mosa.settings",
         "mosa.system.threads",
         "mosa.system.limits",

@@ -19,29 +19,100 @@ class Curve(NamedTuple):
 
 
 CURVES = (
-    Curve("loss/total", "-", "what the step descends: the sum of all weighted terms, mean over the training sequences; of "
-          "Gauss-Newton its cost, minus the logarithm of the posterior, after the step (of several drops the first four count a "
-          "part of the data, and less)"),
-    Curve("loss_raw/<term>", "-", "a term of the loss (`mosa/modules/fitting/losses.py`) before its weight"),
-    Curve("loss_weighted/<term>", "-", "a term of the loss times its weight in `losses`"),
-    Curve("id/contact_offset", "m", "height above the ground at which the grid stops the body, after the step"),
-    Curve("id/<p>", "SI, degrees", "parameter p after the step, without eta"),
-    Curve("adapter/mean_abs_C", "-", "mean of |C| in the step, once the adapter is fitted"),
-    Curve("gradient_norm/<group>", "-", "norm of the gradient of a group of parameters; those of networks before they are clipped"),
-    Curve("lr/<group>", "-", "Adam: learning rate of the group in the step"),
-    Curve("time/step_s", "s", "wall time of the step"),
-    Curve("fit/stage", "-", "0, 1, 2: prior, prior_eta, joint, without those that the run leaves out"),
-    Curve("fit/frames", "-", "frames that the step simulated: the first stage begins with those around first contact"),
-    Curve("fit/inverted", "-", "particles with det F <= 0, counted in every frame"),
-    Curve("fit/distance_m", "m", "Gauss-Newton: mean distance of free rollouts from the motion cues after frame 0, after the step"),
-    Curve("newton/share", "-", "Gauss-Newton: the way that an iteration's steps went, over the length of its first; 0 where none "
-          "improved the cost"),
-    Curve("newton/length", "-", "Gauss-Newton: length of an iteration's first step, in standard deviations of the posterior"),
-    Curve("newton/sd/<block>", "-", "Gauss-Newton: mean prior standard deviation of the numbers of a kind, as the evidence has it "
-          "now"),
-    Curve("epoch", "-", "how many steps the fit had made before this one, as Lightning counts them"),
-    Curve("final/<figure>", "as above", "figure of `metrics.json`, once, beside the configuration (TensorBoard: the tab HPARAMS)"),
-)  # fmt: skip
+    Curve(
+        "loss/total",
+        "-",
+        "the quantity that the step descends. Adam: sum of all weighted terms, mean over "
+        "training sequences. Gauss-Newton: cost (minus the logarithm of the posterior) after "
+        "the step; the first four iterations on several drops count a part of the data",
+    ),
+    Curve(
+        "loss_raw/<term>",
+        "-",
+        "a term of the loss (`mosa/modules/fitting/losses.py`) before its weight",
+    ),
+    Curve(
+        "loss_weighted/<term>",
+        "-",
+        "a term of the loss times its weight in `losses`",
+    ),
+    Curve(
+        "id/contact_offset",
+        "m",
+        "height above the ground at which the grid stops the body, after the step",
+    ),
+    Curve(
+        "id/<p>",
+        "SI, degrees",
+        "parameter p after the step, without eta",
+    ),
+    Curve(
+        "adapter/mean_abs_C",
+        "-",
+        "mean of |C| in the step, once the adapter is fitted",
+    ),
+    Curve(
+        "gradient_norm/<group>",
+        "-",
+        "norm of the gradient of a group of parameters; of networks before clipping",
+    ),
+    Curve(
+        "lr/<group>",
+        "-",
+        "Adam: learning rate of the group",
+    ),
+    Curve(
+        "time/step_s",
+        "s",
+        "wall time of the step",
+    ),
+    Curve(
+        "fit/stage",
+        "-",
+        "0, 1, 2: prior, prior_eta, joint, without stages that the run leaves out",
+    ),
+    Curve(
+        "fit/frames",
+        "-",
+        "frames that the step simulated; the first stage begins with those around first contact",
+    ),
+    Curve(
+        "fit/inverted",
+        "-",
+        "particles with det F <= 0, summed over frames",
+    ),
+    Curve(
+        "fit/distance_m",
+        "m",
+        "Gauss-Newton: mean distance of free rollouts from the motion cues after frame 0",
+    ),
+    Curve(
+        "newton/share",
+        "-",
+        "Gauss-Newton: distance that the iteration's steps went, over the length of its "
+        "first; 0 if no step improved the cost",
+    ),
+    Curve(
+        "newton/length",
+        "-",
+        "Gauss-Newton: length of the iteration's first step, in posterior standard deviations",
+    ),
+    Curve(
+        "newton/sd/<block>",
+        "-",
+        "Gauss-Newton: mean prior standard deviation of a kind of numbers, by the evidence so far",
+    ),
+    Curve(
+        "epoch",
+        "-",
+        "steps before this one, as Lightning counts them",
+    ),
+    Curve(
+        "final/<figure>",
+        "as above",
+        "figure of `metrics.json`, once, beside the configuration (TensorBoard: HPARAMS)",
+    ),
+)
 
 
 def table() -> str:
@@ -50,7 +121,7 @@ def table() -> str:
         f"| `{curve.tag}` | {curve.unit} | {curve.what.replace('|', chr(92) + '|')} |"
         for curve in CURVES
     ]
-    return "\n".join(["| tag | unit | what |", "|---|---|---|", *rows])
+    return "\n".join(["| tag | unit | meaning |", "|---|---|---|", *rows])
 
 
 def described(tag: str, law: str) -> str | None:

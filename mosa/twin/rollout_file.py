@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.physics.contact.colliders import Collider
-from mosa.physics.contact.driven import Points
-from mosa.physics.contact.motion import Motion, Trajectory, rotation_matrices
+from mosa.physics.contact.motion import Motion, Points, Trajectory, rotation_matrices
 from mosa.system.npz import write_npz
 from mosa.types import MotionCues, Rollout
 

@@ -107,7 +107,7 @@ def test_a_film_that_ends_at_the_contact_is_said(frames, held_out, colliders, sa
     scene = SimpleNamespace(frames=frames, times=torch.arange(frames) / 50.0, gravity=torch.tensor([0, -9.8, 0]), name="b",
                             up=torch.tensor([0.0, 1, 0]), ground=Ground(0.0), last_free_frame=None, sequence="train",
                             training_frames=[t for t in range(frames) if t not in held_out])  # fmt: skip
-    world = SimpleNamespace(colliders=colliders, planes=())
+    world = SimpleNamespace(colliders=colliders, planes=(), driven=())
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         warn_of_little(world, body, {"train": start, "test/h": start}, [scene, scene])

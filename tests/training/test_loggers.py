@@ -104,7 +104,7 @@ def test_curves_carry_their_description(tmp_path):
     assert points["final/id/mu"] == [(0, 210.0)]
     assert about["id/mu"].summary_description == "parameter mu after the step, without eta [Pa s]"
     assert about["newton/sd/operator"].summary_description.startswith(
-        "Gauss-Newton: mean prior standard deviation of the numbers"
+        "Gauss-Newton: mean prior standard deviation of a kind"
     )
     for figure, unit in (("test/rms_m", "m"), ("id/mu", "Pa s"), ("id/v0_y", "m/s")):
         said = about[f"final/{figure}"].summary_description

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,14 +18,11 @@ from mosa.errors import ConfigError
 from mosa.physics.contact import shapes as packing
 from mosa.physics.contact.keys import check_keys
 from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
-from mosa.physics.contact.motion import Motion, Trajectory
+from mosa.physics.contact.motion import Motion, Points, Trajectory
 from mosa.physics.contact.planes import MODES, Plane
 from mosa.physics.contact.touch import GRIP
 from mosa.settings import is_number
 from mosa.types import RUBBING
-
-if TYPE_CHECKING:
-    from mosa.physics.contact.driven import Points
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ class Collider:
     shape: Shape
     mode: str = "sticky"
     friction: float = 0.0
-    motion: "Motion | Trajectory | Points" = field(default_factory=Motion)
+    motion: Motion | Trajectory | Points = field(default_factory=Motion)
     name: str = ""
 
 

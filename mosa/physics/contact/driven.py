@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -19,83 +19,10 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider, Particles, Shape, collider_of
 from mosa.physics.contact.keys import fits, rows, three, told
-from mosa.physics.contact.motion import Motion, Trajectory
+from mosa.physics.contact.motion import Motion, Points, Trajectory, ends
 from mosa.physics.contact.reference import signed_distance
 from mosa.settings import Expected, Section, Text, Weight, Whole
 from mosa.system.npz import read_npz
-
-
-@dataclass(frozen=True)
-class Points:
-    """A motion that is given point by point: points (T, n, 3) [m] at times (T,) [s], linear between
-    them, at rest before and after.
-
-    Each driven particle keeps its place relative to the point that is nearest to it at the start.
-    Differentiable in the points. The pose is that of their mean, without rotation: torques are
-    about it. Errors: ConfigError naming the field.
-    """
-
-    times: Tensor
-    points: Tensor
-
-    def __post_init__(self) -> None:
-        times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
-        points = torch.as_tensor(self.points, dtype=torch.float64).cpu()
-        if times.ndim != 1 or len(times) < 2 or not bool((times.diff() > 0).all()):
-            raise ConfigError(
-                f"motion: times: expected at least two ascending numbers, found shape {tuple(times.shape)}"
-            )
-        if (
-            points.ndim != 3
-            or len(points) != len(times)
-            or not points.shape[1]
-            or points.shape[-1] != 3
-        ):
-            raise ConfigError(
-                f"motion: points: expected shape ({len(times)}, n, 3), found {tuple(points.shape)}"
-            )
-        if not bool(torch.isfinite(points.detach()).all()):
-            raise ConfigError("motion: points: expected finite numbers, found others")
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "points", points)
-
-    def at(self, times: Tensor) -> Tensor:
-        """(S, n, 3) points at times (S,) [s]."""
-        place = times.clamp(float(self.times[0]), float(self.times[-1]))
-        after = torch.searchsorted(self.times, place, right=True).clamp(1, len(self.times) - 1)
-        share = (place - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
-        return torch.lerp(self.points[after - 1], self.points[after], share[:, None, None])
-
-    def paths(self, ends: Tensor) -> tuple[Tensor, Tensor]:
-        """(how far each point has moved relative to the mean of all (S, n, 3) [m], its mean rate
-        (S, n, 3) [m/s]) in the substeps between `ends` (S + 1,) [s]."""
-        points = self.at(ends)
-        beside = points - points.mean(1, keepdim=True)
-        first = self.at(torch.zeros(1, dtype=torch.float64))
-        moved = beside - (first - first.mean(1, keepdim=True))
-        return moved[:-1], moved.diff(dim=0) / ends.diff()[:, None, None]
-
-    def sample(
-        self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `Motion.sample`."""
-        mean = self.at(_ends(frames * substeps, dt, start, first)).mean(1)
-        eye = torch.eye(3, dtype=torch.float64).expand(len(mean) - 1, 3, 3)
-        return mean[:-1], eye, mean.diff(dim=0) / dt, torch.zeros_like(mean[:-1])
-
-    def timed(self, frames: int | None, frame_dt: float) -> Points:
-        return self
-
-    def shifted(self, offset: Tensor) -> Points:
-        return replace(self, points=self.points + offset.double().cpu())
-
-    def max_speed(self, reach: float) -> float:
-        steps = self.points.detach().diff(dim=0).norm(dim=-1).amax(1)
-        return float((steps / self.times.diff()).max())
-
-
-def _ends(count: int, dt: float, start: float, first: int) -> Tensor:
-    return start + dt * torch.arange(first, first + count + 1, dtype=torch.float64)
 
 
 def sample_paths(
@@ -103,7 +30,7 @@ def sample_paths(
 ) -> tuple[Tensor, ...]:
     """(paths, rates), (S, P, 3) float64 each, of all points of the motions at S = count substeps;
     () where there are no points."""
-    found = [m.paths(_ends(count, dt, start, first)) for m in motions if isinstance(m, Points)]
+    found = [m.paths(ends(count, dt, start, first)) for m in motions if isinstance(m, Points)]
     return tuple(torch.cat(parts, 1) for parts in zip(*found))
 
 

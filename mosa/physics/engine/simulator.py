@@ -21,8 +21,8 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, reach
-from mosa.physics.contact.driven import Held, Points, hold, stack_held
-from mosa.physics.contact.motion import sample_frame, sample_poses
+from mosa.physics.contact.driven import Held, hold, stack_held
+from mosa.physics.contact.motion import Points, sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.axes import Axes, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers

@@ -79,7 +79,13 @@ def test_the_stiffness_of_a_block_from_a_press_alone(tmp_path):
     settings = IdentificationSettings(grid_error=0.0, threads=1)
     body.material.raw["nu"].requires_grad_(False)
     found = Identification(
-        body, [take], world, Stage("prior", 10, 0.1), Criterion("free"), settings, (False,) * 3
+        body,
+        [take],
+        world,
+        Stage(name="prior", iterations=10, lr=0.1),
+        Criterion(name="free"),
+        settings,
+        (False,) * 3,
     )
     for _ in range(6):
         found.iterate()

@@ -34,7 +34,14 @@ def test_both_are_found_from_a_vibration():
     take.cues = cues_of(truth.simulate(begins, HELD, FRAMES, take.frame_dt), begins.rotation)
     body = body_of(0.7 * E, 3 * DAMPING)
     settings = IdentificationSettings(grid_error=0.0, threads=1)
-    found = Identification(body, [take], HELD, Stage("prior", 10, 0.1), Criterion("free"), settings)
+    found = Identification(
+        body,
+        [take],
+        HELD,
+        Stage(name="prior", iterations=10, lr=0.1),
+        Criterion(name="free"),
+        settings,
+    )
     for _ in range(8):
         found.iterate()
         if found.converged:

@@ -435,7 +435,7 @@ def test_a_calibration_knows_what_a_grid_may_have_done_to_it():
     those that know of the grid."""
     body = small_body(adapter=False)
     take = seen_on_a_coarser_grid(small_body(adapter=False))
-    found = identification(body, [take], "prior", Criterion("free"))
+    found = identification(body, [take], "prior", Criterion(name="free"))
     run(found)
     found.independent = lambda _: (
         1.0

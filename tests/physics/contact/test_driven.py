@@ -10,8 +10,8 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import Box, Collider, HalfSpace, Particles, Sphere
-from mosa.physics.contact.driven import Driven, Points, driven_from_config, hold, loads
-from mosa.physics.contact.motion import Motion, exponential
+from mosa.physics.contact.driven import Driven, driven_from_config, hold, loads
+from mosa.physics.contact.motion import Motion, Points, exponential
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.adaptive_steps import StepControl
 from mosa.physics.time.clock import Adaptive, Replay

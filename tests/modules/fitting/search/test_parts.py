@@ -1,7 +1,6 @@
 """Which parts a law has: nested models predict frames that were held back from them."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -92,11 +91,14 @@ def fitted(monkeypatch, errors: dict[str, float] | None) -> LitMosa:
     take.again = None
     if errors is not None:
         monkeypatch.setattr(Identification, "held_back", lambda self: errors)
-    stages = [Stage(name, 3, 0.1, optimizer="gauss_newton") for name in ("prior", "joint")]
-    stages = [replace(stages[0], iterations=1), stages[1]]
+    stages = [
+        Stage(name=name, iterations=3, lr=0.1, optimizer="gauss_newton")
+        for name in ("prior", "joint")
+    ]
+    stages = [stages[0].but(iterations=1), stages[1]]
     module = LitMosa.of_parts(small_body(E=1.1 * E, on=False), takes=[take], world=WORLD,
                               background=torch.ones(3), weights={"position": 1.0}, stages=stages,
-                              criterion=Criterion("corrected"),
+                              criterion=Criterion(name="corrected"),
                               settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
     module.identify()
     return module
