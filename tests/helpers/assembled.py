@@ -15,6 +15,9 @@ from mosa.training.assembly import Run, assemble
 from mosa.types import Appearance, Scene
 
 ROOT = Path(__file__).parents[2]
+ROUGHLY = ["reconstruction.resolution=40", "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30",
+           "reconstruction.dynamic.iterations=20", "reconstruction.carried.iterations=10"]  # fmt: skip
+"""Overrides of a reconstruction in a third of the time, for tests that ask nothing of its accuracy."""
 KNOWN: dict[tuple, Start] = {}
 """By sequence, body and appearance: a start takes a second, and what is assembled here differs in what comes after it."""
 

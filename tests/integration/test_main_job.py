@@ -288,7 +288,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
     try:
         deadline = time.monotonic() + 300
         while time.monotonic() < deadline:
-            time.sleep(0.02)
+            time.sleep(0.1)
             if (
                 checkpoint.exists()
                 and torch.load(checkpoint, weights_only=True)["mosa"]["fit"]["steps_done"] >= 2

@@ -3,9 +3,9 @@
 import json
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
+
+import forked
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
@@ -24,14 +24,12 @@ def test_the_notebook_runs_from_top_to_bottom(cache, tmp_path):
         '"debug=default"', f'"debug=default", "scene.cache={cache}"'
     )  # the tests' own place for films
     script = tmp_path / "cells.py"
-    script.write_text("\n\n".join(f"{text}\nprint('cell {k} done')" for k, text in enumerate(code)))
+    cells = "\n\n".join(f"{text}\nprint('cell {k} done')" for k, text in enumerate(code))
+    script.write_text(f"import os\n\nos.chdir({str(tmp_path)!r})\n{cells}")
     # Jupyter's kernel would find the package where it is installed, the tests their own tree
     environment = os.environ | {"MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1",
                                 "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}  # fmt: skip
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", str(script)]
-    found = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600
-    )
+    found = forked.call(str(script), environment=environment, timeout=600)
     assert found.returncode == 0, f"{found.stdout[-2000:]}\n{found.stderr[-2000:]}"
     for line in (*(f"cell {k} done" for k in range(len(code))), "Held-out positions", "20 files;"):
         assert line in found.stdout, line

@@ -6,13 +6,19 @@ import forked
 import lightning as L
 import pytest
 import torch
+from assembled import ROUGHLY
 from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 
 from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
 
-HELD = ["scene.holdout_cameras=[1]", "scene.holdout_frames=1", "heterogeneity.enabled=false"]
+HELD = [
+    "scene.holdout_cameras=[1]",
+    "scene.holdout_frames=1",
+    "heterogeneity.enabled=false",
+    *ROUGHLY,
+]
 QUIET = {
     "logger": False,
     "enable_progress_bar": False,
