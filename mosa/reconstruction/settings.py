@@ -190,7 +190,7 @@ class DynamicSettings(Settings):
     where: ClassVar[str] = "reconstruction.dynamic"
     needs: ClassVar[dict[str, str]] = {
         "modes": "model=modes",
-        "bases hidden basis_layers coefficient_layers lr_network": "model=network",
+        "bases hidden basis_layers coefficient_layers *_frequencies lr_network": "model=network",
     }
 
     model: Literal["modes", "network"] = Field(
@@ -239,6 +239,12 @@ class DynamicSettings(Settings):
     coefficient_layers: Layers = Field(
         3,
         description="network: layers of the coefficients",
+    )
+    space_frequencies: int = Field(
+        4, ge=0, le=16, description="network: sines and cosines of a position; GIC: 10"
+    )
+    time_frequencies: int = Field(
+        5, ge=0, le=16, description="network: sines and cosines of the time; GIC: 6"
     )
     lr_network: Weight = Field(5e-4, description="network: step")
 
