@@ -20,11 +20,12 @@ class GeometrySection(Settings):
     where: ClassVar[str] = "reconstruction.geometry"
     needs: ClassVar[dict[str, str]] = {"frames": "source=images"}
 
-    source: Literal["images", "hull"] = Field(
+    source: Literal["images", "hull", "gaussians"] = Field(
         "images",
         description=(
             "images: carved by colours, refined by colours and the outlines of all free"
-            " frames; hull: the hull with its ridges rounded"
+            " frames; hull: the hull with its ridges rounded; gaussians: "
+            "what lies behind the static Gaussians in every view (GIC, the paper)"
         ),
     )
     frames: Count = Field(
