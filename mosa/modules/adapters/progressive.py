@@ -94,9 +94,7 @@ class ProgressiveOperator(nn.Module):
             return s1.new_zeros(n, 3, 3, 3), l1
         if self.constant:
             return self.constant_corrections(s1)[:3].expand(n, 3, 3, 3), l1
-        return self.correction(
-            self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))
-        ), l1
+        return self.correction(self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))), l1
 
     def constant_corrections(self, like: Tensor) -> Tensor:
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""

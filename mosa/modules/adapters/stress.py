@@ -67,7 +67,8 @@ class StressAdapter(Adapter):
         hidden: Hidden = 64, rest_free: RestFree = True, plastic: bool = False, major_symmetry: bool = False,
         state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
         precision: Literal["accurate", "tf32", "half"] = "accurate",
-        factors: Factors = "residual", no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
+        factors: Factors = "residual",
+        no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if no_prior_stress and no_pre:

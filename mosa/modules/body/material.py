@@ -325,9 +325,7 @@ class Material(nn.Module):
         if "E" in values:
             result["mu"], result["lam"] = lame(values["E"], values["nu"])
         if "friction_angle" in values:
-            result["friction_alpha"] = friction_alpha(
-                values["friction_angle"], self.friction_cone
-            )
+            result["friction_alpha"] = friction_alpha(values["friction_angle"], self.friction_cone)
         return result
 
     def max_modulus(self, factor: Tensor | float = 1.0) -> Tensor:

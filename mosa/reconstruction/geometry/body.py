@@ -51,7 +51,8 @@ class GeometrySettings(GeometrySection):
 @dataclass(frozen=True)
 class Geometry:
     """body: values 0 or 1; hull_volume [m^3]; deviation: standard deviation [m] of the surface where it is known at all, on the
-    body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used; static: Gaussians that the body was found by, if any."""
+    body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used;
+    static: Gaussians that the body was found by, if any."""
 
     body: Volume
     hull_volume: float

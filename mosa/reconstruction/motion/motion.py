@@ -117,9 +117,7 @@ class _Layers(nn.Module):
     def __init__(self, inputs: int, hidden: int, layers: int, outputs: int, skip: int = 0) -> None:
         super().__init__()
         self.skip = skip if skip < layers else 0
-        read = [
-            inputs if i == 0 else hidden + inputs * (i == self.skip) for i in range(layers)
-        ]
+        read = [inputs if i == 0 else hidden + inputs * (i == self.skip) for i in range(layers)]
         self.hidden = nn.ModuleList(nn.Linear(width, hidden) for width in read)
         self.last = nn.Linear(hidden, outputs)
         nn.init.normal_(self.last.weight, std=0.02)
