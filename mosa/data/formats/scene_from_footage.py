@@ -50,7 +50,8 @@ def scene_from_footage(
     """Scene from footage and the keys that say what world it shows.
 
     gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; start: falling | rest;
-    last_free_frame and holdout_frames: frame     numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one per frame; fps overrides times.
+    last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
+    per frame; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
     up = vector(up, "up")
