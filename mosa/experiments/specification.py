@@ -148,13 +148,21 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return found
 
 
+def shared_axes(folder: Path) -> dict[str, Any]:
+    """Axes by name: those of the package, and of a folder's own file. Errors: ConfigError."""
+    found: dict[str, Any] = {}
+    for file in dict.fromkeys(each / f"{SHARED}.yaml" for each in (SPECIFICATIONS, folder)):
+        found |= read_yaml(file) if file.is_file() else {}
+    return found
+
+
 def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     """folder/<name>.yaml; quick: with its section `quick` in place of other keys. Errors: ConfigError naming the key."""
     if name not in experiment_names(folder):
         raise ConfigError(
             f"experiment: expected one of {', '.join(experiment_names(folder))} or all, found {name!r}"
         )
-    keys, shared = read_yaml(folder / f"{name}.yaml"), read_yaml(folder / f"{SHARED}.yaml")
+    keys, shared = read_yaml(folder / f"{name}.yaml"), shared_axes(folder)
     small = keys.pop("quick", None)
     if quick:
         if not small:
@@ -334,7 +342,7 @@ SHARED_BY = ("scene", "reconstruction", "seed", "simulation")
 """Parts of the configuration that a reconstruction depends on."""
 ALONE = "alone-"
 """Before the name of a folder whose run had its device to itself: what others share was run in company."""
-QUIET = ("logger", "evaluation.video", "evaluation.assignment", "evaluation.floor")
+QUIET = ("hydra.searchpath", "logger", "evaluation.video", "evaluation.assignment", "evaluation.floor")
 """Overrides that the name of a folder leaves to its digest."""
 
 
