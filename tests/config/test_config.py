@@ -266,7 +266,7 @@ PRINTED = {
     "reconstruction.dynamic.basis_layers": 8, "reconstruction.dynamic.coefficient_layers": 3,
     "reconstruction.dynamic.space_frequencies": 10, "reconstruction.dynamic.time_frequencies": 6,
     "reconstruction.static.shape": "isotropic", "reconstruction.appearance.shape": "isotropic",
-    "reconstruction.informed.iterations": 0,
+    "reconstruction.informed.iterations": 0, "rendering.appearance": "particles",
 }  # fmt: skip
 """What the paper and GIC print, by key (docs/paper.md)."""
 

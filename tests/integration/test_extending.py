@@ -63,7 +63,11 @@ def run(tmp_path_factory, cache):
     assert len(written(folder)) == 11
     row = ["extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "prior=fibres", "adapter=softer",
            "+losses.volume=0.5"]  # fmt: skip
-    scene = ["scene=recording", f"scene.path={recorded(folder, cache)}", f"scene.cache={folder}/cache"]
+    scene = [
+        "scene=recording",
+        f"scene.path={recorded(folder, cache)}",
+        f"scene.cache={folder}/cache",
+    ]
     table = {
         "title": "A method of one's own", "rows": "method", "columns": "scene", "common": QUICK, "plot": None,
         "axes": {"method": {"softer": row}, "scene": {"recording": scene}},
@@ -85,7 +89,9 @@ def test_a_method_of_ones_own_is_a_row(run):
     figures = json.loads((run / "run" / "metrics.json").read_text())
     page = (run / "results" / "mine.md").read_text()
     (row,) = [line for line in page.splitlines() if line.startswith("| softer")]
-    assert float(row.split("|")[2].strip(" *")) == pytest.approx(figures["train/l1_crop"], abs=0.006)
+    assert float(row.split("|")[2].strip(" *")) == pytest.approx(
+        figures["train/l1_crop"], abs=0.006
+    )
 
 
 def test_the_law_is_learned_with_its_direction(run):
