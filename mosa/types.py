@@ -59,6 +59,10 @@ class Ground:
     accuracy: float | None = None
 
 
+FALLING, REST = "falling", "rest"
+"""How a film starts."""
+
+
 @dataclass(frozen=True)
 class Truth:
     """What is known about a synthetic sequence and must never enter the learning path: evaluation only.
@@ -82,6 +86,7 @@ class Scene:
     gravity, up: (3,) [m/s^2], unit; box: (2, 3) [m] min and max of the world that may be used; density [kg/m^3].
     `last_free_frame`: index of the last frame before first contact, None = find it from the data.
     `holdout_cameras`, `holdout_frames`: indices that no stage of learning may read.
+    start: `FALLING`, or `REST`: at frame 0 nothing moves, and the body may be in contact already.
     """
 
     name: str
@@ -104,6 +109,7 @@ class Scene:
     particles: tuple[Tensor, ...] | None = None
     known_parameters: dict[str, float] = field(default_factory=dict)
     fingerprint: str = ""
+    start: str = FALLING
 
     @property
     def frames(self) -> int:

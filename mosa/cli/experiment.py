@@ -49,6 +49,13 @@ def arguments(words: list[str]) -> argparse.Namespace:
         help="write the page of all results, results.md beside their folder",
     )
     parser.add_argument(
+        "--specifications",
+        type=Path,
+        default=None,
+        metavar="FOLDER",
+        help="files of experiments of one's own, in place of the paper's (docs/reproduce.md)",
+    )
+    parser.add_argument(
         "--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders"
     )
     parser.add_argument(
@@ -128,7 +135,9 @@ def run(options: argparse.Namespace) -> int:
         total_minutes,
     )
 
-    folder = SPECIFICATIONS
+    folder = options.specifications or SPECIFICATIONS
+    if not folder.is_dir():
+        raise ConfigError(f"--specifications: expected a folder of YAML files, found {folder}")
     if options.page and not options.names:
         print(write_the_page(folder, options))
         return 0
@@ -266,10 +275,11 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
     Errors: ConfigError."""
     for word in words:
         key = word.partition("=")[0].lstrip("+~")
-        if "=" not in word or key.split(".")[0] == "hydra" or key in ("resume", "seed"):
+        own = key.split(".")[0] == "hydra" and key != "hydra.searchpath"
+        if "=" not in word or own or key in ("resume", "seed"):
             raise ConfigError(
-                f"--set: expected KEY=VALUE of train.py, without hydra's, resume and seed, which are the jobs' own, "
-                f"found {word!r}"
+                "--set: expected KEY=VALUE of train.py, without hydra's (but hydra.searchpath), resume and seed, "
+                f"which are the jobs' own, found {word!r}"
             )
     if not words:
         return
@@ -278,6 +288,7 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
     from omegaconf.errors import OmegaConfBaseException
 
     from mosa.config.build import plain
+    from mosa.config.extensions import load_extensions
     from mosa.training.preflight import check_configuration
 
     try:
@@ -285,6 +296,7 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
             values = plain(compose("train", overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
+    load_extensions(values.get("extensions"))
     check_configuration(values)
 
 

@@ -162,14 +162,16 @@ def build_prior(
     """The prior's parameters, and how its law is taken. law: the one that was chosen among its candidates. Errors:
     ConfigError naming the key."""
     section = PriorSection.read(config)
+    options = LawOptions.read(section.options or {})
     material = Material(
         law or section.law,
         section.parameters,
         names(section.frozen),
         None if section.modulated is None else names(section.modulated),
         () if law else names(section.candidates),
+        options.friction_cone,
     )
-    return material, LawOptions.read(section.options or {})
+    return material, options
 
 
 def build_heterogeneity(

@@ -22,6 +22,7 @@ OWN = (
     "name",
     "frames",
     "fps",
+    "start",
     "last_free_frame",
     "holdout_cameras",
     "particles",

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from mosa.errors import ConfigError, DataError
+from mosa.modules.fitting.stages import STAGES, FitSection
 
 PLOTS = ("bars", "lines", "map", None)
 SPECIFICATIONS = Path(__file__).with_name("specifications")
@@ -148,13 +149,21 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return found
 
 
+def shared_axes(folder: Path) -> dict[str, Any]:
+    """Axes by name: those of the package, and of a folder's own file. Errors: ConfigError."""
+    found: dict[str, Any] = {}
+    for file in dict.fromkeys(each / f"{SHARED}.yaml" for each in (SPECIFICATIONS, folder)):
+        found |= read_yaml(file) if file.is_file() else {}
+    return found
+
+
 def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     """folder/<name>.yaml; quick: with its section `quick` in place of other keys. Errors: ConfigError naming the key."""
     if name not in experiment_names(folder):
         raise ConfigError(
             f"experiment: expected one of {', '.join(experiment_names(folder))} or all, found {name!r}"
         )
-    keys, shared = read_yaml(folder / f"{name}.yaml"), read_yaml(folder / f"{SHARED}.yaml")
+    keys, shared = read_yaml(folder / f"{name}.yaml"), shared_axes(folder)
     small = keys.pop("quick", None)
     if quick:
         if not small:
@@ -299,6 +308,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
                 *more,
                 f"seed={seed}",
             )
+            longer = effort(overrides) / effort([each for each in overrides if each not in more])
             folder = runs / (ALONE * experiment.alone + folder_name(overrides))
             known = found.get(folder)
             if known is not None:
@@ -312,7 +322,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             ]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
             minutes = {
-                device: value * math.prod(option.cost_on(device) for option in options)
+                device: value * longer * math.prod(option.cost_on(device) for option in options)
                 for device, value in experiment.minutes.items()
             }
             found[folder] = Job(
@@ -328,13 +338,44 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     return list(found.values())
 
 
+FIT_SHARE = 0.4
+"""Of a job of 4000 particles and 100 steps of Adam on a GPU: 19 s of 47 s (four networks, rabbit, H200)."""
+
+
+def effort(overrides: Sequence[str]) -> float:
+    """Time of a job over one of 4000 particles and Adam's default steps, from the particles and the
+    steps of stages that its overrides name; 1 where they name none. Where particles are too few to
+    fill a GPU it is too much."""
+    said = dict(each.split("=", 1) for each in overrides if "=" in each)
+    usual = FitSection()
+    stages = {stage: getattr(usual, stage).iterations for stage in STAGES}
+    steps = sum(number(said.get(f"fit.{s}.iterations"), n) for s, n in stages.items())
+    grown = 1 + FIT_SHARE * (steps / sum(stages.values()) - 1)
+    return max(grown * number(said.get("simulation.particles"), 4000) / 4000, 1e-3)
+
+
+def number(text: str | None, usual: float) -> float:
+    """What an override says, the usual value where it says no positive number (auto, null)."""
+    try:
+        value = usual if text is None else float(text)
+    except ValueError:
+        return usual
+    return value if 0 <= value < math.inf else usual
+
+
 USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])
 """Keys of a scene that say what of its films is used, and change none of them."""
 SHARED_BY = ("scene", "reconstruction", "seed", "simulation")
 """Parts of the configuration that a reconstruction depends on."""
 ALONE = "alone-"
 """Before the name of a folder whose run had its device to itself: what others share was run in company."""
-QUIET = ("logger", "evaluation.video", "evaluation.assignment", "evaluation.floor")
+QUIET = (
+    "hydra.searchpath",
+    "logger",
+    "evaluation.video",
+    "evaluation.assignment",
+    "evaluation.floor",
+)
 """Overrides that the name of a folder leaves to its digest."""
 
 

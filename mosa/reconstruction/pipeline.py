@@ -22,6 +22,7 @@ from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.gaussians.carried import fit_carried
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.gaussians.static import fit_splats, start_splats
+from mosa.reconstruction.geometry.behind import fill_behind
 from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
@@ -70,6 +71,8 @@ def object_geometry(
     cache = _geometry_cache(scene, settings, cache_dir)
 
     def stage() -> dict[str, Any]:
+        if settings.geometry.source == "gaussians":
+            return geometry_of_gaussians(scene, settings, device).stored()
         found = find_geometry(
             scene, object_hull(scene, settings), GeometrySettings.of(settings.geometry), ridge_passes=settings.ridge_passes,
             sigma=settings.resolution / 40, margin=settings.margin, device=device,
@@ -77,6 +80,20 @@ def object_geometry(
         return found.stored()
 
     return Geometry.read(cache.stage("geometry", stage))
+
+
+def geometry_of_gaussians(
+    scene: Scene, settings: ReconstructionSettings, device: torch.device | str
+) -> Geometry:
+    """The body behind static Gaussians, which are kept for the static stage. Errors: DataError."""
+    hull = object_hull(scene, settings)
+    windows = object_windows(scene, scene.training_cameras, [0], margin=settings.margin).to(device)
+    start = start_splats(hull, windows, settings.static, count=settings.points, seed=0)
+    static = fit_splats(
+        start, windows, scene.background.to(device), settings.static, move=True, seed=0
+    )
+    body = fill_behind(static, windows, hull)
+    return Geometry(body, hull.occupied_volume(), torch.empty(0), 1, static)
 
 
 FEW = 4000
@@ -148,6 +165,8 @@ def _geometry_cache(
         "ridge_passes": settings.ridge_passes,
         "margin": settings.margin,
     }
+    if settings.geometry.source == "gaussians":
+        parts |= {"points": settings.points, "static": settings.static.plain()}
     return _open_cache(
         cache_dir,
         scene,
@@ -285,6 +304,8 @@ def reconstruct(
                 "static", still, _render_still(imported.splats.to(device), still, background)
             )
             return _tensors(imported.splats)
+        if geometry.static is not None:
+            return _tensors(geometry.static)
         start = start_splats(
             geometry.body, still, settings.static, count=settings.points, seed=seed
         )

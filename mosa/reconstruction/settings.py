@@ -20,11 +20,12 @@ class GeometrySection(Settings):
     where: ClassVar[str] = "reconstruction.geometry"
     needs: ClassVar[dict[str, str]] = {"frames": "source=images"}
 
-    source: Literal["images", "hull"] = Field(
+    source: Literal["images", "hull", "gaussians"] = Field(
         "images",
         description=(
             "images: carved by colours, refined by colours and the outlines of all free"
-            " frames; hull: the hull with its ridges rounded"
+            " frames; hull: the hull with its ridges rounded; gaussians: "
+            "what lies behind the static Gaussians in every view (GIC, the paper)"
         ),
     )
     frames: Count = Field(
@@ -190,7 +191,7 @@ class DynamicSettings(Settings):
     where: ClassVar[str] = "reconstruction.dynamic"
     needs: ClassVar[dict[str, str]] = {
         "modes": "model=modes",
-        "bases hidden basis_layers coefficient_layers lr_network": "model=network",
+        "bases hidden basis_layers coefficient_layers *_frequencies lr_network": "model=network",
     }
 
     model: Literal["modes", "network"] = Field(
@@ -239,6 +240,12 @@ class DynamicSettings(Settings):
     coefficient_layers: Layers = Field(
         3,
         description="network: layers of the coefficients",
+    )
+    space_frequencies: int = Field(
+        4, ge=0, le=16, description="network: sines and cosines of a position; GIC: 10"
+    )
+    time_frequencies: int = Field(
+        5, ge=0, le=16, description="network: sines and cosines of the time; GIC: 6"
     )
     lr_network: Weight = Field(5e-4, description="network: step")
 

@@ -11,6 +11,7 @@ from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from mosa.config.build import build_adapter, build_stages, rehearse
+from mosa.config.command_settings import TrainSettings
 from mosa.errors import ConfigError
 from mosa.modules.adapters.registry import ADAPTERS, adapter_class
 from mosa.modules.body.simulation_settings import SimulationSettings
@@ -248,6 +249,37 @@ def test_an_experiment_is_what_its_overrides_are(name, overrides):
         composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"]
         == composed("prior=stvk")["prior"]["law"]
     )
+
+
+PRINTED = {
+    "adapter.name": "stress", "adapter.alpha": 0.1, "adapter.alpha_normal": None, "adapter.factors": "printed",
+    "adapter.l_max": None, "adapter.rest_free": False, "adapter.plastic": True, "adapter.major_symmetry": False,
+    "adapter.state_dependence": "full", "adapter.no_C": False, "adapter.no_pre": False, "adapter.no_post": False,
+    "losses.image": 1.0, "losses.mask": 1.0, "losses.flow": 1.0, "losses.rotation": 0.1, "losses.stretch": 0.1,
+    "losses.heterogeneity": 0.1, "losses.position": 0.0, "losses.operator": 0.0, "losses.operator_variance": 0.0,
+    "heterogeneity.enabled": True, "heterogeneity.kind": "network", "heterogeneity.amplitude": 0.2,
+    "criterion.name": "free", "simulation.contact_offset": False, "simulation.stride": 1,
+    "prior.options.friction_cone": "printed", "reconstruction.geometry.source": "gaussians",
+    "reconstruction.cue": "gaussian", "reconstruction.dynamic.model": "network",
+    "reconstruction.dynamic.carriers": "particles", "reconstruction.dynamic.elastic": 0.0,
+    "reconstruction.dynamic.bases": 10, "reconstruction.dynamic.hidden": 256,
+    "reconstruction.dynamic.basis_layers": 8, "reconstruction.dynamic.coefficient_layers": 3,
+    "reconstruction.dynamic.space_frequencies": 10, "reconstruction.dynamic.time_frequencies": 6,
+    "reconstruction.static.shape": "isotropic", "reconstruction.appearance.shape": "isotropic",
+    "reconstruction.informed.iterations": 0, "rendering.appearance": "particles",
+}  # fmt: skip
+"""What the paper and GIC print, by key (docs/paper.md)."""
+
+
+@pytest.mark.parametrize("prior", ["neo_hookean", "von_mises", "drucker_prager"])
+def test_the_papers_experiment_is_as_printed(prior):
+    values = TrainSettings.read(composed("experiment=paper", f"prior={prior}"))
+    found = flat(values.plain())
+    assert {key: found[key] for key in PRINTED} == PRINTED
+    stages = rehearse(values)
+    assert [stage.name for stage in stages] == ["prior", "prior_eta", "joint"]
+    assert not any(stage.newton for stage in stages)
+    assert rehearse(composed("debug=default", "experiment=paper", f"prior={prior}"))
 
 
 @pytest.mark.parametrize("name", sorted(ADAPTERS))

@@ -28,6 +28,7 @@ from mosa.experiments.report.printed import printed_table
 from mosa.experiments.report.writing import write_results
 from mosa.experiments.specification import (
     CROWD,
+    FIT_SHARE,
     MINUTES,
     Figure,
     Option,
@@ -113,6 +114,19 @@ def test_a_mistake_in_a_file_names_its_key(tmp_path, text, message):
         load_experiment(tmp_path, "wrong")
 
 
+def test_ones_own_folder_has_the_paper_s_axes_and_its_own(tmp_path, capsys):
+    (tmp_path / "_shared.yaml").write_text("mine: {softer: [adapter=softer]}\n")
+    text = "title: Mine\naxes: {method: mine, scene: {of: objects, only: [rabbit]}}\nrows: method\ncolumns: scene\n"
+    (tmp_path / "mine.yaml").write_text(text + "figures: [{label: PSNR, figure: test/psnr_crop}]\n")
+    words = ["--specifications", str(tmp_path), "--runs", str(tmp_path / "runs")]
+    assert run(arguments(words)) == 0 and capsys.readouterr().out.split() == ["mine", "Mine"]
+    assert run(arguments(["mine", "--dry-run", *words])) == 0
+    said = capsys.readouterr().out
+    assert "scene=rabbit" in said and "adapter=softer" in said and "1 jobs, 1 to run" in said
+    with pytest.raises(ConfigError, match="--specifications: expected a folder"):
+        run(arguments(["mine", "--specifications", str(tmp_path / "none")]))
+
+
 def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
     for words, message in (
         (["nothing"], "experiment: expected one of .* or all, found 'nothing'"),
@@ -180,6 +194,19 @@ def test_the_estimate_learns_from_the_jobs_that_are_complete(tmp_path):
         estimate(jobs, [None], 1)[0][-1]
         == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
     )
+
+
+def test_the_estimate_follows_what_the_command_sets(tmp_path):
+    """Time goes with the particles, and a share of it with the steps of Adam."""
+    plain, more = jobs_of(experiment(), tmp_path), ["simulation.particles=12000"]
+    three = jobs_of(experiment(), tmp_path, more)
+    assert [j.minutes["cpu"] / p.minutes["cpu"] for j, p in zip(three, plain)] == [3.0] * 8
+    known = jobs_of(experiment(common=("simulation.particles=6000",)), tmp_path, more)
+    assert known[0].minutes["cpu"] == pytest.approx(2 * plain[0].minutes["cpu"])
+    longer = jobs_of(experiment(), tmp_path, ["fit.joint.iterations=400"])[0]
+    assert longer.minutes["gpu"] == pytest.approx((1 + FIT_SHARE * 3.6) * plain[0].minutes["gpu"])
+    odd = jobs_of(experiment(), tmp_path, ["simulation.particles=auto", "prior=stvk"])[0]
+    assert odd.minutes == plain[0].minutes
 
 
 def test_the_estimate_knows_the_longest_job_and_what_shares_a_gpu(tmp_path):

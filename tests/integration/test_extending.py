@@ -10,6 +10,7 @@ import forked
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from mosa.data.scene import load_scene
 
@@ -48,17 +49,49 @@ def recorded(folder: Path, cache: Path) -> Path:
     return folder / "fall.npz"
 
 
+TABLES = """
+from mosa.cli.experiment import main
+if __name__ == "__main__":
+    main()
+"""
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
+    """The package as a row of a table of its own: a specification in a folder, whose job is the run."""
     folder = tmp_path_factory.mktemp("extending")
     assert len(written(folder)) == 11
-    given = [*QUICK, "extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "scene=recording",
-             f"scene.path={recorded(folder, cache)}", f"scene.cache={folder}/cache", "prior=fibres", "adapter=softer",
-             "+losses.volume=0.5"]  # fmt: skip
-    result = forked.call("train.py", f"hydra.run.dir={folder}/run", *given,
+    row = ["extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "prior=fibres", "adapter=softer",
+           "+losses.volume=0.5"]  # fmt: skip
+    scene = [
+        "scene=recording",
+        f"scene.path={recorded(folder, cache)}",
+        f"scene.cache={folder}/cache",
+    ]
+    table = {
+        "title": "A method of one's own", "rows": "method", "columns": "scene", "common": QUICK, "plot": None,
+        "axes": {"method": {"softer": row}, "scene": {"recording": scene}},
+        "figures": [{"label": "l1", "figure": "train/l1_crop", "best": "least"}],
+    }  # fmt: skip
+    (folder / "tables").mkdir()
+    (folder / "tables" / "mine.yaml").write_text(yaml.safe_dump(table))
+    (folder / "tables.py").write_text(TABLES)
+    result = forked.call(str(folder / "tables.py"), "mine", "--specifications", f"{folder}/tables", "--runs", f"{folder}/runs",
+                         "--results", f"{folder}/results",
                          environment=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"})  # fmt: skip
-    assert result.returncode == 0, result.stderr[-3000:]
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-3000:]
+    (job,) = (path for path in (folder / "runs").iterdir() if path.is_dir())
+    (folder / "run").symlink_to(job)
     return folder
+
+
+def test_a_method_of_ones_own_is_a_row(run):
+    figures = json.loads((run / "run" / "metrics.json").read_text())
+    page = (run / "results" / "mine.md").read_text()
+    (row,) = [line for line in page.splitlines() if line.startswith("| softer")]
+    assert float(row.split("|")[2].strip(" *")) == pytest.approx(
+        figures["train/l1_crop"], abs=0.006
+    )
 
 
 def test_the_law_is_learned_with_its_direction(run):

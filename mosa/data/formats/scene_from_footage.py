@@ -15,7 +15,7 @@ from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
 from mosa.errors import ConfigError
 from mosa.settings import is_number
-from mosa.types import Ground, Scene, Truth
+from mosa.types import FALLING, REST, Ground, Scene, Truth
 
 DENSITIES = 0.1, 1e5
 """[kg/m^3]: aerogel has 1, osmium 22,590."""
@@ -38,6 +38,7 @@ def scene_from_footage(
     density: float = 1000.0,
     sequence: str = "train",
     fps: float | None = None,
+    start: str = FALLING,
     last_free_frame: int | None = None,
     holdout_cameras=(),
     holdout_frames=(),
@@ -48,8 +49,9 @@ def scene_from_footage(
 ) -> Scene:
     """Scene from footage and the keys that say what world it shows.
 
-    gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; last_free_frame and holdout_frames: frame
-    numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one per frame; fps overrides times.
+    gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; start: falling | rest;
+    last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
+    per frame; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
     up = vector(up, "up")
@@ -82,6 +84,15 @@ def scene_from_footage(
         times = torch.tensor(
             [(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32
         )
+    if start not in (FALLING, REST):
+        raise ConfigError(f"scene.start: expected {FALLING} or {REST}, found {start!r}")
+    if start == REST:
+        if last_free_frame is not None:
+            raise ConfigError(
+                f"scene.last_free_frame: expected null with scene.start={REST}, where no frame is one of "
+                f"free flight, found {last_free_frame!r}"
+            )
+        last_free_frame = footage.frames[0]
     if last_free_frame is not None:
         if isinstance(last_free_frame, bool) or last_free_frame not in footage.frames:
             raise ConfigError(
@@ -98,7 +109,7 @@ def scene_from_footage(
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
         gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
-        background=footage.background, synthetic=synthetic, last_free_frame=last_free_frame,
+        background=footage.background, synthetic=synthetic, start=start, last_free_frame=last_free_frame,
         holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
         particles=read_clouds(particles, footage.frames) if particles is not None else None,

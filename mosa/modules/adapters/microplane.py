@@ -62,6 +62,24 @@ def correction(numbers: Tensor) -> Tensor:
     return L + U + L @ U
 
 
+OFFSET = 0.01
+"""Diagonal offset of both factors in the printed form. The paper calls it small and gives no number."""
+
+
+def printed_correction(numbers: Tensor) -> Tensor:
+    """C = (L + e I)(U + e I), (..., 3, 3) from (..., 12), e = `OFFSET`: the paper's own form.
+
+    C itself is then invertible, as the paper asks, and no numbers give e^2 I in place of 0. Entries
+    of C stay below about 3 alpha^2."""
+    offset = OFFSET * torch.eye(3, dtype=numbers.dtype, device=numbers.device)
+    L, U = lu_factors(numbers)
+    return (L + offset) @ (U + offset)
+
+
+CORRECTIONS = {"residual": correction, "printed": printed_correction}
+"""What makes a matrix C of its 12 numbers."""
+
+
 def plane_operator(planes: Tensor) -> Tensor:
     """(N, 6, 6) T - I of the corrections (N, 3, 3, 3) of the three planes: T s = (normals, averaged shears) (step 3)."""
     return (planes.flatten(-3) @ _placement(planes.dtype, planes.device)).unflatten(-1, (6, 6))

@@ -30,18 +30,21 @@ class ProgressiveOperator(nn.Module):
 
     alpha: bound of the entries of the LU factors; alpha_normal: of those of C_xyz and of l2, None: alpha;
     l_max: of L_pre and L_post, None leaves them linear (the paper's form);
+    factors: residual | printed, see `microplane.CORRECTIONS`;
     state_dependence: full | constant (the four matrices are learned numbers, not functions of the state);
     major_symmetry: (A + C0 A^T C0^-1)/2 in place of A, needs `poisson` of C0;
-    no_prior_stress: s1 = L_pre instead of s + L_pre. The output is exactly 0 at initialisation.
+    no_prior_stress: s1 = L_pre instead of s + L_pre.
+    The output is exactly 0 at initialisation; with printed factors it is 1e-4 of the stress there.
     """
 
     def __init__(
         self, *, alpha: float, l_max: float | None, input_scale: float, hidden: int, no_C: bool, no_pre: bool, no_post: bool,
         state_dependence: str = "full", major_symmetry: bool = False, no_prior_stress: bool = False,
-        alpha_normal: float | None = None,
+        alpha_normal: float | None = None, factors: str = "residual",
     ) -> None:  # fmt: skip
         super().__init__()
         self.alpha, self.l_max, self.scale = alpha, l_max, input_scale
+        self.factors, self.correction = factors, microplane.CORRECTIONS[factors]
         self.alpha_normal = alpha if alpha_normal is None else alpha_normal
         self.no_C, self.no_pre, self.no_post, self.no_prior_stress = (
             no_C,
@@ -91,9 +94,7 @@ class ProgressiveOperator(nn.Module):
             return s1.new_zeros(n, 3, 3, 3), l1
         if self.constant:
             return self.constant_corrections(s1)[:3].expand(n, 3, 3, 3), l1
-        return microplane.correction(
-            self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))
-        ), l1
+        return self.correction(self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))), l1
 
     def constant_corrections(self, like: Tensor) -> Tensor:
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
@@ -102,7 +103,7 @@ class ProgressiveOperator(nn.Module):
         bound = torch.cat(
             [torch.full((rows, 1), value, device=like.device) for rows, value in bounds]
         ).to(like)
-        return microplane.correction(bound * torch.tanh(self.scale * self.free).to(like))
+        return self.correction(bound * torch.tanh(self.scale * self.free).to(like))
 
     def constant_operator(self) -> Tensor:
         """(6, 6) A - I of the constant matrices, before the projection to major symmetry."""
@@ -119,7 +120,7 @@ class ProgressiveOperator(nn.Module):
             return n.new_zeros(len(n), 3, 3), l2
         if self.constant:
             return self.constant_corrections(n)[3].expand(len(n), 3, 3), l2
-        return microplane.correction(numbers), l2
+        return self.correction(numbers), l2
 
     def last(self, l2: Tensor | None, kw: Tensor, s2: Tensor) -> Tensor:
         """Step 5: L_post (N, 6)."""

@@ -30,6 +30,13 @@ StressBound = Annotated[
 ]
 Scale = Annotated[Positive, Field(description="factor of what the networks read")]
 Hidden = Annotated[Width, Field(description="width of the networks")]
+Factors = Annotated[
+    Literal["residual", "printed"],
+    Field(
+        description="C = (I + L)(I + U) - I, or the paper's C = (L + 0.01 I)(U + 0.01 I) of "
+        "triangular L, U"
+    ),
+]
 RestFree = Annotated[
     bool, Field(description="an undeformed body stays stress-free; false: the paper's literal form")
 ]
@@ -51,6 +58,7 @@ class StressAdapter(Adapter):
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
     precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster) | half
     (forward in float16, backward in tf32: the same errors, fastest);
+    factors: residual | printed, how the 12 numbers make a matrix (`microplane.CORRECTIONS`);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 
@@ -59,6 +67,7 @@ class StressAdapter(Adapter):
         hidden: Hidden = 64, rest_free: RestFree = True, plastic: bool = False, major_symmetry: bool = False,
         state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
         precision: Literal["accurate", "tf32", "half"] = "accurate",
+        factors: Factors = "residual",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
@@ -79,6 +88,7 @@ class StressAdapter(Adapter):
             "hidden": hidden,
         }
         shape |= {
+            "factors": factors,
             "state_dependence": state_dependence,
             "no_C": no_C,
             "no_pre": no_pre,

@@ -152,7 +152,7 @@ class Material(nn.Module):
     of a direction three numbers of any length); frozen: names that are not learned; modulated:
     names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa
     together). damping, bulk_damping among the parameters: with a viscous branch of the law
-    (`constitutive.damping`). candidates: laws among which a calibration chooses, with law=auto;
+    (`constitutive.damping`). friction_cone: of `friction_alpha`. candidates: laws among which a calibration chooses, with law=auto;
     until then it is the first. A parameter that starts on a bound of its range is held there.
     Errors: ConfigError naming the parameter, what was expected and what was found.
     """
@@ -164,6 +164,7 @@ class Material(nn.Module):
         frozen: Sequence[str] = (),
         modulated: Sequence[str] | None = None,
         candidates: Sequence[str] = (),
+        friction_cone: str = "klar",
     ) -> None:
         super().__init__()
         if (law == AUTO) != bool(candidates):
@@ -179,7 +180,7 @@ class Material(nn.Module):
             )
         for each in candidates or (law,):
             self._check_names(each, parameters, frozen, modulated)
-        self.candidates = tuple(candidates)
+        self.candidates, self.friction_cone = tuple(candidates), friction_cone
         self.law, self.names = candidates[0] if candidates else law, tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
         self.modulated = (
@@ -324,7 +325,7 @@ class Material(nn.Module):
         if "E" in values:
             result["mu"], result["lam"] = lame(values["E"], values["nu"])
         if "friction_angle" in values:
-            result["friction_alpha"] = friction_alpha(values["friction_angle"])
+            result["friction_alpha"] = friction_alpha(values["friction_angle"], self.friction_cone)
         return result
 
     def max_modulus(self, factor: Tensor | float = 1.0) -> Tensor:

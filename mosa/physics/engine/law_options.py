@@ -17,6 +17,13 @@ class LawOptions(Settings):
     yield_convention: Literal["paper", "sqrt23"] = Field(
         "paper", description="of von Mises; sqrt23 is PAC-NeRF's"
     )
+    friction_cone: Literal["klar", "printed"] = Field(
+        "klar",
+        description=(
+            "Drucker-Prager's slope of an angle phi: klar: sqrt(2/3) 2 sin phi/(3 - sin phi); "
+            "printed: the root over all of it, as the paper prints"
+        ),
+    )
     norm_eps: Weight = Field(0.0, description="under the root of yield norms")
     rebuild: bool = Field(
         False, description="write U S V^T back also where nothing yielded (PAC-NeRF does)"

@@ -27,7 +27,7 @@ from mosa.reconstruction.geometry.refinement import (
 from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pose.flight import free_motions
 from mosa.reconstruction.settings import GeometrySection
-from mosa.types import Scene
+from mosa.types import Scene, Splats
 
 OPTIMISM = 1.3
 """Root mean square error of the surface over the standard deviation that its information alone gives: neighbouring pixels are not
@@ -51,12 +51,14 @@ class GeometrySettings(GeometrySection):
 @dataclass(frozen=True)
 class Geometry:
     """body: values 0 or 1; hull_volume [m^3]; deviation: standard deviation [m] of the surface where it is known at all, on the
-    body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used."""
+    body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used;
+    static: Gaussians that the body was found by, if any."""
 
     body: Volume
     hull_volume: float
     deviation: Tensor
     free_frames: int
+    static: Splats | None = None
 
     def figures(self, spacing: float) -> dict[str, float]:
         """`geometry/...`: volumes [m^3], share of the hull that was emptied, and, where images were used, share of the surface
@@ -79,6 +81,7 @@ class Geometry:
         return {
             "values": self.body.values.cpu(), "origin": self.body.origin.cpu(), "pitch": self.body.pitch,
             "hull_volume": self.hull_volume, "deviation": self.deviation.cpu(), "free_frames": self.free_frames,
+            "static": None if self.static is None else vars(self.static.to("cpu")),
         }  # fmt: skip
 
     @classmethod
@@ -89,6 +92,7 @@ class Geometry:
             stored["hull_volume"],
             stored["deviation"],
             stored["free_frames"],
+            Splats(**stored["static"]) if stored.get("static") else None,
         )
 
 

@@ -227,6 +227,8 @@ def fit_motion(
                 hidden=settings.hidden,
                 basis_layers=settings.basis_layers,
                 coefficient_layers=settings.coefficient_layers,
+                space_frequencies=settings.space_frequencies,
+                time_frequencies=settings.time_frequencies,
             ).to(background.device)
         objective = Objective(motion, carried, scaffold, background, settings)
         rate = settings.lr_network

@@ -110,22 +110,39 @@ def _encoded(x: Tensor, frequencies: int) -> Tensor:
     return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
 
 
-def _mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
-    parts: list[nn.Module] = []
-    for i in range(layers):
-        parts += [nn.Linear(inputs if i == 0 else hidden, hidden), nn.ReLU()]
-    last = nn.Linear(hidden, outputs)
-    nn.init.normal_(last.weight, std=0.02)
-    nn.init.zeros_(last.bias)
-    return nn.Sequential(*parts, last)
+class _Layers(nn.Module):
+    """`layers` hidden layers of ReLU and a linear one; skip: the input is read once more after that
+    many of them, 0: never."""
+
+    def __init__(self, inputs: int, hidden: int, layers: int, outputs: int, skip: int = 0) -> None:
+        super().__init__()
+        self.skip = skip if skip < layers else 0
+        read = [inputs if i == 0 else hidden + inputs * (i == self.skip) for i in range(layers)]
+        self.hidden = nn.ModuleList(nn.Linear(width, hidden) for width in read)
+        self.last = nn.Linear(hidden, outputs)
+        nn.init.normal_(self.last.weight, std=0.02)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = x
+        for i, layer in enumerate(self.hidden):
+            h = torch.cat([x, h], -1) if i and i == self.skip else h
+            h = layer(h).relu()
+        return self.last(h)
 
 
 class MotionBasisNetwork(nn.Module):
-    """Deformation = mean over `bases` of coefficient_b(x, t) basis_b(t), after GIC (paper, eq. 2).
+    """Deformation = mean over `bases` of coefficient_b(x, t) basis_b(t), number by number (GIC; eq. 2).
 
-    basis_b: time to 10 numbers (translation 3 in units of `reach` [m], quaternion 4, log scale 3); coefficient_b: position
-    and time to a number. The value at t = 0 is subtracted, so that frame 0 is the rest frame. Scale and rotation are free.
+    basis_b: time to 10 numbers (translation 3 in units of `reach` [m], quaternion 4, log scale 3), by
+    layers that read the time again after the fourth; coefficient_b: position and time to the factors
+    of these numbers. Both read the time through a small network, from `time_frequencies` sines and
+    cosines, and positions as `space_frequencies` of them. The value at t = 0 is subtracted, so that
+    frame 0 is the rest frame. Scale and rotation are free. Skip and widths are those of GIC (Cai et al.
+    2024), which has 10 and 6 frequencies, one scale and no rotation; the paper frees both.
     """
+
+    SKIP, CLOCK = 4, (256, 30)
 
     def __init__(
         self,
@@ -145,17 +162,23 @@ class MotionBasisNetwork(nn.Module):
         self.register_buffer("centre", centre)
         self.reach, self.bases = reach, bases
         self.space_frequencies, self.time_frequencies = space_frequencies, time_frequencies
-        time_inputs, space_inputs = 1 + 2 * time_frequencies, 3 * (1 + 2 * space_frequencies)
-        self.basis = _mlp(time_inputs, hidden, basis_layers, bases * 10)
-        self.coefficient = _mlp(time_inputs + space_inputs, hidden, coefficient_layers, bases)
-        nn.init.normal_(self.coefficient[-1].bias)
+        width, clock = self.CLOCK
+        self.clock = nn.Sequential(
+            nn.Linear(1 + 2 * time_frequencies, width), nn.ReLU(), nn.Linear(width, clock)
+        )
+        self.basis = _Layers(clock, hidden, basis_layers, bases * 10, self.SKIP)
+        space = 3 * (1 + 2 * space_frequencies)
+        self.coefficient = _Layers(clock + space, hidden, coefficient_layers, bases * 10)
+        nn.init.normal_(self.coefficient.last.bias)
 
     def _raw(self, time: Tensor, points: Tensor) -> Tensor:
         """(S, N, 10) before subtraction; time: (S, 1) in [0, 1]; points: (N, 3) normalised."""
-        basis = self.basis(_encoded(time, self.time_frequencies)).unflatten(-1, (self.bases, 10))
+        clock = self.clock(_encoded(time, self.time_frequencies))
+        basis = self.basis(clock).unflatten(-1, (self.bases, 10))
         encoded = _encoded(points, self.space_frequencies).expand(len(time), -1, -1)
-        clock = _encoded(time, self.time_frequencies)[:, None].expand(-1, len(points), -1)
-        return self.coefficient(torch.cat([encoded, clock], -1)) @ basis / self.bases
+        read = torch.cat([encoded, clock[:, None].expand(-1, len(points), -1)], -1)
+        factors = self.coefficient(read).unflatten(-1, (self.bases, 10))
+        return (factors * basis[:, None]).mean(-2)
 
     def forward(
         self,

@@ -16,7 +16,7 @@ from mosa.reconstruction.pose.registration import initial_velocity, register_pos
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
-from mosa.types import Appearance, Scene, Splats
+from mosa.types import REST, Appearance, Scene, Splats
 
 MOST_FRAMES = 6
 """Frames of free flight that a velocity is fitted to at most: more take longer and say little more."""
@@ -88,7 +88,7 @@ def sequence_start(
     body: RestShape, appearance: Appearance, scene: Scene, *, register: bool
 ) -> Start:
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
-    rest shape's own. appearance: at rest, of `appearance_of`.
+    rest shape's own. A film that starts at rest has no velocity. appearance: at rest, of `appearance_of`.
 
     The free frames are found on the way: a rough velocity from the first two frames predicts the contact, the frames before it
     give the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is
@@ -111,6 +111,8 @@ def sequence_start(
         torch.zeros(3).to(body.rest),
         torch.zeros(3).to(body.rest),
     )
+    if scene.start == REST:
+        return start
     count, most, exact = 2, MOST_FRAMES, False
     while True:
         velocity, spin = initial_velocity(
@@ -130,7 +132,8 @@ def sequence_start(
         if free < 2 and exact:
             raise DataError(
                 f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
-                "frames of free flight are needed (scene.frames, scene.last_free_frame)"
+                "frames of free flight are needed (scene.frames, scene.last_free_frame); of a film that starts at "
+                "rest say scene.start=rest"
             )
         if not exact:
             count, exact = max(2, min(free, most)), True

@@ -14,7 +14,7 @@ from mosa.data.scene import load_scene
 from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.errors import DataError
 from mosa.rendering.cameras import rays
-from mosa.types import Ground, Scene
+from mosa.types import REST, Ground, Scene
 
 RADIUS, REBOUND, FPS, FRAMES = 0.1, 0.6, 30, 12
 
@@ -201,6 +201,17 @@ def test_an_object_that_the_border_cuts_is_named(scene):
         left = scene.mattes.clone()
         left[..., :12, :] = left.amax(-2, keepdim=True)[..., :12, :]  # up to the upper border
         validate(replace(scene, mattes=left))
+
+
+def test_what_is_pressed_may_move_in_any_way(scene):
+    """The ball's frames, ten times as slow: refused of a fall, and nothing is asked of a film that starts at rest."""
+    slow = replace(scene, times=10 * scene.times)
+    with pytest.raises(DataError, match=r"say scene\.start=rest"):
+        validate(slow)
+    validate(replace(slow, start=REST))
+    frozen = reordered(slow, [0] * FRAMES)
+    with pytest.raises(DataError, match="identical"):
+        validate(replace(frozen, start=REST))
 
 
 def test_a_camera_that_is_a_frame_late_is_named(scene):

@@ -118,3 +118,16 @@ def test_isotropic_stiffness_is_hooke_in_mandel_scaling():
         return MANDEL * torch.stack([A[0, 0], A[1, 1], A[2, 2], A[1, 2], A[2, 0], A[0, 1]])
 
     torch.testing.assert_close(C0 @ mandel(strain), mandel(stress), rtol=1e-12, atol=1e-14)
+
+
+def test_the_printed_factors_are_a_product_with_an_offset():
+    """C = (L + e I)(U + e I): invertible, e^2 I of no numbers, entries of at most about 3 alpha^2."""
+    e, eye = microplane.OFFSET, torch.eye(3, dtype=torch.float64)
+    numbers = 0.1 * torch.tanh(drawn(50, 12, seed=3, size=3.0))
+    L, U = microplane.lu_factors(numbers)
+    C = microplane.printed_correction(numbers)
+    torch.testing.assert_close(C, L @ U + e * (L + U) + e**2 * eye, rtol=0, atol=1e-15)
+    assert float(C.abs().max()) <= 3 * 0.1**2 + 2 * e * 0.1 + e**2
+    nothing = microplane.printed_correction(torch.zeros(12, dtype=torch.float64))
+    torch.testing.assert_close(nothing, e**2 * eye, rtol=0, atol=1e-18)
+    assert float(torch.linalg.det(nothing)) > 0

@@ -180,6 +180,12 @@ def test_friction_alpha():
     )
 
 
+def test_the_printed_cone_is_the_root_of_the_whole_fraction():
+    angle = torch.tensor(30.0).double()  # sin = 1/2: sqrt(2/3 * 1/2.5)
+    assert float(friction_alpha(angle, "printed")) == pytest.approx(math.sqrt(4 / 15), rel=1e-12)
+    assert float(friction_alpha(angle)) == pytest.approx(math.sqrt(2 / 3) * 0.4, rel=1e-12)
+
+
 @pytest.mark.parametrize("angle", [20.0, 30.0])
 def test_drucker_prager_is_steeper_in_plane_strain(angle):
     """A friction angle is that of triaxial compression: sheared in plane strain until it flows, the law's stresses reach

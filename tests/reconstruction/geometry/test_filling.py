@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import squashed_body
 import torch
+from scipy import ndimage
 
 from mosa.data.hull import (
     Volume,
@@ -18,7 +19,10 @@ from mosa.data.hull import (
     visual_hull,
 )
 from mosa.errors import DataError
+from mosa.reconstruction.gaussians.static import start_splats
+from mosa.reconstruction.geometry.behind import fill_behind
 from mosa.reconstruction.geometry.filling import body_volume, fill
+from mosa.reconstruction.settings import StaticSettings
 
 TRUE_VOLUME = 4 / 3 * np.pi * np.prod(squashed_body.RADII)
 CENTRE = torch.tensor(squashed_body.forward(np.zeros((1, 3)), 0.0, 1.0)[0], dtype=torch.float32)
@@ -137,3 +141,23 @@ def test_debris_goes_and_cavities_close():
     assert body_volume(Volume(values, volume.origin, volume.pitch)) == pytest.approx(
         body_volume(volume)
     )
+
+
+def test_what_lies_behind_gaussians_of_a_skin_is_the_body(hull, still):
+    """Of an opaque skin, whose depth no Gaussian of the far side draws in: the inside is filled, and nothing is added beyond the
+    hull's own voxels and their neighbours."""
+    skin = start_splats(hull, still, StaticSettings(), count=3000, seed=0)
+    skin = replace(skin, opacities=torch.full_like(skin.opacities, 0.999))
+    found = fill_behind(skin, still, hull)
+    inside, true = found.values.numpy() > 0.5, truly_inside(hull)
+    deep = ndimage.binary_erosion(true, iterations=5)
+    assert deep.sum() > 0.2 * true.sum() and inside[deep].all()
+    assert not inside[~ndimage.binary_dilation(hull.values.numpy() > 0.5)].any()
+    assert 0.85 < body_volume(found) / TRUE_VOLUME < 1.05
+
+
+def test_no_gaussians_fill_nothing(hull, still):
+    skin = start_splats(hull, still, StaticSettings(), count=100, seed=0)
+    clear = replace(skin, opacities=torch.full_like(skin.opacities, 1e-4))
+    with pytest.raises(DataError, match="behind the 100 static Gaussians"):
+        fill_behind(clear, still, hull)

@@ -105,7 +105,7 @@ def test_free_shapes_start_at_rest_and_get_gradients(model, scaffold):
     assert torch.allclose(sample.covariances, covariance_from(sample.scales, sample.rotations))
     target = 2 * sample.covariances.detach()[1] + 1e-4
     ((sample.covariances[1] - target) ** 2).sum().backward()
-    touched = motion.shape_amplitude if model == "modes" else motion.basis[-1].weight
+    touched = motion.shape_amplitude if model == "modes" else motion.basis.last.weight
     assert float(touched.grad.abs().sum()) > 0
 
 

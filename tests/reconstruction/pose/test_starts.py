@@ -28,7 +28,7 @@ def drop(monkeypatch, seen_wrongly, frames=9, last_free_frame=None, height=HEIGH
     rest = corners + torch.tensor([0.0, height, 0.0])
     body = SimpleNamespace(rest=rest, center=rest.mean(0), volume=torch.full((8,), 1e-12))
     scene = SimpleNamespace(name="cube", sequence="train", frames=frames, times=t, gravity=torch.tensor([0, GRAVITY, 0]),
-                            up=torch.tensor([0.0, 1, 0]), ground=Ground(0.0), last_free_frame=last_free_frame,
+                            up=torch.tensor([0.0, 1, 0]), ground=Ground(0.0), last_free_frame=last_free_frame, start="falling",
                             training_cameras=[0], images=torch.zeros(1, frames, 1, 1, 3), mattes=torch.zeros(1, frames, 1, 1),
                             cameras=SimpleNamespace(select=lambda _: None), background=torch.ones(3))  # fmt: skip
     asked = []
@@ -84,3 +84,14 @@ def test_contact_before_the_second_frame_is_an_error(monkeypatch):
         DataError, match="cube/train: the object touches the ground before the second frame"
     ):
         start()
+
+
+def test_a_film_that_starts_at_rest_has_no_velocity_and_asks_for_no_flight(monkeypatch):
+    start, asked, body, scene = drop(monkeypatch, {}, height=0.1, last_free_frame=0)
+    with pytest.raises(DataError, match=r"scene\.start=rest"):
+        start()
+    asked.clear()
+    scene.start = "rest"
+    found = start()
+    assert asked == [] and starts.first_contact(body, found, scene) == 1
+    assert not found.velocity.any() and not found.angular_velocity.any()
