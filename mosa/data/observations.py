@@ -73,6 +73,10 @@ def training_observations(
 ) -> Observations:
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
+    if scene.markers is not None:
+        return Observations(
+            scene.images[:, frames], scene.mattes[:, frames], None, scene.cameras, 1
+        ).to(device)
     found = cropped(scene, scene.training_cameras, frames, margin).to(device)
     cues, splats = reconstruction.cues, reconstruction.splats
     flow = [
