@@ -95,13 +95,16 @@ def predicted_spread(
         figures[f"posterior/{s.prefix}/sd_m"] = float(sd[s.contact :].square().mean().sqrt())
         if s.scene.markers is not None:
             cues = cues_of_markers(s.scene, body.rest.cpu())
-            points = total_spread(torch.stack([cues.seen(each[s.prefix].cpu()) for each in drawn]), posterior.model_error,
-                                  among_forms(cues.seen(base[s.prefix].cpu()), [cues.seen(each[s.prefix].cpu()) for each in others]),
-                                  seen=s.prefix.startswith("train"))  # fmt: skip
-            error = (cues.seen(base[s.prefix].cpu()) - cues.positions).norm(dim=-1)
-            there = torch.isfinite(error[s.contact :])
-            within = error[s.contact :] <= 2 * points[s.contact :]
-            figures[f"posterior/{s.prefix}/coverage"] = float(within[there].double().mean())
+            here, *rivals = (cues.seen(each[s.prefix].cpu()) for each in (base, *others))
+            points = total_spread(
+                torch.stack([cues.seen(each[s.prefix].cpu()) for each in drawn]),
+                posterior.model_error,
+                among_forms(here, rivals),
+                seen=s.prefix.startswith("train"),
+            )
+            error = (here - cues.positions).norm(dim=-1)[s.contact :]
+            within = (error <= 2 * points[s.contact :])[torch.isfinite(error)]
+            figures[f"posterior/{s.prefix}/coverage"] = float(within.double().mean())
         target = true_motion(body, s.scene)
         if target is not None:
             error = (base[s.prefix].cpu() - target)[s.contact :].norm(dim=-1)

@@ -30,7 +30,7 @@ def filled(solid, spacing: float) -> tuple[Tensor, Tensor]:
     low, high = extent(solid)
     counts = ((high - low) / spacing).round().clamp_min(1).long()
     pitch = (high - low) / counts
-    axes = [low[i] + (torch.arange(int(counts[i])) + 0.5) * pitch[i] for i in range(3)]
+    axes = [low[i] + (torch.arange(int(counts[i])).double() + 0.5) * pitch[i] for i in range(3)]
     local = torch.cartesian_prod(*axes)
     if not isinstance(solid.shape, Box):
         local = local[signed_distance(solid.shape, local) < 0]

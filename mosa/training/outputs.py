@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from mosa.data.io.gaussian_ply import save_ply
 from mosa.data.synthetic.true_geometry import geometry_figures
 from mosa.evaluation.analysis.comparison import TITLES, compare, write_comparisons
+from mosa.evaluation.analysis.marker_figures import write_markers
 from mosa.evaluation.analysis.tables import (
     columns_text,
     continued_text,
@@ -18,7 +19,6 @@ from mosa.evaluation.analysis.tables import (
     parameter_table,
     results_table,
 )
-from mosa.evaluation.analysis.marker_figures import write_markers
 from mosa.evaluation.evaluate import (
     Sequence,
     evaluate,

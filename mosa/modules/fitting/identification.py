@@ -354,9 +354,7 @@ class Identification:
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues after frame 0."""
-        found = [
-            take.cues.away(self.rollout(self.body, i).x) for i, take in enumerate(self.takes)
-        ]
+        found = [take.cues.away(self.rollout(self.body, i).x) for i, take in enumerate(self.takes)]
         return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
 
     def _hold_substeps(self) -> None:
