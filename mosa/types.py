@@ -106,7 +106,7 @@ class Scene:
     times: Tensor
     gravity: Tensor
     up: Tensor
-    ground: Ground
+    ground: Ground | None
     box: Tensor
     density: float
     background: Tensor

@@ -13,7 +13,7 @@ from mosa.errors import DataError
 from mosa.physics.contact.colliders import Box
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.world import Start
-from mosa.types import MarkerCues, Reconstruction, Scene, Splats
+from mosa.types import MarkerCues, Markers, Reconstruction, Scene, Splats
 
 NEIGHBOURS = 32
 """Particles that tell where a tracked point is."""
@@ -41,11 +41,18 @@ def filled(solid, spacing: float) -> tuple[Tensor, Tensor]:
     return (local @ rotation.T + position).float(), volume
 
 
+def points_of(scene: Scene) -> Markers:
+    """Of a scene that has tracked points."""
+    assert scene.markers is not None
+    return scene.markers
+
+
 def marker_spacing(scene: Scene, particles: int | None) -> float:
     """Of about so many particles [m]."""
-    low, high = extent(scene.markers.body)
+    solid = points_of(scene).body
+    low, high = extent(solid)
     rough = float((high - low).prod() / (particles or USUAL)) ** (1 / 3)
-    share = len(filled(scene.markers.body, rough)[0]) / (particles or USUAL)
+    share = len(filled(solid, rough)[0]) / (particles or USUAL)
     return rough * share ** (1 / 3)
 
 
@@ -55,7 +62,7 @@ def cues_of_markers(scene: Scene, rest: Tensor) -> MarkerCues:
     A point is a fixed sum over its `NEIGHBOURS` nearest particles, the value there of the affine
     field nearest to their positions (weights fall off as a Gaussian): exact for every affine
     motion, and for points beside the body, which go with its surface. Errors: DataError."""
-    markers, x = scene.markers, rest.detach().double().cpu()
+    markers, x = points_of(scene), rest.detach().double().cpu()
     distance, index = torch.cdist(markers.rest.double(), x).topk(
         min(NEIGHBOURS, len(x)), largest=False
     )
@@ -76,7 +83,7 @@ def cues_of_markers(scene: Scene, rest: Tensor) -> MarkerCues:
 
 def reconstruction_of_markers(scene: Scene, spacing: float) -> Reconstruction:
     """Particles of the given shape, in grey, with the training recording as cues."""
-    x, volume = filled(scene.markers.body, spacing)
+    x, volume = filled(points_of(scene).body, spacing)
     n = len(x)
     turns = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
     scales = torch.full((n, 3), 0.35 * spacing)
@@ -92,4 +99,4 @@ def followed_by_markers(scene: Scene, first: Reconstruction) -> Reconstruction:
 def start_at_rest(scene: Scene, center: Tensor) -> Start:
     """Undeformed and at rest, with the loads of the recording. center: (3,) of the body [m]."""
     zero = torch.zeros_like(center)
-    return Start(torch.eye(3).to(center), center, zero, zero.clone(), scene.markers.loads)
+    return Start(torch.eye(3).to(center), center, zero, zero.clone(), points_of(scene).loads)
