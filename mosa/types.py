@@ -79,6 +79,19 @@ class Truth:
 
 
 @dataclass(frozen=True)
+class Markers:
+    """Tracked points of a sequence. names: M; rest: (M, 3) [m] where they are about the undeformed
+    body; positions: (T, M, 3) [m], NaN where one was not seen; body: the solid (`colliders`) that
+    the body is at rest; loads: sets with a mass, as in world.driven, of this sequence."""
+
+    names: tuple[str, ...]
+    rest: Tensor
+    positions: Tensor
+    body: Any
+    loads: tuple[dict[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
 class Scene:
     """One sequence of multi-view images of one object; the same for every data format.
 
@@ -87,6 +100,7 @@ class Scene:
     `last_free_frame`: index of the last frame before first contact, None = find it from the data.
     `holdout_cameras`, `holdout_frames`: indices that no stage of learning may read.
     start: `FALLING`, or `REST`: at frame 0 nothing moves, and the body may be in contact already.
+    `markers`: tracked points in place of images, of which there are then none (V = 0).
     """
 
     name: str
@@ -97,7 +111,7 @@ class Scene:
     times: Tensor
     gravity: Tensor
     up: Tensor
-    ground: Ground
+    ground: Ground | None
     box: Tensor
     density: float
     background: Tensor
@@ -110,6 +124,7 @@ class Scene:
     known_parameters: dict[str, float] = field(default_factory=dict)
     fingerprint: str = ""
     start: str = FALLING
+    markers: Markers | None = None
 
     @property
     def frames(self) -> int:
@@ -181,6 +196,40 @@ class MotionCues:
         """Of the first `frames` frames."""
         return MotionCues(*(getattr(self, f.name)[:frames] for f in fields(self)))
 
+    def away(self, x: Tensor) -> Tensor:
+        """(T, N, 3) [m] of particles at x from where they were seen."""
+        return x - self.positions
+
+
+@dataclass(frozen=True)
+class MarkerCues:
+    """Tracked points as cues. positions: (T, M, 3) [m], NaN where one was not seen; each is the sum
+    of `weights` (M, K) times the positions of `particles` (M, K)."""
+
+    positions: Tensor
+    particles: Tensor
+    weights: Tensor
+
+    def to(self, device: torch.device | str) -> MarkerCues:
+        return MarkerCues(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+    def first(self, frames: int) -> MarkerCues:
+        """Of the first `frames` frames."""
+        return replace(self, positions=self.positions[:frames])
+
+    def seen(self, x: Tensor) -> Tensor:
+        """(T, M, 3) [m] where the points are when the particles are at x (T, N, 3)."""
+        return (x[:, self.particles] * self.weights.to(x)[..., None]).sum(-2)
+
+    def away(self, x: Tensor) -> Tensor:
+        """(T, M, 3) [m] of the points, when the particles are at x, from where they were seen: 0
+        for those that were not, and the others of the frame stand in for them in its mean
+        square."""
+        found = self.seen(x) - self.positions
+        there = torch.isfinite(found).all(-1, keepdim=True)
+        share = there.to(x).mean(1, keepdim=True).clamp_min(1 / there.shape[1])
+        return torch.where(there, found, 0.0) / share.sqrt()
+
 
 @dataclass(frozen=True)
 class Reconstruction:
@@ -193,7 +242,7 @@ class Reconstruction:
     splats: Splats
     spacing: float
     volume: Tensor
-    cues: MotionCues
+    cues: MotionCues | MarkerCues
     static: Splats | None = None
     geometry: dict[str, float] = field(default_factory=dict)
     appearance: Appearance | None = None

@@ -128,12 +128,14 @@ class WorldRecord(Settings):
 
 
 class StartRecord(Settings):
-    """A body's first state: rotation, centre [m], velocity [m/s], angular velocity [rad/s]."""
+    """A body's first state: rotation, centre [m], velocity [m/s], angular velocity [rad/s]; masses
+    that go with it in this sequence."""
 
     rotation: Rotation
     center: Three
     velocity: Three
     angular_velocity: Three
+    loads: list[Section] = []
 
 
 class BodyRecord(Settings):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
 from mosa.rendering.observer import observe
-from mosa.types import Cameras, Reconstruction, Scene
+from mosa.types import Cameras, MotionCues, Reconstruction, Scene
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,13 @@ def training_observations(
 ) -> Observations:
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
+    if scene.markers is not None:
+        return Observations(
+            scene.images[:, frames], scene.mattes[:, frames], None, scene.cameras, 1
+        ).to(device)
     found = cropped(scene, scene.training_cameras, frames, margin).to(device)
     cues, splats = reconstruction.cues, reconstruction.splats
+    assert isinstance(cues, MotionCues)  # of a scene with images
     flow = [
         observe(
             cues.positions[: len(frames)].to(device),

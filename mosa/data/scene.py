@@ -18,6 +18,7 @@ FORMATS = {
     "pacnerf": "mosa.data.formats.pacnerf:load_pacnerf",
     "spring_gaus": "mosa.data.formats.spring_gaus:load_spring_gaus",
     "transforms": "mosa.data.formats.transforms:load_transforms",
+    "markers": "mosa.data.formats.markers:load_markers",
     "builtin": "mosa.data.synthetic:load_builtin",
 }
 """Format -> module:function. A new format is one function (path=..., the keys it needs) -> Scene and one line here, or a call of

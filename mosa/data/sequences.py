@@ -28,8 +28,13 @@ OWN = (
     "particles",
     "scale",
     "fill_holes",
+    "start",
+    "duration",
+    "loads",
 )
 """What a sequence may have otherwise than the training one: not the world, of which there is one for all."""
+FILES = (".json", ".c3d", ".csv")
+"""Endings of a sequence that is a file, which are no part of its name."""
 DEPTH = 3
 """Folders that a name is made of at most; what is then still called the same is numbered."""
 SHARED = 0.05
@@ -192,7 +197,7 @@ def place(root: str | None, path: str) -> Path:
 def pieces(path: Path) -> list[str]:
     """The parts of a path that a name can be made of, without the ending of a file."""
     *above, last = path.parts
-    parts = [*above, Path(last).stem if last.endswith(".json") else last]
+    parts = [*above, Path(last).stem if last.endswith(FILES) else last]
     return [safe for part in parts if (safe := re.sub(r"[^\w.-]+", "_", part).strip("._"))] or [
         "sequence"
     ]

@@ -22,6 +22,7 @@ from mosa.evaluation.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.evaluation.settings import EvaluationSettings
 from mosa.modules.body.body import VARIANTS, Body, Start, World
 from mosa.modules.body.material import material_states
+from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.reconstruction.pose.starts import first_contact
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.carried_splats import seen
@@ -148,6 +149,9 @@ def motion_metrics(
     after = [t for t in frames if t >= sequence.contact]
     if not after:
         return {}
+    if sequence.scene.markers is not None:
+        away = cues_of_markers(sequence.scene, body.rest.cpu()).away(x)[after]
+        return {"rms_m": float(away.square().sum(-1).mean().sqrt())}
     if truth is None:
         clouds = sequence.scene.particles
         if clouds is None:
@@ -268,7 +272,8 @@ def sequence_metrics(
     training = sequence.prefix.startswith("train")
     frames = scene.training_frames if training else list(range(scene.frames))
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
-    images = render(body, rollout, scene, cameras)
+    # without a camera there is nothing to compare
+    images = render(body, rollout, scene, cameras) if cameras else scene.images
     figures: Mapping[str, float] = {
         **motion_metrics(x, body, sequence, frames, settings, target),
         **image_metrics(images, scene, cameras, frames),

@@ -67,6 +67,8 @@ def warn_of_others(body: Body, found: Mapping[str, Start], scenes: Sequence[Scen
     of the training film as `train`; scenes: theirs, in this order."""
     own = Likeness(USUAL, torch.zeros(3))
     for (prefix, start), scene in zip(found.items(), scenes):
+        if scene.markers is not None:
+            continue
         like = likeness(body, start, scene)
         if prefix == "train":
             own = like

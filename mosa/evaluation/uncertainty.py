@@ -18,6 +18,7 @@ from mosa.modules.body.material import FORMS as RANGES
 from mosa.modules.body.material import RELATIVE, Form, Material
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import as_rival, each_law, limits_of
+from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.system.progress import tqdm
 
 DRAWS = 12
@@ -92,6 +93,18 @@ def predicted_spread(
                           [each[s.prefix] for each in others]), seen=s.prefix.startswith("train"))  # fmt: skip
         spreads[s.prefix] = sd.cpu()
         figures[f"posterior/{s.prefix}/sd_m"] = float(sd[s.contact :].square().mean().sqrt())
+        if s.scene.markers is not None:
+            cues = cues_of_markers(s.scene, body.rest.cpu())
+            here, *rivals = (cues.seen(each[s.prefix].cpu()) for each in (base, *others))
+            points = total_spread(
+                torch.stack([cues.seen(each[s.prefix].cpu()) for each in drawn]),
+                posterior.model_error,
+                among_forms(here, rivals),
+                seen=s.prefix.startswith("train"),
+            )
+            error = (here - cues.positions).norm(dim=-1)[s.contact :]
+            within = (error <= 2 * points[s.contact :])[torch.isfinite(error)]
+            figures[f"posterior/{s.prefix}/coverage"] = float(within.double().mean())
         target = true_motion(body, s.scene)
         if target is not None:
             error = (base[s.prefix].cpu() - target)[s.contact :].norm(dim=-1)

@@ -22,23 +22,27 @@ FASTER = 1.5
 @dataclass(frozen=True)
 class Start:
     """Initial state of a sequence. rotation: (3, 3) pose Q relative to the rest shape; center: (3,) position of the rest
-    centre [m]; velocity: (3,) [m/s]; angular_velocity: (3,) [rad/s]."""
+    centre [m]; velocity: (3,) [m/s]; angular_velocity: (3,) [rad/s]; loads: entries as of
+    world.driven of masses that go with the body in this sequence alone."""
 
     rotation: Tensor
     center: Tensor
     velocity: Tensor
     angular_velocity: Tensor
+    loads: tuple[Mapping[str, Any], ...] = ()
 
     def written(self) -> dict[str, list[Any]]:
         """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
-        return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
+        moving = {f.name: getattr(self, f.name).tolist() for f in fields(self)[:-1]}
+        return moving | ({"loads": [dict(each) for each in self.loads]} if self.loads else {})
 
     @classmethod
     def read(cls, written: Mapping[str, list[Any]], like: Tensor | None = None) -> Start:
         """like: tensor of the device and type wanted, None for the CPU's float32."""
-        found = {name: torch.tensor(value) for name, value in written.items()}
+        found = {name: torch.tensor(written[name]) for name in (f.name for f in fields(cls)[:-1])}
         return cls(
-            **{name: value if like is None else value.to(like) for name, value in found.items()}
+            **{name: value if like is None else value.to(like) for name, value in found.items()},
+            loads=tuple(written.get("loads") or ()),
         )
 
 

@@ -35,6 +35,11 @@ from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
 from mosa.evaluation.evaluate import sequences
 from mosa.modules.fitting.training_sequences import Take
 from mosa.physics.world import Start
+from mosa.reconstruction.marker_body import (
+    followed_by_markers,
+    marker_spacing,
+    reconstruction_of_markers,
+)
 from mosa.reconstruction.motion.moved import SecondLook
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
 from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequence_start
@@ -152,6 +157,8 @@ class SceneDataModule(L.LightningDataModule):
         dx, particles, per_cell = settings.dx, settings.particles, settings.particles_per_cell
         if dx is not None:
             return float(dx / grid_spacing(1.0, per_cell))
+        if self.scene.markers is not None:
+            return marker_spacing(self.scene, None if particles == "auto" else int(particles))
         return spacing_for(
             self.scene,
             None if particles == "auto" else particles,
@@ -180,6 +187,8 @@ class SceneDataModule(L.LightningDataModule):
     @cached_property
     def reconstruction(self) -> Reconstruction:
         """Of the training sequence."""
+        if self.scene.markers is not None:
+            return reconstruction_of_markers(self.scene, self.spacing)
         return reconstruct(
             self.scene,
             settings=self.reconstruction_settings,
@@ -197,6 +206,8 @@ class SceneDataModule(L.LightningDataModule):
 
     def followed(self, scene: Scene) -> Reconstruction:
         """Reconstruction of another sequence of the body that was found in the training one."""
+        if scene.markers is not None:
+            return followed_by_markers(scene, self.reconstruction)
         start = self.starts[f"train/{scene.sequence}"]
         return follow(
             scene,
@@ -260,7 +271,7 @@ class SceneDataModule(L.LightningDataModule):
     def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
         """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
         settings = self.reconstruction_settings
-        if not settings.looks_again:
+        if not settings.looks_again or scene.markers is not None:
             return None
         return SecondLook(scene, reconstruction, settings, self.settings.seed, self.device or "cpu")
 
@@ -271,7 +282,7 @@ class SceneDataModule(L.LightningDataModule):
     @cached_property
     def epochs(self) -> Epochs:
         """The batches of training; the fit says before each epoch what it is."""
-        views = len(self.takes[0].observations.cameras)
+        views = max(1, len(self.takes[0].observations.cameras))  # none beside tracked points
         return Epochs(ViewSchedule(views, self.settings.fit.views, self.settings.seed), self.batch)
 
     def batch(self, views: Sequence[int]) -> MotionBatch:
@@ -283,7 +294,8 @@ class SceneDataModule(L.LightningDataModule):
         )
 
     def sequence_batch(self, index: int, take: Take, views: Sequence[int]) -> SequenceBatch:
-        chosen = [view % len(take.observations.cameras) for view in views]
+        cameras = len(take.observations.cameras)
+        chosen = [view % cameras for view in views] if cameras else []
         frames = list(range(len(take.cues.positions)))
         return SequenceBatch(
             name=take.name,

@@ -86,7 +86,8 @@ def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
     """What `LitMosa._begin` takes of a record. Errors: ConfigError naming the key."""
     settings = TrainSettings.part(record.settings)
     stages = build_stages(settings.fit, body.heterogeneity, body.adapter)
-    if not settings.reconstruction.informed.iterations:
+    filmed = settings.scene.plain().get("format") != "markers"
+    if not settings.reconstruction.informed.iterations or not filmed:
         stages = [stage for stage in stages if not stage.looks_again]
     return {
         "world": replace(world_of(record), forces=forces_from_config(settings.world.forces or ())),

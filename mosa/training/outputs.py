@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from mosa.data.io.gaussian_ply import save_ply
 from mosa.data.synthetic.true_geometry import geometry_figures
 from mosa.evaluation.analysis.comparison import TITLES, compare, write_comparisons
+from mosa.evaluation.analysis.marker_figures import write_markers
 from mosa.evaluation.analysis.tables import (
     columns_text,
     continued_text,
@@ -114,7 +115,10 @@ def write_outputs(
     if body.splats is not None:
         known = body.splats.appearance
         save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
-    if cfg.evaluation.video:
+    marked = [s for s in evaluated if s.scene.markers is not None]
+    if marked:
+        write_markers(folder, body, marked, kept)
+    elif cfg.evaluation.video:
         simulated = [s for s in evaluated if TITLES.keys() & kept[s.prefix].keys()]
         shown = [s for s in simulated if s.prefix.startswith("test")] or simulated[:1]
         if shown:

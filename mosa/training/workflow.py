@@ -102,17 +102,23 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("data"):
         scene, others = data.scenes
     sequences_taught = 1 + len(data.taught)
-    check_seen(cfg, scene)
-    clock.costs = estimate(
-        settings.plain(),
-        scene,
-        len(others),
-        sequences_taught,
-        device,
-        stored=data.reconstructed(),
-        most=most_particles(device),
-    )
-    log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
+    filmed = scene.markers is None
+    if filmed:
+        check_seen(cfg, scene)
+        clock.costs = estimate(
+            settings.plain(),
+            scene,
+            len(others),
+            sequences_taught,
+            device,
+            stored=data.reconstructed(),
+            most=most_particles(device),
+        )
+        log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
+    else:
+        log.info(
+            "tracked points alone: no reconstruction from images, no figures of images, no video"
+        )
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -147,14 +153,21 @@ def train(cfg: DictConfig) -> float | None:
         warn_of_others(body, starts, [scene, *others])
         if cfg.extrapolate:
             check_can_extrapolate(module)
-        log.info(fit_estimate(module, clock.costs))
+        if filmed:
+            log.info(fit_estimate(module, clock.costs))
+        elif not all(stage.newton for stage in module.stages):
+            raise ConfigError(
+                "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
+                "found Adam (fit.<stage>.optimizer): choose adapter=operator or adapter=none"
+            )
         fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
-    save_observed(
-        folder / "observed.npz",
-        {prefix: take.cues for prefix, take in zip(learned_from, module.takes)},
-    )
+    if filmed:
+        save_observed(
+            folder / "observed.npz",
+            {prefix: take.cues for prefix, take in zip(learned_from, module.takes)},
+        )
     with clock.measure("evaluation"):
         evaluated = run.sequences
         figures, kept = figures_of(

@@ -42,6 +42,8 @@ def validate(scene: Scene) -> Scene:
 
     Suspicious holes in the mattes of real footage are a warning: only who took it knows whether they are openings.
     """
+    if scene.markers is not None:  # which its reader has checked
+        return scene
     V, T = len(scene.cameras), scene.frames
     H, W = scene.cameras.height, scene.cameras.width
     label = f"scene {scene.name} ({scene.sequence})"

@@ -21,7 +21,7 @@ from mosa.modules.body.material import Material
 from mosa.modules.body.model import Model
 from mosa.modules.body.ready import Ready
 from mosa.modules.body.simulation_settings import SimulationSettings
-from mosa.physics.contact.driven import held_in, loads
+from mosa.physics.contact.driven import driven_from_config, held_in, loads
 from mosa.physics.engine.axes import PERIOD
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
@@ -289,15 +289,16 @@ class Body(nn.Module):
             "density": self.density, "adapter": adapter,
             "stride": None if adapter is not None and adapter.steady else self.settings.stride,
         }  # fmt: skip
-        if world.driven:
-            arguments |= self.driven(world, state.x - lift)
+        if world.driven or start.loads:
+            arguments |= self.driven(world, state.x - lift, start)
         return Ready(simulator, state, lift, arguments, timing)
 
-    def driven(self, world: World, x: Tensor) -> dict[str, Any]:
-        """What `Simulator.rollout` takes for the driven sets of a world, of the body's particles
-        that start at x (N, 3) [m]."""
+    def driven(self, world: World, x: Tensor, start: Start) -> dict[str, Any]:
+        """What `Simulator.rollout` takes for the driven sets of a world and the loads of a start,
+        of the body's particles that start at x (N, 3) [m]."""
         held = held_in(world.driven, x, len(world.colliders))
-        added = loads(world.driven, x, self.volume)
+        own = driven_from_config(start.loads, "scene.loads")
+        added = loads((*world.driven, *own), x, self.volume)
         given = {} if held is None else {"held": held}
         return given if added is None else given | {"density": self.density + added}
 

@@ -29,7 +29,7 @@ from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.constitutive.laws import law_named
 from mosa.reconstruction.motion.response import Response
-from mosa.types import Rollout
+from mosa.types import MarkerCues, Rollout
 
 COUNTED_AT_FIRST = 100 / 30
 """Of a calibration's data over a later stage's, frame by frame: it has few numbers, and no model of its own error in its noise."""
@@ -85,16 +85,19 @@ class Identification:
         self.heterogeneity = (
             not self.calibrating and is_learned(body.heterogeneity) and "stiffness" in parts
         )
+        marked = any(take is not None and isinstance(take.cues, MarkerCues) for take in self.takes)
         free = self.calibrating and (law_named(body.material.law).plastic or body.settings.adaptive)
-        self.gains = (0.0,) if free else criterion.gains
-        self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
+        # a few points say neither where all the particles are nor how they are strained
+        self.gains = (0.0,) if free or marked else criterion.gains
+        self.kinds = (True, False, False) if (self.calibrating or marked) and kinds[0] else kinds
         if not any(self.kinds) and not world.forces:
             raise ConfigError(
                 "losses: identification compares motion cues, and the weights of position, rotation and stretch are "
                 "all 0; use fit=adam, which learns from images too"
             )
         columns_of(world.forces, world)
-        self.chosen = residuals.sampled(len(body.rest), body.rest.device)
+        compared = self.takes[0].cues.positions.shape[1] if marked else len(body.rest)
+        self.chosen = residuals.sampled(compared, body.rest.device)
         blocks = blocks_of(
             body,
             adapter=self.adapter,
@@ -344,16 +347,14 @@ class Identification:
         least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
         logarithms = []
         for i, gain in self.pairs:
-            away = self.rollout(self.body, i, gain).x - self.takes[i].cues.positions
+            away = self.takes[i].cues.away(self.rollout(self.body, i, gain).x)
             square = away[1:].square().sum(-1).mean(-1).double() + least
             logarithms.append(0.5 * float(square.log().mean()))
         return math.exp(sum(logarithms) / len(logarithms))
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues after frame 0."""
-        found = [
-            self.rollout(self.body, i).x - take.cues.positions for i, take in enumerate(self.takes)
-        ]
+        found = [take.cues.away(self.rollout(self.body, i).x) for i, take in enumerate(self.takes)]
         return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
 
     def _hold_substeps(self) -> None:
@@ -432,7 +433,7 @@ class Identification:
         it finds, as its search leaves that out: how far, the coarser grid says."""
         found = []
         for i, take in enumerate(self.takes):
-            away = self.rollout(self.body, i).x - take.cues.positions
+            away = take.cues.away(self.rollout(self.body, i).x)
             found.append(float(away[take.first_contact :].square().sum(-1).mean()))
         share, wrong = 1.0, None
         if self.calibrating and self.noise is not None:

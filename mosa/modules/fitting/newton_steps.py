@@ -15,7 +15,6 @@ from torch import Tensor
 
 from mosa.errors import DataError, SimulationDiverged
 from mosa.modules.fitting.identification import EVIDENCE_ITERATIONS, Identification
-from mosa.modules.fitting.residuals import SAMPLES
 from mosa.modules.fitting.search.backbone import choose_law
 from mosa.modules.fitting.search.ground import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.fitting.search.ground_choice import EXPLAINED, alike, learned_on, named, rivals_of
@@ -212,7 +211,7 @@ class NewtonSteps:
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
         """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""
         expected = [len(self.takes[i].cues.positions) - 1 for i, _ in identification.pairs]
-        samples = min(len(self.body.rest), SAMPLES)
+        samples = len(identification.chosen)
         for name, size in (("noise", ()), ("grid", (samples, 3))):
             found = saved.get(name)
             if found is not None and [[tuple(t.shape) for t in each] for each in found] != [

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.reconstruction.motion.response import Response
-from mosa.types import MotionCues, Rollout
+from mosa.types import MarkerCues, MotionCues, Rollout
 
 CUE_ERRORS = (0.5e-3, 0.01, 0.015)
 """Per component: positions [m], rotations [rad], singular values. Cues that a simulation informed are 0.5 to 0.7 mm off after
@@ -49,14 +49,18 @@ def sampled(particles: int, device: torch.device) -> Tensor:
 @torch.no_grad()
 def fields(
     rollout: Rollout,
-    cues: MotionCues,
+    cues: MotionCues | MarkerCues,
     start_rotation: Tensor,
     chosen: Tensor,
     response: Response | None = None,
 ) -> Fields:
     """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence;
-    response: what the cues keep of the prediction that they were found about."""
+    response: what the cues keep of the prediction that they were found about. Of tracked points,
+    `chosen` of which are compared, positions alone: the others are 0."""
     frames, x, F = len(rollout.x), rollout.x, rollout.F_tot
+    if isinstance(cues, MarkerCues):
+        away = cues.first(frames).away(x)[1:, chosen]
+        return Fields(away, torch.zeros_like(away), torch.zeros_like(away))
     if response is not None:
         x, F = response.seen(x, F, start_rotation)
     U, S, V = singular_value_decomposition(F[1:, chosen])

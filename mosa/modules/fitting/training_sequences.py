@@ -14,7 +14,7 @@ from mosa.errors import ConfigError, MosaError
 from mosa.modules.body.body import Body, Start, World
 from mosa.reconstruction.motion.moved import SecondLook
 from mosa.reconstruction.motion.response import Response
-from mosa.types import MotionCues
+from mosa.types import MarkerCues, MotionCues
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ class Take:
 
     start: Start
     observations: Observations
-    cues: MotionCues
+    cues: MotionCues | MarkerCues
     frame_dt: float
     first_contact: int
     again: SecondLook | None = None

@@ -153,16 +153,16 @@ def _welded(points: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def field_of_mesh(
     path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0
 ) -> SignedDistanceField:
-    """Signed distances to the mesh of an OBJ or PLY file (faces with more corners are cut into fans), times `scale` to metres.
+    """Signed distances to the mesh of an OBJ, PLY or STL file (faces with more corners are cut into fans), times `scale` to metres.
 
     Errors: ConfigError naming the file.
     """
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"mesh: no file {path}")
-    readers = {".obj": _read_obj, ".ply": _read_ply}
+    readers = {".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}
     if path.suffix.lower() not in readers:
-        raise ConfigError(f"mesh: {path}: expected a file .obj or .ply")
+        raise ConfigError(f"mesh: {path}: expected a file .obj, .ply or .stl")
     try:
         vertices, faces = readers[path.suffix.lower()](path)
         triangles = np.array(
@@ -170,6 +170,8 @@ def field_of_mesh(
         ).reshape(-1, 3)
     except DataError as error:
         raise ConfigError(f"mesh: {error}") from error
+    except ConfigError:
+        raise
     except Exception as error:  # whatever a parser finds: the file is not what its name says
         raise ConfigError(
             f"mesh: {path} cannot be read ({type(error).__name__}: {error})"
@@ -178,6 +180,18 @@ def field_of_mesh(
         return field_of_triangles(scale * vertices, triangles, spacing, margin)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+def _read_stl(path: Path) -> tuple[np.ndarray, list]:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ConfigError(
+            f"mesh: {path}: an STL file needs the package trimesh, which is not installed: "
+            "pip install trimesh, or write an OBJ or PLY file"
+        ) from error
+    mesh = trimesh.load(path, file_type="stl", force="mesh")
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces).tolist()
 
 
 def _read_obj(path: Path) -> tuple[np.ndarray, list]:

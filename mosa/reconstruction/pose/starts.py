@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mosa.errors import DataError
 from mosa.physics.world import Start
+from mosa.reconstruction.marker_body import start_at_rest
 from mosa.reconstruction.pose.registration import initial_velocity, register_pose
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
@@ -94,6 +95,8 @@ def sequence_start(
     give the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is
     kept that frames after its own contact went into. Errors: DataError where contact comes before the second frame.
     """
+    if scene.markers is not None:
+        return start_at_rest(scene, body.center)
     cameras = scene.training_cameras
     images, mattes = scene.images[cameras], scene.mattes[cameras]
     views = scene.cameras.select(cameras)

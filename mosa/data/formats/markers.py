@@ -1,0 +1,176 @@
+"""scene=markers: tracked points of a body of known shape, without images (docs/beam.md)."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mosa.data.io.markers import AT_REST, alignment, read_markers, released
+from mosa.errors import ConfigError, DataError
+from mosa.physics.contact.colliders import Box, collider_of
+from mosa.physics.contact.driven import driven_from_config
+from mosa.physics.contact.mesh import SignedDistanceField
+from mosa.settings import is_number
+from mosa.types import AUTO, Cameras, Ground, Markers, Scene
+
+log = logging.getLogger(__name__)
+
+WIDE = 3.0
+"""The world reaches so many sizes of the body beyond it."""
+
+
+def load_markers(
+    *,
+    path: Path,
+    body: Mapping[str, Any],
+    density: float,
+    ground: Ground | None = None,
+    name: str | None = None,
+    sequence: str = "train",
+    points: Mapping[str, Sequence[float]] | None = None,
+    tracked: Sequence[str] | None = None,
+    start: float | str = AUTO,
+    duration: float | None = None,
+    fps: float | None = None,
+    up: Sequence[float] = (0, 1, 0),
+    gravity: Sequence[float] = (0, -9.8, 0),
+    loads: Sequence[Mapping[str, Any]] = (),
+    holdout_frames: int = 0,
+) -> Scene:
+    """A sequence without cameras, whose frame 0 is when the body was let go at rest, undeformed.
+
+    path: the recording (`read_markers`); body: {type: box, size} or {type: mesh, path, scale} with
+    position and rotation as a collider has them, at rest, in the axes in which the run computes;
+    density [kg/m^3]; points: name -> place (x, y, z) [m] in these axes, by which the recording is
+    aligned as a rigid body, None where it is in them already; tracked: names that are compared,
+    None for all; start: auto (the release is found) or [s] of the recording; duration [s], None to
+    the end; fps: frames per second that it is resampled to, None for the recording's; loads: sets
+    with a mass that goes with the body in this recording, as in world.driven; holdout_frames: how
+    many last frames are not learned from.
+    Errors: ConfigError naming the key, DataError naming the file.
+    """
+    recording = read_markers(Path(path))
+    names = recording.names if tracked is None else tuple(tracked)
+    seen = recording.of(names, "scene.tracked")
+    times = recording.times
+    if start == AUTO:
+        begin = released(times, seen, str(path))
+    elif is_number(start) and times[0] <= float(start) < times[-1]:
+        begin = float(start)
+    else:
+        raise ConfigError(
+            f"scene.start: expected auto, or seconds from {times[0]:g} to {times[-1]:g}, "
+            f"found {start!r}"
+        )
+    rate = 1 / float(np.median(np.diff(times))) if fps is None else float(fps)
+    end = times[-1] if duration is None else min(times[-1], begin + float(duration))
+    frames = int(np.floor((end - begin) * rate + 1e-6)) + 1
+    held = int(holdout_frames) if is_number(holdout_frames) else -1
+    if not 0 <= held <= frames - 2:
+        raise ConfigError(
+            f"scene.holdout_frames: expected a number of last frames that leaves 2 of {frames} to "
+            f"learn from, found {holdout_frames!r} (scene.duration, scene.fps)"
+        )
+    before = (times <= begin) & (times >= begin - AT_REST)
+    known = {name: None for name in names} if points is None else dict(points)
+    still = np.array([median(each) for each in
+                      np.moveaxis(recording.of(list(known), "scene.points")[before], 1, 0)])  # fmt: skip
+    R, t = np.eye(3), np.zeros(3)
+    if points is not None:
+        R, t, off = alignment(still, points, "scene.points")
+        log.info("%s: aligned by %d points, %.2g mm off (rms)", Path(path).name, len(points), 1e3 * off)  # fmt: skip
+    chosen = [recording.names.index(each) for each in names]
+    moving = recording.at(begin + np.arange(frames) / rate)[:, chosen] @ R.T + t
+    rest = np.array([median(each) for each in np.moveaxis(seen[before], 1, 0)]) @ R.T + t
+    if unseen := [each for each, place in zip(names, rest) if not np.isfinite(place).all()]:
+        raise DataError(
+            f"{path}: expected every tracked point at rest before the release at {begin:.3f} s, "
+            f"found none of {unseen[0]!r}; leave it out of scene.tracked, or set scene.start"
+        )
+    log.info("%s: let go at %.4f s; %d frames at %g Hz", Path(path).name, begin, frames, rate)
+    solid = solid_of(body, Path(path).parent)
+    low, high = corners(solid)
+    far = WIDE * (high - low).max()
+    for each in driven_from_config(loads, "scene.loads"):
+        if each.held or not each.mass:
+            raise ConfigError(
+                "scene.loads: expected sets with a mass and held: false, which go with the body; "
+                "what holds it belongs to world.driven"
+            )
+    nothing = torch.zeros(0, frames, 1, 1)
+    return Scene(
+        name=name or Path(path).stem,
+        sequence=sequence,
+        images=nothing[..., None].expand(-1, -1, -1, -1, 3),
+        mattes=nothing,
+        cameras=Cameras(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4), 1, 1, ()),
+        times=torch.arange(frames) / rate,
+        gravity=torch.tensor(gravity, dtype=torch.float32),
+        up=torch.tensor(up, dtype=torch.float32),
+        ground=ground,
+        box=torch.stack([low - far, high + far]).float(),
+        density=float(density),
+        background=torch.ones(3),
+        synthetic=False,
+        last_free_frame=0,
+        holdout_frames=tuple(range(frames - held, frames)),
+        fingerprint=hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16],
+        markers=Markers(
+            names,
+            torch.from_numpy(rest).float(),
+            torch.from_numpy(moving).float(),
+            solid,
+            tuple(dict(each) for each in loads),
+        ),
+    )
+
+
+def median(places: np.ndarray) -> np.ndarray:
+    """(3,) of places (n, 3) that were seen, NaN where none was."""
+    there = places[np.isfinite(places).all(1)]
+    return np.median(there, 0) if len(there) else np.full(3, np.nan)
+
+
+def solid_of(body: Mapping[str, Any], folder: Path):
+    """The body at rest as a solid with a pose. folder: of relative paths. Errors: ConfigError."""
+    if not isinstance(body, Mapping) or body.get("type") not in ("box", "mesh"):
+        raise ConfigError(
+            "scene.body: expected {type: box, size: [x, y, z]} or {type: mesh, path: <file>}, with "
+            f"position and rotation, found {body!r}"
+        )
+    keys = {key: value for key, value in body.items() if value is not None}
+    if isinstance(keys.get("path"), str):
+        keys["path"] = str(folder / keys["path"])
+    return collider_of(keys, "scene.body")
+
+
+def extent(solid) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lowest and highest corner (3,) float64 [m] of a box or a mesh in its own axes."""
+    shape = solid.shape
+    if isinstance(shape, Box):
+        half = 0.5 * torch.tensor(shape.size, dtype=torch.float64)
+        return -half, half
+    assert isinstance(shape, SignedDistanceField)
+    low = torch.tensor(shape.origin, dtype=torch.float64)
+    high = low + shape.spacing * (torch.tensor(shape.values.shape) - 1)
+    return low + shape.margin, high - shape.margin
+
+
+def corners(solid) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lowest and highest corner (3,) float64 [m] of a solid where it stands."""
+    position, rotation = pose_of(solid)
+    ends = torch.stack(extent(solid))
+    every = torch.cartesian_prod(*ends.T) @ rotation.T + position
+    return every.amin(0), every.amax(0)
+
+
+def pose_of(solid) -> tuple[torch.Tensor, torch.Tensor]:
+    """Position (3,) and rotation (3, 3) float64 of a solid at rest."""
+    position, rotation, *_ = solid.motion.timed(None, 1.0).sample(1, 1, 1e-9)
+    return position[0], rotation[0]

@@ -1,0 +1,188 @@
+"""Recordings of tracked points: read from c3d and csv, release from rest, alignment, resampling."""
+
+from __future__ import annotations
+
+import csv
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mosa.errors import ConfigError, DataError
+
+COLUMNS = ("time", "name", "x", "y", "z")
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1e-3}
+"""Of a c3d file, which means millimetres where it says nothing."""
+AT_REST = 0.2
+"""Seconds at the start of a recording in which nothing moves, where the release is sought."""
+SEEN = 0.05
+"""Of the largest displacement: points that have moved by more have been let go; hands that do so
+move them by less."""
+EARLY = 0.4
+"""Of the largest displacement: up to there it grows as the square of the time since the release."""
+GAP = 2.5
+"""Samples apart between which a recording is joined by a line; a longer gap stays one."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """names: M points; times: (n,) [s] ascending; positions: (n, M, 3) [m], NaN where one was not
+    seen."""
+
+    names: tuple[str, ...]
+    times: np.ndarray
+    positions: np.ndarray
+
+    def of(self, names: Sequence[str], where: str) -> np.ndarray:
+        """(n, len(names), 3) [m] of the points of these names. Errors: ConfigError."""
+        if unknown := [name for name in names if name not in self.names]:
+            raise ConfigError(
+                f"{where}: expected points of the recording ({', '.join(self.names)}), "
+                f"found {unknown[0]!r}"
+            )
+        return self.positions[:, [self.names.index(name) for name in names]]
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """(T, M, 3) [m] at other times, linear between samples; NaN in a gap, and outside."""
+        found = np.full((len(times), len(self.names), 3), np.nan)
+        most = GAP * float(np.median(np.diff(self.times)))
+        for m in range(len(self.names)):
+            there = np.isfinite(self.positions[:, m]).all(1)
+            if there.sum() < 2:
+                continue
+            known, values = self.times[there], self.positions[there, m]
+            after = np.clip(np.searchsorted(known, times, side="left"), 1, len(known) - 1)
+            slack = 1e-6 * most
+            inside = (times >= known[0] - slack) & (times <= known[-1] + slack)
+            kept = inside & (known[after] - known[after - 1] <= most)
+            for axis in range(3):
+                line = np.interp(times, known, values[:, axis])
+                found[kept, m, axis] = line[kept]
+        return found
+
+
+def read_markers(path: Path) -> Recording:
+    """A recording of a .c3d file, or of a .csv file with the columns time [s], name, x, y, z [m]:
+    one row for each point in each frame; a row that is missing, or has no numbers, was not seen.
+
+    Errors: DataError naming the file and, of a csv, its line; ConfigError without the package."""
+    readers = {".c3d": _read_c3d, ".csv": _read_csv}
+    if path.suffix.lower() not in readers:
+        raise DataError(f"{path}: expected a recording .c3d or .csv")
+    if not path.is_file():
+        raise DataError(f"{path}: file not found")
+    found = readers[path.suffix.lower()](path)
+    if len(found.times) < 2 or not np.isfinite(found.positions).any():
+        raise DataError(f"{path}: expected at least two frames of points, found fewer")
+    if len(set(found.names)) < len(found.names):
+        raise DataError(f"{path}: expected every point's name once, found {found.names}")
+    return found
+
+
+def _read_c3d(path: Path) -> Recording:
+    try:
+        import c3d
+    except ImportError as error:
+        raise ConfigError(
+            f"{path}: a c3d file needs the package c3d (pip install 'mosa[markers]', or c3d), "
+            "which is not installed; or write a csv with time, name, x, y, z"
+        ) from error
+    try:
+        with warnings.catch_warnings(), path.open("rb") as file:
+            warnings.simplefilter("ignore")  # of files without analog data
+            reader = c3d.Reader(file)
+            names = tuple(str(label).strip() for label in reader.point_labels)
+            rate, unit = float(reader.point_rate), reader.get("POINT:UNITS")
+            unit = "" if unit is None else unit.string_value.strip().lower()
+            points = np.array([frame[:, :4] for _, frame, _ in reader.read_frames()], dtype=float)
+    except Exception as error:  # whatever the parser finds
+        raise DataError(
+            f"{path}: expected a c3d file of points, found a damaged or other one "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    if unit not in UNITS or rate <= 0 or points.ndim != 3 or points.shape[1] != len(names):
+        raise DataError(
+            f"{path}: expected named points in m, cm or mm at a rate above 0, found the unit "
+            f"{unit!r}, {rate} Hz, shape {points.shape}, {len(names)} names"
+        )
+    positions = UNITS[unit] * points[..., :3]
+    positions[points[..., 3] < 0] = np.nan
+    return Recording(names, np.arange(len(points)) / rate, positions)
+
+
+def _read_csv(path: Path) -> Recording:
+    rows: dict[tuple[float, str], list[float]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            table = csv.DictReader(file, skipinitialspace=True)
+            if missing := [key for key in COLUMNS if key not in (table.fieldnames or ())]:
+                raise DataError(
+                    f"{path}: expected the columns {', '.join(COLUMNS)}, found no {missing[0]}"
+                )
+            for row in table:
+                key = float(row["time"]), str(row["name"])
+                if key in rows:
+                    raise DataError(
+                        f"{path}, line {table.line_num}: {key[1]!r} at {key[0]} s for a second time"
+                    )
+                rows[key] = [float(row[axis] or "nan") for axis in "xyz"]
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
+        raise DataError(f"{path}: expected rows of {', '.join(COLUMNS)} ({error})") from error
+    times = np.array(sorted({time for time, _ in rows}))
+    names = tuple(dict.fromkeys(name for _, name in rows))
+    if not np.isfinite(times).all():
+        raise DataError(f"{path}: expected finite times [s], found others")
+    positions = np.full((len(times), len(names), 3), np.nan)
+    frame = {time: i for i, time in enumerate(times.tolist())}
+    for (time, name), place in rows.items():
+        positions[frame[time], names.index(name)] = place
+    return Recording(names, times, positions)
+
+
+def released(times: np.ndarray, positions: np.ndarray, where: str) -> float:
+    """When points (n, M, 3) [m] that are at rest at first are let go [s], to a part of a sample.
+
+    A force that acts at once moves them by the square of the time since then: the root of their
+    early displacement is a line, which ends at the release. Errors: DataError."""
+    rest = times - times[0] <= AT_REST
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of frames in which nothing is seen
+        away = positions - np.nanmedian(positions[rest], 0)
+        moved = np.nanmean(np.linalg.norm(away, axis=-1), 1)
+        largest, still = np.nanmax(moved), np.nanmax(moved[rest])
+    threshold = max(SEEN * largest, 2 * still)
+    gone = np.flatnonzero(moved > threshold)
+    if not len(gone) or not threshold < EARLY * largest:
+        raise DataError(
+            f"{where}: expected points at rest for {AT_REST} s and then let go, found them moving "
+            f"by {1e3 * still:.3g} mm of {1e3 * largest:.3g} mm by then; set scene.start [s]"
+        )
+    first = int(gone[0])
+    early = first + int(np.argmax(moved[first:] > EARLY * largest))
+    chosen = np.arange(first, max(early, first + 2))
+    chosen = chosen[np.isfinite(moved[chosen])]
+    slope, height = np.polyfit(times[chosen], np.sqrt(moved[chosen]), 1)
+    found = times[first] if slope <= 0 else -height / slope
+    return float(np.clip(found, times[0], times[first]))
+
+
+def alignment(
+    seen: np.ndarray, known: Mapping[str, Sequence[float]], where: str
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """(rotation R (3, 3), translation t (3,) [m], rms distance [m]) that take points seen (M, 3)
+    to R p + t nearest to the known ones (M, by name), by least squares (Kabsch, Acta
+    Crystallographica A 32, 1976). Errors: ConfigError."""
+    target = np.array([list(map(float, place)) for place in known.values()]).reshape(-1, 3)
+    there = np.isfinite(seen).all(1)
+    if there.sum() < 3:
+        raise ConfigError(f"{where}: expected three points that are seen at rest, found fewer")
+    a, b = seen[there], target[there]
+    U, S, Vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+    if S[1] < 1e-6 * S[0]:
+        raise ConfigError(f"{where}: expected points that are not on one line")
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = (U @ turn @ Vt).T
+    t = b.mean(0) - R @ a.mean(0)
+    return R, t, float(np.sqrt(((a @ R.T + t - b) ** 2).sum(1).mean()))

@@ -1,0 +1,162 @@
+"""Tracked points: files, release, alignment, how they go with the body, and a law learned from
+them alone."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_bodies import FREE, NU, E, small_body
+
+from mosa.data.io.markers import alignment, read_markers, released
+from mosa.data.scene import load_scene
+from mosa.errors import ConfigError, DataError
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.stages import Stage
+from mosa.modules.fitting.training_sequences import Take
+from mosa.physics.contact.driven import driven_from_config
+from mosa.physics.world import Start
+from mosa.reconstruction.marker_body import cues_of_markers, filled, marker_spacing
+from mosa.types import MarkerCues, Markers
+
+BEAMS = Path(os.environ.get("MOSA_DATA", "")) / "real" / "beams"
+BOX = {"type": "box", "size": [0.4, 0.1, 0.2]}
+
+
+def write(path, times, names, positions):
+    rows = ["time,name,x,y,z"]
+    for time, frame in zip(times, positions):
+        rows += [f"{time:.4f},{name},{','.join('' if np.isnan(v) else f'{v:.6f}' for v in p)}"
+                 for name, p in zip(names, frame)]  # fmt: skip
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def let_go(at=0.3037, rate=100.0):
+    """(times, positions (n, 4, 3)) of points of a block that falls from rest from `at` [s] on."""
+    times = np.arange(80) / rate
+    places = np.array([[0.2, 0.0, 0.0], [0.0, 0.05, 0.0], [0.0, 0.0, 0.1], [-0.2, 0.05, 0.1]])
+    positions = np.repeat(places[None], len(times), 0)
+    positions[..., 1] -= 0.5 * 9.8 * np.clip(times - at, 0, None)[:, None] ** 2
+    return times, positions
+
+
+def test_a_scene_of_a_csv_file(tmp_path):
+    times, positions = let_go()
+    angle = 0.7
+    R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    seen = positions @ R.T + [1.0, 2.0, 3.0]
+    seen[45, 1] = np.nan
+    path = write(tmp_path / "fall.csv", times, "abcd", seen)
+    known = dict(zip("abcd", positions[0].tolist()))
+    scene = load_scene(format="markers", path=str(path), body=BOX, density=900.0, points=known,
+                       tracked=["a", "b"], fps=50, duration=0.2, holdout_frames=2)  # fmt: skip
+    assert scene.frames == 11 and scene.training_frames == list(range(9))
+    assert len(scene.cameras) == 0 and scene.markers.names == ("a", "b")
+    expected = positions[0, :2, 1] - 0.5 * 9.8 * scene.times.numpy()[:, None] ** 2
+    found = scene.markers.positions.numpy()
+    assert np.nanmax(np.abs(found[..., 1] - expected)) < 4e-4  # of lines between samples
+    torch.testing.assert_close(scene.markers.rest.double(), torch.tensor(positions[0, :2]), atol=1e-5, rtol=0)  # fmt: skip
+    x, volume = filled(scene.markers.body, marker_spacing(scene, 500))
+    assert 400 < len(x) < 600 and float(volume.sum()) == pytest.approx(8e-3, rel=1e-5)
+
+
+def test_the_release_is_found_to_a_part_of_a_sample():
+    times, positions = let_go()
+    assert released(times, positions, "here") == pytest.approx(0.3037, abs=2e-4)
+    with pytest.raises(DataError, match="set scene"):
+        released(times, positions[::-1], "here")
+
+
+def test_a_gap_stays_one(tmp_path):
+    times, positions = let_go()
+    positions[20:26, 2] = np.nan
+    found = read_markers(write(tmp_path / "gap.csv", times, "abcd", positions))
+    resampled = found.at(np.array([0.1, 0.225, 0.4]))
+    assert np.isnan(resampled[1, 2]).all() and np.isfinite(resampled[[0, 2]]).all()
+
+
+def test_points_in_line_align_nothing():
+    line = np.arange(3)[:, None] * np.ones(3)
+    with pytest.raises(ConfigError, match="one line"):
+        alignment(line, dict(zip("abc", line.tolist())), "scene.points")
+
+
+@pytest.mark.parametrize(
+    "keys, said",
+    [({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
+     ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads")],
+)  # fmt: skip
+def test_a_mistake_names_its_key(tmp_path, keys, said):
+    path = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1])
+    with pytest.raises(ConfigError, match=said):
+        load_scene(**{"format": "markers", "path": str(path), "body": BOX, "density": 900.0} | keys)
+
+
+@pytest.fixture(scope="module")
+def swinging(tmp_path_factory):
+    """A block of known law that hangs from one end, and a recording of three of its points."""
+    body = small_body(adapter=False, E=E, law="neo_hookean", counts=(8, 3, 3))
+    world = replace(FREE, gravity=torch.tensor([0, -9.8, 0]).double(), driven=driven_from_config(
+        [{"type": "plane", "normal": [1, 0, 0], "position": [float(body.rest[:, 0].min()) + 0.03, 0, 0]}]))  # fmt: skip
+    begin = Start(torch.eye(3).double(), body.center, *torch.zeros(2, 3).double())
+    with torch.no_grad():
+        x = body.simulate(begin, world, 12, 1 / 60).x
+    places = torch.tensor([[0.07, 0.03, 0.0], [0.07, -0.01, 0.01], [0.02, 0.0, -0.01]])
+    markers = Markers(tuple("abc"), places, places.expand(12, 3, 3), None)
+    scene = load_scene(format="markers", path=str(write(tmp_path_factory.mktemp("a") / "a.csv", *(
+        let_go()[0], "abcd", let_go()[1]))), body=BOX, density=900.0)  # fmt: skip
+    cues = cues_of_markers(replace(scene, markers=markers), body.rest)
+    seen = cues.seen(x)
+    seen[5, 1] = torch.nan
+    return body, world, begin, replace(cues, positions=seen)
+
+
+def test_points_go_with_every_affine_motion(swinging):
+    body, _, _, cues = swinging
+    A = torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).double()
+    x = body.rest @ A.T + 1.0
+    rest = MarkerCues(cues.positions, cues.particles, cues.weights).seen(body.rest[None])[0]
+    torch.testing.assert_close(cues.seen(x[None])[0], rest @ A.T + 1.0, atol=1e-9, rtol=0)
+    expected = torch.tensor([[0.07, 0.03, 0.0], [0.07, -0.01, 0.01], [0.02, 0.0, -0.01]])
+    torch.testing.assert_close(rest, expected.double(), atol=1e-7, rtol=0)
+
+
+@torch.no_grad()
+def test_a_law_from_points_alone(swinging):
+    """From 0.8 of the true E, in six iterations, with a sample that was not seen."""
+    _, world, begin, cues = swinging
+    body = small_body(adapter=False, E=0.8 * E, law="neo_hookean", counts=(8, 3, 3))
+    body.material.raw["nu"].copy_(small_body(E=E, adapter=False).material.raw["nu"])
+    body.material.raw["nu"].requires_grad_(False)
+    stage = Stage(name="prior", iterations=6, lr=0.1)
+    fit = Identification(body, [Take(begin, None, cues, 1 / 60, 1)], world, stage, Criterion(name="corrected"),
+                         IdentificationSettings(), seats=1)  # fmt: skip
+    for _ in range(6):
+        fit.iterate()
+    assert float(body.material.physical()["E"]) == pytest.approx(E, rel=0.02)
+    assert float(body.material.physical()["nu"]) == pytest.approx(NU, abs=1e-3)
+
+
+@torch.no_grad()
+def test_a_load_of_one_recording_sags_more(swinging):
+    body, world, begin, _ = swinging
+    load = {"type": "plane", "normal": [-1, 0, 0], "position": [0.06, 0, 0], "mass": 0.3, "held": False}  # fmt: skip
+    loaded = Start.read(replace(begin, loads=(load,)).written(), body.rest)
+    assert loaded.loads == (load,)
+    low, without = (body.simulate(each, world, 8, 1 / 60).x[-1, :, 1].min() for each in (loaded, begin))  # fmt: skip
+    assert float(low) < float(without) - 1e-3
+
+
+@pytest.mark.skipif(not BEAMS.is_dir(), reason="the recordings are no part of the project")
+def test_a_measured_beam():
+    pytest.importorskip("c3d")
+    box = {"type": "box", "size": [0.112, 0.03, 0.03]}
+    scene = load_scene(format="markers", path=str(BEAMS / "beam_gravity_V2_a.c3d"), body=box,
+                       density=1070.0, duration=3.0)  # fmt: skip
+    moved = (scene.markers.positions - scene.markers.rest)[-50:].mean(0) * 1e3
+    assert float(moved[0, 0]) == pytest.approx(-6.64, abs=0.05)  # the sag of the first marker
