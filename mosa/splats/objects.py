@@ -24,6 +24,7 @@ from mosa.config.record import BodyRecord
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
+from mosa.physics.engine.inputs import numbers
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.geometry.filling import fill
 from mosa.reconstruction.geometry.shell import solid_of
@@ -34,7 +35,6 @@ from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
 from mosa.twin.saved import save_twin
-from mosa.twin.start import numbers
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
 
@@ -63,11 +63,10 @@ def read_object(
     splats, harmonics = load_ply(path)
     chosen = splats.opacities >= opacity
     if box is not None:
-        corners = numbers("box", box, "two corners [[x, y, z], [x, y, z]], min below max")
-        if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
-            raise ConfigError(
-                f"box: expected two corners [[x, y, z], [x, y, z]], min below max, found {box}"
-            )
+        expected = "two corners [[x, y, z], [x, y, z]], min below max"
+        corners = numbers("box", box, expected, (2, 3))
+        if not bool((corners[0] < corners[1]).all()):
+            raise ConfigError(f"box: expected {expected}, found {box}")
         chosen &= ((splats.means > corners[0]) & (splats.means < corners[1])).all(1)
     if int(chosen.sum()) < 100:
         low, high = (
@@ -149,8 +148,8 @@ def object_twin(
     None for the learned one's, or 1000; up: (3,) in the file's axes; height [m] of its lowest particle above the ground; ground:
     mode and friction. Errors: ConfigError, DataError.
     """
-    direction = numbers("up", up, "a direction (x, y, z)")
-    if direction.shape != (3,) or not float(direction.norm()) > 0:
+    direction = numbers("up", up, "a direction (x, y, z)", (3,))
+    if not float(direction.norm()) > 0:
         raise ConfigError(f"up: expected a direction (x, y, z), found {list(up)}")
     direction = direction / direction.norm()
     tensors, shown, cell = fill_object(

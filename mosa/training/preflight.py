@@ -15,7 +15,7 @@ from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
 from mosa.data.checks.cameras import lines_of_sight, misses
-from mosa.data.io.splat_formats import check_formats
+from mosa.data.io.splat_formats import Formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.modules.body.body import Body, Start, World
@@ -24,6 +24,7 @@ from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
+from mosa.settings import check
 from mosa.system.limits import counted
 from mosa.twin.twin import Twin
 from mosa.types import Scene
@@ -62,7 +63,7 @@ def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
     settings = SplatsSettings.read(values)
     if settings.video:
         ffmpeg("video")
-    check_formats(settings.formats)
+    check("formats", settings.formats, Formats)
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)
     return settings

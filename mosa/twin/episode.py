@@ -185,6 +185,8 @@ class Episode:
                 raise ConfigError(
                     f"state.{f.name}: expected finite numbers, found {found[~torch.isfinite(found)][0]}"
                 )
+        if self._stepper.prepared.numerics.check_J and float(torch.linalg.det(state.F).min()) <= 0:
+            raise ConfigError("state.F: expected det F > 0, which the law needs, found less")
         if self.colliders:
             rotation_matrices(state.rotation, state.rotation.ndim - 2)
         for name in ("frames", "substeps"):

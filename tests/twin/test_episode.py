@@ -486,7 +486,7 @@ def test_errors_of_starts_and_states():
     worlds = made.worlds(2)
     worlds.reset()
     with pytest.raises(
-        ConfigError, match=r"restart: expected numbers of worlds below 2, found \[True\]"
+        ConfigError, match=r"which: expected a list of numbers of worlds, found \[True\]"
     ):
         worlds.restart([True])
     with pytest.raises(ConfigError, match=r"worlds: expected at most .*, found 1e\+09 x 120"):

@@ -16,6 +16,33 @@ from mosa.physics.engine.numerics import Numerics, State
 from mosa.types import ParticleState
 
 UNBOUNDED = 1e30
+FASTEST = 1e6
+"""[m/s], [rad/s] of a start: the time step would be refused far below."""
+
+
+def numbers(
+    name: str, value: Sequence | Tensor, expected: str, shape: tuple[int, ...] | None = None
+) -> Tensor:
+    """Tensor of finite numbers, float64 where they are given so, else float32; of a shape where that is given. Errors: ConfigError
+    naming the argument."""
+    try:
+        found = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
+    if found.dtype == torch.bool or found.is_complex() or not bool(found.detach().float().isfinite().all()):  # fmt: skip
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
+    if shape is not None and found.shape != shape:
+        raise ConfigError(f"{name}: expected {expected}, found shape {tuple(found.shape)}")
+    return found if found.dtype == torch.float64 else found.float()
+
+
+def vector(name: str, value: Sequence[float] | Tensor) -> Tensor:
+    """(3,) tensor. Errors: ConfigError naming the argument."""
+    expected = f"three finite numbers within {FASTEST:g}"
+    result = numbers(name, value, expected, (3,))
+    if float(result.detach().abs().max()) > FASTEST:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
+    return result
 
 
 def pack_parameters(
@@ -63,6 +90,8 @@ def pack_parameters(
 def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> None:
     """Errors: ConfigError naming what has another shape, type or device; x may be float64 in any case."""
     *worlds, n = state.x.shape[:-1]
+    if not n:
+        raise ConfigError("x: expected one particle at least, found none")
     shapes = {
         name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3)
         for name in State._fields
@@ -95,10 +124,10 @@ def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Te
             )
         density = density.detach().to(volume)
         valid = (torch.isfinite(density) & (density > 0)).all()
-    numbers = [(volume > 0).all(), valid, (density * volume).mean()]
-    volumes, densities, mass = torch.stack([n.double() for n in numbers]).tolist()
+    told = [((volume > 0) & volume.isfinite()).all(), valid, (density * volume).mean()]
+    volumes, densities, mass = torch.stack([n.double() for n in told]).tolist()
     if not volumes:
-        raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+        raise ConfigError("volume: expected positive, finite numbers [m^3] for all particles")
     if not densities:
         raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
     return density, mass
