@@ -75,7 +75,7 @@ def test_what_is_drawn_is_what_is_seen_or_held():
     env.reset(seed=0)
     env.step(np.ones(3, np.float32))
     assert len(env.render()) == 2
-    with pytest.raises(Exception, match="render_mode: expected one of rgb_array"):
+    with pytest.raises(Exception, match="render_mode: expected rgb_array or rgb_array_list"):
         TwinEnv("pushing", render_mode="human")
 
 
