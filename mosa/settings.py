@@ -369,23 +369,32 @@ def call(where: str, build: Callable[..., Any], keys: Mapping[str, Any], **given
     return build(**given, **{key: getattr(checked, key) for key in keys})
 
 
-def typed(*own: str) -> Callable[[Public], Public]:
-    """A public function whose arguments are of the types that it says, as keys of a configuration are.
+def typed(function: Public) -> Public:
+    """A public function whose arguments are of the types that it says, as keys of a configuration are: numbers, texts, flags, and
+    types with metadata. Tensors, solids and functions it reads by itself. Errors: ConfigError naming the argument."""
+    signature = inspect.signature(function)
 
-    own: arguments that the function reads by itself. Errors: ConfigError naming the argument."""
+    @functools.wraps(function)
+    def called(*args: Any, **keys: Any) -> Any:
+        given = signature.bind(*args, **keys).arguments
+        arguments_of(function, "", *_untold(function)).part(given)
+        return function(*args, **keys)
 
-    def of(function: Public) -> Public:
-        signature = inspect.signature(function)
+    return called  # type: ignore[return-value]
 
-        @functools.wraps(function)
-        def called(*args: Any, **keys: Any) -> Any:
-            given = signature.bind(*args, **keys).arguments
-            arguments_of(function, "", "self", *own).part(given)
-            return function(*args, **keys)
 
-        return called  # type: ignore[return-value]
+@functools.cache
+def _untold(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Names of the arguments whose types are none of settings."""
 
-    return of
+    def told(kind: Any) -> bool:
+        if get_origin(kind) in (Union, types.UnionType):
+            return all(map(told, get_args(kind)))
+        plain = (int, float, str, bool, Path, type(None))
+        return get_origin(kind) in (Annotated, Literal) or kind in plain
+
+    hints = typing.get_type_hints(function, include_extras=True)
+    return tuple(n for n in inspect.signature(function).parameters if not told(hints.get(n, Any)))
 
 
 def node_of(model: type[Settings], without: Iterable[str] = ()) -> dict[str, Any]:

@@ -36,10 +36,6 @@ except ImportError as error:
     ) from error
 
 
-READ = ("task", "simulator", "checkpoint", "scene", "device", "spacing")
-"""Arguments of an environment that `arena_of` reads."""
-
-
 def reinforcement_library():
     """stable_baselines3. Errors: ConfigError where it is not installed."""
     try:
@@ -126,7 +122,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
 
     metadata: ClassVar[dict] = {"render_modes": ["rgb_array", "rgb_array_list"], "render_fps": 25}
 
-    @typed(*READ)
+    @typed
     def __init__(
         self, task: str | Task = "pushing", *, simulator: str = "learned", checkpoint: str | Path | None = None,
         scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
@@ -139,7 +135,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
             observation_space(self.task),
         )
 
-    @typed("options")
+    @typed
     def reset(
         self, *, seed: Seed | None = None, options: dict | None = None
     ) -> tuple[np.ndarray, dict]:
@@ -183,7 +179,7 @@ class TwinVectorEnv(VectorEnv, _Worlds):
 
     metadata: ClassVar[dict] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    @typed(*READ)
+    @typed
     def __init__(
         self, task: str | Task = "pushing", worlds: Count = 8, *, simulator: str = "learned", checkpoint: str | Path | None = None,
         scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
@@ -197,7 +193,7 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         self.action_space = batch_space(self.single_action_space, worlds)
         self.observation_space = batch_space(self.single_observation_space, worlds)
 
-    @typed("options")
+    @typed
     def reset(
         self, *, seed: Seed | None = None, options: dict | None = None
     ) -> tuple[np.ndarray, dict]:

@@ -13,7 +13,7 @@ LARGEST = {"stress": 1e-10, "tangent": 1e-6}
 """Relative difference that a text may have."""
 
 
-@typed()
+@typed
 def export(path: str | Path, folder: str | Path, check: Whole) -> dict[str, float]:
     """Write umat.f90, law_ufl.py, law_warp.py and law.json of a checkpoint or a material.json.
 

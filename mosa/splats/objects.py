@@ -81,8 +81,7 @@ def read_object(
     chosen = splats.opacities >= opacity
     if box is not None:
         expected = "two corners [[x, y, z], [x, y, z]], min below max"
-        numbers("box", box, expected, (2, 3))
-        corners = torch.as_tensor(box, dtype=torch.float64) - offset
+        corners = numbers("box", box, expected, (2, 3), dtype=torch.float64) - offset
         if not bool((corners[0] < corners[1]).all()):
             raise ConfigError(f"box: expected {expected}, found {box}")
         chosen &= ((splats.means > corners[0]) & (splats.means < corners[1])).all(1)

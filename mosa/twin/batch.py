@@ -19,7 +19,6 @@ from mosa.settings import Count, Expected, typed
 from mosa.system.limits import counted
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.start import (
-    GIVEN,
     Seconds,
     StartArguments,
     Variant,
@@ -63,7 +62,7 @@ class TwinWorlds:
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 
-    @typed("starts", "gravity", *GIVEN)
+    @typed
     def reset(
         self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
@@ -93,7 +92,7 @@ class TwinWorlds:
         )  # fmt: skip
         return self.episode.state
 
-    @typed("starts")
+    @typed
     def restart(
         self,
         which: Annotated[Sequence[int], Expected("a list of numbers of worlds")],

@@ -12,6 +12,7 @@ from annotated_types import Gt, Le
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from mosa.config.record import is_rotation
 from mosa.errors import ConfigError
 from mosa.modules.body.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
@@ -21,8 +22,6 @@ from mosa.physics.engine.inputs import FASTEST, numbers, vector
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
 
-GIVEN = ("rotation", "position", "velocity", "angular_velocity", "colliders", "box", "driven")
-"""Arguments of a motion that `start_in` reads: vectors, matrices, solids."""
 UNDER = 0.25
 """Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
@@ -95,12 +94,10 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
     expected = "(ax, ay, az, degrees) with a non-zero axis or a 3x3 rotation matrix"
     value = numbers("rotation", value, expected)
     if value.shape == (3, 3):
-        R = value.detach().double()
-        defect = float((R @ R.T - torch.eye(3).double()).abs().max())
-        if defect > 1e-3 or float(torch.linalg.det(R)) < 0:
+        if not is_rotation(value.tolist()):
             raise ConfigError(
-                f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
-                f"{float(torch.linalg.det(R)):.3g}: scaled, sheared or mirrored bodies are not what was learned"
+                f"rotation: expected R R^T = I and det R = 1, found {value.tolist()}: scaled, sheared or mirrored bodies are not "
+                "what was learned"
             )
         return value
     if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:

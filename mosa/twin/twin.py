@@ -58,7 +58,6 @@ from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
 from mosa.twin.shown_solids import with_solids
 from mosa.twin.start import (
-    GIVEN,
     Seconds,
     Variant,
     check_frames,
@@ -117,7 +116,7 @@ class Twin:
         posterior = None if record.posterior is None else Posterior.read(record.posterior.plain())
         return cls(body.to(device).eval(), world, record.frame_dt, record.body, start, posterior)
 
-    @typed()
+    @typed
     def predict(
         self, *, draws: Draws = DRAWS, seed: Seed = 0, **start: Any
     ) -> tuple[Rollout, Tensor]:
@@ -145,7 +144,7 @@ class Twin:
             torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others)
         )
 
-    @typed(*GIVEN)
+    @typed
     def simulate(
         self,
         *,
@@ -190,7 +189,7 @@ class Twin:
                 start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update()
             )
 
-    @typed(*GIVEN)
+    @typed
     def reset(
         self,
         *,
@@ -258,7 +257,7 @@ class Twin:
     def state(self, state: TwinState) -> None:
         self.episode.state = state
 
-    @typed("laws")
+    @typed
     def worlds(self, count: Count, laws: Tensor | None = None) -> TwinWorlds:
         """`count` copies of the body, each in a world of its own, that are reset and stepped together.
 
@@ -267,7 +266,7 @@ class Twin:
         return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
 
     @torch.no_grad()
-    @typed("colliders")
+    @typed
     def render(
         self,
         rollout: Motion,
@@ -337,7 +336,7 @@ class Twin:
             )
         return tuple(solids)
 
-    @typed("colliders")
+    @typed
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,

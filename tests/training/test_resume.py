@@ -139,7 +139,8 @@ def test_a_fit_goes_on_with_the_data_that_it_began_with(tmp_path):
 @pytest.mark.parametrize("stored, here, other", [
     ({"train": "a"}, {"train": "a"}, None), ({"train": "a"}, {"train": "b"}, r"\(train\)"),
     ({"train": "a", "test/x": "c"}, {"train": "a", "test/x": "d"}, r"\(test/x\)"), ({}, {"train": "b"}, None),
-    ({"train": "a"}, {"train": "a", "test/new": "e"}, None), ({"train": "a", "train/x": "c"}, {"train": "b", "train/x": "d"}, "train, train/x"),
+    ({"train": "a"}, {"train": "a", "test/new": "e"}, None),
+    ({"train": "a", "train/x": "c"}, {"train": "b", "train/x": "d"}, "train, train/x"),
 ])  # fmt: skip
 def test_films_are_known_by_their_bytes(tmp_path, stored, here, other):
     """Another film below the same path was evaluated as the training one, without a word."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,19 +22,22 @@ FASTEST = 1e6
 
 
 def numbers(
-    name: str, value: Sequence | Tensor, expected: str, shape: tuple[int, ...] | None = None
+    name: str, value: Any, expected: str, *shapes: tuple[int, ...], dtype: torch.dtype | None = None
 ) -> Tensor:
-    """Tensor of finite numbers, float64 where they are given so, else float32; of a shape where that is given. Errors: ConfigError
-    naming the argument."""
+    """Tensor of finite numbers, of one of the shapes, if any; of a type, by default float64 where they are given so, else float32.
+    Errors: ConfigError naming the argument."""
     try:
         found = torch.as_tensor(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
-    if found.dtype == torch.bool or found.is_complex() or not bool(found.detach().float().isfinite().all()):  # fmt: skip
-        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
-    if shape is not None and found.shape != shape:
-        raise ConfigError(f"{name}: expected {expected}, found shape {tuple(found.shape)}")
-    return found if found.dtype == torch.float64 else found.float()
+        odd = found.dtype == torch.bool or found.is_complex()
+        if odd or not bool(found.detach().double().isfinite().all()):
+            raise ValueError
+        dtype = dtype or (torch.float64 if found.dtype == torch.float64 else torch.float32)
+        result = torch.as_tensor(value, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from None
+    if shapes and tuple(result.shape) not in shapes:
+        raise ConfigError(f"{name}: expected {expected}, found shape {tuple(result.shape)}")
+    return result
 
 
 def vector(name: str, value: Sequence[float] | Tensor) -> Tensor:
@@ -149,11 +153,8 @@ def gravity_of_worlds(
     """common: where none is given. Errors: ConfigError."""
     if gravity is None:
         return (common,) * worlds
-    gravity = torch.as_tensor(gravity, dtype=torch.float64)
-    if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
-        raise ConfigError(
-            f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}"
-        )
+    shape = (worlds, 3)
+    gravity = numbers("gravity", gravity, f"finite numbers {shape}", shape, dtype=torch.float64)
     if gravity.requires_grad and torch.is_grad_enabled():
         raise ConfigError(
             "gravity: expected numbers without gradients, found a tensor that requires them: pass its detach()"

@@ -53,18 +53,6 @@ from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
 
 Substeps = Annotated[int, Ge(1), Le(MOST_SUBSTEPS)]
-GIVEN = (
-    "state",
-    "parameters",
-    "volume",
-    "density",
-    "adapter",
-    "motions",
-    "gravity",
-    "together",
-    "held",
-)
-"""Arguments of a rollout that are read beside the state (`mosa.physics.engine.inputs`)."""
 NEAR = 8
 """Cells from the origin within which driven particles of float32 may move before the origin follows
 them, with new buffers."""
@@ -81,7 +69,7 @@ class Simulator:
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
-    @typed("gravity", "ground", "up", "planes", "colliders", "box", "dtype", "device", "options")
+    @typed
     def __init__(
         self,
         law: Text,
@@ -172,7 +160,7 @@ class Simulator:
             self.law, parameters, shape, like, rotation=rotation, yield_factor=factor
         )
 
-    @typed(*GIVEN, "progress", "collect", "timing")
+    @typed
     def rollout(
         self,
         state: ParticleState,
@@ -261,7 +249,7 @@ class Simulator:
             reactions=world.vectors(forces), counts=tuple(counts),
         )  # fmt: skip
 
-    @typed(*GIVEN, "timing")
+    @typed
     def stepper(
         self,
         state: ParticleState,
