@@ -17,8 +17,9 @@ import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
+from pathlib import Path
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -27,6 +28,7 @@ from typing import (
     Literal,
     NamedTuple,
     Self,
+    TypeVar,
     Union,
     get_args,
     get_origin,
@@ -56,6 +58,9 @@ LARGEST, MOST = 1e20, 10**9
 """Of numbers and of whole numbers without limits of their own: single precision and an array's length hold them."""
 WIDEST = 4096
 """Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
+
+
+Public = TypeVar("Public", bound=Callable[..., Any])
 
 
 class Expected(NamedTuple):
@@ -265,8 +270,8 @@ def described(kind: Any) -> str:
         return ", or ".join(some + ["null"] * (type(None) in inside))
     if kind in (int, float):
         return numbers_described(kind, []) or ""
-    return {bool: "true or false", str: "a text", type(None): "null"}.get(
-        kind, "a list" if origin is list or kind is list else "a section of keys"
+    return {bool: "true or false", str: "a text", Path: "a path", type(None): "null"}.get(
+        kind, "a list" if list in (origin, kind) or origin is Sequence else "a section of keys"
     )
 
 
@@ -362,6 +367,34 @@ def call(where: str, build: Callable[..., Any], keys: Mapping[str, Any], **given
     missing, or whose value is of another type."""
     checked = arguments_of(build, where, *given).read(keys, where)
     return build(**given, **{key: getattr(checked, key) for key in keys})
+
+
+def typed(function: Public) -> Public:
+    """A public function whose arguments are of the types that it says, as keys of a configuration are: numbers, texts, flags, and
+    types with metadata. Tensors, solids and functions it reads by itself. Errors: ConfigError naming the argument."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def called(*args: Any, **keys: Any) -> Any:
+        given = signature.bind(*args, **keys).arguments
+        arguments_of(function, "", *_untold(function)).part(given)
+        return function(*args, **keys)
+
+    return called  # type: ignore[return-value]
+
+
+@functools.cache
+def _untold(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Names of the arguments whose types are none of settings."""
+
+    def told(kind: Any) -> bool:
+        if get_origin(kind) in (Union, types.UnionType):
+            return all(map(told, get_args(kind)))
+        plain = (int, float, str, bool, Path, type(None))
+        return get_origin(kind) in (Annotated, Literal) or kind in plain
+
+    hints = typing.get_type_hints(function, include_extras=True)
+    return tuple(n for n in inspect.signature(function).parameters if not told(hints.get(n, Any)))
 
 
 def node_of(model: type[Settings], without: Iterable[str] = ()) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
@@ -23,6 +24,8 @@ MODELS = {
 }
 """Model -> number in binary files, names of its parameters. Others (FULL_OPENCV, FOV, THIN_PRISM_FISHEYE) are refused."""
 BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
+POINTS = re.compile(r"[-+.\deE\s]+")
+"""A line of an image's points: numbers by threes."""
 MOST = 100_000
 """Cameras or images of a model: of a damaged file the count is any number."""
 
@@ -146,11 +149,13 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
 
 
 def text_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
-    """An image takes two lines, the second of which (its points, maybe none) is passed over."""
-    found = []
-    for i, line in lines_of(file)[::2]:
-        if not line:
+    """An image takes two lines, the second of which, its points, is passed over; some programs leave it out where it is empty."""
+    found, named = [], False
+    for i, line in lines_of(file):
+        named, points = not named, named and len(line.split()) % 3 == 0
+        if not line or (points and POINTS.fullmatch(line)):
             continue
+        named = True
         words, where = line.split(maxsplit=9), f"{file}, line {i}"
         if len(words) < 10:
             raise DataError(

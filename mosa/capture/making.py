@@ -370,6 +370,10 @@ def figures(
     return found | {"warnings": warnings_of(found, values, knowledge, phones)}
 
 
+SIZES = 0.005, 0.75
+"""[m] of an object's radius that somebody lets fall: lengths go with the square of the clock."""
+
+
 def warnings_of(
     found: dict[str, Any], values: Mapping[str, Any], knowledge: Knowledge, phones: list[Phone]
 ) -> list[str]:
@@ -417,6 +421,11 @@ def warnings_of(
         said.append(
             f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the "
             "floor with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
+        )
+    if not SIZES[0] <= found["radius"] <= SIZES[1]:
+        said.append(
+            f"the object would be {2 * found['radius']:.2g} m across: lengths follow from gravity and the clock alone; "
+            "measure one, set scale=, and check fps="
         )
     if found["free_frames"] < 3:
         said.append(f"only {found['free_frames']} frames of free fall are written: raise before=")

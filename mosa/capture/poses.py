@@ -22,6 +22,10 @@ MOVED, TURNED = 0.01, 0.5
 """Share of the distance between cameras, and degrees, by which poses of one phone may differ: it stands still."""
 
 
+FOCUS = 0.02
+"""Of the focal length, by which intrinsics of one phone may differ."""
+
+
 def read_phones(
     videos: str | Path, poses: str | Path, sizes: dict[str, tuple[int, int]]
 ) -> list[Phone]:
@@ -33,10 +37,15 @@ def read_phones(
     cameras = read_poses(poses)
     centres = np.array([camera.centre for camera in cameras.values()])
     extent = float(np.ptp(centres, axis=0).max())
-    phones = []
+    phones, stems = [], [Path(file).stem for file in sizes]
     for file, size in sizes.items():
         video = folder / file
-        mine = {name: camera for name, camera in cameras.items() if belongs(name, video.stem)}
+        mine = {
+            name: camera
+            for name, camera in cameras.items()
+            if belongs(name, video.stem)
+            and not any(belongs(name, s) for s in stems if len(s) > len(video.stem))
+        }
         if not mine:
             raise DataError(
                 f"{poses}: no pose for {video}: expected an image named {video.stem}.<ending>, {video.stem}_<number>, or "
@@ -66,11 +75,15 @@ def read_poses(path: str | Path) -> dict[str, Camera]:
 
 
 def model_folder(place: Path) -> Path | None:
-    """Where a COLMAP model lies, in the folder or as COLMAP nests it; None where there is none."""
-    return next(
-        (f for f in (place, place / "sparse" / "0", place / "sparse", place / "0") if is_model(f)),
-        None,
-    )
+    """Where a COLMAP model lies, in the folder or as COLMAP nests it, of several the one with the most images, as COLMAP numbers
+    parts that it could not join in no order; None where there is none."""
+    places = [
+        place,
+        place / "sparse",
+        *sorted(place.glob("[0-9]")),
+        *sorted(place.glob("sparse/[0-9]")),
+    ]
+    return max(filter(is_model, places), key=lambda f: len(read_model(f)), default=None)
 
 
 def scene_points(path: str | Path) -> np.ndarray:
@@ -147,8 +160,7 @@ def belongs(image: str, phone: str) -> bool:
 
 def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
     """The one camera that all poses of a phone are. Errors: DataError where they differ."""
-    first, *others = cameras.items()
-    name, one = first
+    (name, one), *others = cameras.items()
     for _, camera in others:
         away = float(np.linalg.norm(camera.centre - one.centre))
         turn = camera.w2c[:3, :3] @ one.w2c[:3, :3].T
@@ -157,6 +169,14 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
             raise DataError(
                 f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
                 f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each"
+            )
+        if (
+            np.abs(camera.K / camera.size[0] - one.K / one.size[0]).max()
+            > FOCUS * one.K[0, 0] / one.size[0]
+        ):
+            raise DataError(
+                f"{camera.where}: phone {phone} has other intrinsics than in {name}, at the same place: expected one lens a phone; "
+                "give its images one camera (COLMAP: ImageReader.single_camera_per_folder), or use one image of each"
             )
     return one
 

@@ -12,6 +12,7 @@ import numpy as np
 from mosa.capture.poses import VIDEOS
 from mosa.data.images.reading import read_image
 from mosa.errors import ConfigError, DataError
+from mosa.system.ply import named
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def find_videos(folder: str | Path) -> list[Path]:
     place = Path(folder)
     if not place.is_dir():
         raise DataError(f"{place}: folder not found; expected one video of each phone in it")
-    found = sorted(file for file in place.iterdir() if file.suffix.lower() in VIDEOS)
+    found = sorted(f for f in place.iterdir() if f.suffix.lower() in VIDEOS and f.name[0] != ".")
     if not found:
         raise DataError(
             f"{place}: expected videos ({', '.join(VIDEOS)}), one of each phone, found none"
@@ -57,7 +58,7 @@ def open_clip(path: Path, fps: float | None = None) -> Clip:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise DataError(
-            f"{path}: expected a video that OpenCV can read, found a damaged or unknown one; export it as H.264 in .mp4"
+            f"{path}: expected a video that OpenCV can read (H.264 in .mp4 is), found {named(path)}"
         )
     times, nominal = [], float(video.get(cv2.CAP_PROP_FPS))
     while video.grab():

@@ -106,9 +106,11 @@ def world_of(record: BodyRecord) -> World:
 
 
 def measured(
-    settings: Mapping[str, Any], scene: Scene, dx: float, starts: Mapping[str, Start] | None = None
-) -> BodyRecord:
-    """The record of a body that was found in a scene. settings: of the run, as they were given; dx [m]."""
+    settings: Mapping[str, Any], scene: Scene, dx: float, starts: Mapping[str, Start] | None = None,
+    data: Mapping[str, str] | None = None,
+) -> BodyRecord:  # fmt: skip
+    """The record of a body that was found in a scene. settings: of the run, as they were given; dx [m]; data: fingerprints of the
+    films by sequence."""
     known = world_config(scene)
     return BodyRecord(
         settings=dict(settings),
@@ -118,6 +120,7 @@ def measured(
         dx=dx,
         frame_dt=float(scene.times[1] - scene.times[0]),
         starts={prefix: start.written() for prefix, start in (starts or {}).items()},
+        data=dict(data or {}),
     )
 
 

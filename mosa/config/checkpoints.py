@@ -342,6 +342,17 @@ def check_same_scene(record: RunRecord, values: Mapping[str, Any], path: str | P
         )
 
 
+def check_same_data(record: RunRecord, here: Mapping[str, str], path: str | Path) -> None:
+    """Films are those of the run by their bytes, whatever their paths; one that either does not say is passed over. here:
+    fingerprints by sequence. Errors: DataError naming the sequences."""
+    if other := [name for name, bytes_ in here.items() if record.data.get(name, bytes_) != bytes_]:
+        raise DataError(
+            f"ckpt_path: {path}: expected the films that the run was fitted to, found other images, masks, cameras or times "
+            f"below the same path ({', '.join(other)}): put those back (scene.root=, scene.path=), fit anew, or evaluate on "
+            "these as another scene with python eval.py scene=<option>"
+        )
+
+
 def listed(found: Sequence[tuple[str, Any, Any]]) -> str:
     """Keys that differ, with both values."""
     shown = ", ".join(

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -15,6 +15,8 @@ from torch import Tensor
 from mosa.environments.task import LAST, Task, Trials, View
 from mosa.environments.truth import true_twin
 from mosa.errors import ConfigError, DataError, SimulationDiverged
+from mosa.physics.engine.inputs import numbers
+from mosa.settings import check
 from mosa.twin.episode import TwinState
 from mosa.twin.twin import Twin
 
@@ -43,8 +45,7 @@ def simulator_named(
 
     spacing [m]: of the truth's particles, None for the films' own. Errors: ConfigError, DataError naming what is missing.
     """
-    if name not in SIMULATORS:
-        raise ConfigError(f"simulator: expected one of {', '.join(SIMULATORS)}, found {name!r}")
+    check("simulator", name, Literal[SIMULATORS])
     if checkpoint is None and (name != "truth" or scene is None):
         wanted = (
             "a run's checkpoint, or truth.scene=<a built-in scene>"
@@ -154,6 +155,20 @@ class Arena:
         """(B,) of the moments seen last; of a world that diverged the loss of a body far away."""
         found = torch.stack(self.last[-LAST:]).mean(0)
         return torch.where(self.diverged.to(found.device), found.new_tensor(LOST), found)
+
+    def taken(self, action: Any) -> Tensor:
+        """(B, A) in [-1, 1] of an action that others give. Errors: ConfigError before a reset, and for another shape."""
+        shape = len(self.begun), len(self.task.actions)
+        return numbers("action", action, f"{shape} finite numbers", shape).float().clamp(-1, 1)
+
+    @property
+    def begun(self) -> Trials:
+        """The trials that go on. Errors: ConfigError before a reset."""
+        if self.trials is None:
+            raise ConfigError(
+                "environment: expected reset() before step and render, found no trial"
+            )
+        return self.trials
 
     def success(self) -> Tensor:
         """(B,) bool, now."""

@@ -10,7 +10,7 @@ or, after importing this module, gymnasium.make("mosa/Pushing-v0", checkpoint=..
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ from mosa.environments.pictures import picture
 from mosa.environments.task import Task
 from mosa.environments.tasks import TASKS, task_named
 from mosa.errors import ConfigError
+from mosa.settings import Count, Section, Seed, typed
+from mosa.twin.twin import Pixels
 
 try:
     import gymnasium
@@ -97,7 +99,7 @@ class _Worlds:
     def _step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """(observations (B, O), rewards (B,), whether the episodes are over)."""
         arena = self.arena
-        seen, over = arena.step(torch.as_tensor(np.asarray(actions, np.float32)).clamp(-1, 1))
+        seen, over = arena.step(arena.taken(actions))
         loss = arena.loss() if arena.task.once else arena.last[-1] / arena.task.steps
         return _array(seen), -_array(loss).astype(np.float64), over
 
@@ -120,15 +122,12 @@ class TwinEnv(gymnasium.Env, _Worlds):
 
     metadata: ClassVar[dict] = {"render_modes": ["rgb_array", "rgb_array_list"], "render_fps": 25}
 
+    @typed
     def __init__(
         self, task: str | Task = "pushing", *, simulator: str = "learned", checkpoint: str | Path | None = None,
-        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: dict | None = None,
-        render_mode: str | None = None, size: int = 240,
+        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
+        render_mode: Literal["rgb_array", "rgb_array_list"] | None = None, size: Pixels = 240,
     ) -> None:  # fmt: skip
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ConfigError(
-                f"render_mode: expected one of {', '.join(self.metadata['render_modes'])}, found {render_mode!r}"
-            )
         self.arena = arena_of(task, 1, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.render_mode, self.size = self.arena.task, render_mode, size
         self.action_space, self.observation_space = (
@@ -136,14 +135,17 @@ class TwinEnv(gymnasium.Env, _Worlds):
             observation_space(self.task),
         )
 
+    @typed
     def reset(
-        self, *, seed: int | None = None, options: dict | None = None
+        self, *, seed: Seed | None = None, options: dict | None = None
     ) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
         return self._draw(self.np_random, self.render_mode is not None)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        seen, reward, over = self._step(np.asarray(action)[None])
+        seen, reward, over = self._step(
+            action[None] if isinstance(action, np.ndarray) else [action]
+        )
         decided = self.task.once
         info = {"success": bool(self.arena.success()[0]), "diverged": bool(self.arena.diverged[0])}
         return seen[0], float(reward[0]), over and decided, over and not decided, info
@@ -151,7 +153,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
     def render(self) -> np.ndarray | list[np.ndarray] | None:
         if self.render_mode is None:
             return None
-        shots = self.arena.states or [held(self.arena)]
+        shots = (self.arena.begun and self.arena.states) or [held(self.arena)]
         pictures = [picture(self.arena, x[0], F[0], None if tool is None else tool[0], self.size)
                     for x, F, tool in (shots if self.render_mode == "rgb_array_list" else shots[-1:])]  # fmt: skip
         return pictures if self.render_mode == "rgb_array_list" else pictures[-1]
@@ -177,9 +179,10 @@ class TwinVectorEnv(VectorEnv, _Worlds):
 
     metadata: ClassVar[dict] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
+    @typed
     def __init__(
-        self, task: str | Task = "pushing", worlds: int = 8, *, simulator: str = "learned", checkpoint: str | Path | None = None,
-        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: dict | None = None,
+        self, task: str | Task = "pushing", worlds: Count = 8, *, simulator: str = "learned", checkpoint: str | Path | None = None,
+        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
     ) -> None:  # fmt: skip
         self.arena = arena_of(task, worlds, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.num_envs, self.render_mode = self.arena.task, worlds, None
@@ -190,8 +193,9 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         self.action_space = batch_space(self.single_action_space, worlds)
         self.observation_space = batch_space(self.single_observation_space, worlds)
 
+    @typed
     def reset(
-        self, *, seed: int | None = None, options: dict | None = None
+        self, *, seed: Seed | None = None, options: dict | None = None
     ) -> tuple[np.ndarray, dict]:
         if seed is not None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)

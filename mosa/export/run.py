@@ -7,12 +7,14 @@ from pathlib import Path
 from mosa.export.checking import check_all
 from mosa.export.source import as_json, read_source
 from mosa.export.texts import ufl_text, umat, warp_text
+from mosa.settings import Whole, typed
 
 LARGEST = {"stress": 1e-10, "tangent": 1e-6}
 """Relative difference that a text may have."""
 
 
-def export(path: str | Path, folder: Path, check: int) -> dict[str, float]:
+@typed
+def export(path: str | Path, folder: str | Path, check: Whole) -> dict[str, float]:
     """Write umat.f90, law_ufl.py, law_warp.py and law.json of a checkpoint or a material.json.
 
     Returns relative differences at `check` drawn deformations, none for 0. Errors: DataError, ConfigError."""
@@ -23,6 +25,7 @@ def export(path: str | Path, folder: Path, check: int) -> dict[str, float]:
         "law_warp.py": warp_text(found),
         "law.json": as_json(found),
     }
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text)

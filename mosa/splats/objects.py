@@ -8,22 +8,28 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.config.build import build_body, plain, world_of
 from mosa.config.extensions import load_extensions
 from mosa.config.record import BodyRecord
-from mosa.data.io.gaussian_ply import load_ply
+from mosa.data.io.gaussian_ply import read_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
+from mosa.physics.engine.inputs import numbers
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.geometry.filling import fill
 from mosa.reconstruction.geometry.shell import solid_of
@@ -34,7 +40,6 @@ from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
 from mosa.twin.saved import save_twin
-from mosa.twin.start import numbers
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
 
@@ -42,6 +47,10 @@ log = logging.getLogger(__name__)
 
 ROOM = 4.0
 """Of the object's size, to each side of what it falls through."""
+GAP, PART = 0.1, 0.01
+"""Of the extent of nine tenths of the Gaussians, and of their number: smaller groups that lie farther away are strays."""
+USUAL = 0.002, 20.0
+"""[m] of an object's longest side."""
 NEAR = 3.0
 """Spacings from the nearest particle beyond which a Gaussian does not belong to the body."""
 HALF_CELL = 0.35
@@ -54,20 +63,27 @@ def read_object(
     box: Sequence[Sequence[float]] | None = None,
     opacity: float = 0.1,
     size: float | None = None,
+    up: Sequence[float] | None = None,
 ) -> Appearance:
     """The Gaussians of a 3DGS PLY that are the object.
 
     box: two corners in the file's units; opacity: the least that is kept; size [m] that the longest side gets, None where the file
-    is in metres. Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument.
+    is in metres; up: compared with the file's header. Strays away from the object are left out before it is sized.
+    Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument.
     """
-    splats, harmonics = load_ply(path)
+    splats, harmonics, offset, vertical = read_ply(path, centred=True)
+    axis = "xyz".find(vertical[-1:] or "?")
+    if up is not None and axis >= 0 and abs(up[axis]) < 0.9 * math.hypot(*up):
+        warnings.warn(
+            f"{path}: its header says that {vertical} is vertical, and up is {list(up)}",
+            stacklevel=2,
+        )
     chosen = splats.opacities >= opacity
     if box is not None:
-        corners = numbers("box", box, "two corners [[x, y, z], [x, y, z]], min below max")
-        if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
-            raise ConfigError(
-                f"box: expected two corners [[x, y, z], [x, y, z]], min below max, found {box}"
-            )
+        expected = "two corners [[x, y, z], [x, y, z]], min below max"
+        corners = numbers("box", box, expected, (2, 3), dtype=torch.float64) - offset
+        if not bool((corners[0] < corners[1]).all()):
+            raise ConfigError(f"box: expected {expected}, found {box}")
         chosen &= ((splats.means > corners[0]) & (splats.means < corners[1])).all(1)
     if int(chosen.sum()) < 100:
         low, high = (
@@ -78,14 +94,32 @@ def read_object(
             f"{path}: expected at least 100 Gaussians of an opacity of {opacity:g} or more{where}, found "
             f"{int(chosen.sum())} of {len(chosen)}; the file spans {low} to {high}"
         )
+    chosen[chosen.clone()] = together(splats.means[chosen])
     splats, harmonics = (
         Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats))),
         harmonics[chosen],
     )
+    longest = float((splats.means.amax(0) - splats.means.amin(0)).max())
     if size is not None:
-        factor = size / float((splats.means.amax(0) - splats.means.amin(0)).max())
+        factor, longest = size / longest, size
         splats = replace(splats, means=factor * splats.means, scales=factor * splats.scales)
+    if not USUAL[0] <= longest <= USUAL[1]:
+        said = f"{path}: the object is {longest:.3g} m long; size= says its longest side in metres"
+        warnings.warn(said, stacklevel=2)
     return Appearance(splats, harmonics)
+
+
+def together(means: Tensor) -> Tensor:
+    """(N,) which Gaussians are the object: with those that are at most `GAP` of its extent away, at least `PART` of all."""
+    x = means.double().numpy()
+    extent, near = np.ptp(np.quantile(x, [0.05, 0.95], axis=0), axis=0), cKDTree(x).query(x, k=2)[0]
+    gap = max(GAP * float(extent.max()), 3 * float(np.median(near[:, 1])), 1e-30)
+    cells, at = np.unique(np.floor(x / gap), axis=0, return_inverse=True)
+    pairs = cKDTree(cells).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells),) * 2)
+    piece = connected_components(links, directed=False)[1][at.reshape(-1)]
+    count = np.bincount(piece)[piece]
+    return torch.from_numpy(count > PART * len(means))
 
 
 def fill_object(
@@ -140,17 +174,19 @@ def object_twin(
     resolution: int = 80,
     share: float = 0.9,
     open_below: bool = False,
+    flight: float = 0.0,
 ) -> Twin:
     """A twin of the object that Gaussians show.
 
     law: configuration with seed, simulation, prior, heterogeneity and adapter, as conf/splats.yaml composes it; or a learned twin,
     of which material, adapter and contact are taken, and no stiffness field, which is of another body's places. particles, dx,
     per_cell, most: as `fill_object` takes them; density [kg/m^3]:
-    None for the learned one's, or 1000; up: (3,) in the file's axes; height [m] of its lowest particle above the ground; ground:
+    None for the learned one's, or 1000; flight [m]: how far it may fly; up: (3,) in the
+    file's axes; height [m] of its lowest particle above the ground; ground:
     mode and friction. Errors: ConfigError, DataError.
     """
-    direction = numbers("up", up, "a direction (x, y, z)")
-    if direction.shape != (3,) or not float(direction.norm()) > 0:
+    direction = numbers("up", up, "a direction (x, y, z)", (3,))
+    if not float(direction.norm()) > 0:
         raise ConfigError(f"up: expected a direction (x, y, z), found {list(up)}")
     direction = direction / direction.norm()
     tensors, shown, cell = fill_object(
@@ -168,7 +204,7 @@ def object_twin(
     cfg = copy.deepcopy(dict(learned.record.settings if learned is not None else law))
     cfg["heterogeneity"] = {**cfg.get("heterogeneity", {}), "enabled": False}
     cfg.pop("world", None)
-    room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height
+    room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height + flight
     met = {
         "height": float((rest @ direction).min()) - height,
         "mode": "sticky",
@@ -215,7 +251,8 @@ def drop(cfg: DictConfig) -> None:
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
     check_splats(values)
-    found = read_object(cfg.ply, box=values["box"], opacity=cfg.opacity, size=cfg.size)
+    given = {name: values[name] for name in ("box", "opacity", "size", "up")}
+    found = read_object(cfg.ply, **given)
     law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
     names = ("density", "up", "gravity", "height", "ground", "resolution", "share", "open_below")
     simulation, device = values["simulation"], named_device(cfg.device)
@@ -223,7 +260,12 @@ def drop(cfg: DictConfig) -> None:
     grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
             "most": most_particles(device)}  # fmt: skip
     twin = object_twin(
-        found, law, frame_dt=1 / cfg.rate, **grid, **{name: values[name] for name in names}
+        found,
+        law,
+        frame_dt=1 / cfg.rate,
+        flight=math.hypot(*cfg.velocity) * cfg.frames / cfg.rate,
+        **grid,
+        **{name: values[name] for name in names},
     )
     twin.body.to(device)
     volume, size = float(twin.body.volume.sum()), twin.body.size

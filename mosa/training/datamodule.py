@@ -139,6 +139,16 @@ class SceneDataModule(L.LightningDataModule):
         """The training sequence."""
         return self.scenes[0]
 
+    def prefix(self, scene: Scene) -> str:
+        """Of the figures of a sequence beside the training one: train/<name> where it is learned from, else test/<name>."""
+        return f"{'train' if scene.sequence in self.taught else 'test'}/{scene.sequence}"
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Of the films by sequence, without those that this program makes."""
+        named = {"train": self.scene} | {self.prefix(scene): scene for scene in self.scenes[1]}
+        return {name: scene.fingerprint for name, scene in named.items() if not scene.synthetic}
+
     # ---------------------------------------------------------------- reconstruction
     @property
     def cache(self) -> Path:
@@ -232,8 +242,7 @@ class SceneDataModule(L.LightningDataModule):
         seen = appearance_of(shape)
         found = {"train": sequence_start(shape, seen, training, register=False)}
         for scene in tqdm(others, "poses of the other sequences", leave=False):
-            prefix = f"{'train' if scene.sequence in self.taught else 'test'}/{scene.sequence}"
-            found[prefix] = sequence_start(shape, seen, scene, register=True)
+            found[self.prefix(scene)] = sequence_start(shape, seen, scene, register=True)
         return found
 
     @property
@@ -244,7 +253,7 @@ class SceneDataModule(L.LightningDataModule):
     @property
     def measured(self) -> BodyRecord:
         """What a checkpoint keeps of the data, beside the settings: world, density, spacing, starts."""
-        return measured(plain(self.cfg), self.scene, self.dx, self.starts)
+        return measured(plain(self.cfg), self.scene, self.dx, self.starts, self.fingerprints)
 
     # ---------------------------------------------------------------- what a fit reads
     @cached_property

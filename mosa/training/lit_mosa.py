@@ -31,7 +31,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_stages, plain, world_of
-from mosa.config.checkpoints import read_checkpoint
+from mosa.config.checkpoints import check_same_data, read_checkpoint
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
@@ -327,6 +327,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 f"{'none' if saved is None else saved.particles}: the checkpoint belongs to another scene, reconstruction or "
                 "simulation.particles"
             )
+        if self.record is not None:
+            check_same_data(record, self.record.data, "the checkpoint")
         self.stage_index, self.losses, self.steps_done = (
             saved.stage,
             list(saved.losses),

@@ -14,8 +14,9 @@ from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkp
 from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
+from mosa.config.record import RunRecord
 from mosa.data.checks.cameras import lines_of_sight, misses
-from mosa.data.io.splat_formats import check_formats
+from mosa.data.io.splat_formats import Formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.modules.body.body import Body, Start, World
@@ -24,6 +25,7 @@ from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
+from mosa.settings import check
 from mosa.system.limits import counted
 from mosa.twin.twin import Twin
 from mosa.types import Scene
@@ -62,7 +64,7 @@ def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
     settings = SplatsSettings.read(values)
     if settings.video:
         ffmpeg("video")
-    check_formats(settings.formats)
+    check("formats", settings.formats, Formats)
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)
     return settings
@@ -83,10 +85,11 @@ def check_particles(key: str, count: float) -> None:
     counted(key, [count], "take as many as this machine has memory for", each=PARTICLE_BYTES / 2)
 
 
-def check_begin(cfg: DictConfig) -> None:
-    """The checkpoint that a fit is to go on from is one, and of this scene. Errors: DataError, ConfigError naming the keys."""
+def check_begin(cfg: DictConfig) -> RunRecord | None:
+    """The record of the checkpoint that a fit is to go on from, which is of this scene. Errors: DataError, ConfigError naming the
+    keys."""
     if cfg.ckpt_path is None:
-        return
+        return None
     try:
         found = read_checkpoint(cfg.ckpt_path)
         record = check_resumed(found, cfg.ckpt_path)
@@ -96,6 +99,7 @@ def check_begin(cfg: DictConfig) -> None:
         )
         raise DataError(f"{error}{again}") from error
     check_same_scene(record, plain(cfg), cfg.ckpt_path)
+    return record
 
 
 def check_seen(cfg: DictConfig, scene: Scene) -> None:

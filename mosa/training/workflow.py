@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__
 from mosa.config.build import measured, plain, world_of
+from mosa.config.checkpoints import check_same_data
 from mosa.config.composition import with_defaults
 from mosa.config.extensions import load_extensions
 from mosa.errors import ConfigError, DataError
@@ -93,7 +94,7 @@ def train(cfg: DictConfig) -> float | None:
         log.info("skipped: %s has its metrics.json (resume=auto)", folder)
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
-    check_begin(cfg)
+    begun = check_begin(cfg)
     trainer = build_trainer(cfg, folder)
     device = str(trainer.strategy.root_device)
     run = assemble(cfg, device)
@@ -101,6 +102,8 @@ def train(cfg: DictConfig) -> float | None:
     log.info(before_data(settings.plain(), most_particles(device)))
     with clock.measure("data"):
         scene, others = data.scenes
+    if begun is not None:
+        check_same_data(begun, data.fingerprints, cfg.ckpt_path)
     sequences_taught = 1 + len(data.taught)
     filmed = scene.markers is None
     if filmed:
@@ -269,6 +272,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
                 f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
                 f"found {len(found)}: the scene is another one than the run's"
             )
+        here = zip(found, (scene, *held_out), strict=True)
+        check_same_data(twin.record, {name: s.fingerprint for name, s in here}, cfg.ckpt_path)
     check_starts(world, body, found)
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = figures_of(settings.evaluation, body, evaluated, world, twin.posterior, folder)

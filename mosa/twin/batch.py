@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -13,17 +13,17 @@ from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import Driven
+from mosa.physics.engine.inputs import numbers
+from mosa.physics.engine.simulator import Substeps
+from mosa.settings import Count, Expected, typed
 from mosa.system.limits import counted
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.start import (
-    STARTED,
-    check_differentiable,
+    Seconds,
+    StartArguments,
+    Variant,
     check_frames,
-    check_variant,
     check_wants_no_gradients,
-    checked_dt,
-    checked_substeps,
-    numbers,
     start_in,
 )
 
@@ -40,8 +40,6 @@ class TwinWorlds:
         count: int,
         laws: Tensor | None = None,
     ) -> None:
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
             shape, fits = (
@@ -64,11 +62,12 @@ class TwinWorlds:
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 
+    @typed
     def reset(
         self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
-        variant: str = "adapted", control_dt: float | None = None,
-        substeps: int | None = None, frames: int = 30, differentiable: bool = False,
+        variant: Variant = "adapted", control_dt: Seconds | None = None,
+        substeps: Substeps | None = None, frames: Count = 30, differentiable: bool = False,
         box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
     ) -> TwinState:  # fmt: skip
         """Begin a motion in every world; returns the state (count, ...).
@@ -77,39 +76,31 @@ class TwinWorlds:
         for each; gravity: (count, 3) [m/s^2], None for the world's; others as `Twin.reset`. Errors: ConfigError naming the world.
         """
         check_frames(frames, self.count * len(self.body.rest))
-        check_variant(variant)
-        check_differentiable(differentiable)
         if not differentiable:
             check_wants_no_gradients(
                 starts=starts, colliders=colliders, gravity=gravity, box=box, driven=driven
             )
         found = self._found(starts, range(self.count), colliders, box, driven)
         if gravity is not None:
-            gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
-            if gravity.shape != (self.count, 3):
-                raise ConfigError(
-                    f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}"
-                )
+            shape = (self.count, 3)
+            gravity = numbers("gravity", gravity, f"finite numbers {shape}", shape)
         self._box = box
         self.episode = Episode(
-            self.body, found[0][1], checked_dt(control_dt, self.frame_dt), [start for start, _ in found],
-            variant=variant, frames=frames, substeps=checked_substeps(substeps), laws=self.laws, gravity=gravity,
+            self.body, found[0][1], control_dt or self.frame_dt, [start for start, _ in found],
+            variant=variant, frames=frames, substeps=substeps, laws=self.laws, gravity=gravity,
             differentiable=differentiable,
         )  # fmt: skip
         return self.episode.state
 
+    @typed
     def restart(
         self,
-        which: Sequence[int],
+        which: Annotated[Sequence[int], Expected("a list of numbers of worlds")],
         starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     ) -> TwinState:
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
-        if not isinstance(which, (list, tuple, range)):
-            raise ConfigError(
-                f"restart: expected a list of numbers of worlds, found {str(which)[:80]}"
-            )
         which, episode = list(which), self._going()
         given = (
             None
@@ -145,10 +136,7 @@ class TwinWorlds:
             )
         found: list[tuple[Start, World]] = []
         for i, (b, given) in enumerate(zip(which, each)):
-            if unknown := sorted(set(given) - set(STARTED)):
-                raise ConfigError(
-                    f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}"
-                )
+            StartArguments.read(given, f"starts[{b}]")
             if i and given is each[0]:
                 found.append(found[0])
                 continue

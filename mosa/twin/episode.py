@@ -29,6 +29,7 @@ from mosa.physics.contact.motion import (
 )
 from mosa.physics.contact.overlap import check_clear
 from mosa.physics.engine.axes import entered
+from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.numerics import State, flat
 from mosa.physics.time.clock import Moment
 from mosa.twin.start import check_wants_no_gradients
@@ -185,6 +186,8 @@ class Episode:
                 raise ConfigError(
                     f"state.{f.name}: expected finite numbers, found {found[~torch.isfinite(found)][0]}"
                 )
+        if self._stepper.prepared.numerics.check_J and float(torch.linalg.det(state.F).min()) <= 0:
+            raise ConfigError("state.F: expected det F > 0, which the law needs, found less")
         if self.colliders:
             rotation_matrices(state.rotation, state.rotation.ndim - 2)
         for name in ("frames", "substeps"):
@@ -427,18 +430,8 @@ class Episode:
         batches = [(), *([] if self.worlds is None else [(self.worlds,)])]
         kinds = [(3,), (3, 3)] if where.endswith(".rotation") else [(3,)]
         shapes = [(*batch, *kind) for batch in batches for kind in kinds]
-        expected = f"{where}: expected finite numbers {' or '.join(map(str, shapes))}"
-        try:
-            found = torch.as_tensor(value, dtype=torch.float64).cpu()
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ConfigError(f"{expected}, found {str(value)[:80]}") from error
-        if tuple(found.shape) not in shapes or not bool(torch.isfinite(found.detach()).all()):
-            what = (
-                f"shape {tuple(found.shape)}"
-                if tuple(found.shape) not in shapes
-                else f"{found.tolist()}"
-            )
-            raise ConfigError(f"{expected}, found {what}")
+        expected = f"finite numbers {' or '.join(map(str, shapes))}"
+        found = numbers(where, value, expected, *shapes, dtype=torch.float64).cpu()
         if not where.endswith(".rotation"):
             return found
         # (3, 3) is a matrix also where there are three worlds

@@ -5,63 +5,51 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Gt, Le
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from mosa.config.record import is_rotation
 from mosa.errors import ConfigError
 from mosa.modules.body.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.overlap import check_clear
-from mosa.physics.time.time_step import MOST_SUBSTEPS
-from mosa.settings import is_number
+from mosa.physics.engine.inputs import FASTEST, numbers, vector
+from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
 
-STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
-"""What a start may say."""
-FASTEST = 1e6
-"""[m/s], [rad/s] of a start: the time step would be refused far below."""
 UNDER = 0.25
 """Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
 """Of a particle in a frame of a rollout: x, v, F, F_tot."""
 
 
+Variant = Annotated[str, Expected(f"one of {', '.join(VARIANTS)}"), such(lambda v: v in VARIANTS)]
+Seconds = Annotated[float, Gt(0), Le(100)]
+
+
+class StartArguments(Settings):
+    """A start by name, as one of many worlds has it."""
+
+    rotation: Any = None
+    height: Number | None = None
+    position: Any = None
+    velocity: Any = None
+    angular_velocity: Any = None
+
+
 def check_frames(frames: int, particles: int) -> None:
-    """Errors: ConfigError where frames are no whole number, or are more than the machine can hold."""
-    if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
-        raise ConfigError(f"frames: expected a whole number of at least 1, found {frames!r}")
+    """Errors: ConfigError where they are more than the machine can hold."""
     counted(
         "frames",
         (frames, particles),
         "frames times particles, of which this machine can hold fewer",
         each=STORED_BYTES,
     )
-
-
-def check_variant(variant: str) -> None:
-    if variant not in VARIANTS:
-        raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
-
-
-def checked_dt(value: float | None, default: float) -> float:
-    """[s] of a step. Errors: ConfigError."""
-    if value is None:
-        return default
-    if not is_number(value) or not 0 < value <= 100:
-        raise ConfigError(
-            f"control_dt: expected a positive number of at most 100 [s], found {value!r}"
-        )
-    return float(value)
-
-
-def check_differentiable(value: bool) -> None:
-    """Errors: ConfigError."""
-    if not isinstance(value, bool):
-        raise ConfigError(f"differentiable: expected True or False, found {value!r}")
 
 
 def check_wants_no_gradients(**given: Any) -> None:
@@ -90,16 +78,6 @@ def asks_for_gradients(value: Any) -> bool:
     return False
 
 
-def checked_substeps(value: int | None) -> int | None:
-    if value is not None and (
-        isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_SUBSTEPS
-    ):
-        raise ConfigError(
-            f"substeps: expected a whole number of at least 1 and at most {MOST_SUBSTEPS}, or None, found {value!r}"
-        )
-    return value
-
-
 def placed(position: Sequence[float | None] | Tensor, center: Tensor) -> Tensor:
     """(3,) the centre with the numbers of `position` that are not None. Errors: ConfigError."""
     if isinstance(position, Sequence) and not isinstance(position, str) and len(position) == 3:
@@ -111,32 +89,15 @@ def placed(position: Sequence[float | None] | Tensor, center: Tensor) -> Tensor:
     return vector("position", position).to(center)
 
 
-def numbers(name: str, value: Sequence[float] | Tensor, expected: str) -> Tensor:
-    """Tensor of finite numbers, float64 where they are given so, else float32. Errors: ConfigError naming the field."""
-    try:
-        result = torch.as_tensor(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
-    if (
-        result.dtype == torch.bool
-        or result.is_complex()
-        or not bool(torch.isfinite(result.detach().float()).all())
-    ):
-        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
-    return result if result.dtype == torch.float64 else result.float()
-
-
 def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
     """(3, 3) from (ax, ay, az, degrees) or a matrix. Errors: ConfigError for anything else, and a matrix that is no rotation."""
     expected = "(ax, ay, az, degrees) with a non-zero axis or a 3x3 rotation matrix"
     value = numbers("rotation", value, expected)
     if value.shape == (3, 3):
-        R = value.detach().double()
-        defect = float((R @ R.T - torch.eye(3).double()).abs().max())
-        if defect > 1e-3 or float(torch.linalg.det(R)) < 0:
+        if not is_rotation(value.tolist()):
             raise ConfigError(
-                f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
-                f"{float(torch.linalg.det(R)):.3g}: scaled, sheared or mirrored bodies are not what was learned"
+                f"rotation: expected R R^T = I and det R = 1, found {value.tolist()}: scaled, sheared or mirrored bodies are not "
+                "what was learned"
             )
         return value
     if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:
@@ -147,24 +108,11 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
     )
 
 
-def vector(name: str, value: Sequence[float]) -> Tensor:
-    """(3,) tensor. Errors: ConfigError naming the field."""
-    expected = f"three finite numbers within {FASTEST:g}"
-    result = numbers(name, value, expected)
-    if result.shape != (3,) or float(result.detach().abs().max()) > FASTEST:
-        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
-    return result
-
-
 def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
     """(2, 3) [m] the corners of a box. Errors: ConfigError."""
     expected = f"[low, high] corners, (2, 3) finite numbers within {FASTEST:g} [m] with low below high on every axis"
-    result = numbers("box", value, expected).detach()
-    if (
-        result.shape != (2, 3)
-        or float(result.abs().max()) > FASTEST
-        or not bool((result[0] < result[1]).all())
-    ):
+    result = numbers("box", value, expected, (2, 3)).detach()
+    if float(result.abs().max()) > FASTEST or not bool((result[0] < result[1]).all()):
         raise ConfigError(f"box: expected {expected}, found {str(value)[:120]}")
     return result
 
@@ -190,10 +138,8 @@ def start_in(
     up = world.up.to(body.rest)
     arms = (body.rest - body.center) @ Q.T
     if height is not None:
-        if not is_number(height) or (height < 0 and world.ground is not None):
-            raise ConfigError(
-                f"height: expected metres above the ground, a finite number >= 0, found {height!r}"
-            )
+        if height < 0 and world.ground is not None:
+            raise ConfigError(f"height: expected metres above the ground, >= 0, found {height:g}")
         ground, low = world.ground.height if world.ground is not None else 0.0, arms @ up
         if (
             world.ground is not None and world.ground.mode == "touch"

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from plyfile import PlyData, PlyElement
+from pydantic import InstanceOf
 from torch import Tensor
 
 from mosa.config.build import build_body, world_of
@@ -26,7 +28,7 @@ from mosa.config.checkpoints import (
     read_checkpoint,
 )
 from mosa.config.record import BodyRecord
-from mosa.data.io.splat_formats import check_formats, drop_later_frames, save_frames
+from mosa.data.io.splat_formats import Formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation.analysis.comparison import ground_lines, on_ground
 from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_video
@@ -42,8 +44,10 @@ from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
 from mosa.physics.contact.driven import Driven
+from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
+from mosa.settings import Count, Expected, Number, Seed, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import written_whole
@@ -54,15 +58,17 @@ from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
 from mosa.twin.shown_solids import with_solids
 from mosa.twin.start import (
-    check_differentiable,
+    Seconds,
+    Variant,
     check_frames,
-    check_variant,
     check_wants_no_gradients,
-    checked_dt,
-    checked_substeps,
     start_in,
 )
 from mosa.types import Cameras, Rollout
+
+Draws = Annotated[int, Ge(2), Le(10_000)]
+Pixels = Annotated[int, Ge(8), Le(8192)]
+Motion = Annotated[Rollout, InstanceOf, Expected("a Rollout, as simulate returns it")]
 
 
 class Twin:
@@ -110,7 +116,10 @@ class Twin:
         posterior = None if record.posterior is None else Posterior.read(record.posterior.plain())
         return cls(body.to(device).eval(), world, record.frame_dt, record.body, start, posterior)
 
-    def predict(self, *, draws: int = DRAWS, seed: int = 0, **start: Any) -> tuple[Rollout, Tensor]:
+    @typed
+    def predict(
+        self, *, draws: Draws = DRAWS, seed: Seed = 0, **start: Any
+    ) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
         start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
@@ -135,16 +144,17 @@ class Twin:
             torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others)
         )
 
+    @typed
     def simulate(
         self,
         *,
         rotation: Sequence[float] | Tensor | None = None,
-        height: float | None = None,
+        height: Number | None = None,
         position: Sequence[float | None] | Tensor | None = None,
         velocity: Sequence[float] | None = None,
         angular_velocity: Sequence[float] | None = None,
-        frames: int = 30,
-        variant: str = "adapted",
+        frames: Count = 30,
+        variant: Variant = "adapted",
         progress: bool = False,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         box: Sequence[Sequence[float]] | Tensor | None = None,
@@ -165,7 +175,6 @@ class Twin:
         (also a solid that the body starts in), SimulationDiverged (the body leaves the box).
         """
         check_frames(frames, len(self.body.rest))
-        check_variant(variant)
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
                  "driven": driven}  # fmt: skip
@@ -180,19 +189,20 @@ class Twin:
                 start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update()
             )
 
+    @typed
     def reset(
         self,
         *,
         rotation: Sequence[float] | Tensor | None = None,
-        height: float | None = None,
+        height: Number | None = None,
         position: Sequence[float | None] | Tensor | None = None,
         velocity: Sequence[float] | Tensor | None = None,
         angular_velocity: Sequence[float] | Tensor | None = None,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        variant: str = "adapted",
-        control_dt: float | None = None,
-        substeps: int | None = None,
-        frames: int = 30,
+        variant: Variant = "adapted",
+        control_dt: Seconds | None = None,
+        substeps: Substeps | None = None,
+        frames: Count = 30,
         differentiable: bool = False,
         box: Sequence[Sequence[float]] | Tensor | None = None,
         driven: Sequence[Driven | Mapping[str, Any]] | None = None,
@@ -207,8 +217,6 @@ class Twin:
         require gradients are refused. Errors: ConfigError.
         """
         check_frames(frames, len(self.body.rest))
-        check_variant(variant)
-        check_differentiable(differentiable)
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
                  "driven": driven}  # fmt: skip
@@ -216,8 +224,8 @@ class Twin:
             check_wants_no_gradients(**given)
         start, world = start_in(self.body, self.world, self.training_start, **given)
         self._episode = Episode(
-            self.body, world, checked_dt(control_dt, self.frame_dt), start, variant=variant, frames=frames,
-            substeps=checked_substeps(substeps), differentiable=differentiable,
+            self.body, world, control_dt or self.frame_dt, start, variant=variant, frames=frames,
+            substeps=substeps, differentiable=differentiable,
         )  # fmt: skip
         return self._episode.state
 
@@ -249,7 +257,8 @@ class Twin:
     def state(self, state: TwinState) -> None:
         self.episode.state = state
 
-    def worlds(self, count: int, laws: Tensor | None = None) -> TwinWorlds:
+    @typed
+    def worlds(self, count: Count, laws: Tensor | None = None) -> TwinWorlds:
         """`count` copies of the body, each in a world of its own, that are reset and stepped together.
 
         laws: (count, numbers) of a law for each, as `posterior.draws(count)` gives them, None for the learned one in all.
@@ -257,10 +266,11 @@ class Twin:
         return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
 
     @torch.no_grad()
+    @typed
     def render(
         self,
-        rollout: Rollout,
-        size: int = 400,
+        rollout: Motion,
+        size: Pixels = 400,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
     ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
@@ -326,22 +336,20 @@ class Twin:
             )
         return tuple(solids)
 
+    @typed
     def export(
-        self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
-        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
+        formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`. colliders: those that
         the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
-        if not isinstance(formats, (list, tuple)):
-            raise ConfigError(f"formats: expected a list like ['ply'], found {str(formats)[:80]!r}")
-        check_formats(formats)
         solids = self._met(rollout, colliders)
         try:
             folder = Path(folder)
             (folder / "ply").mkdir(parents=True, exist_ok=True)
-        except (OSError, TypeError, ValueError) as error:
+        except (OSError, ValueError) as error:
             raise ConfigError(
                 f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
             ) from error

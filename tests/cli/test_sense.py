@@ -110,12 +110,12 @@ def test_a_body_starts_above_the_ground():
 
 @pytest.mark.parametrize("call, message", [
     (lambda t: t.reset(height=0.05, substeps=10**9), "substeps: expected a whole number of at least 1 and at most"),
-    (lambda t: t.reset(height=0.05, differentiable=None), "differentiable: expected True or False"),
+    (lambda t: t.reset(height=0.05, differentiable=None), "differentiable: expected true or false"),
     (lambda t: t.worlds(2, laws=5), r"laws: expected one for each of 2 worlds, a tensor"),
     (lambda t: t.worlds(2).reset(5), "starts: expected what Twin.simulate takes"),
-    (lambda t: t.worlds(2).restart(5), "restart: expected a list of numbers of worlds"),
+    (lambda t: t.worlds(2).restart(5), "which: expected a list of numbers of worlds, found 5"),
     (lambda t: t.export(t.simulate(frames=2), "/proc/nowhere", video=False), "export: expected a folder that can be written"),
-    (lambda t: t.export(t.simulate(frames=2), "x", formats="ply"), "formats: expected a list like"),
+    (lambda t: t.export(t.simulate(frames=2), "x", formats="ply"), "formats: expected a list of some of ply, splat"),
 ])  # fmt: skip
 def test_calls_of_a_twin_that_mean_nothing(call, message):
     with pytest.raises(ConfigError, match=message):

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from mosa.environments.tasks import TASKS, task_named
+from mosa.errors import ConfigError
 from tests.environments.test_environments import SHORT, arena, drawn, simulator
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -74,7 +75,7 @@ def test_what_is_drawn_is_what_is_seen_or_held():
     env.reset(seed=0)
     env.step(np.ones(3, np.float32))
     assert len(env.render()) == 2
-    with pytest.raises(Exception, match="render_mode: expected one of rgb_array"):
+    with pytest.raises(Exception, match="render_mode: expected rgb_array or rgb_array_list"):
         TwinEnv("pushing", render_mode="human")
 
 
@@ -132,3 +133,42 @@ def test_a_library_learns_in_the_worlds(method):
     )
     actions = found.policy(drawn(made, 4).observed)
     assert actions.shape == (4, 4) and float(actions.abs().max()) <= 1
+
+
+@pytest.mark.parametrize("name, wrong", [
+    ("render_mode", ("human", 5, True, [], "")), ("size", (0, 2.5, "a", True, 10**6)),
+    ("worlds", (0, 2.5, "a", True, 10**12)), ("options", (5, "a", [], True, 1.0)),
+])  # fmt: skip
+def test_a_wrong_argument_of_an_environment_is_named(name, wrong):
+    for value in wrong:
+        with pytest.raises(ConfigError, match=f"^{name}: expected"):
+            make = TwinVectorEnv if name == "worlds" else TwinEnv
+            make("pushing", **{"simulator": "truth", "scene": "tiny", name: value})
+
+
+def test_calls_out_of_turn_and_wrong_actions_and_seeds_are_named():
+    env = TwinEnv(
+        "placement", simulator="truth", scene="tiny", spacing=0.03, render_mode="rgb_array"
+    )
+    for call in (lambda: env.step(np.zeros(4, np.float32)), env.render):
+        with pytest.raises(ConfigError, match=r"expected reset\(\) before step and render"):
+            call()
+    for seed in (-1, 2.5, "a", True, 2**40):
+        with pytest.raises(ConfigError, match=r"^seed: expected a whole number"):
+            env.reset(seed=seed)
+    env.reset(seed=0)
+    nan = np.full(4, np.nan)
+    for action in (
+        np.zeros(3),
+        np.zeros((1, 4)),
+        "a",
+        None,
+        5,
+        [0, 0, 0, "a"],
+        nan,
+        np.zeros(4, bool),
+        np.zeros(4, complex),
+        [[1], 2],
+    ):
+        with pytest.raises(ConfigError, match=r"^action: expected \(1, 4\) finite numbers"):
+            env.step(action)

@@ -176,7 +176,11 @@ def test_the_command_makes_all_of_it(tmp_path):
     ("key", "value", "message"),
     [
         ("share", 2, "share: expected a number above 0 and at most 1, found 2"),
-        ("formats", ["obj"], "formats: expected some of ply, splat, spz, usd, found 'obj'"),
+        (
+            "formats",
+            ["obj"],
+            "formats: expected a list of some of ply, splat, spz, usd, found",
+        ),
         ("box", [[0, 0, 0]], "box: expected two corners"),
         ("up", [0, 1], "up: expected three"),
     ],

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from strangers import saved
 
-from mosa.config.checkpoints import check_same_scene, read_checkpoint, record_of
+from mosa.config.checkpoints import check_same_data, check_same_scene, read_checkpoint, record_of
 from mosa.errors import ConfigError, DataError
 from mosa.training import fitting
 from mosa.training.callbacks import KeepLast
@@ -134,6 +134,23 @@ def test_a_fit_goes_on_with_the_data_that_it_began_with(tmp_path):
         ConfigError, match=r"in x\.ckpt a fit to this scene, .*scene\.path: /a/duck there, /a/goose"
     ):
         check_same_scene(found, {"scene": scene | {"path": "/a/goose"}}, path)
+
+
+@pytest.mark.parametrize("stored, here, other", [
+    ({"train": "a"}, {"train": "a"}, None), ({"train": "a"}, {"train": "b"}, r"\(train\)"),
+    ({"train": "a", "test/x": "c"}, {"train": "a", "test/x": "d"}, r"\(test/x\)"), ({}, {"train": "b"}, None),
+    ({"train": "a"}, {"train": "a", "test/new": "e"}, None),
+    ({"train": "a", "train/x": "c"}, {"train": "b", "train/x": "d"}, "train, train/x"),
+])  # fmt: skip
+def test_films_are_known_by_their_bytes(tmp_path, stored, here, other):
+    """Another film below the same path was evaluated as the training one, without a word."""
+    trained(tmp_path)
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    record = record_of(read_checkpoint(last), last).but(data=stored)
+    if other is None:
+        return check_same_data(record, here, "x.ckpt")
+    with pytest.raises(DataError, match=rf"x\.ckpt: .*found other images.*{other}.*scene\.root="):
+        check_same_data(record, here, "x.ckpt")
 
 
 @pytest.mark.parametrize("changed", [

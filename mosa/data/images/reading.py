@@ -10,6 +10,7 @@ from PIL import Image
 
 from mosa.errors import ConfigError, DataError
 from mosa.system.limits import counted
+from mosa.system.ply import named
 
 MOST_PIXELS = 2**26
 """Of one picture: twice an 8K frame."""
@@ -31,7 +32,7 @@ def read_image(path: Path) -> np.ndarray:
                 pixels = np.asarray(picture.convert(plain_mode(picture)))
     except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
         raise DataError(
-            f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again"
+            f"{path}: expected a readable image, found {named(path)} ({error})"
         ) from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.float32) / 255

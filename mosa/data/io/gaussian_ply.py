@@ -6,11 +6,15 @@ opacity (logit), scale_0..2 (log of the standard deviations), rot_0..3 (quaterni
 
 from __future__ import annotations
 
+import io
+import math
+import warnings
 from pathlib import Path
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import DataError
@@ -29,6 +33,10 @@ AXES = ("x", "y", "z")
 SCALES = tuple(f"scale_{i}" for i in range(3))
 ROTATIONS = tuple(f"rot_{i}" for i in range(4))
 CONSTANT = tuple(f"f_dc_{i}" for i in range(3))
+SPREAD = 0.3
+"""Of plain opacities, at least: logits that lie within 0 to 1 are of opacities from 0.5 to 0.73."""
+FAR = 100.0
+"""Extents from the origin, from which on an object is read about its own middle: float32 would round its shape."""
 OPACITY_MARGIN = 1e-6
 """Opacities are kept this far from 0 and 1, where the logit has no number."""
 SMALLEST = 1e-9
@@ -69,8 +77,16 @@ def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = Non
 
 
 def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
-    """Gaussians of a 3DGS PLY and their spherical harmonics (N, K, 3), K = 1, 4, 9 or 16; float32.
+    """`read_ply` without the rest."""
+    return read_ply(path)[:2]
 
+
+def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, Tensor, str]:
+    """Gaussians of a 3DGS PLY, their spherical harmonics (N, K, 3), K = 1, 4, 9 or 16, what was taken from their means (3,), and
+    the axis that the header calls vertical; float32, the offset float64.
+
+    Scales that are no logarithms and opacities that are no logits are known by their numbers, with a warning; the 3D filter of
+    Mip-Splatting (Yu et al. 2024) is applied. centred: means far from the origin are taken about their median.
     `Splats.colors` are the colours averaged over directions, rotations have unit length.
     Errors: DataError naming the file and the field: missing, of another number of harmonics, not finite.
     """
@@ -79,12 +95,20 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
         raise DataError(f"{path}: file not found; expected a PLY file of 3D Gaussians")
     check_ply(path)
     try:
-        document = PlyData.read(path)
+        head, end, body = path.read_bytes().partition(b"end_header")
+        plain = head.decode("ascii", "replace").replace("\ufffd", "?").encode()  # of comments
+        document = PlyData.read(io.BytesIO(plain + end + body))
         vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
     except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path}: expected a PLY file with an element vertex, found a damaged or other one ({error})"
         ) from error
+    if any(name.startswith("scalar_") for name in vertices):  # as CloudCompare writes them
+        vertices = {name.removeprefix("scalar_"): column for name, column in vertices.items()}
+    if "packed_position" in vertices:
+        raise DataError(
+            f"{path}: expected a 3DGS PLY, found a compressed one; export it uncompressed"
+        )
     rest = [name for name in vertices if name.startswith("f_rest_")]
     per_channel, left = divmod(len(rest), 3)
     if left or per_channel + 1 not in DEGREES:
@@ -97,7 +121,8 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
             if name not in vertices:
                 raise DataError(
                     f"{path}: no field {name}, which 3D Gaussians have; found {', '.join(list(vertices)[:8])} ...: "
-                    "a point cloud or mesh cannot be used"
+                    f"{'a point cloud or mesh' if 'scale_0' not in vertices else 'another layout'} cannot be used; "
+                    "train 3DGS on its images and give the PLY that it writes"
                 )
         columns = [
             _finite(np.asarray(vertices[name], dtype=np.float32), name, path, "found")
@@ -109,10 +134,34 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
             else torch.empty(len(vertices["x"]), 0)
         )
 
-    means = read(AXES)
-    if len(means) == 0:
+    read(AXES)  # all there, and finite
+    places = torch.from_numpy(
+        np.stack([np.asarray(vertices[name], np.float64) for name in AXES], -1)
+    )
+    if len(places) == 0:
         raise DataError(f"{path}: expected Gaussians, found none")
-    scales, opacity, rotations = read(SCALES).exp(), read(("opacity",))[:, 0], read(ROTATIONS)
+    middle, (low, high) = places.median(0).values, np.quantile(places.numpy(), [0.05, 0.95], axis=0)
+    extent = float((high - low).max())
+    offset = middle if centred and float(middle.abs().max()) > FAR * extent else 0 * middle
+    means = (places - offset).float()
+    logs, opacity, rotations = read(SCALES), read(("opacity",))[:, 0], read(ROTATIONS)
+    odd, scales = [], logs.exp()
+    if float(logs.min()) > 0:  # then they are what is nearer to the Gaussians' distances
+        apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) or extent or 1.0
+        if abs(math.log(logs.median() / apart)) < abs(logs.median() - math.log(apart)):
+            odd, scales = ["scales as lengths, not their logarithms"], logs
+    opacities, span = torch.sigmoid(opacity), float(opacity.max() - opacity.min())
+    if (
+        float(opacity.min()) >= 0
+        and float(opacity.max()) <= 1
+        and (span > SPREAD or float(opacity.max()) == 1)
+    ):
+        odd, opacities = [*odd, "opacities as they are, not their logits"], opacity
+    if odd:
+        warnings.warn(f"{path}: read with {' and '.join(odd)}, as its numbers are", stacklevel=3)
+    if "filter_3D" in vertices:
+        wide = (scales.square() + read(("filter_3D",)).square()).sqrt()
+        opacities, scales = opacities * (scales / wide).prod(1), wide
     if not bool(torch.isfinite(scales).all()):
         raise DataError(
             f"{path}: field scale_*: expected logarithms of standard deviations, found some too large for exp"
@@ -129,7 +178,9 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
     )
     coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)
     colors = mean_colors(coefficients)
-    return Splats(means, scales, rotations / length, torch.sigmoid(opacity), colors), coefficients
+    said = " ".join(document.comments).lower().partition("vertical axis:")[2].split()[:1]
+    splats = Splats(means, scales, rotations / length, opacities, colors)
+    return splats, coefficients, offset, "".join(said)
 
 
 def export_splats(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -19,10 +20,14 @@ from mosa.errors import ConfigError, DataError
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import Y0, degree_of, mean_colors, rotated
 from mosa.rendering.covariance import scales_and_rotations
+from mosa.settings import Expected, check, such
 from mosa.system.whole_files import written_whole
 from mosa.types import Appearance, Splats
 
 FORMATS = ("ply", "splat", "spz", "usd")
+Formats = Annotated[
+    Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: set(v) <= set(FORMATS))
+]  # fmt: skip
 SPLAT = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )
@@ -177,12 +182,6 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
     return path
 
 
-def check_formats(formats: Sequence[str]) -> None:
-    """Errors: ConfigError for one that is not known."""
-    if unknown := [name for name in formats if name not in FORMATS]:
-        raise ConfigError(f"formats: expected some of {', '.join(FORMATS)}, found {unknown[0]!r}")
-
-
 def drop_later_frames(folder: Path, suffix: str, count: int) -> None:
     """What a longer motion left in the folder before: a viewer would go on from this one into it."""
     for old in folder.glob(f"*{suffix}"):
@@ -202,7 +201,7 @@ def save_frames(
 
     rate [1/s], up (3,): of the USD stage. Errors: ConfigError for another format, or where a package is missing; DataError.
     """
-    check_formats(formats)
+    check("formats", formats, Formats)
     folder, frames = Path(folder), []
     for kind in ("ply", "splat", "spz"):
         drop_later_frames(folder / kind, f".{kind}", len(shown.means))

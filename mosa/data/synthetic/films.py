@@ -111,7 +111,7 @@ def make(
         write_take(file, take)
     except OSError as error:
         raise ConfigError(
-            f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with XDG_CACHE_HOME or scene.cache="
+            f"scene.cache: cannot write {file} ({error.strerror}); set XDG_CACHE_HOME to another folder"
         ) from error
     return take
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,36 @@ from mosa.physics.engine.numerics import Numerics, State
 from mosa.types import ParticleState
 
 UNBOUNDED = 1e30
+FASTEST = 1e6
+"""[m/s], [rad/s] of a start: the time step would be refused far below."""
+
+
+def numbers(
+    name: str, value: Any, expected: str, *shapes: tuple[int, ...], dtype: torch.dtype | None = None
+) -> Tensor:
+    """Tensor of finite numbers, of one of the shapes, if any; of a type, by default float64 where they are given so, else float32.
+    Errors: ConfigError naming the argument."""
+    try:
+        found = torch.as_tensor(value)
+        odd = found.dtype == torch.bool or found.is_complex()
+        if odd or not bool(found.detach().double().isfinite().all()):
+            raise ValueError
+        dtype = dtype or (torch.float64 if found.dtype == torch.float64 else torch.float32)
+        result = torch.as_tensor(value, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from None
+    if shapes and tuple(result.shape) not in shapes:
+        raise ConfigError(f"{name}: expected {expected}, found shape {tuple(result.shape)}")
+    return result
+
+
+def vector(name: str, value: Sequence[float] | Tensor) -> Tensor:
+    """(3,) tensor. Errors: ConfigError naming the argument."""
+    expected = f"three finite numbers within {FASTEST:g}"
+    result = numbers(name, value, expected, (3,))
+    if float(result.detach().abs().max()) > FASTEST:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
+    return result
 
 
 def pack_parameters(
@@ -63,6 +94,8 @@ def pack_parameters(
 def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> None:
     """Errors: ConfigError naming what has another shape, type or device; x may be float64 in any case."""
     *worlds, n = state.x.shape[:-1]
+    if not n:
+        raise ConfigError("x: expected one particle at least, found none")
     shapes = {
         name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3)
         for name in State._fields
@@ -95,10 +128,10 @@ def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Te
             )
         density = density.detach().to(volume)
         valid = (torch.isfinite(density) & (density > 0)).all()
-    numbers = [(volume > 0).all(), valid, (density * volume).mean()]
-    volumes, densities, mass = torch.stack([n.double() for n in numbers]).tolist()
+    told = [((volume > 0) & volume.isfinite()).all(), valid, (density * volume).mean()]
+    volumes, densities, mass = torch.stack([n.double() for n in told]).tolist()
     if not volumes:
-        raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+        raise ConfigError("volume: expected positive, finite numbers [m^3] for all particles")
     if not densities:
         raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
     return density, mass
@@ -120,11 +153,8 @@ def gravity_of_worlds(
     """common: where none is given. Errors: ConfigError."""
     if gravity is None:
         return (common,) * worlds
-    gravity = torch.as_tensor(gravity, dtype=torch.float64)
-    if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
-        raise ConfigError(
-            f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}"
-        )
+    shape = (worlds, 3)
+    gravity = numbers("gravity", gravity, f"finite numbers {shape}", shape, dtype=torch.float64)
     if gravity.requires_grad and torch.is_grad_enabled():
         raise ConfigError(
             "gravity: expected numbers without gradients, found a tensor that requires them: pass its detach()"

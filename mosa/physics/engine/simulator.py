@@ -10,9 +10,10 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from mosa.errors import ConfigError
@@ -35,6 +36,7 @@ from mosa.physics.engine.inputs import (
     motions_of_worlds,
     pack_parameters,
     polar_rotation,
+    vector,
 )
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
@@ -46,9 +48,11 @@ from mosa.physics.launching import SCALARS
 from mosa.physics.time.adaptive_steps import StepChooser, check_counts
 from mosa.physics.time.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.time.time_step import MOST_SUBSTEPS
+from mosa.settings import Count, Number, Positive, Text, typed
 from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
 
+Substeps = Annotated[int, Ge(1), Le(MOST_SUBSTEPS)]
 NEAR = 8
 """Cells from the origin within which driven particles of float32 may move before the origin follows
 them, with new buffers."""
@@ -65,13 +69,14 @@ class Simulator:
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
+    @typed
     def __init__(
         self,
-        law: str,
+        law: Text,
         *,
-        dx: float,
-        substeps: int,
-        frame_dt: float,
+        dx: Positive,
+        substeps: Substeps,
+        frame_dt: Positive,
         gravity: Sequence[float] | Tensor = (0.0, -9.8, 0.0),
         ground: Ground | None = None,
         up: Sequence[float] | Tensor | None = None,
@@ -80,24 +85,12 @@ class Simulator:
         box: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
-        strain: str | None = None,
+        strain: Literal[tuple(STRAINS)] | None = None,  # type: ignore[valid-type]
         options: LawOptions = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
-        for name, value, most in (
-            ("dx", dx, 1e300),
-            ("frame_dt", frame_dt, 1e300),
-            ("substeps", substeps, MOST_SUBSTEPS),
-        ):
-            if not 0 < value <= most:
-                raise ConfigError(
-                    f"{name}: expected a positive number of at most {most:g}, found {value}"
-                )
-        if strain is not None and (strain not in STRAINS or not self.law.sheared):
-            if strain not in STRAINS:
-                raise ConfigError(
-                    f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}"
-                )
+        vector("gravity", gravity)
+        if strain is not None and not self.law.sheared:
             raise ConfigError(
                 f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
             )
@@ -167,19 +160,20 @@ class Simulator:
             self.law, parameters, shape, like, rotation=rotation, yield_factor=factor
         )
 
+    @typed
     def rollout(
         self,
         state: ParticleState,
         parameters: dict[str, Tensor],
         volume: Tensor,
         density: float | Tensor,
-        frames: int,
+        frames: Count,
         adapter: Callable[[MaterialState], AdapterOperator] | Sequence[Callable] | None = None,
-        stride: int | None = 1,
+        stride: Count | None = 1,
         progress: Callable[[int], None] | None = None,
         started: bool = False,
         motions: Sequence | None = None,
-        start_time: float = 0.0,
+        start_time: Number = 0.0,
         timing: Adaptive | Replay | None = None,
         collect: Callable[[Any], None] | None = None,
         gravity: Tensor | Sequence | None = None,
@@ -255,6 +249,7 @@ class Simulator:
             reactions=world.vectors(forces), counts=tuple(counts),
         )  # fmt: skip
 
+    @typed
     def stepper(
         self,
         state: ParticleState,
@@ -262,14 +257,14 @@ class Simulator:
         volume: Tensor,
         density: float | Tensor,
         adapter: Callable | Sequence[Callable] | None = None,
-        stride: int | None = 1,
+        stride: Count | None = 1,
         *,
         started: bool = False,
         motions: Sequence | None = None,
         gravity: Tensor | Sequence | None = None,
         together: int | None = None,
         timing: Adaptive | None = None,
-        steps: int = 30,
+        steps: Count = 30,
         held: Held | None = None,
     ) -> tuple[Stepper, Moment]:
         """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout`.
@@ -392,10 +387,6 @@ class Simulator:
         held: Held | None = None,
     ) -> Prepared:  # fmt: skip
         """What a rollout needs besides its state. Errors: ConfigError."""
-        if (frames is not None and frames < 1) or (stride is not None and stride < 1):
-            raise ConfigError(
-                f"frames and stride: expected at least 1, found {frames} and {stride}"
-            )
         counted(
             "particles of all frames",
             (frames or 1, *state.x.shape[:-1]),

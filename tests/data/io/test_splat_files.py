@@ -101,7 +101,7 @@ def test_damaged_splat_files_are_named(tmp_path):
 
 def test_another_format_is_refused(tmp_path):
     with pytest.raises(
-        ConfigError, match="formats: expected some of ply, splat, spz, usd, found 'obj'"
+        ConfigError, match="formats: expected a list of some of ply, splat, spz, usd, found"
     ):
         save_frames(drawn(0), tmp_path, ("ply", "obj"))
     assert not (tmp_path / "ply").exists()

@@ -1,0 +1,91 @@
+"""Arguments of public calls are checked by their types, as keys of a configuration are."""
+
+import functools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mosa.errors import ConfigError
+from mosa.physics.engine.simulator import Simulator
+from mosa.types import Ground, ParticleState
+from tests.modules.body.test_world import twin
+
+TWIN = functools.cache(twin)
+MOTION = functools.cache(lambda: TWIN().simulate(frames=2))
+
+
+@pytest.mark.parametrize("name, wrong, call", [
+    ("size", (0, -1, 2.5, "a", True, 10**6, None), lambda v: TWIN().render(MOTION(), size=v)),
+    ("rollout", (5, None, "a", {}, [1]), lambda v: TWIN().render(v)),
+    ("rollout", (5, None, "a", {}, [1]), lambda v: TWIN().export(v, "nowhere")),
+    ("folder", (5, None, True, [], 1.5), lambda v: TWIN().export(MOTION(), v)),
+    ("formats", (5, "ply", ["obj"], [1], None), lambda v: TWIN().export(MOTION(), "nowhere", formats=v)),
+    ("video", (1, "no", None, [], 0.0), lambda v: TWIN().export(MOTION(), "nowhere", video=v)),
+    ("draws", (-1, 1, 2.5, "a", True, 10**12), lambda v: TWIN().predict(draws=v)),
+    ("seed", (-1, 0.5, "a", True, 2**32), lambda v: TWIN().predict(seed=v)),
+    ("frames", (0, -1, 2.5, "a", True, 10**12), lambda v: TWIN().simulate(frames=v)),
+    ("variant", (0, "best", None, ["prior"], True), lambda v: TWIN().simulate(variant=v)),
+    ("height", ("a", math.nan, True, [0.1], -1), lambda v: TWIN().simulate(height=v)),
+    ("control_dt", (0, -1, math.inf, "a", True, 1e3), lambda v: TWIN().reset(control_dt=v)),
+    ("substeps", (0, -1, 2.5, "a", True, 10**9), lambda v: TWIN().reset(substeps=v)),
+    ("count", (0, -1, 2.5, "a", True, 10**12), lambda v: TWIN().worlds(v)),
+    ("which", (5, "ab", [True], [0.5], ["a"]), lambda v: TWIN().worlds(2).restart(v)),
+    (r"starts\[0\]\.height", ("a", math.nan, True, [0.1], {}), lambda v: TWIN().worlds(2).reset({"height": v})),
+])  # fmt: skip
+def test_a_wrong_argument_of_a_twin_is_named(name, wrong, call):
+    for value in wrong:
+        with pytest.raises(ConfigError, match=rf"^{name}: expected") as told:
+            call(value)
+        assert "found" in str(told.value)
+
+
+def test_an_unknown_part_of_a_start_is_named_with_the_nearest():
+    with pytest.raises(ConfigError, match=r"^starts\[1\]\.heigth: .* nearest is starts\[1\]\.he"):
+        TWIN().worlds(2).reset([{}, {"heigth": 1.0}])
+
+
+def test_a_state_that_is_inside_out_is_refused_where_the_law_has_no_such():
+    made = twin()
+    made.body.law_options = made.body.law_options.but(on_inversion="error")
+    now = made.reset()
+    made.state = now
+    with pytest.raises(ConfigError, match=r"^state\.F: expected det F > 0"):
+        made.state = replace(now, F=-now.F)
+
+
+GRID = {"dx": 0.05, "substeps": 40, "frame_dt": 1 / 30}
+
+
+@pytest.mark.parametrize("name, wrong", [
+    ("law", (5, None, True, [], 1.0)), ("dx", (0, -1, math.nan, "a", True)), ("substeps", (0, 2.5, "a", True, 10**9)),
+    ("frame_dt", (0, -1, math.inf, "a", None)), ("strain", ("foo", 5, True, [], "")),
+    ("gravity", ("abc", (0, 1), (0, math.nan, 0), 5, None, (0, 1e9, 0))),
+])  # fmt: skip
+def test_a_wrong_argument_of_a_simulator_is_named(name, wrong):
+    for value in wrong:
+        with pytest.raises(ConfigError, match=f"^{name}: expected"):
+            Simulator(**{"law": "neo_hookean", **GRID, name: value})
+
+
+def rolled(count=4, volume=1e-6, density=1000.0, **keys):
+    made = Simulator("corotated", ground=Ground(0.0), **GRID)
+    F, x = torch.eye(3).repeat(count, 1, 1), torch.rand(count, 3) + 0.1
+    state = ParticleState(x=x, v=0 * x, C_affine=0 * F, F=F, F_tot=F)
+    volumes = torch.full((count,), 1e-6)
+    volumes[:1] = volume
+    parameters = dict.fromkeys(made.law.parameters, 1e4)
+    return made.rollout(state, parameters, volumes, density, **{"frames": 2} | keys)
+
+
+@pytest.mark.parametrize("keys, message", [
+    ({"frames": 2.5}, "frames: "), ({"frames": 0}, "frames: "), ({"frames": "a"}, "frames: "), ({"frames": True}, "frames: "),
+    ({"stride": 0}, "stride: "), ({"stride": 1.5}, "stride: "), ({"started": 1}, "started: "),
+    ({"start_time": math.nan}, "start_time: "),
+    ({"count": 0}, "x: expected one particle"), ({"volume": math.inf}, "volume: "), ({"volume": 0.0}, "volume: "),
+    ({"volume": math.nan}, "volume: "), ({"volume": -1.0}, "volume: "), ({"density": math.inf}, "density: "),
+])  # fmt: skip
+def test_a_wrong_argument_of_a_rollout_is_named(keys, message):
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        rolled(**keys)
