@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import mosa.physics
-from mosa.physics.adapters.network_evaluation import from_weights, same_weights
 from mosa.physics.engine.budget import Budget
 from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
 from mosa.physics.launching import same_memory
@@ -107,16 +106,6 @@ def test_memory_is_the_same_whoever_views_it():
         and not same_memory([a], [a[:3]])
         and not same_memory([a], [a, a])
     )
-
-
-def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay():
-    """Freed memory may come back at the same address: what was made of it is held, so that it does not."""
-    with same_weights():
-        for value in range(50):
-            weights = [torch.full((1000,), float(value))]
-            assert (
-                from_weights(lambda weights=weights: float(weights[0][0]), weights, "key") == value
-            )
 
 
 def test_a_part_of_the_physics_knows_only_those_below_it():
