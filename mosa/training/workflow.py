@@ -32,7 +32,6 @@ from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import assemble, scenes
 from mosa.training.costs import Costs, before_data, estimate
-from mosa.training.extrapolation import check_can_extrapolate, extrapolated
 from mosa.training.fitting import build_trainer, fit, fit_estimate
 from mosa.training.loggers import log_outcome
 from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
@@ -145,8 +144,6 @@ def train(cfg: DictConfig) -> float | None:
         check_starts(world, body, starts)
         warn_of_little(world, body, starts, [scene, *others])
         warn_of_others(body, starts, [scene, *others])
-        if cfg.extrapolate:
-            check_can_extrapolate(module)
         log.info(fit_estimate(module, clock.costs))
         fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
@@ -172,9 +169,6 @@ def train(cfg: DictConfig) -> float | None:
             for name, value in touched.items()
             if math.isfinite(value)
         }
-    if cfg.extrapolate:
-        with clock.measure("extrapolation"):
-            figures |= extrapolated(cfg, run, scene.known_parameters)
     figures |= (
         clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     )
