@@ -20,8 +20,8 @@ from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.gaussians.carried import fit_carried
-from mosa.reconstruction.gaussians.initial import inherited_colors
-from mosa.reconstruction.gaussians.static import fit_splats, start_splats
+from mosa.reconstruction.gaussians.initial import inherited_colors, initial_splats
+from mosa.reconstruction.gaussians.static import fit_splats
 from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
@@ -285,9 +285,7 @@ def reconstruct(
                 "static", still, _render_still(imported.splats.to(device), still, background)
             )
             return _tensors(imported.splats)
-        start = start_splats(
-            geometry.body, still, settings.static, count=settings.points, seed=seed
-        )
+        start = initial_splats(geometry.body, still, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
             fitted = fit_splats(
                 start,

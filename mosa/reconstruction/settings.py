@@ -68,54 +68,13 @@ class StaticSettings(FitSettings):
     """The static stage: Gaussians fitted to frame 0."""
 
     where: ClassVar[str] = "reconstruction.static"
-    needs: ClassVar[dict[str, str]] = {"max_points refine_every growth fade noise": "densify=mcmc"}
 
-    start: Literal["hull", "random"] = Field(
-        "hull",
+    relocate_every: Whole = Field(
+        100,
         description=(
-            "where Gaussians start: hull: on the visual hull's surface; random: in its box"
+            "steps after which vanished Gaussians are moved to where opaque ones are; 0: never"
         ),
     )
-    densify: Literal["relocate", "mcmc"] = Field(
-        "relocate",
-        description=(
-            "relocate: vanished Gaussians are moved to where opaque ones are; mcmc: and"
-            " more are added, up to max_points, as copies that leave the image as it is"
-        ),
-    )
-    max_points: Annotated[int, Interval(ge=8, le=10**9)] | None = Field(
-        None,
-        description="mcmc: Gaussians at most, at least `points`; null: as many as `points`",
-    )
-    relocate_every: Whole = Field(100, description="relocate: steps between moves; 0: never")
-    refine_every: Count = Field(10, description="mcmc: steps between moves")
-    growth: Weight = Field(
-        0.1,
-        description="mcmc: share of the number that is added",
-    )
-    fade: Weight = Field(
-        0.03,
-        description=(
-            "mcmc: what an opacity of 1 costs, in pixels of an image: Gaussians that no"
-            " image shows vanish and get moved"
-        ),
-    )
-    noise: Weight = Field(
-        0.2,
-        description=(
-            "mcmc: random steps of those about to vanish, in their standard deviations "
-            "at the first step"
-        ),
-    )
-
-    @model_validator(mode="after")
-    def _number_kept(self) -> StaticSettings:
-        if self.max_points is not None and self.densify != "mcmc":
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected null, found {self.max_points}: densify={self.densify} keeps the "
-                "number of Gaussians (reconstruction.points); set reconstruction.static.densify=mcmc"
-            )
-        return self
 
 
 class CarriedSettings(FitSettings):
@@ -261,9 +220,7 @@ class ReconstructionSettings(Settings):
             "geometry.source=images starts; 0: the hull itself"
         ),
     )
-    points: int = Field(
-        3000, ge=8, le=10**8, description="static Gaussians (static.densify=mcmc: at the start)"
-    )
+    points: int = Field(3000, ge=8, le=10**8, description="static Gaussians")
     neighbours: int = Field(
         20,
         ge=4,
@@ -312,11 +269,6 @@ class ReconstructionSettings(Settings):
 
     @model_validator(mode="after")
     def _together(self) -> ReconstructionSettings:
-        if self.static.max_points is not None and self.static.max_points < self.points:
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
-                f"start, found {self.static.max_points}"
-            )
         free = self.dynamic.free_shape or self.dynamic.model == "network"
         if self.cue == "gaussian" and not free:
             raise ConfigError(

@@ -90,7 +90,6 @@ def test_windows_show_what_the_shifted_cameras_see(squashed):
 
 
 def test_an_empty_matte_names_camera_and_frame(squashed):
-    from dataclasses import replace
 
     mattes = squashed.mattes.clone()
     mattes[2, 1] = 0
@@ -159,7 +158,9 @@ def test_hardly_seen_particles_keep_their_first_colour(squashed, hull, fitted):
         fill(hull, spacing=(body_volume(hull) / 1500) ** (1 / 3)), fitted, "cpu"
     )
     fits = {
-        keep: fit_splats(start, two, torch.ones(3), replace(QUICK, keep=keep), move=False, seed=0)
+        keep: fit_splats(
+            start, two, torch.ones(3), QUICK.model_copy(update={"keep": keep}), move=False, seed=0
+        )
         for keep in (0.0, 1.0)
     }
     features = torch.zeros(1, len(start.means), 1, requires_grad=True)
