@@ -31,8 +31,8 @@ from mosa.rendering.settings import RenderingSettings
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import assemble, scenes
-from mosa.training.costs import Costs, before_data, estimate
-from mosa.training.fitting import build_trainer, fit, fit_estimate
+from mosa.training.costs import before_data, estimate, estimate_text, peak_memory
+from mosa.training.fitting import build_trainer, fit
 from mosa.training.loggers import log_outcome
 from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
 from mosa.training.preflight import (
@@ -62,20 +62,18 @@ log = logging.getLogger(__name__)
 
 
 class StageTimes:
-    """Wall time per stage, into `time/<stage>_s`. costs: of what is still to come, once that can be said."""
+    """Wall time per stage, into `time/<stage>_s`."""
 
     def __init__(self) -> None:
         self.figures: dict[str, float] = {}
-        self.costs = Costs({}, 0.0)
 
     @contextmanager
     def measure(self, stage: str):
         began = time.perf_counter()
         yield
-        self.figures[f"time/{stage}_s"] = (
-            self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
-        )
-        log.info(self.costs.done(stage, time.perf_counter() - began))
+        took, name = time.perf_counter() - began, f"time/{stage}_s"
+        self.figures[name] = self.figures.get(name, 0.0) + took
+        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory() / 1e9)
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -102,7 +100,7 @@ def train(cfg: DictConfig) -> float | None:
         scene, others = data.scenes
     sequences_taught = 1 + len(data.taught)
     check_seen(cfg, scene)
-    clock.costs = estimate(
+    parts, memory = estimate(
         settings.plain(),
         scene,
         len(others),
@@ -111,7 +109,7 @@ def train(cfg: DictConfig) -> float | None:
         stored=data.reconstructed(),
         most=most_particles(device),
     )
-    log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
+    log.info(estimate_text(parts, memory))
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -144,7 +142,12 @@ def train(cfg: DictConfig) -> float | None:
         check_starts(world, body, starts)
         warn_of_little(world, body, starts, [scene, *others])
         warn_of_others(body, starts, [scene, *others])
-        log.info(fit_estimate(module, clock.costs))
+        log.info(
+            "fit: %d particles, %d frames, at most %d steps",
+            len(body.rest),
+            len(module.takes[0].cues.positions),
+            sum(stage.iterations for stage in module.stages),
+        )
         fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
