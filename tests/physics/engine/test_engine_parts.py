@@ -109,9 +109,9 @@ def test_memory_is_the_same_whoever_views_it():
 
 
 def test_a_part_of_the_physics_knows_only_those_below_it():
-    """launching, sums, rotations < constitutive, grid < contact < reference, world < engine with its adapters and its time."""
+    """launching, sums, rotations < constitutive, grid < contact < world < engine with its adapters and its time."""
     order = {"launching": 0, "memory_sums": 0, "exact_sums": 0, "rotations": 0, "constitutive": 1, "grid": 1, "contact": 2,
-             "reference": 3, "world": 3, "engine": 4}  # fmt: skip
+             "world": 3, "engine": 4}  # fmt: skip
     whole = {"adapters": "engine", "time": "engine"}
     root, upwards, seen = Path(mosa.physics.__file__).parent, [], set()
     for path in root.rglob("*.py"):
