@@ -42,9 +42,6 @@ class FitSettings(Settings):
     views: Count = Field(2, description="images in a step")
     lr_positions: Weight = Field(0.03, description="step of positions, in units of the mean scale")
     lr_scales: Weight = Field(0.02, description="step of the logarithms of scales")
-    lr_opacities: Weight = Field(0.05, description="step of the logits of opacities")
-    lr_colors: Weight = Field(0.02, description="step of colours")
-    lr_rotations: Weight = Field(0.02, description="step of quaternions, where anisotropic")
     ssim: Share = Field(0.2, description="weight of 1 - SSIM against L1")
     matte: Weight = Field(1.0, description="weight of the alpha term")
     keep: Weight = Field(
@@ -81,7 +78,7 @@ class CarriedSettings(FitSettings):
     """The static Gaussians, fitted to all training frames as the observed motion carries them: what images show."""
 
     where: ClassVar[str] = "reconstruction.carried"
-    needs: ClassVar[dict[str, str]] = {"[!i]*": "iterations!=0", "lr_light": "light=true"}
+    needs: ClassVar[dict[str, str]] = {"[!i]*": "iterations!=0"}
 
     views: Count = Field(4, description="images in a step")
     keep: Weight = Field(
@@ -90,9 +87,7 @@ class CarriedSettings(FitSettings):
     shape: Literal["isotropic", "anisotropic"] = Field(
         "anisotropic", description="anisotropic: three scales and a rotation each"
     )
-    lr_colors: Weight = Field(0.03, description="step of mean colours")
     degree: int = Field(1, ge=0, le=3, description="of the spherical harmonics")
-    lr_harmonics: Weight = Field(0.005, description="step of the coefficients of degree 1 and more")
     keep_harmonics: Weight = Field(
         10.0,
         description=(
@@ -101,7 +96,6 @@ class CarriedSettings(FitSettings):
         ),
     )
     light: bool = Field(True, description="fit light that stays while the body turns")
-    lr_light: Weight = Field(0.02, description="step of the light")
 
 
 class InformedSettings(Settings):
@@ -149,7 +143,7 @@ class DynamicSettings(Settings):
     where: ClassVar[str] = "reconstruction.dynamic"
     needs: ClassVar[dict[str, str]] = {
         "modes": "model=modes",
-        "bases hidden basis_layers coefficient_layers lr_network": "model=network",
+        "bases hidden basis_layers lr_network": "model=network",
     }
 
     model: Literal["modes", "network"] = Field(
@@ -175,7 +169,6 @@ class DynamicSettings(Settings):
     track_views: Count = Field(4, description="images in a step of the first pass")
     iterations: Whole = Field(150, description="steps of the joint refinement")
     views: Count = Field(1, description="images of every frame in a step of the refinement")
-    lr_track: Weight = Field(0.03, description="step of the first pass")
     lr: Weight = Field(0.01, description="step of the refinement")
     ssim: Share = Field(0.0, description="weight of 1 - SSIM against L1")
     matte: Weight = Field(1.0, description="weight of the alpha term")
@@ -195,10 +188,6 @@ class DynamicSettings(Settings):
     bases: Width = Field(10, description="network: motion bases")
     hidden: Width = Field(256, description="network: width")
     basis_layers: Layers = Field(8, description="network: layers of the bases")
-    coefficient_layers: Layers = Field(
-        3,
-        description="network: layers of the coefficients",
-    )
     lr_network: Weight = Field(5e-4, description="network: step")
 
 

@@ -18,6 +18,8 @@ from mosa.types import Splats
 
 SMALLEST = 0.25
 """Bound of a scale in units of its start."""
+OPACITY_RATE, COLOR_RATE, ROTATION_RATE = 0.05, 0.08, 0.02
+"""Adam's steps of the logits of opacities and colours, and of quaternions."""
 
 
 def fit_splats(
@@ -41,9 +43,9 @@ def fit_splats(
     rates = Rates(
         settings.lr_positions * unit,
         settings.lr_scales,
-        settings.lr_opacities,
-        settings.lr_colors * 4,
-        settings.lr_rotations,
+        opacity=OPACITY_RATE,
+        color=COLOR_RATE,
+        rotation=ROTATION_RATE,
     )
     gaussians = FreeGaussians(
         splats,

@@ -136,7 +136,6 @@ class MotionBasisNetwork(nn.Module):
         bases: int = 10,
         hidden: int = 256,
         basis_layers: int = 8,
-        coefficient_layers: int = 3,
         space_frequencies: int = 4,
         time_frequencies: int = 5,
     ) -> None:
@@ -147,7 +146,7 @@ class MotionBasisNetwork(nn.Module):
         self.space_frequencies, self.time_frequencies = space_frequencies, time_frequencies
         time_inputs, space_inputs = 1 + 2 * time_frequencies, 3 * (1 + 2 * space_frequencies)
         self.basis = _mlp(time_inputs, hidden, basis_layers, bases * 10)
-        self.coefficient = _mlp(time_inputs + space_inputs, hidden, coefficient_layers, bases)
+        self.coefficient = _mlp(time_inputs + space_inputs, hidden, 3, bases)
         nn.init.normal_(self.coefficient[-1].bias)
 
     def _raw(self, time: Tensor, points: Tensor) -> Tensor:
