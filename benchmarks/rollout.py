@@ -57,7 +57,7 @@ YARDSTICK_ROUNDS = 10
 ALLOWED = 1.25
 """Factor by which a ratio may exceed the stored one."""
 DX, DT, DENSITY, MU, LAM = 1 / 32, 1e-4, 1000.0, 4e4, 6e4
-STRIDE = SimulationSettings.stride
+STRIDE = SimulationSettings.model_fields["stride"].default
 VARIANTS = {
     "none": (None, 1),
     "operator": ("operator", None),

@@ -39,7 +39,7 @@ from mosa.settings import (
 )
 
 FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames",
-           "extrapolated", "val")  # fmt: skip
+           "val")  # fmt: skip
 """What the names of figures begin with."""
 Figure = Annotated[
     str, Expected("a figure's name like test/rms_m (docs/figures.md)"), such(lambda v: "/" in v and v.split("/")[0] in FIGURES)
@@ -130,13 +130,6 @@ class TrainSettings(BodySections, DataSections):
         description=(
             "auto: skip where the run folder has metrics.json, go on from its "
             "checkpoints/last.ckpt (docs/sweeps.md); a checkpoint's path is ckpt_path"
-        ),
-    )
-    extrapolate: bool = Field(
-        False,
-        description=(
-            "identify once more on a grid 1.44 times as coarse, and continue E, nu, ..."
-            " to a spacing of 0"
         ),
     )
     optimized_metric: Figure = Field(

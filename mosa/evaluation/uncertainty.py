@@ -188,7 +188,7 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
     middle, sd = (
         raw.detach().clamp(low, high),
         min(max(sd, 1e-9), 1e9),
-    )  # one that was extrapolated may lie beyond a limit
+    )
     below, within = torch.special.ndtr(
         (torch.tensor([low, high], dtype=torch.float64) - middle) / sd
     ).tolist()

@@ -20,8 +20,8 @@ from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.gaussians.carried import fit_carried
-from mosa.reconstruction.gaussians.initial import inherited_colors
-from mosa.reconstruction.gaussians.static import fit_splats, start_splats
+from mosa.reconstruction.gaussians.initial import inherited_colors, initial_splats
+from mosa.reconstruction.gaussians.static import fit_splats
 from mosa.reconstruction.geometry.behind import fill_behind
 from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
@@ -88,7 +88,7 @@ def geometry_of_gaussians(
     """The body behind static Gaussians, which are kept for the static stage. Errors: DataError."""
     hull = object_hull(scene, settings)
     windows = object_windows(scene, scene.training_cameras, [0], margin=settings.margin).to(device)
-    start = start_splats(hull, windows, settings.static, count=settings.points, seed=0)
+    start = initial_splats(hull, windows, count=settings.points, seed=0)
     static = fit_splats(
         start, windows, scene.background.to(device), settings.static, move=True, seed=0
     )
@@ -306,9 +306,7 @@ def reconstruct(
             return _tensors(imported.splats)
         if geometry.static is not None:
             return _tensors(geometry.static)
-        start = start_splats(
-            geometry.body, still, settings.static, count=settings.points, seed=seed
-        )
+        start = initial_splats(geometry.body, still, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
             fitted = fit_splats(
                 start,

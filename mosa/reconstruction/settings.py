@@ -43,9 +43,6 @@ class FitSettings(Settings):
     views: Count = Field(2, description="images in a step")
     lr_positions: Weight = Field(0.03, description="step of positions, in units of the mean scale")
     lr_scales: Weight = Field(0.02, description="step of the logarithms of scales")
-    lr_opacities: Weight = Field(0.05, description="step of the logits of opacities")
-    lr_colors: Weight = Field(0.02, description="step of colours")
-    lr_rotations: Weight = Field(0.02, description="step of quaternions, where anisotropic")
     ssim: Share = Field(0.2, description="weight of 1 - SSIM against L1")
     matte: Weight = Field(1.0, description="weight of the alpha term")
     keep: Weight = Field(
@@ -69,61 +66,20 @@ class StaticSettings(FitSettings):
     """The static stage: Gaussians fitted to frame 0."""
 
     where: ClassVar[str] = "reconstruction.static"
-    needs: ClassVar[dict[str, str]] = {"max_points refine_every growth fade noise": "densify=mcmc"}
 
-    start: Literal["hull", "random"] = Field(
-        "hull",
+    relocate_every: Whole = Field(
+        100,
         description=(
-            "where Gaussians start: hull: on the visual hull's surface; random: in its box"
+            "steps after which vanished Gaussians are moved to where opaque ones are; 0: never"
         ),
     )
-    densify: Literal["relocate", "mcmc"] = Field(
-        "relocate",
-        description=(
-            "relocate: vanished Gaussians are moved to where opaque ones are; mcmc: and"
-            " more are added, up to max_points, as copies that leave the image as it is"
-        ),
-    )
-    max_points: Annotated[int, Interval(ge=8, le=10**9)] | None = Field(
-        None,
-        description="mcmc: Gaussians at most, at least `points`; null: as many as `points`",
-    )
-    relocate_every: Whole = Field(100, description="relocate: steps between moves; 0: never")
-    refine_every: Count = Field(10, description="mcmc: steps between moves")
-    growth: Weight = Field(
-        0.1,
-        description="mcmc: share of the number that is added",
-    )
-    fade: Weight = Field(
-        0.03,
-        description=(
-            "mcmc: what an opacity of 1 costs, in pixels of an image: Gaussians that no"
-            " image shows vanish and get moved"
-        ),
-    )
-    noise: Weight = Field(
-        0.2,
-        description=(
-            "mcmc: random steps of those about to vanish, in their standard deviations "
-            "at the first step"
-        ),
-    )
-
-    @model_validator(mode="after")
-    def _number_kept(self) -> StaticSettings:
-        if self.max_points is not None and self.densify != "mcmc":
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected null, found {self.max_points}: densify={self.densify} keeps the "
-                "number of Gaussians (reconstruction.points); set reconstruction.static.densify=mcmc"
-            )
-        return self
 
 
 class CarriedSettings(FitSettings):
     """The static Gaussians, fitted to all training frames as the observed motion carries them: what images show."""
 
     where: ClassVar[str] = "reconstruction.carried"
-    needs: ClassVar[dict[str, str]] = {"[!i]*": "iterations!=0", "lr_light": "light=true"}
+    needs: ClassVar[dict[str, str]] = {"[!i]*": "iterations!=0"}
 
     views: Count = Field(4, description="images in a step")
     keep: Weight = Field(
@@ -132,9 +88,7 @@ class CarriedSettings(FitSettings):
     shape: Literal["isotropic", "anisotropic"] = Field(
         "anisotropic", description="anisotropic: three scales and a rotation each"
     )
-    lr_colors: Weight = Field(0.03, description="step of mean colours")
     degree: int = Field(1, ge=0, le=3, description="of the spherical harmonics")
-    lr_harmonics: Weight = Field(0.005, description="step of the coefficients of degree 1 and more")
     keep_harmonics: Weight = Field(
         10.0,
         description=(
@@ -143,7 +97,6 @@ class CarriedSettings(FitSettings):
         ),
     )
     light: bool = Field(True, description="fit light that stays while the body turns")
-    lr_light: Weight = Field(0.02, description="step of the light")
 
 
 class InformedSettings(Settings):
@@ -217,7 +170,6 @@ class DynamicSettings(Settings):
     track_views: Count = Field(4, description="images in a step of the first pass")
     iterations: Whole = Field(150, description="steps of the joint refinement")
     views: Count = Field(1, description="images of every frame in a step of the refinement")
-    lr_track: Weight = Field(0.03, description="step of the first pass")
     lr: Weight = Field(0.01, description="step of the refinement")
     ssim: Share = Field(0.0, description="weight of 1 - SSIM against L1")
     matte: Weight = Field(1.0, description="weight of the alpha term")
@@ -268,9 +220,7 @@ class ReconstructionSettings(Settings):
             "geometry.source=images starts; 0: the hull itself"
         ),
     )
-    points: int = Field(
-        3000, ge=8, le=10**8, description="static Gaussians (static.densify=mcmc: at the start)"
-    )
+    points: int = Field(3000, ge=8, le=10**8, description="static Gaussians")
     neighbours: int = Field(
         20,
         ge=4,
@@ -319,11 +269,6 @@ class ReconstructionSettings(Settings):
 
     @model_validator(mode="after")
     def _together(self) -> ReconstructionSettings:
-        if self.static.max_points is not None and self.static.max_points < self.points:
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
-                f"start, found {self.static.max_points}"
-            )
         free = self.dynamic.free_shape or self.dynamic.model == "network"
         if self.cue == "gaussian" and not free:
             raise ConfigError(

@@ -1,4 +1,4 @@
-"""What a run will cost in time and memory, said before it is spent and corrected as it goes.
+"""What a run will cost in time and memory, estimated before it is spent.
 
 Seconds come from a small calibration on this machine (a frame of a rollout with as many particles as the run will have, a picture
 of as many Gaussians in a window as large as the object's) and from counts. What is not rolled out or rendered is scaled from
@@ -57,8 +57,6 @@ MEASURED = 20_000
 """Particles and Gaussians of the calibration at most: from there on the time is proportional to their number."""
 REFERENCE_PICTURE = 7.5e-3
 """Seconds that `speed_of_pictures` found on the machine that the constants of `seconds_of_parts` were measured on."""
-LEAST, MOST = 0.5, 3.0
-"""How far the parts that are done correct those that are not."""
 
 
 @dataclass(frozen=True)
@@ -408,10 +406,10 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
 
 
 def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, device: str, *, stored: bool = False,
-             most: int = MEASURED) -> Costs:  # fmt: skip
-    """Of what follows the data. most: particles where their number is left open. Changes no random state.
+             most: int = MEASURED) -> tuple[dict[str, float], float]:  # fmt: skip
+    """(seconds of each part that follows the data, bytes of memory at most). Changes no random state.
 
-    Errors: ConfigError where this machine's memory does not hold the run."""
+    most: particles where their number is left open. Errors: ConfigError where this machine's memory does not hold the run."""
     size, radius = size_of(cfg, scene, others, taught, most)
     memory = check_memory(cfg, size)
     windows = object_windows(
@@ -445,45 +443,10 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
         memory += min(evaluations, 100) * size.particles * ADAPTER_BYTES
     if any(not stage.newton for stage in module.stages) and device == "cpu":
         memory += KEPT_ON_CPU
-    return Costs(parts, memory, speeds)
+    return parts, memory
 
 
-class Costs:
-    """Seconds by part, of which those that are done correct the others; memory [bytes] at most; speeds: what they come from."""
-
-    def __init__(
-        self, parts: Mapping[str, float], memory: float, speeds: Speeds | None = None
-    ) -> None:
-        self.parts, self.memory, self.speeds = dict(parts), memory, speeds
-        self.expected, self.took = 0.0, 0.0
-
-    def _factor(self) -> float:
-        return min(max(self.took / self.expected, LEAST), MOST) if self.expected > 0 else 1.0
-
-    def rest(self) -> dict[str, float]:
-        """What is still to come, by part, corrected."""
-        return {name: self._factor() * seconds for name, seconds in self.parts.items()}
-
-    def known(self, name: str, seconds: float) -> None:
-        """A better estimate of a part: this many seconds, which nothing corrects any more."""
-        if name in self.parts:
-            self.parts[name] = seconds / self._factor()
-
-    def said(self) -> str:
-        """One line on what is still to come."""
-        rest = self.rest()
-        return f"about {duration(sum(rest.values()))}: " + ", ".join(
-            f"{name} {duration(s)}" for name, s in rest.items()
-        )
-
-    def done(self, name: str, seconds: float) -> str:
-        """One line when a part is done: what was expected, what is left."""
-        expected = self.rest().get(name)
-        planned = self.parts.pop(name, None)
-        if planned is not None and math.isfinite(planned):
-            self.expected, self.took = self.expected + planned, self.took + seconds
-        text = f"{name} took {seconds:.1f} s"
-        if expected is not None:
-            text += f" (expected {duration(expected)})"
-        text += f", {peak_memory() / 1e9:.1f} GB at most so far"
-        return text + (f"; what is left takes {self.said()}" if self.parts else "")
+def estimate_text(parts: Mapping[str, float], memory: float) -> str:
+    """One line on what `estimate` found."""
+    each = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items())
+    return f"this run takes about {duration(sum(parts.values()))}: {each}; {memory / 1e9:.1f} GB"

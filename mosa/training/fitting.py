@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,28 +20,12 @@ from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
-from mosa.training.costs import Costs, duration, seconds_of_fit, speed_of_rollouts
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa
 from mosa.training.loggers import DescribingLogger
 from mosa.training.run_folder import VALIDATION
 
 log = logging.getLogger(__name__)
-
-
-def fit_estimate(module: LitMosa, costs: Costs) -> str:
-    """One line on how long the fit will take, from rollouts of the body that was found, which `costs` takes over."""
-    first, body = module.takes[0], module.body
-    frames = len(first.cues.positions)
-    frame = speed_of_rollouts(body, first.frame_dt, module.world.gravity, module.world.up)
-    speeds = replace(costs.speeds, frame=frame)
-    seconds = seconds_of_fit(module, speeds, frames)
-    costs.known("fit", seconds)
-    return (
-        f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
-        f"{sum(s.iterations for s in module.stages)} steps, about {duration(seconds)}; the run takes about "
-        f"{costs.memory / 1e9:.1f} GB"
-    )
 
 
 def instantiated(cfg: DictConfig, section: str) -> list[Any]:

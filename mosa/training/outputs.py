@@ -13,7 +13,6 @@ from mosa.evaluation.analysis.comparison import TITLES, compare, write_compariso
 from mosa.evaluation.analysis.marker_figures import write_markers
 from mosa.evaluation.analysis.tables import (
     columns_text,
-    continued_text,
     determined_text,
     geometry_lines,
     parameter_table,
@@ -125,7 +124,7 @@ def write_outputs(
             write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
     law = body.material.law
     parts = (results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
-             continued_text(figures, law), determined_text(figures, law), geometry_lines(figures))  # fmt: skip
+             determined_text(figures, law), geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:
         partial.write_text(table + "\n")

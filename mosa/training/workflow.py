@@ -32,9 +32,8 @@ from mosa.rendering.settings import RenderingSettings
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import assemble, scenes
-from mosa.training.costs import Costs, before_data, estimate
-from mosa.training.extrapolation import check_can_extrapolate, extrapolated
-from mosa.training.fitting import build_trainer, fit, fit_estimate
+from mosa.training.costs import before_data, estimate, estimate_text, peak_memory
+from mosa.training.fitting import build_trainer, fit
 from mosa.training.loggers import log_outcome
 from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
 from mosa.training.preflight import (
@@ -64,20 +63,18 @@ log = logging.getLogger(__name__)
 
 
 class StageTimes:
-    """Wall time per stage, into `time/<stage>_s`. costs: of what is still to come, once that can be said."""
+    """Wall time per stage, into `time/<stage>_s`."""
 
     def __init__(self) -> None:
         self.figures: dict[str, float] = {}
-        self.costs = Costs({}, 0.0)
 
     @contextmanager
     def measure(self, stage: str):
         began = time.perf_counter()
         yield
-        self.figures[f"time/{stage}_s"] = (
-            self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
-        )
-        log.info(self.costs.done(stage, time.perf_counter() - began))
+        took, name = time.perf_counter() - began, f"time/{stage}_s"
+        self.figures[name] = self.figures.get(name, 0.0) + took
+        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory() / 1e9)
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -108,7 +105,7 @@ def train(cfg: DictConfig) -> float | None:
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
-        clock.costs = estimate(
+        parts, memory = estimate(
             settings.plain(),
             scene,
             len(others),
@@ -117,7 +114,7 @@ def train(cfg: DictConfig) -> float | None:
             stored=data.reconstructed(),
             most=most_particles(device),
         )
-        log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
+        log.info(estimate_text(parts, memory))
     else:
         log.info(
             "tracked points alone: no reconstruction from images, no figures of images, no video"
@@ -154,15 +151,17 @@ def train(cfg: DictConfig) -> float | None:
         check_starts(world, body, starts)
         warn_of_little(world, body, starts, [scene, *others])
         warn_of_others(body, starts, [scene, *others])
-        if cfg.extrapolate:
-            check_can_extrapolate(module)
-        if filmed:
-            log.info(fit_estimate(module, clock.costs))
-        elif not all(stage.newton for stage in module.stages):
+        if not filmed and not all(stage.newton for stage in module.stages):
             raise ConfigError(
                 "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
                 "found Adam (fit.<stage>.optimizer): choose adapter=operator or adapter=none"
             )
+        log.info(
+            "fit: %d particles, %d frames, at most %d steps",
+            len(body.rest),
+            len(module.takes[0].cues.positions),
+            sum(stage.iterations for stage in module.stages),
+        )
         fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
@@ -188,9 +187,6 @@ def train(cfg: DictConfig) -> float | None:
             for name, value in touched.items()
             if math.isfinite(value)
         }
-    if cfg.extrapolate:
-        with clock.measure("extrapolation"):
-            figures |= extrapolated(cfg, run, scene.known_parameters)
     figures |= (
         clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     )

@@ -1,10 +1,10 @@
 """Deformation gradients, rotations and evaluations shared by the tests of the anisotropic truth laws."""
 
 import torch
+from substep_reference import polar, unvech
 
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import polar, unvech
 
 
 def drawn_rotations(count: int, seed: int) -> torch.Tensor:

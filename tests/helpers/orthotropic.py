@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
+from substep_reference import polar
 from torch import Tensor
 
 from mosa.data.synthetic.materials.axes import axes_matrix, axes_parameter, axes_rotation
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.kinematics import ROTATION_FLOOR, svd
 from mosa.physics.constitutive.laws import LawParameters, register_law
-from mosa.physics.reference import polar
 
 ORTHOTROPIC = "orthotropic_linear"
 MODULI = ("C11", "C22", "C33", "C23", "C13", "C12", "C44", "C55", "C66")

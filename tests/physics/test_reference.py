@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import pytest
+import substep_reference as reference
 import torch
 
 from mosa.errors import ConfigError
-from mosa.physics import reference
 from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.simulator import Simulator

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import torch
 from bodies import DENSITY, NU, eyes, lattice, parameters_of, resting, uniform_volume
+from substep_reference import unvech
 from torch import Tensor
 
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import unvech
 from mosa.types import ParticleState
 
 GRAVITY = 9.8

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import substep_reference as reference
 import torch
 from bodies import (
     DENSITY,
@@ -22,7 +23,6 @@ from stresses import deformations, stress
 
 from mosa.errors import ConfigError
 from mosa.modules.adapters.stress import StressAdapter
-from mosa.physics import reference
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.material_operations import first_advance

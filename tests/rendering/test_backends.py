@@ -7,11 +7,11 @@ from types import ModuleType
 import pytest
 import torch
 from drawn_splats import NAMES, draw, render
+from raster_reference import visible_covariance
 
 from mosa.errors import ConfigError
 from mosa.rendering import gsplat_backend, rasterizer
 from mosa.rendering.rasterizer import rasterize, use_backend
-from mosa.rendering.reference import visible_covariance
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from drawn_splats import draw, ring
+from raster_reference import visible_covariance
 from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError, DataError
@@ -25,7 +26,6 @@ from mosa.rendering.covariance import (
     square_root,
 )
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.reference import visible_covariance
 
 
 def test_rays_pass_through_their_pixel_centres():

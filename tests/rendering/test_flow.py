@@ -3,10 +3,10 @@
 import pytest
 import torch
 from drawn_splats import draw, ring
+from raster_reference import alphas, composite, visible_covariance
 
 from mosa.rendering.flow import flow_features, flow_from_features
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.reference import alphas, composite, visible_covariance
 
 
 def root(M):

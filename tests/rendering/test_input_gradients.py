@@ -7,11 +7,11 @@ import pytest
 import torch
 from depth import expected_depth, rasterize_with_depth
 from drawn_splats import CASES, NAMES, draw, objective, render, slopes
+from raster_reference import rasterize_reference
 
 from mosa.rendering.appearance.spherical_harmonics import view_colors
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.reference import rasterize_reference
 
 
 def agree(picture, leaves):

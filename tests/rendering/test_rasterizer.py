@@ -6,10 +6,10 @@ import pytest
 import torch
 from depth import expected_depth
 from drawn_splats import CASES, NAMES, dense, draw, edge, gradients, objective, render, ring, slopes
+from raster_reference import alphas, rasterize_reference, visible_covariance
 
 from mosa.errors import ConfigError, DataError
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.reference import alphas, rasterize_reference, visible_covariance
 
 
 def thresholds(scene):

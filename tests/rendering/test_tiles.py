@@ -7,13 +7,13 @@ import pytest
 import torch
 import warp as wp
 from drawn_splats import NAMES, draw, gradients, objective, render, ring, slopes
+from raster_reference import rasterize_reference
 
 from mosa.errors import ConfigError
 from mosa.physics import exact_sums
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.records import record_functions
-from mosa.rendering.reference import rasterize_reference
 from mosa.rendering.splatting import PRESETS, Geometry, depth_lists, project, start_warp
 from mosa.rendering.tile_kernels import BLOCK_HEIGHT, BLOCK_WIDTH, reach_function
 

@@ -276,27 +276,6 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     return "\n".join(lines)
 
 
-def continued_text(figures: Mapping[str, float], law: str) -> str:
-    """Sentences for results.md; empty where nothing was extrapolated. law: of the prior."""
-    if "extrapolated/dx_m" not in figures:
-        return ""
-    fine, coarse = (1e3 * figures[f"extrapolated/{name}"] for name in ("dx_m", "coarse_dx_m"))
-    lines = [f"On grids of {fine:.3g} and {coarse:.3g} mm, and continued to 0:", ""]
-    for name in (
-        k.removeprefix("extrapolated/").removesuffix("_coarse")
-        for k in figures
-        if k.endswith("_coarse")
-    ):
-        values = (
-            figures[f"id/{name}"],
-            *(figures[f"extrapolated/{name}{end}"] for end in ("_coarse", "", "_sd")),
-        )
-        lines.append(
-            "- {}: {:.4g}, {:.4g}, **{:.4g}** +- {:.2g}".format(with_unit(law, name), *values)
-        )
-    return "\n".join(lines)
-
-
 def geometry_lines(figures: Mapping[str, float]) -> str:
     """Sentences on the body that was filled: how surely its surface is known, and against the true shape where that is known."""
     lines, get = [], lambda name: figures.get(f"geometry/{name}")

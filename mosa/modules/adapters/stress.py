@@ -56,8 +56,7 @@ class StressAdapter(Adapter):
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
-    precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster) | half
-    (forward in float16, backward in tf32: the same errors, fastest);
+    precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster);
     factors: residual | printed, how the 12 numbers make a matrix (`microplane.CORRECTIONS`);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
@@ -66,7 +65,7 @@ class StressAdapter(Adapter):
         self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: StressBound = 0.1, input_scale: Scale = 10.0,
         hidden: Hidden = 64, rest_free: RestFree = True, plastic: bool = False, major_symmetry: bool = False,
         state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
-        precision: Literal["accurate", "tf32", "half"] = "accurate",
+        precision: Literal["accurate", "tf32"] = "accurate",
         factors: Factors = "residual",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip

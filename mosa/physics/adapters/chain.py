@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.adapters.interface import ANSWER
-from mosa.physics.adapters.network_evaluation import at_hand, same_weights
+from mosa.physics.adapters.network_evaluation import at_hand
 from mosa.physics.engine.capture import ATTEMPTS, Graphs, TorchCapture
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.numerics import Numerics, State, Steps
@@ -165,7 +165,6 @@ class Chain:
             [], *self._ask(work.F[slot], work.C_affine[slot], work.held["parameters"], collects)
         )
 
-    @same_weights()
     def _forward(self, full: bool) -> None:
         work = self.workspace(full)
         collected = [
@@ -188,7 +187,6 @@ class Chain:
             step += length
             yield evaluation
 
-    @same_weights()
     def _adjoint(self, source: str, penalised: bool) -> None:
         """source: of the states, tape | states | graphs: loaded, or made again, without or with the evaluations' graphs."""
         work, step, made = self.full, self.substeps, []

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from mosa.reconstruction.gaussians.photometric import image_loss
-from mosa.reconstruction.gaussians.static import SMALLEST
+from mosa.reconstruction.gaussians.static import OPACITY_RATE, ROTATION_RATE, SMALLEST
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import CarriedSettings
 from mosa.rendering.appearance.carrying import bind
@@ -30,6 +30,9 @@ from mosa.rendering.appearance.spherical_harmonics import (
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Appearance, Splats
+
+CONSTANT_RATE, HIGHER_RATE, LIGHT_RATE = 0.03, 0.005, 0.02
+"""Adam's steps of mean colours, of the harmonics of degree 1 and more, and of the light."""
 
 
 class RestGaussians:
@@ -48,12 +51,12 @@ class RestGaussians:
             splats.means.new_zeros(len(splats.means), extra, 3),
         )
         self.light = splats.means.new_zeros(LIGHT)
-        rates = {"shift": settings.lr_positions * unit, "log_scale": settings.lr_scales, "logit": settings.lr_opacities,
-                 "constant": settings.lr_colors, "higher": settings.lr_harmonics}  # fmt: skip
+        rates = {"shift": settings.lr_positions * unit, "log_scale": settings.lr_scales, "logit": OPACITY_RATE,
+                 "constant": CONSTANT_RATE, "higher": HIGHER_RATE}  # fmt: skip
         if settings.shape == "anisotropic":
-            rates["quaternion"] = settings.lr_rotations
+            rates["quaternion"] = ROTATION_RATE
         if settings.light:
-            rates["light"] = settings.lr_light
+            rates["light"] = LIGHT_RATE
         groups = [
             {"params": [getattr(self, name).requires_grad_(True)], "start": rate}
             for name, rate in rates.items()

@@ -58,7 +58,7 @@ class FreeGaussians:
             self.parameters["rotation"] = splats.rotations.clone()
         self.fixed = {"lower": (scale * smallest).log(), "upper": (scale * largest).log(), "rotations": splats.rotations,
                       "first_colors": splats.colors}  # fmt: skip
-        self.anisotropic, self.axis_ratio, self.annealed = anisotropic, axis_ratio, 1.0
+        self.anisotropic, self.axis_ratio = anisotropic, axis_ratio
         learned = {
             name: p.requires_grad_(True)
             for name, p in self.parameters.items()
@@ -98,7 +98,6 @@ class FreeGaussians:
 
     def anneal(self, factor: float) -> None:
         """Steps at `factor` of their start."""
-        self.annealed = factor
         for group in self.optimizer.param_groups:
             group["lr"] = group["start"] * factor
 
@@ -136,15 +135,6 @@ class FreeGaussians:
     def shift(self, rows: Tensor | slice, vectors: Tensor) -> None:
         """Moves the Gaussians `rows` by (M, 3, 1) [m]."""
         self.parameters["means"][rows] += vectors[..., 0]
-
-    @torch.no_grad()
-    def dim(self, rows: Tensor, opacity: Tensor, factor: Tensor) -> None:
-        """Gives the Gaussians `rows` (N,) bool other opacities (M,) and `factor` (M,) times their scales, within the bounds."""
-        self.parameters["opacity"][rows] = torch.logit(opacity.clamp(1e-6, 1 - 1e-6))
-        self.parameters["log_scale"][rows] += (
-            factor.log()[:, None] if self.anisotropic else factor.log()
-        )
-        self.bound()
 
     @torch.no_grad()
     def splats(self) -> Splats:

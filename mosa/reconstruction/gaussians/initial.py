@@ -1,4 +1,4 @@
-"""Where the static stage starts: Gaussians on the visual hull's surface or at random in its box, coloured by the images."""
+"""Where the static stage starts: Gaussians on the visual hull's surface, coloured by the images."""
 
 from __future__ import annotations
 
@@ -85,31 +85,3 @@ def inherited_colors(points: Tensor, splats: Splats, *, neighbours: int = 4) -> 
     weight = torch.as_tensor(1 / (distance + 1e-6), dtype=torch.float32)
     colors = splats.colors.detach().cpu()[opaque][torch.as_tensor(index)]
     return ((weight[..., None] * colors).sum(1) / weight.sum(1, keepdim=True)).to(points.device)
-
-
-def random_splats(volume: Volume, windows: Windows, *, count: int, seed: int) -> Splats:
-    """Isotropic Gaussians at uniformly random points of the volume's box, of its values nothing is read; as wide as the root mean
-    square distance to the three nearest, coloured by what the mattes show there, grey where they show nothing."""
-    size = volume.pitch * (torch.tensor(volume.values.shape) - 1)
-    points = volume.origin.cpu() + size * torch.rand(
-        count, 3, generator=torch.Generator().manual_seed(seed)
-    )
-    distance = cKDTree(points.numpy()).query(points.numpy(), k=min(4, count))[0][:, 1:]
-    scale = torch.as_tensor(np.sqrt((distance**2).mean(1)), dtype=torch.float32)
-    device = windows.images.device
-    points, scale = points.to(device), scale.to(device)
-    rotations = torch.zeros(count, 4, device=device)
-    rotations[:, 0] = 1
-    sampled = sampled_windows(points, windows)
-    seen = sampled[..., 3].sum(0)
-    colors = sampled[..., :3].sum(0) / seen.clamp(min=1e-9)[:, None]
-    colors = torch.where(seen[:, None] > 0.1, colors, torch.full_like(colors, 0.5)).clamp(
-        0.02, 0.98
-    )
-    return Splats(
-        points,
-        scale[:, None].repeat(1, 3),
-        rotations,
-        torch.full((count,), 0.3, device=device),
-        colors,
-    )

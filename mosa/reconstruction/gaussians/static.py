@@ -1,4 +1,4 @@
-"""Static stage: Gaussians fitted to one frame by rendering, and where they start (paper, section 3.2)."""
+"""Static stage: Gaussians fitted to one frame by rendering (paper, section 3.2)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from mosa.data.hull import Volume
-from mosa.reconstruction.gaussians.densification import MarkovChain, Relocation
 from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
-from mosa.reconstruction.gaussians.initial import initial_splats, random_splats
 from mosa.reconstruction.gaussians.photometric import image_loss
+from mosa.reconstruction.gaussians.relocation import UNTIL, relocate
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import FitSettings, StaticSettings
 from mosa.rendering.rasterizer import rasterize
@@ -20,27 +18,8 @@ from mosa.types import Splats
 
 SMALLEST = 0.25
 """Bound of a scale in units of its start."""
-STARTS = {"hull": initial_splats, "random": random_splats}
-
-
-def densifier_of(settings: StaticSettings, count: int) -> Relocation | MarkovChain:
-    """What moves and adds Gaussians, of which there are `count` at the start."""
-    if settings.densify == "relocate":
-        return Relocation(settings.relocate_every)
-    return MarkovChain(
-        settings.max_points or count,
-        settings.refine_every,
-        settings.growth,
-        settings.fade,
-        settings.noise,
-    )
-
-
-def start_splats(
-    volume: Volume, windows: Windows, settings: StaticSettings, *, count: int, seed: int
-) -> Splats:
-    """`count` Gaussians, less where the hull's surface has fewer voxels, from which the static stage starts."""
-    return STARTS[settings.start](volume, windows, count=count, seed=seed)
+OPACITY_RATE, COLOR_RATE, ROTATION_RATE = 0.05, 0.08, 0.02
+"""Adam's steps of the logits of opacities and colours, and of quaternions."""
 
 
 def fit_splats(
@@ -55,30 +34,25 @@ def fit_splats(
 ) -> Splats:
     """Gaussians fitted to windows of ONE frame: colours, opacities, scales, rotations where anisotropic, positions with `move`.
 
-    They start isotropic, of the mean scale of `splats`. With `move` and StaticSettings vanished ones are moved; with densify=mcmc
-    their number changes, never beyond `max_points`. The same bits for the same seed on a CPU.
+    They start isotropic, of the mean scale of `splats`. With `move` and StaticSettings vanished ones are moved onto opaque
+    ones. The same bits for the same seed on a CPU.
     """
     generator = torch.Generator().manual_seed(seed)
-    densifier = (
-        densifier_of(settings, len(splats.means))
-        if move and isinstance(settings, StaticSettings)
-        else None
-    )
+    every = settings.relocate_every if move and isinstance(settings, StaticSettings) else 0
     unit = float(splats.scales.mean(1).mean())
     rates = Rates(
         settings.lr_positions * unit,
         settings.lr_scales,
-        settings.lr_opacities,
-        settings.lr_colors * 4,
-        settings.lr_rotations,
+        opacity=OPACITY_RATE,
+        color=COLOR_RATE,
+        rotation=ROTATION_RATE,
     )
     gaussians = FreeGaussians(
         splats,
         rates,
         move=move,
         anisotropic=settings.shape == "anisotropic",
-        smallest=SMALLEST
-        * (densifier.shrinkage(len(splats.means)) if densifier is not None else 1.0),
+        smallest=SMALLEST,
         largest=settings.largest,
         axis_ratio=settings.axis_ratio,
     )
@@ -105,16 +79,12 @@ def fit_splats(
             # shows when the object turns
             change = gaussians.colors - gaussians.fixed["first_colors"]
             loss = loss + settings.keep * change.square().mean(1).sum() / alpha.numel()
-        if densifier is not None and densifier.fade > 0:
-            loss = loss + densifier.fade * gaussians.opacities.sum() / alpha.numel()
         gaussians.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         gaussians.optimizer.step()
         gaussians.bound()
-        if densifier is not None and step:
-            densifier.after_step(gaussians, step, settings.iterations, generator)
+        if every and step and step % every == 0 and step < UNTIL * settings.iterations:
+            relocate(gaussians, generator)
         if progress is not None:
             progress(1)
-    if densifier is not None:
-        densifier.finish(gaussians)
     return gaussians.splats()

@@ -26,6 +26,9 @@ from mosa.types import Splats
 
 Motion = ModalMotion | MotionBasisNetwork
 
+TRACK_RATE = 0.03
+"""Step of the first pass, in units of the object's radius."""
+
 
 @dataclass(frozen=True)
 class Scaffold:
@@ -203,7 +206,7 @@ def fit_motion(
             with torch.no_grad():
                 motion.amplitude[t] = motion.amplitude[t - 1]
             # a fresh optimiser per frame: frames without a gradient and without momentum stay where they are
-            optimizer = UniformAdam(motion.parameters(), lr=settings.lr_track, betas=(0.8, 0.95))
+            optimizer = UniformAdam(motion.parameters(), lr=TRACK_RATE, betas=(0.8, 0.95))
             minimise(
                 objective,
                 optimizer,
@@ -211,7 +214,7 @@ def fit_motion(
                 windows,
                 settings.track_iterations,
                 settings.track_views,
-                settings.lr_track,
+                TRACK_RATE,
                 generator,
                 progress,
             )

@@ -7,7 +7,6 @@ from omegaconf import OmegaConf
 
 from mosa.evaluation.analysis.tables import (
     columns_text,
-    continued_text,
     determined_text,
     parameter_table,
 )
@@ -64,15 +63,6 @@ def test_a_parameter_of_another_package_has_the_unit_that_it_was_registered_with
         parameter_table({"id_prior/fibre_stiffness": 1.0, "id_prior/exponent": 1.0}, "stvk")
     )[2:]
     assert [row[0] for row in rows] == ["fibre_stiffness [Pa]", "exponent"]
-
-
-def test_what_is_continued_to_a_fine_grid_has_its_unit():
-    figures = {"extrapolated/dx_m": 0.01, "extrapolated/coarse_dx_m": 0.014, "id/mu": 200.0, "extrapolated/mu": 190.0,
-               "extrapolated/mu_coarse": 210.0, "extrapolated/mu_sd": 5.0}  # fmt: skip
-    assert (
-        continued_text(figures, "newtonian").splitlines()[-1]
-        == "- mu [Pa s]: 200, 210, **190** +- 5"
-    )
 
 
 @pytest.mark.parametrize(("law", "figures", "said"), [

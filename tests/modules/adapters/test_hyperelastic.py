@@ -4,6 +4,7 @@ import copy
 import math
 
 import pytest
+import substep_reference as reference
 import torch
 import warp as wp
 from small_bodies import FRAME_DT, FREE, STICKY, WORLD, small_body, start
@@ -18,7 +19,6 @@ from mosa.modules.adapters.hyperelastic import (
 )
 from mosa.modules.adapters.microplane import isotropic_stiffness
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
-from mosa.physics import reference
 from mosa.physics.adapters.interface import MaterialState
 from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import field_types, stress_kernel

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from substep_reference import unvech
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import lame, wave_modulus
 from mosa.physics.constitutive.laws import law_named, law_names
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import unvech
 
 MU, LAM, KAPPA = 3.0, 5.0, 7.0
 ELASTIC = {"mu": MU, "lam": LAM}

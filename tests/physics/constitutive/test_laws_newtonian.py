@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from substep_reference import polar, unvech
 
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import polar, unvech
 
 MU, KAPPA, DT = 0.4, 7.0, 1e-3
 EYE = torch.eye(3).double()

@@ -3,9 +3,9 @@
 import math
 
 import pytest
+import substep_reference as reference
 import torch
 
-from mosa.physics import reference
 from mosa.physics.constitutive.plasticity import friction_alpha
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.material_operations import first_advance

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from substep_reference import deviator, hencky_material
 
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import deviator, hencky_material
 
 MU, KAPPA, YIELD, DT = 3.0, 7.0, 0.8, 1e-3
 LAWS = ["herschel_bulkley", "herschel_bulkley_hencky"]

@@ -5,6 +5,7 @@ import math
 
 import mpmath
 import pytest
+import substep_reference as reference
 import torch
 import warp as wp
 from mpmath import mpf
@@ -12,7 +13,6 @@ from mpmath import mpf
 from mosa.errors import ConfigError
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.adapters.stress import StressAdapter
-from mosa.physics import reference
 from mosa.physics.adapters.interface import MaterialState
 from mosa.physics.constitutive.laws import SLOTS, law_named, register_law
 from mosa.physics.constitutive.material_kernels import field_types, stress_kernel

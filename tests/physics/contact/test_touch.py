@@ -4,9 +4,9 @@ elements."""
 import math
 
 import pytest
+import substep_reference as reference
 import torch
 
-from mosa.physics import reference
 from mosa.physics.contact.planes import Plane
 from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.simulator import Simulator

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import mosa.physics
-from mosa.physics.adapters.network_evaluation import from_weights, same_weights
 from mosa.physics.engine.budget import Budget
 from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
 from mosa.physics.launching import same_memory
@@ -109,20 +108,10 @@ def test_memory_is_the_same_whoever_views_it():
     )
 
 
-def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay():
-    """Freed memory may come back at the same address: what was made of it is held, so that it does not."""
-    with same_weights():
-        for value in range(50):
-            weights = [torch.full((1000,), float(value))]
-            assert (
-                from_weights(lambda weights=weights: float(weights[0][0]), weights, "key") == value
-            )
-
-
 def test_a_part_of_the_physics_knows_only_those_below_it():
-    """launching, sums, rotations < constitutive, grid < contact < reference, world < engine with its adapters and its time."""
+    """launching, sums, rotations < constitutive, grid < contact < world < engine with its adapters and its time."""
     order = {"launching": 0, "memory_sums": 0, "exact_sums": 0, "rotations": 0, "constitutive": 1, "grid": 1, "contact": 2,
-             "reference": 3, "world": 3, "engine": 4}  # fmt: skip
+             "world": 3, "engine": 4}  # fmt: skip
     whole = {"adapters": "engine", "time": "engine"}
     root, upwards, seen = Path(mosa.physics.__file__).parent, [], set()
     for path in root.rglob("*.py"):

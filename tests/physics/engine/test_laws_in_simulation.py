@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import pytest
+import substep_reference as reference
 import torch
 
-from mosa.physics import reference
 from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.simulator import Simulator

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from substep_reference import unvech
 
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import unvech
 from mosa.types import Ground, ParticleState
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*det F <= 0")

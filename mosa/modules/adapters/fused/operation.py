@@ -1,6 +1,6 @@
 """The fused networks as one torch operation: what `ProgressiveOperator` computes, with nothing stored but inputs and weights.
 
-Sources of the kernels: network_kernels.py and half_kernel.py (forward), assembly_kernels.py, adjoint_kernels.py, sum_kernels.py.
+Sources of the kernels: network_kernels.py (forward), assembly_kernels.py, adjoint_kernels.py, sum_kernels.py.
 Their torch twin is mosa/modules/adapters/progressive.py.
 """
 
@@ -26,8 +26,6 @@ from mosa.modules.adapters.fused.assembly_kernels import (
     normals,
     normals_adjoint,
 )
-from mosa.modules.adapters.fused.half_kernel import operator_half
-from mosa.modules.adapters.fused.half_weights import packed
 from mosa.modules.adapters.fused.network_kernels import (
     phi_forward,
     psi1_forward,
@@ -35,7 +33,7 @@ from mosa.modules.adapters.fused.network_kernels import (
     theta_forward,
 )
 from mosa.modules.adapters.fused.sum_kernels import weight_gradients
-from mosa.physics.adapters.network_evaluation import backward_at_hand, from_weights
+from mosa.physics.adapters.network_evaluation import backward_at_hand
 
 LANES = 128
 """Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""
@@ -44,14 +42,10 @@ BLOCK = 64
 INTERPRETED_PROGRAMS = 2
 REGISTERS, PROGRAMS = 168, 3
 """Of a thread in the forward kernels, and programs a multiprocessor, which that many registers leave room for."""
-HALF_PROGRAMS = 2
-"""The same of the kernel in float16, by its shared memory."""
-HALF_SHARED = 113 * 1024
-"""Bytes that it takes of it at most, with a hidden width of 64."""
 
 
 class Settings(NamedTuple):
-    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: tf32x3 | tf32 | half."""
+    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: tf32x3 | tf32."""
 
     alpha: float
     l_max: float | None
@@ -78,10 +72,6 @@ def hopper(device: torch.device) -> bool:
     return torch.cuda.get_device_capability(device)[0] == 9
 
 
-def _shared(device: torch.device) -> int:
-    return torch.cuda.get_device_properties(device).shared_memory_per_block_optin
-
-
 class _Launch:
     """How the kernels of networks of one width are launched for one number of particles."""
 
@@ -91,17 +81,10 @@ class _Launch:
             -(-(n + 1) // LANES) * LANES
         )  # the particles, the state at rest, and as many more of these as fill the last one
         self.lanes = (self.rows // LANES,)
-        precision = (
-            "tf32" if settings.precision == "half" else settings.precision
-        )  # half is of the forward kernel alone
+        precision = settings.precision
         # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
         self.small = (
             precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
-        )
-        self.half = (
-            settings.precision == "half"
-            and hidden <= 64
-            and (device.type != "cuda" or _shared(device) >= HALF_SHARED)
         )
         self.size = {"H": hidden, "P": precision}
         self.warps = 8 if hidden > 64 else 4  # a warp group for 64 rows of 64 columns
@@ -121,14 +104,6 @@ class _Launch:
         tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
         options = {"KEEP": self.small, "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
         return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
-
-    def forward_half(self) -> tuple[tuple[int], dict]:
-        return (self.programs(BLOCK, HALF_PROGRAMS),), {
-            "H": self.hidden,
-            "BLOCK": BLOCK,
-            "num_warps": 4,
-            "num_stages": 1,
-        }
 
     def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
         if not (self.small and wanted):
@@ -227,75 +202,18 @@ def _evaluate_all(
     return b, post
 
 
-class _FromWeights(NamedTuple):
-    """packed: see half_weights.py; rest: (6,) b of the state at rest; known: False for zeros in place of it."""
-
-    packed: Tensor
-    rest: Tensor
-    known: bool
-
-
-def _from_weights(settings: Settings, weights: Sequence[Tensor], stored: bool) -> _FromWeights:
-    """For `_evaluate_half`. The rest is one more evaluation, of a particle in this state, by the same program."""
-
-    def make() -> _FromWeights:
-        zero = weights[0].new_zeros(1, 6)
-        made = _FromWeights(packed(weights), zero[0], False)
-        if not settings.rest_free:
-            return made
-        outputs = zero.new_empty(1, 6, 6), zero.new_empty(1, 6)
-        launch = _Launch(settings, 1, weights[0].shape[0], zero.device)
-        _evaluate_half(launch, zero, zero, zero.new_ones(1), settings, made, outputs, stored)
-        return made._replace(rest=outputs[1][0], known=True)
-
-    return from_weights(make, weights, settings, stored)
-
-
-def _evaluate_half(
-    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, made: _FromWeights,
-    outputs: tuple[Tensor, Tensor] | None, stored: bool,
-) -> tuple[_Buffers, Tensor]:  # fmt: skip
-    """(buffers, post (6, M)) in float16. outputs: G (N, 6, 6) and h (N, 6) to be filled, None for steps 1 to 4 alone; stored: l1
-    and l2 too."""
-    m, hidden, operator = launch.rows, launch.hidden, outputs is not None
-    sizes = (
-        6,
-        6,
-        (hidden if stored else 0) + 3,
-        48,
-        hidden + 12 if stored else 0,
-        6,
-        6 if operator else 0,
-    )
-    b = _Buffers(*(w.new_empty(k, m) for k in sizes))
-    post = w.new_empty(6 if operator else 0, m)
-    grid, size = launch.forward_half()
-    operator_half[grid](
-        w, s, unit, made.packed, made.rest, b.pre, b.s1, b.l1, b.l1[-3:], b.t, b.l2, b.s2, b.moved, post,
-        *(outputs or (b.t, b.t)), launch.n, m, int(made.known), settings.scale, settings.l_max or 0.0, settings.alpha,
-        BOUNDED=settings.l_max is not None, OPERATOR=operator, STORE=stored, **size,
-    )  # fmt: skip
-    return b, post
-
-
 class _FusedOperator(torch.autograd.Function):
     @staticmethod
     def forward(ctx, settings: Settings, unit: Tensor, w: Tensor, s: Tensor, *weights: Tensor):
         w, s = w.contiguous(), s.contiguous()
-        given, weights = weights, tuple(weight.contiguous() for weight in weights)
+        weights = tuple(weight.contiguous() for weight in weights)
         n = len(w)
         launch = _Launch(settings, n, weights[0].shape[0], w.device)
         G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
-        stored, made = backward_at_hand(), None
+        stored = backward_at_hand()
         with torch.cuda.device_of(w):
-            if (
-                launch.half
-            ):  # from the weights as given: another copy of them each time would not be known again
-                made = _from_weights(settings, given, stored)
-                buffers, post = _evaluate_half(launch, w, s, unit, settings, made, (G, h), stored)
-            else:
-                buffers, post = _evaluate_all(launch, w, s, unit, settings, weights, G, h)
-        ctx.settings, ctx.launch, ctx.made = settings, launch, made
+            buffers, post = _evaluate_all(launch, w, s, unit, settings, weights, G, h)
+        ctx.settings, ctx.launch = settings, launch
         ctx.buffers = buffers if stored else None
         ctx.save_for_backward(unit, w, s, post, *weights)
         ctx.set_materialize_grads(False)
@@ -317,11 +235,7 @@ class _FusedOperator(torch.autograd.Function):
         with torch.cuda.device_of(w):
             buffers, inputs = ctx.buffers, (ctx.launch, w, s, unit, ctx.settings)
             if buffers is None:
-                buffers = (
-                    _evaluate_half(*inputs, ctx.made, None, True)[0]
-                    if ctx.launch.half
-                    else _evaluate(*inputs, weights, None)
-                )
+                buffers = _evaluate(*inputs, weights, None)
             gw, gs, gradients = _backward(*inputs, weights, post, seeds, extra, any(needs), buffers)
         gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
         return None, None, gw, gs, *gradients

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.adapters.progressive import ProgressiveOperator
 
-PRECISIONS = {"accurate": "tf32x3", "tf32": "tf32", "half": "half"}
-"""How products are made on tensor cores: three of tf32 with the rounding errors carried along, one, or, half, one of tf32 in the
-backward pass and one of float16 forward, which rounds numbers from 6e-5 to 65504 alike and takes half the instructions."""
+PRECISIONS = {"accurate": "tf32x3", "tf32": "tf32"}
+"""How products are made on tensor cores: three of tf32 with the rounding errors carried along, or one."""
 
 
 def interpreted() -> bool:

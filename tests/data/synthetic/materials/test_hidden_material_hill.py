@@ -6,11 +6,11 @@ import pytest
 import torch
 from anisotropic_states import check_gradients, drawn_rotations, drawn_states, mapped, stress
 from hill_material import HillMaterial
+from substep_reference import deviator, hencky_material, polar
 
 from mosa.data.synthetic.materials.hill import COEFFICIENTS, HILL
 from mosa.errors import ConfigError
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.reference import deviator, hencky_material, polar
 from mosa.types import Ground, ParticleState
 
 AXES = drawn_rotations(1, 31)[0]

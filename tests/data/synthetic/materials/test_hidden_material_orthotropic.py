@@ -4,11 +4,11 @@ import pytest
 import torch
 from anisotropic_states import check_gradients, drawn_rotations, drawn_states, stress
 from orthotropic import MODULI, ORTHOTROPIC, OrthotropicMaterial, orthotropic_energy
+from substep_reference import polar
 
 from mosa.data.synthetic.materials.axes import axes_matrix, axes_parameter
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
-from mosa.physics.reference import polar
 
 AXES = drawn_rotations(1, 21)[0]
 WOOD = OrthotropicMaterial(E=(8.0, 3.0, 1.5), nu=(0.25, 0.3, 0.35), G=(0.9, 1.1, 1.6), axes=AXES)

@@ -19,7 +19,7 @@ FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
 BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
 BETWEEN = ("assemble", "assemble_adjoint", "normals", "normals_adjoint", "finish")
 FLAGS = {"BOUNDED": True, "EXTRA": False, "RESTED": True, "OPERATOR": True}
-INTEGERS, FLOATS = ("N", "M", "known", "start", "size"), ("scale", "bound", "alpha")
+INTEGERS, FLOATS = ("N", "M", "start", "size"), ("scale", "bound", "alpha")
 
 
 def compiled(module: str, name: str, options: dict) -> dict:
@@ -32,7 +32,7 @@ def compiled(module: str, name: str, options: dict) -> dict:
         elif argument in INTEGERS or argument in FLOATS:
             signature[argument] = "i32" if argument in INTEGERS else "fp32"
         else:
-            signature[argument] = "*fp16" if argument == "packed" else "*fp32"
+            signature[argument] = "*fp32"
         if argument == "M" or signature[argument].startswith("*"):
             divisible[(place,)] = [["tt.divisibility", 16]]
     launch = {key: options[key] for key in ("num_warps", "num_stages", "maxnreg") if key in options}
@@ -54,12 +54,6 @@ def main(hidden: int, precision: str) -> None:
         name: compiled("assembly_kernels", name, {"BLOCK": LANES, "num_warps": 4})
         for name in BETWEEN
     }
-    if launch.half:
-        for stored, operator in ((False, True), (True, True), (True, False)):
-            options = launch.forward_half()[1] | {"STORE": stored, "OPERATOR": operator}
-            found[f"half {stored} {operator} forward"] = compiled(
-                "half_kernel", "operator_half", options
-            )
     print(json.dumps(found), flush=True)
 
 

@@ -1,16 +1,11 @@
 """The fused kernels against the torch modules: on CUDA where there is a device, else in Triton's interpreter."""
 
-from contextlib import nullcontext
-
 import pytest
 import torch
 from drawn_adapters import E_REF, drawn_adapter, drawn_states, material_state
 
 from mosa.errors import ConfigError
-from mosa.modules.adapters.fused.half_weights import packed
-from mosa.modules.adapters.fused.selection import weights_of
 from mosa.modules.adapters.stress import StressAdapter
-from mosa.physics.adapters.network_evaluation import at_hand, from_weights, same_weights
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -79,120 +74,17 @@ def test_outputs_and_all_gradients_are_those_of_the_modules(options, penalised):
     assert error <= ACCURATE, worst
 
 
-@pytest.mark.parametrize("precision", ["tf32", "half"])
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_the_fast_modes_round_factors_to_ten_bits(options, precision):
-    """Their rounding is in the kernels, so the interpreter, whose products are exact, shows the same errors as a card. With the
+def test_the_fast_mode_rounds_factors_to_ten_bits(options):
+    """Its rounding is in the kernels, so the interpreter, whose products are exact, shows the same errors as a card. With the
     penalty, which adds to what is without it."""
-    error, worst = compared(options, 150, True, DEVICE, precision)
+    error, worst = compared(options, 150, True, DEVICE, "tf32")
     assert 1e-4 < error <= TF32, worst
-
-
-def test_evaluations_in_half_precision_without_a_backward_pass_and_before_one_agree():
-    """Before a backward pass the kernel leaves hidden layers behind; else the backward pass makes them again."""
-    results = []
-    for follows in (False, True):
-        adapter = drawn_adapter(dtype=torch.float32, size=0.2, fused=True, precision="half").to(
-            DEVICE
-        )
-        w, s = (t.float().to(DEVICE).requires_grad_() for t in drawn_states(70))
-        with at_hand() if follows else nullcontext():
-            answer = adapter(material_state(w, s))
-        inputs = [w, s, *adapter.operator.parameters()]
-        results.append(
-            [
-                answer.G,
-                answer.h,
-                *torch.autograd.grad(answer.G.square().sum() + answer.h.square().sum(), inputs),
-            ]
-        )
-    for alone, at_once in zip(*results, strict=True):
-        assert torch.equal(alone, at_once)
-
-
-def test_states_far_beyond_the_numbers_of_half_precision_give_finite_answers():
-    adapter = drawn_adapter(dtype=torch.float32, size=0.2, fused=True, precision="half").to(DEVICE)
-    w, s = (t.float().to(DEVICE) for t in drawn_states(5))
-    answer = adapter(material_state(w, 1e9 * s))
-    assert answer.G.isfinite().all() and answer.h.isfinite().all()
-
-
-@pytest.mark.parametrize("follows", [False, True])
-def test_next_to_no_strain_in_half_precision_there_is_next_to_no_stress(follows):
-    """The rest that is subtracted has the same rounding errors, also where another program leaves hidden layers behind."""
-    adapter = drawn_adapter(dtype=torch.float32, size=0.2, fused=True, precision="half").to(DEVICE)
-    w, s = (t.float().to(DEVICE) for t in drawn_states(70, size=1e-9))
-    with at_hand() if follows else nullcontext():
-        answer = adapter(material_state(w, s))
-    assert (
-        answer.h.abs().max() <= (1e-8 if DEVICE == "cuda" else 1e-6) * E_REF
-    )  # where NumPy multiplies, rows round differently
-
-
-def test_networks_too_wide_for_half_precision_are_evaluated_in_tf32():
-    states = material_state(*(t.float().to(DEVICE) for t in drawn_states(5)))
-    answers = [
-        drawn_adapter(
-            dtype=torch.float32, size=0.1, hidden=128, fused=True, precision=precision
-        ).to(DEVICE)(states)
-        for precision in ("tf32", "half")
-    ]
-    for tf32, half in zip(*(answer[:2] for answer in answers), strict=True):
-        assert torch.equal(tf32, half)
-
-
-def test_half_weights_hold_every_weight_once_and_zeros():
-    weights = [p.detach() for p in weights_of(drawn_adapter(dtype=torch.float32).operator)]
-    count = sum(p.numel() for p in weights)
-    powers = [
-        torch.arange(start, start + p.numel()).view_as(p)
-        for start, p in zip(starts_of(weights), weights)
-    ]
-    seen = []
-    for k in range(17):  # of the number of each weight, one binary digit after the other
-        digits = packed([1.0 + (2.0 * (p >> k & 1)) for p in powers])
-        seen.append(digits)
-    values = torch.stack(seen).float()
-    filled = values.abs().amax(0) > 0
-    factor = torch.where(values[:, filled].amin(0) < 1, 0.5, 1.0)
-    numbers = (
-        ((values[:, filled] / factor - 1.0) / 2.0).round().long() << torch.arange(17)[:, None]
-    ).sum(0)
-    assert torch.equal(numbers.sort().values, torch.arange(count))
-
-
-def starts_of(weights: list[torch.Tensor]) -> list[int]:
-    return [sum(p.numel() for p in weights[:k]) for k in range(len(weights))]
-
-
-def test_what_is_made_of_weights_serves_one_pass_and_no_other():
-    made, weights = [], [torch.ones(2), torch.zeros(3)]
-
-    def make() -> float:
-        made.append(float(weights[0].sum()))
-        return made[-1]
-
-    assert [from_weights(make, weights, "key") for _ in range(2)] == [2.0, 2.0] and len(made) == 2
-    with same_weights():
-        assert [from_weights(make, weights, "key") for _ in range(3)] == [2.0] * 3 and len(
-            made
-        ) == 3
-        assert (
-            from_weights(make, weights, "another") == 2.0
-            and from_weights(make, weights[::-1], "key") == 2.0
-            and len(made) == 5
-        )
-    weights[0].mul_(3)
-    with same_weights():
-        assert from_weights(make, weights, "key") == 6.0
-    assert from_weights(make, weights, "key") == 6.0 and len(made) == 7
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("penalised", [False, True])
-@pytest.mark.parametrize(
-    "precision, tolerance", [("accurate", ACCURATE), ("tf32", TF32), ("half", TF32)]
-)
+@pytest.mark.parametrize("precision, tolerance", [("accurate", ACCURATE), ("tf32", TF32)])
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_on_cuda_in_all_precisions(options, precision, tolerance, penalised):
     """20000 particles are more tiles than a card has multiprocessors. The accurate mode must not be the same numbers."""
@@ -210,7 +102,7 @@ def test_on_cuda_it_is_chosen_and_repeats_bit_for_bit():
         assert torch.equal(value, results[1][name]), name
 
 
-@pytest.mark.parametrize("precision", ["accurate", "tf32", "half"])
+@pytest.mark.parametrize("precision", ["accurate", "tf32"])
 def test_the_prior_at_initialisation_and_no_stress_at_rest_bit_for_bit(precision):
     adapter = StressAdapter(fused=True, precision=precision).to(DEVICE)
     adapter.switch_on(E_REF)
@@ -223,7 +115,7 @@ def test_the_prior_at_initialisation_and_no_stress_at_rest_bit_for_bit(precision
     assert torch.equal(answer.h[3], torch.zeros_like(answer.h[3])) and answer.h[4].abs().max() > 0
 
 
-@pytest.mark.parametrize("precision", ["accurate", "half"])
+@pytest.mark.parametrize("precision", ["accurate", "tf32"])
 def test_frozen_weights_get_no_gradient_and_change_none(precision):
     gradients = []
     for frozen in (False, True):

@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("triton")
-from mosa.modules.adapters.fused.operation import HALF_SHARED
 
 SHARED = 227 * 1024
 """Bytes of a multiprocessor's shared memory that one program may have (compute capability 9.0)."""
 
 
-PRECISIONS = ("tf32", "tf32x3", "half")
+PRECISIONS = ("tf32", "tf32x3")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def compiled() -> dict[str, dict]:
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_they_compile_for_hopper(compiled, precision):
     found = compiled[precision]
-    assert len(found) == (16 if precision == "half" else 13)
+    assert len(found) == 13
     for name, kernel in found.items():
-        assert kernel["shared"] <= (HALF_SHARED if name.startswith("half") else SHARED), name
+        assert kernel["shared"] <= SHARED, name
         assert kernel["tensor_cores"] == name.endswith(("forward", "backward")), name
