@@ -30,13 +30,12 @@ def composed(*overrides: str) -> dict:
 
 
 @pytest.mark.parametrize("scene", group("scene"))
-def test_every_scene_with_every_prior_composes(scene):
-    """And every pair of them with an adapter: with each scene the adapters go round the priors by one."""
-    adapters, first = group("adapter"), group("scene").index(scene)
-    for i, prior in enumerate(group("prior")):
-        config = composed(
-            f"scene={scene}", f"prior={prior}", f"adapter={adapters[(first + i) % len(adapters)]}"
-        )
+def test_every_scene_composes_with_priors_and_adapters(scene):
+    """With each scene four of them, so that every prior and every adapter meets several scenes."""
+    adapters, priors, first = group("adapter"), group("prior"), group("scene").index(scene)
+    for i in range(4 * first, 4 * first + 4):
+        prior, adapter = priors[i % len(priors)], adapters[i % len(adapters)]
+        config = composed(f"scene={scene}", f"prior={prior}", f"adapter={adapter}")
         assert config["prior"] and config["scene"]
 
 
