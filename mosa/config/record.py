@@ -17,6 +17,7 @@ from pydantic import AllowInfNan, BeforeValidator, model_validator
 from torch import Tensor
 
 from mosa.config.command_settings import BodySections
+from mosa.data.scene import GroundSettings
 from mosa.errors import ConfigError
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.body.material import RIVALS
@@ -110,15 +111,6 @@ def sequence_names(starts: Any) -> Any:
     return starts
 
 
-class GroundRecord(Settings):
-    """The ground that the body met: the scene's, or with mode auto the one that the fit decided on."""
-
-    height: Number
-    mode: Literal["sticky", "slip", "separate", "touch", "auto"] = "sticky"
-    friction: Weight = 0.0
-    accuracy: Weight | None = None
-
-
 class WorldRecord(Settings):
     """What a scene says of its world: gravity [m/s^2], up, box [m]. Walls and solids are in the settings."""
 
@@ -148,7 +140,7 @@ class BodyRecord(Settings):
 
     settings: Section
     law: str | None = None
-    ground: GroundRecord | None
+    ground: GroundSettings | None
     world: WorldRecord
     density: Annotated[float, Interval(ge=0.1, le=1e5)]
     dx: Annotated[float, Interval(ge=1e-6, le=100)]
@@ -168,7 +160,7 @@ class BodyRecord(Settings):
 
     def on(self, ground: Ground) -> Self:
         """With the ground that was found."""
-        return self.but(ground=GroundRecord(**asdict(ground)))
+        return self.but(ground=GroundSettings(**asdict(ground)))
 
     @classmethod
     def of(cls, body: Body, world: World, frame_dt: float, start: Start | None = None) -> Self:

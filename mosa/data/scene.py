@@ -7,12 +7,13 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Literal
 
 from mosa.data.checks.validation import validate
-from mosa.data.formats.scene_from_footage import check_fps, scene_from_footage
+from mosa.data.formats.scene_from_footage import scene_from_footage
 from mosa.errors import ConfigError
-from mosa.settings import is_number
-from mosa.types import AUTO, GROUND_MODES, RUBBING, Ground, Scene
+from mosa.settings import Number, Positive, Settings, Weight, check
+from mosa.types import RUBBING, Ground, Scene
 
 FORMATS = {
     "pacnerf": "mosa.data.formats.pacnerf:load_pacnerf",
@@ -68,8 +69,7 @@ def load_scene(
         return validate(
             call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}})
         )
-    if keys.get("fps") is not None:
-        check_fps(keys["fps"])
+    check("scene.fps", keys.get("fps"), Positive | None)
     check_names(name=keys.get("name"), sequence=keys.get("sequence"))
     for key, text in (
         ("root", root),
@@ -161,43 +161,24 @@ def call(loader: Callable, arguments: dict) -> Scene:
     return loader(**arguments)
 
 
+class GroundSettings(Settings):
+    """The ground of a scene or of a run, as `Ground`."""
+
+    where = "scene.ground"
+    height: Number
+    mode: Literal["sticky", "slip", "separate", "touch", "auto"] = "sticky"
+    friction: Weight = 0.0
+    accuracy: Weight | None = None
+
+
 def ground_from(keys) -> Ground | None:
     """Ground of {height, mode, friction}, None for none. Errors: ConfigError naming the key."""
     if keys is None or isinstance(keys, Ground):
         return keys
-    if not isinstance(keys, Mapping):
+    given = keys.items() if isinstance(keys, Mapping) else ()
+    found = GroundSettings.read({k: v for k, v in given if v is not None} if given else keys)
+    if found.friction > 0 and found.mode not in RUBBING:
         raise ConfigError(
-            f"scene.ground: expected the keys height, mode and friction, or null, found {keys!r}"
+            f"scene.ground.friction: acts with modes {' and '.join(RUBBING)} only, found {found.friction} with mode {found.mode!r}"
         )
-    unknown = set(keys) - {"height", "mode", "friction", "accuracy"}
-    if unknown:
-        raise ConfigError(
-            f"scene.ground.{min(unknown)}: expected the keys height, mode, friction and accuracy only"
-        )
-    mode, friction = keys.get("mode", "sticky"), keys.get("friction") or 0.0
-    if not isinstance(mode, str) or mode not in (AUTO, *GROUND_MODES):
-        raise ConfigError(
-            f"scene.ground.mode: expected {', '.join(GROUND_MODES)} or {AUTO}, found {mode!r}"
-        )
-    if not is_number(keys.get("height")):
-        raise ConfigError(
-            f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}"
-        )
-    if not is_number(friction) or friction < 0:
-        raise ConfigError(
-            f"scene.ground.friction: expected a finite number >= 0, found {friction!r}"
-        )
-    if friction > 0 and mode not in RUBBING:
-        modes = " and ".join(RUBBING)
-        raise ConfigError(
-            f"scene.ground.friction: acts with modes {modes} only, found {friction} with mode {mode!r}"
-        )
-    accuracy = keys.get("accuracy")
-    if accuracy is not None and not (is_number(accuracy) and accuracy >= 0):
-        raise ConfigError(
-            "scene.ground.accuracy: expected the standard deviation of the height in metres, or null, "
-            f"found {accuracy!r}"
-        )
-    return Ground(
-        float(keys["height"]), mode, float(friction), None if accuracy is None else float(accuracy)
-    )
+    return Ground(**dict(found))

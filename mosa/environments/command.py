@@ -6,6 +6,7 @@ import logging
 import os
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -17,6 +18,7 @@ from mosa.environments.policies import METHODS, Search
 from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, put_into, table
 from mosa.environments.tasks import TASKS
 from mosa.errors import ConfigError
+from mosa.settings import arguments_of, check
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_environments
 
@@ -32,20 +34,12 @@ def setting_of(values: dict) -> Setting:
     device, worlds = named_device(values["device"]), values["worlds"]
     if worlds == "auto":
         worlds = AT_A_TIME if device == "cpu" else values["trials"]
-    for key, found, known in (
-        ("task", values["task"], tuple(TASKS)),
-        ("policy", values["policy"], METHODS),
-    ):
-        if found not in known:
-            raise ConfigError(f"{key}: expected one of {', '.join(known)}, found {found!r}")
-    fields = TASKS[values["task"]].__dataclass_fields__
+    check("task", values["task"], Literal[tuple(TASKS)])
+    check("policy", values["policy"], Literal[METHODS])
     values["options"] = {
         key: value for key, value in values["options"].items() if value is not None
     }
-    if unknown := sorted(set(values["options"]) - (set(fields) - {"extents"})):
-        raise ConfigError(
-            f"options.{unknown[0]}: expected one of {', '.join(f for f in fields if f != 'extents')}, found it"
-        )
+    arguments_of(TASKS[values["task"]], "options", "extents").read(values["options"])
     return Setting(
         **{key: values[key] for key in ("task", "checkpoint", "policy", "decisions", "trials", "options")}, **values["truth"],
         device=device, search=Search(**values["search"]), worlds=min(worlds, values["trials"]),
@@ -69,10 +63,7 @@ def train_and_test(cfg: DictConfig) -> None:
     if values["jobs_only"]:
         known = (*SIMULATORS, UNTRAINED)
     for name in names:
-        if name not in known:
-            raise ConfigError(
-                f"simulator: expected {', '.join(SIMULATORS)}, or a list of them, found {name!r}"
-            )
+        check("simulator", name, Literal[known])
     if setting.device == "cpu":
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1").split(",")[0]))
     # a body that rolls off the box may fold over itself for a moment; the trial is lost either way

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.world import World
-from mosa.settings import Expected, described, fits, is_number, such
+from mosa.settings import Expected, check, is_number, such
 from mosa.system.limits import counted
 from mosa.types import Ground
 
@@ -114,11 +114,8 @@ class Task(ABC):
     def __post_init__(self) -> None:
         """Errors: ConfigError naming the field that is out of its range."""
         for field in fields(self):
-            value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
-            if not fits(kind, value):
-                raise ConfigError(
-                    f"options.{field.name}: expected {described(kind)}, found {str(value)[:80]!r}"
-                )
+            kind = RANGES.get(field.name, LENGTH)
+            check(f"options.{field.name}", getattr(self, field.name), kind)
         for low, high in (("low", "high"), ("close", "far"), ("slowest", "fastest")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):
                 raise ConfigError(

@@ -10,15 +10,15 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from mosa.environments.task import CLEARANCE, Quantity, Task, Trials, View
-from mosa.errors import ConfigError
 from mosa.physics.contact.motion import exponential
+from mosa.settings import call, check
 
 ABOVE = 0.035
 """[m] from the ground to the paddle's lower edge."""
@@ -437,11 +437,6 @@ def task_named(name: str, rest: Tensor, **options: Any) -> Task:
     """The task for a body with rest positions (N, 3) [m]: its sizes follow from the body's. options: of the task.
 
     Errors: ConfigError naming what is unknown."""
-    if not isinstance(name, str) or name not in TASKS:
-        raise ConfigError(f"task: expected one of {', '.join(TASKS)}, found {name!r}")
-    if unknown := sorted(
-        set(options) - {field.name for field in fields(TASKS[name])} | set(options) & {"extents"}
-    ):
-        raise ConfigError(f"options.{unknown[0]}: expected a field of the task {name}, found it")
+    check("task", name, Literal[tuple(TASKS)])
     extents = tuple(round(float(e), 2) for e in (rest.amax(0) - rest.amin(0)))
-    return TASKS[name](extents, **options)
+    return call("options", TASKS[name], options, extents=extents)

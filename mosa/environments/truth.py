@@ -16,12 +16,11 @@ from mosa.data.synthetic.drop import COURANT, GRAVITY, place
 from mosa.data.synthetic.films import built
 from mosa.data.synthetic.materials.hidden import Hidden
 from mosa.data.synthetic.materials.published import PublishedMaterial
-from mosa.errors import ConfigError
 from mosa.modules.body.body import Body
 from mosa.modules.body.model import Model
 from mosa.modules.body.simulation_settings import SimulationSettings
 from mosa.physics.world import Start, World
-from mosa.settings import Seed, fits
+from mosa.settings import Expected, Seed, check
 from mosa.system.limits import named_device
 from mosa.twin.twin import Twin
 from mosa.types import Ground
@@ -74,16 +73,14 @@ def true_twin(
     Rest positions are those of the training sequence's frame 0, as a learned twin's are. Errors: ConfigError naming the key.
     """
     device, body, drop = named_device(device), object_named(name), drop_named(name, sequence)
-    if not fits(Seed, seed):
-        raise ConfigError(
-            f"scene.seed: expected a whole number of at least 0 and below 2^32, found {str(seed)[:80]!r}"
-        )
+    check("scene.seed", seed, Seed)
     widest = float(np.ptp(np.asarray(SHAPES[body.shape].bounds), axis=0).max()) / COARSEST
-    if spacing is not None and not fits(Annotated[float, Interval(ge=FINEST, le=widest)], spacing):
-        raise ConfigError(
-            f"truth.spacing: expected a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the "
-            f"body's longest side, or null, found {str(spacing)[:80]!r}"
-        )
+    said = f"a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the body's longest side, or null"
+    check(
+        "truth.spacing",
+        spacing,
+        Annotated[Annotated[float, Interval(ge=FINEST, le=widest)] | None, Expected(said)],
+    )
     spacing = body.spacing if spacing is None else float(spacing)
     surface, particles, _ = built(body.shape, body.pitch, spacing, seed)
     hidden = body.material.variant(material)

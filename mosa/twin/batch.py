@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
-import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
@@ -42,16 +41,9 @@ class TwinWorlds:
     ) -> None:
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
-            shape, fits = (
-                (count, len(read_numbers(body))),
-                isinstance(laws, Tensor) and laws.is_floating_point(),
-            )
-            if not (fits and laws.shape == shape and bool(torch.isfinite(laws.detach()).all())):
-                found = tuple(laws.shape) if fits and laws.shape != shape else repr(laws)[:80]
-                raise ConfigError(
-                    f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, "
-                    f"found {found}"
-                )
+            shape = (count, len(read_numbers(body)))
+            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers"
+            laws = numbers("laws", laws, said, shape)
         self.body, self.world, self.frame_dt, self.training_start = (
             body,
             world,

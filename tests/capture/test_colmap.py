@@ -228,3 +228,68 @@ def test_poses_that_do_not_fit_the_videos_are_named(tmp_path):
     ):
         (tmp_path / "empty").mkdir()
         read_poses(tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        ("sparse/0", "sparse/1"),
+        ("0", "1"),
+        ("sparse/0", "sparse/2"),
+        ("sparse", "sparse/1"),
+        (".", "sparse/0"),
+    ],
+)
+def test_of_several_models_the_one_with_most_images_is_taken(tmp_path, places):
+    for place, count in zip(places, (2, 3)):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        model(tmp_path / place, binary=place.endswith("1"), count=count)
+    assert len(read_poses(tmp_path)) == 3
+
+
+@pytest.mark.parametrize("change", [
+    lambda lines: [line for line in lines if line], lambda lines: [line for line in lines if line and "2.0 -1" not in line],
+    lambda lines: [*lines, ""], lambda lines: [*lines, "", ""], lambda lines: ["# a comment", *lines],
+])  # fmt: skip
+def test_empty_lines_of_points_may_be_left_out(tmp_path, change):
+    made = model(tmp_path, binary=False)
+    file = tmp_path / "images.txt"
+    file.write_text("\n".join(change(file.read_text().splitlines())) + "\n")
+    found = read_model(tmp_path)
+    assert list(found) == [f"shots/phone {i}.jpg" for i in range(3)]
+    assert all(np.allclose(a.w2c, b.w2c) for a, b in zip(made, found.values()))
+
+
+@pytest.mark.parametrize("names", [
+    ("clip", "clip 2", "clip 3"), ("a", "a_1", "a_2"), ("b-1", "b", "b-1-2"), ("x.1", "x", "x.2"), ("p frame 1", "p", "p 2"),
+])  # fmt: skip
+def test_a_name_that_continues_another_is_a_phone_of_its_own(tmp_path, names):
+    made = model(tmp_path, binary=False)
+    text = (tmp_path / "images.txt").read_text()
+    for i, name in enumerate(names):
+        text = text.replace(f"phone {i}.jpg", f"{name}.jpg")
+    (tmp_path / "images.txt").write_text(text)
+    phones = read_phones(tmp_path, tmp_path, {f"{name}.mp4": made[0].size for name in names})
+    assert all(np.allclose(phone.camera.w2c, own.w2c) for phone, own in zip(phones, made))
+
+
+@pytest.mark.parametrize(
+    "index, factor, refused",
+    [(0, 1.1, True), (0, 0.97, True), (2, 1.2, True), (3, 0.8, True), (0, 1.005, False)],
+)
+def test_intrinsics_of_one_phone_are_compared(tmp_path, index, factor, refused):
+    made = model(tmp_path, binary=False)
+    lines = (tmp_path / "cameras.txt").read_text().splitlines()
+    words = lines[-1].split()
+    words[0], words[4 + index] = "99", repr(float(words[4 + index]) * factor)
+    (tmp_path / "cameras.txt").write_text("\n".join([*lines, " ".join(words)]) + "\n")
+    images = (tmp_path / "images.txt").read_text().splitlines()
+    again = images[-2].replace(" 12 shots/phone 2.jpg", " 99 shots/phone 2_7.jpg")
+    (tmp_path / "images.txt").write_text("\n".join([*images, again, ""]) + "\n")
+    sizes = {f"phone {i}.mp4": made[0].size for i in range(3)}
+    if not refused:
+        return read_phones(tmp_path, tmp_path, sizes)
+    with pytest.raises(
+        DataError, match=r"phone 2 has other intrinsics than in .*single_camera_per"
+    ):
+        read_phones(tmp_path, tmp_path, sizes)

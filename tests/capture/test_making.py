@@ -6,15 +6,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from filming import BODY, CONTACT, HEIGHT, WORLD, filmed, write_films
 from omegaconf import OmegaConf
 
-from mosa.capture.making import capture, make
+from mosa.capture.making import capture, make, warnings_of
+from mosa.capture.videos import find_videos, open_clip
 from mosa.capture.world import floor_of_points, ground_height, read_world
 from mosa.config.leaf_settings import CaptureSettings
+from mosa.data.images.reading import read_image
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 from mosa.settings import node_of
@@ -170,3 +173,45 @@ def test_the_command_ends_in_one_message(filmed_folder, tmp_path):
                             env=os.environ | {"PYTHONPATH": str(ROOT)})  # fmt: skip
     assert result.returncode == 2 and "Traceback" not in result.stderr, result.stderr[-2000:]
     assert "DataError: videos/phone0.mp4: no background plate: expected phone0.png" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "radius, said", [(2.0, True), (0.9, True), (0.001, True), (0.05, False), (0.5, False)]
+)
+def test_lengths_that_nobody_lets_fall_are_said(radius, said):
+    knowledge = SimpleNamespace(scale=None, up=None)
+    found = {
+        "scale_sd": None,
+        "phones": [],
+        "ground": {"tilt_degrees": None, "from": "given"},
+        "radius": radius,
+        "free_frames": 9,
+    }
+    told = warnings_of(found, {"gravity": 9.81}, knowledge, [])
+    assert [("m across: lengths follow from gravity and the clock" in line) for line in told] == [
+        True
+    ] * said
+
+
+def test_what_a_mac_leaves_beside_a_video_is_none(tmp_path):
+    for name in (
+        "._phone0.mp4",
+        ".DS_Store",
+        "phone0.mp4",
+        "phone1.MOV",
+        "._phone1.MOV",
+        ".hidden.mp4",
+    ):
+        (tmp_path / name).touch()
+    assert [file.name for file in find_videos(tmp_path)] == ["phone0.mp4", "phone1.MOV"]
+
+
+@pytest.mark.parametrize("content, said", [
+    (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS; git lfs pull"), (b"<html>", "a web page"),
+    (b"PK\x03\x04", "a zip file"), (b"", "damaged or other one of 0 bytes"), (b"\0" * 99, "damaged or other one of 99 bytes"),
+])  # fmt: skip
+def test_a_file_that_is_no_video_or_picture_is_called_by_what_it_is(tmp_path, content, said):
+    for name, read in (("a.mp4", open_clip), ("a.png", read_image)):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=said):
+            read(tmp_path / name)

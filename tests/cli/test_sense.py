@@ -97,7 +97,7 @@ def test_a_tasks_ranges_begin_before_they_end():
         ConfigError, match=r"options.low: expected at most options.high=0.2, found 0.4"
     ):
         task_named("placement", torch.rand(9, 3), low=0.4, high=0.2)
-    with pytest.raises(ConfigError, match=r"options.foo: expected a field of the task placement"):
+    with pytest.raises(ConfigError, match=r"options.foo: unknown key; expected one of steps"):
         task_named("placement", torch.rand(9, 3), foo=1)
 
 

@@ -7,14 +7,16 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 
 from mosa.data.checks.validation import fingerprint
 from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
 from mosa.errors import ConfigError
-from mosa.settings import is_number
+from mosa.settings import Positive, check
 from mosa.types import FALLING, REST, Ground, Scene, Truth
 
 DENSITIES = 0.1, 1e5
@@ -73,14 +75,10 @@ def scene_from_footage(
         raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
     if float(box.abs().max()) > WIDEST:
         raise ConfigError(f"scene.box: expected metres within {WIDEST:g}, found {box.tolist()}")
-    if not is_number(density) or not DENSITIES[0] <= density <= DENSITIES[1]:
-        raise ConfigError(
-            f"scene.density: expected a positive number of {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3, "
-            f"found {density!r}"
-        )
+    check("scene.density", density, Annotated[float, Interval(ge=DENSITIES[0], le=DENSITIES[1])])
     times = footage.times
     if fps is not None:
-        check_fps(fps)
+        check("scene.fps", fps, Positive)
         times = torch.tensor(
             [(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32
         )
@@ -155,12 +153,6 @@ def vector(value, key: str) -> torch.Tensor:
     if result.shape != (3,) or not bool(torch.isfinite(result).all()):
         raise ConfigError(f"scene.{key}: expected three finite numbers, found {value!r}")
     return result
-
-
-def check_fps(fps) -> None:
-    """Errors: ConfigError where frames per second are none."""
-    if not is_number(fps) or not fps > 0:
-        raise ConfigError(f"scene.fps: expected a positive number, found {fps!r}")
 
 
 def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:

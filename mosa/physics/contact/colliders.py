@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.contact.motion import Motion, Points, Trajectory
 from mosa.physics.contact.planes import MODES, Plane
 from mosa.physics.contact.touch import GRIP
-from mosa.settings import is_number
+from mosa.settings import Weight, check
 from mosa.types import RUBBING
 
 
@@ -201,12 +201,8 @@ def reach(shape: Shape) -> float:
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
     """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
-    if not isinstance(mode, str) or mode not in MODES:
-        raise ConfigError(f"world.walls.mode: expected one of {', '.join(MODES)}, found {mode!r}")
-    if not is_number(friction) or friction < 0:
-        raise ConfigError(
-            f"world.walls.friction: expected a finite number >= 0, found {friction!r}"
-        )
+    check("world.walls.mode", mode, Literal[MODES])
+    check("world.walls.friction", friction, Weight)
     if friction > 0 and mode not in RUBBING:
         raise ConfigError(
             f"world.walls.friction: acts with modes {' and '.join(RUBBING)} only, found mode {mode!r}"

@@ -531,7 +531,7 @@ def test_the_accuracy_of_a_ground_is_read_and_checked():
     assert ground_from(keys | {"accuracy": 0.003}) == Ground(0.1, accuracy=0.003)
     for wrong in (-1.0, "low", True):
         with pytest.raises(
-            ConfigError, match=r"scene\.ground\.accuracy: expected the standard deviation"
+            ConfigError, match=r"scene\.ground\.accuracy: expected a number of at least 0"
         ):
             ground_from(keys | {"accuracy": wrong})
 
