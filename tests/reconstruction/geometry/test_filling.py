@@ -19,10 +19,9 @@ from mosa.data.hull import (
     visual_hull,
 )
 from mosa.errors import DataError
-from mosa.reconstruction.gaussians.static import start_splats
+from mosa.reconstruction.gaussians.initial import initial_splats
 from mosa.reconstruction.geometry.behind import fill_behind
 from mosa.reconstruction.geometry.filling import body_volume, fill
-from mosa.reconstruction.settings import StaticSettings
 
 TRUE_VOLUME = 4 / 3 * np.pi * np.prod(squashed_body.RADII)
 CENTRE = torch.tensor(squashed_body.forward(np.zeros((1, 3)), 0.0, 1.0)[0], dtype=torch.float32)
@@ -146,7 +145,7 @@ def test_debris_goes_and_cavities_close():
 def test_what_lies_behind_gaussians_of_a_skin_is_the_body(hull, still):
     """Of an opaque skin, whose depth no Gaussian of the far side draws in: the inside is filled, and nothing is added beyond the
     hull's own voxels and their neighbours."""
-    skin = start_splats(hull, still, StaticSettings(), count=3000, seed=0)
+    skin = initial_splats(hull, still, count=3000, seed=0)
     skin = replace(skin, opacities=torch.full_like(skin.opacities, 0.999))
     found = fill_behind(skin, still, hull)
     inside, true = found.values.numpy() > 0.5, truly_inside(hull)
@@ -157,7 +156,7 @@ def test_what_lies_behind_gaussians_of_a_skin_is_the_body(hull, still):
 
 
 def test_no_gaussians_fill_nothing(hull, still):
-    skin = start_splats(hull, still, StaticSettings(), count=100, seed=0)
+    skin = initial_splats(hull, still, count=100, seed=0)
     clear = replace(skin, opacities=torch.full_like(skin.opacities, 1e-4))
     with pytest.raises(DataError, match="behind the 100 static Gaussians"):
         fill_behind(clear, still, hull)
