@@ -10,12 +10,29 @@ import torch
 from torch import Tensor
 
 
+def in_brief(held: Any) -> str:
+    """A dataclass in one line: of tensors their shapes, of what holds many things how many, of the rest the values."""
+
+    def said(value: Any) -> str:
+        if isinstance(value, Tensor):
+            return str(tuple(value.shape)) if value.numel() > 3 else str(value.tolist())
+        if isinstance(value, (tuple, list, dict)) and len(value) > 3:
+            return f"{len(value)} items"
+        return repr(value)
+
+    parts = ((f.name, getattr(held, f.name)) for f in fields(held) if f.repr)
+    shown = ", ".join(f"{name}={said(value)}" for name, value in parts if value is not None)
+    return f"{type(held).__name__}({shown})"
+
+
 @dataclass(frozen=True)
 class Cameras:
     """V pinhole cameras of one image size. `w2c` maps world metres to OpenCV camera axes (x right, y down, z forward).
 
     K: (V, 3, 3) [px], pixel centres at half integers; w2c: (V, 4, 4); names: V strings.
     """
+
+    __repr__ = in_brief
 
     K: Tensor
     w2c: Tensor
@@ -71,6 +88,8 @@ class Truth:
     sequence relative to the training rest shape; velocity: (3,) [m/s]; parameters: name -> value of the hidden material.
     """
 
+    __repr__ = in_brief
+
     rest: Tensor
     positions: Tensor
     rotation: Tensor
@@ -102,6 +121,8 @@ class Scene:
     start: `FALLING`, or `REST`: at frame 0 nothing moves, and the body may be in contact already.
     `markers`: tracked points in place of images, of which there are then none (V = 0).
     """
+
+    __repr__ = in_brief
 
     name: str
     sequence: str
@@ -145,6 +166,8 @@ class Splats:
     """N Gaussians at rest: means (N, 3) [m], scales (N, 3) standard deviations [m], rotations (N, 4) unit quaternions wxyz,
     opacities (N,) in (0, 1), colors (N, 3) in [0, 1]."""
 
+    __repr__ = in_brief
+
     means: Tensor
     scales: Tensor
     rotations: Tensor
@@ -161,6 +184,8 @@ class Appearance:
     spherical harmonics in the axes of the rest shape (`spherical_harmonics.py`); `splats.colors` are their means.
     normals: (N, 3) of the surface at rest and light: (8,) by which the colours change as these turn (`lighting.py`);
     None: they do not."""
+
+    __repr__ = in_brief
 
     splats: Splats
     harmonics: Tensor
@@ -182,6 +207,8 @@ class MotionCues:
     weight: (T, N) in [0, 1], 0 where rotation and stretch are not determined; covariances: (T, N, 3, 3) [m^2] of the dynamic
     Gaussians, from which cue flow maps are rendered.
     """
+
+    __repr__ = in_brief
 
     positions: Tensor
     rotation: Tensor
@@ -239,6 +266,8 @@ class Reconstruction:
     (`gaussians/carried.py`); moving: what its motion was fitted with (`MovingParts`), for the
     second look at it."""
 
+    __repr__ = in_brief
+
     splats: Splats
     spacing: float
     volume: Tensor
@@ -255,6 +284,8 @@ class ParticleState:
 
     For laws without return mapping F_tot is the same tensor as F. Of B worlds: (B, N, ...) each.
     """
+
+    __repr__ = in_brief
 
     x: Tensor
     v: Tensor
@@ -303,6 +334,8 @@ class Rollout:
     Where the substeps vary by frame they are (T - 1, 1, K, 6), that mean. counts: substeps of each of the T - 1 frame intervals.
     Of B worlds: x (T, B, N, 3) and so on, final (B, N, ...), reactions (T - 1, substeps, B, K, 6), see `worlds`.
     """
+
+    __repr__ = in_brief
 
     x: Tensor
     v: Tensor

@@ -13,7 +13,7 @@ from torch import Tensor
 from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.planes import Plane
-from mosa.types import Ground
+from mosa.types import Ground, in_brief
 
 FASTER = 1.5
 """Times the speed that its energy allows a body, which single particles reach (measured on blocks of 1 to 30 kPa: 0.7 to 1.47)."""
@@ -24,6 +24,8 @@ class Start:
     """Initial state of a sequence. rotation: (3, 3) pose Q relative to the rest shape; center: (3,) position of the rest
     centre [m]; velocity: (3,) [m/s]; angular_velocity: (3,) [rad/s]; loads: entries as of
     world.driven of masses that go with the body in this sequence alone."""
+
+    __repr__ = in_brief
 
     rotation: Tensor
     center: Tensor
@@ -51,6 +53,8 @@ class World:
     """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground;
     colliders: moving rigid solids; driven: sets of the body's own particles that are held, moved or
     loaded; forces: what was measured on these (`data.io.forces`), which moves nothing."""
+
+    __repr__ = in_brief
 
     ground: Ground | None
     gravity: Tensor

@@ -88,6 +88,10 @@ class SceneDataModule(L.LightningDataModule):
         self.settings = DataSections.part(plain(self.cfg))
         self.device, self.held_out, self.predict = device, held_out, list(predict)
 
+    def __repr__(self) -> str:
+        scene = dict(self.cfg.scene)
+        return f"SceneDataModule(scene={scene.get('name') or scene.get('path')!r})"
+
     # ---------------------------------------------------------------- Lightning's hooks
     def prepare_data(self) -> None:
         """Makes the films of a built-in scene where they are not in the cache, or reads those of a folder. Nothing is kept."""

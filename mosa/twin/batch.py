@@ -54,6 +54,9 @@ class TwinWorlds:
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 
+    def __repr__(self) -> str:
+        return f"TwinWorlds({self.count} worlds of {len(self.body.rest)} particles)"
+
     @typed
     def reset(
         self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,

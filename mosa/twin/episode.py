@@ -33,7 +33,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.numerics import State, flat
 from mosa.physics.time.clock import Moment
 from mosa.twin.start import check_wants_no_gradients
-from mosa.types import ParticleState
+from mosa.types import ParticleState, in_brief
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
 
@@ -47,6 +47,8 @@ class TwinState:
     driven: (K,) bool, whether an action has moved a collider yet; frames, substeps: () steps and substeps since the start; time: ()
     [s]; lag: () [s], length of the last substep.
     """
+
+    __repr__ = in_brief
 
     x: Tensor
     v: Tensor

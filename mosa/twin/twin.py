@@ -53,6 +53,7 @@ from mosa.system.progress import tqdm
 from mosa.system.whole_files import written_whole
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import Episode, Stepped, TwinState
+from mosa.twin.material import TwinMaterial, summary
 from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
@@ -368,6 +369,19 @@ class Twin:
             frames = side_by_side({title: self.render(rollout, colliders=solids)}, footer=moments)
             write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
         return folder
+
+    @property
+    def material(self) -> TwinMaterial:
+        """Its material, to read and to set in physical units: `twin.material.E = 2e4`, `twin.material.preset("jelly")`."""
+        return TwinMaterial(self)
+
+    def summary(self) -> str:
+        """Body, law, world and grid in lines of text with units, and how sure the law is."""
+        return summary(self)
+
+    def __repr__(self) -> str:
+        body = self.body
+        return f"Twin({len(body.rest)} particles, {1e3 * body.size:.4g} mm, {self.material!r})"
 
 
 def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:

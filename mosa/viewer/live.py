@@ -169,6 +169,10 @@ class Live:
         self.running = self.begin(self.drop_as)
         return self.running
 
+    def soften(self, E: float) -> None:
+        """Young's modulus [Pa] of the drops to come; how sure the learned one was says nothing about it."""
+        self.twin.material.E, self.uncertain = E, False
+
     def reset(self) -> bool:
         """Back to the beginning of the last drop, the ball at home, paused."""
         self.target = self.home()

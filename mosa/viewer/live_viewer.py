@@ -51,6 +51,13 @@ class LiveViewer:
             }  # fmt: skip
             self.uncertain = gui.add_checkbox("uncertainty", False, disabled=live.twin.posterior is None,
                                               hint=f"{live.draws} drawn laws are simulated along: slower")  # fmt: skip
+            E = live.twin.material.E
+            self.stiffness, middle = None, round(float(np.log10(E)), 2) if E > 0 else 0.0
+            if E > 0:
+                self.stiffness = gui.add_slider(
+                    "log10 of E [Pa]", middle - 1.5, middle + 1.5, 0.01, middle
+                )
+            self.set_stiffness = middle
         self.slowdown = gui.add_slider(
             "speed of time", 0.05, 1.0, 0.05, 1.0, hint="at most: a slow machine is slower"
         )
@@ -122,6 +129,10 @@ class LiveViewer:
         """Let the body go as the sliders say."""
         with self.busy:
             self.live.uncertain = bool(self.uncertain.value)
+            if self.stiffness is not None and offered(self.stiffness) != self.set_stiffness:
+                self.set_stiffness = float(offered(self.stiffness))
+                self.live.soften(10**self.set_stiffness)
+                self.uncertain.value, self.uncertain.disabled = False, True
             self.live.change(
                 **{name: float(offered(slider)) for name, slider in self.sliders.items()}
             )

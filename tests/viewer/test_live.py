@@ -235,7 +235,9 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         assert shown.points.visible and not shown.splats.visible and shown.legend.visible
         assert np.allclose(shown.points.points, live.positions.numpy(), atol=1e-6)
         shown.sliders["height"].value, shown.sliders["tilt"].value = 0.25, 30
+        shown.stiffness.value = 4.0
         shown.drop()
+        assert live.twin.material.E == pytest.approx(1e4)
         with shown.busy:
             assert live.drop_as.height == 0.25 and live.drop_as.tilt == 30 and live.running
         until = time.time() + 30

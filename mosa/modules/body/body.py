@@ -96,6 +96,11 @@ class Body(nn.Module):
                 variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
 
+    def __repr__(self) -> str:
+        parts = (self.heterogeneity, self.adapter)
+        more = "".join(f", {type(part).__name__}" for part in parts if part is not None)
+        return f"Body({len(self.rest)} particles, {self.size:.4g} m, {self.material.law}{more})"
+
     def __getstate__(self) -> dict[str, Any]:
         """Without the simulator, whose buffers are no part of a body: a copy makes its own."""
         return {k: v for k, v in self.__dict__.items() if not k.startswith("_simulator")}

@@ -1,0 +1,284 @@
+"""A twin's material in hand: read and set in physical units, and what it says of itself."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+from mosa.evaluation.analysis.law_stress import in_double, tangent
+from mosa.evaluation.analysis.stiffness import stiffest
+from mosa.evaluation.uncertainty import determined
+from mosa.modules.adapters.microplane import MANDEL
+from mosa.modules.body.body import Body
+from mosa.modules.body.material import FORMS, RELATIVE, Form, Material, unit_of
+from mosa.physics.constitutive.damping import DAMPED, DAMPING
+from mosa.physics.constitutive.laws import law_named
+from mosa.physics.engine.law_options import AS_USUAL
+from mosa.settings import is_number
+from mosa.twin.presets import preset
+
+if TYPE_CHECKING:
+    from mosa.twin.twin import Twin
+
+PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+"""Tensor entries of the six components xx, yy, zz, yz, zx, xy."""
+DENSEST = (0.1, 1e5)
+"""[kg/m^3] that a record allows."""
+
+
+class TwinMaterial:
+    """The material of a twin. What is set counts from the next `simulate` or `reset` on.
+
+    Reading: `parameters`, `E`, `nu`, `density`, `damping`, `stiffness`, `field`. Setting: `set(E=2e4, damping=5)`, or an
+    attribute, `twin.material.E = 2e4`; `preset("jelly")` takes a known material.
+    """
+
+    __slots__ = ("_twin",)
+
+    def __init__(self, twin: Twin) -> None:
+        self._twin = twin
+
+    @property
+    def _body(self) -> Body:
+        return self._twin.body
+
+    # ---------------------------------------------------------------- reading
+    @property
+    def law(self) -> str:
+        """Name of the law (docs/theory_to_code.md), without its damping."""
+        return self._body.material.law.removesuffix(DAMPED)
+
+    @property
+    @torch.no_grad()
+    def parameters(self) -> dict[str, float]:
+        """Values of the law's parameters, SI units, friction_angle in degrees; of a direction its three components."""
+        return {name: float(value) for name, value in self._body.material.physical().items()}
+
+    @property
+    def E(self) -> float:
+        """Young's modulus [Pa] at small strain, of the law without its correction; 0 of a fluid. Multiplied by `field` over the
+        body."""
+        found = self.parameters
+        if "E" in found:
+            return found["E"]
+        mu, kappa = found.get("mu", 0.0), found["kappa"]
+        return 9 * kappa * mu / (3 * kappa + mu) if law_named(self.law).sheared else 0.0
+
+    @E.setter
+    def E(self, value: float) -> None:
+        self.set(E=value)
+
+    @property
+    def nu(self) -> float:
+        """Poisson's ratio at small strain."""
+        return float(self._body.material.poisson())
+
+    @nu.setter
+    def nu(self, value: float) -> None:
+        self.set(nu=value)
+
+    @property
+    def density(self) -> float:
+        """[kg/m^3] at rest. A film alone does not tell it: trained twins have the scene's."""
+        return self._body.density
+
+    @density.setter
+    def density(self, value: float) -> None:
+        self.set(density=value)
+
+    @property
+    def damping(self) -> float:
+        """Shear viscosity [Pa s] beside the law; 0 without."""
+        return self.parameters.get("damping", 0.0)
+
+    @damping.setter
+    def damping(self, value: float) -> None:
+        self.set(damping=value)
+
+    @property
+    def field(self) -> Tensor:
+        """(N,) factor of the stiffness at every particle: E(X) = E * field. Ones where it does not vary."""
+        with torch.no_grad():
+            return self._body.factor(self._body.heterogeneity).detach().clone()
+
+    @property
+    def stiffness(self) -> Tensor:
+        """(6, 6) float64 [Pa] at rest, prior and correction, where `field` is 1: stress over strain in Mandel scaling, components
+        xx, yy, zz, yz, zx, xy in the axes of the rest shape. Errors: ConfigError for an adapter without a law."""
+        body = self._body
+        with torch.no_grad():
+            C = tangent(
+                in_double(copy.deepcopy(body.material).cpu(), configured=False),
+                None,
+                torch.eye(3).double()[None],
+            )[0]
+            rows, columns = (torch.tensor(each) for each in zip(*PAIRS))
+            scale = torch.tensor(MANDEL, dtype=torch.float64)
+            C = 0.5 * (C + C.mT)[rows[:, None], columns[:, None], rows[None], columns[None]] * scale[:, None] * scale  # fmt: skip
+            adapter = body.adapter
+            if adapter is None or not adapter.is_on:
+                return C
+            if adapter.own_dynamics:
+                raise ConfigError(
+                    "stiffness: this adapter moves the particles itself, without a law"
+                )
+            adapter.follow(body.material.poisson())
+            known, E_ref = adapter.in_double(), float(adapter.E_ref)
+            vech = (
+                C / scale[:, None] / scale * torch.tensor([1.0, 1, 1, 2, 2, 2], dtype=torch.float64)
+            )
+
+        def stress(strain: Tensor) -> Tensor:
+            prior = vech @ strain / E_ref
+            return E_ref * (prior + known.increment(strain[None], prior[None])[0])
+
+        J = torch.autograd.functional.jacobian(stress, torch.zeros(6, dtype=torch.float64))
+        return (J * scale[:, None] / scale).detach()
+
+    # ---------------------------------------------------------------- setting
+    def set(self, law: str | None = None, **values: float) -> None:
+        """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa s], and all of `parameters`.
+
+        law: of another one all parameters are needed. The learned correction stays, in proportion to E, and so does `field`.
+        What the run knew about the uncertainty of the law is dropped, and the variants `prior` and `prior_eta` become the material
+        that was set. Errors: ConfigError naming the value."""
+        density = values.pop("density", None)
+        if density is not None:
+            low, high = DENSEST
+            if not is_number(density) or not low <= density <= high:
+                raise ConfigError(
+                    f"density: expected {low:g} to {high:g} kg/m^3, found {density!r}"
+                )
+        same = law in (None, self.law)
+        known = values_of(self._body.material) if same else {}
+        given = {**known, **values}
+        if "E" not in known and {"mu", "kappa"} <= set(known) and {"E", "nu"} & set(values):
+            E, nu = given.pop("E", self.E), given.pop("nu", self.nu)
+            if not is_number(E) or not is_number(nu) or not E > 0 or not -1 < nu < 0.5:
+                raise ConfigError(
+                    f"E, nu: expected a number above 0 and one from -1 to 0.5, found {E!r}, {nu!r}"
+                )
+            given |= {"mu": E / (2 * (1 + nu)), "kappa": E / (3 * (1 - 2 * nu))}
+        if not any(given.get(name) for name in DAMPING):
+            given = {name: value for name, value in given.items() if name not in DAMPING}
+        modulated = self._body.material.modulated if same else None
+        self._take(Material(law or self.law, given, modulated=modulated), density, new=not same)
+
+    def preset(self, name: str) -> None:
+        """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the learned correction.
+
+        Errors: ConfigError naming the known ones."""
+        found = preset(name)
+        self._body.adapter = self._body.heterogeneity = None
+        for variant in self._body.frozen.values():
+            assert isinstance(variant, nn.ModuleDict)
+            if "heterogeneity" in variant:
+                del variant["heterogeneity"]
+        self._take(Material(found.law, dict(found.parameters)), found.density, new=True)
+
+    def _take(self, material: Material, density: float | None, new: bool) -> None:
+        """Put a material into the body, and into the record that a checkpoint keeps of it."""
+        twin, body = self._twin, self._body
+        density = body.density if density is None else float(density)
+        settings = copy.deepcopy(dict(twin.record.settings))
+        if settings:
+            prior = {} if new else settings.get("prior", {})
+            values, law = values_of(material), material.law.removesuffix(DAMPED)
+            settings["prior"] = {
+                **prior,
+                "law": law,
+                "parameters": values,
+                "candidates": None,
+                "frozen": None,
+            }
+            if body.adapter is None:
+                settings["adapter"] = {"name": None}
+            if body.heterogeneity is None:
+                settings["heterogeneity"] = {"enabled": False}
+        changed = twin.record.but(settings=settings, law=None, density=density)
+        twin._record, twin.posterior, body.density = changed, None, density
+        body.material = material.to(body.rest)
+        for variant in body.frozen.values():
+            assert isinstance(variant, nn.ModuleDict)
+            variant["material"] = copy.deepcopy(body.material).requires_grad_(False)
+        if new:  # the simulator in hand takes yield stresses as the law before did
+            body.law_options = AS_USUAL
+            body.__dict__.pop("_simulator_key", None)
+
+    def __repr__(self) -> str:
+        values = ", ".join(said(self._body.material.law, k, v) for k, v in self.parameters.items())
+        return f"TwinMaterial({self.law}: {values}; {self.density:.4g} kg/m^3)"
+
+
+@torch.no_grad()
+def values_of(material: Material) -> dict[str, Any]:
+    """What `Material` takes: a number of each parameter, three of a direction; what is held is at its bound exactly."""
+    values: dict[str, Any] = {}
+    found = material.physical()
+    for name in material.names:
+        form = FORMS[name]
+        if name in material.directions or not isinstance(form, Form):
+            values[name] = material.direction(name).tolist()
+            continue
+        values[name] = float(found[name])
+        if name in material.held:
+            values[name] = min(form.held, key=lambda bound: abs(bound - values[name]))
+    return values
+
+
+def said(law: str, name: str, value: float) -> str:
+    """`E = 3e+04 Pa`."""
+    unit = unit_of(law, name)
+    return f"{name} = {value:.4g}{' ' + unit if unit else ''}"
+
+
+@torch.no_grad()
+def summary(twin: Twin) -> str:
+    """What a twin is, in lines of text with units, and how sure its law is where the run kept that."""
+    body, world, material = twin.body, twin.world, twin.material
+    volume = float(body.volume.sum())
+    sure: Mapping[str, float] = {} if twin.posterior is None else determined(body, twin.posterior)
+    lines = [
+        f"body      {len(body.rest)} particles, {1e3 * body.size:.4g} mm long, {1e6 * volume:.4g} cm^3, "
+        f"{1e3 * volume * body.density:.4g} g at {body.density:.4g} kg/m^3",
+        f"law       {body.material.law}",
+    ]
+    for name, value in material.parameters.items():
+        relative, own = sure.get(f"posterior/{name}_relative_sd"), sure.get(f"posterior/{name}_sd")
+        spread = f" +- {relative:.1%}" if name in RELATIVE and relative is not None else ""
+        spread = spread if own is None else f" +- {own:.2g}"
+        lines.append(f"          {said(body.material.law, name, value)}{spread}")
+    adapter = body.adapter
+    if adapter is None or not adapter.is_on:
+        lines.append("correction  none")
+    else:
+        lines.append(f"correction  {type(adapter).__name__}")
+        if (stiffness := adapter.stiffness()) is not None:
+            axis, ratio = stiffest(stiffness.cpu())
+            where = ", ".join(f"{v:.2f}" for v in axis.tolist())
+            lines.append(
+                f"          largest over smallest Young's modulus {float(ratio):.3g}, stiffest along ({where})"
+            )
+    field = material.field
+    if float(field.max() - field.min()) > 1e-6:
+        lines.append(
+            f"field     stiffness varies from {float(field.min()):.3g} to {float(field.max()):.3g} of it"
+        )
+    if twin.posterior is None:
+        lines.append(
+            "sureness  not known: the run kept no posterior, or the material was set by hand"
+        )
+    ground = "no ground" if world.ground is None else (
+        f"ground at {world.ground.height:.4g} m, {world.ground.mode}, friction {world.ground.friction:.3g}")  # fmt: skip
+    up = ", ".join(f"{v:.3g}" for v in world.up.tolist())
+    lines += [
+        f"world     {ground}; up ({up}); gravity {float(world.gravity.norm()):.4g} m/s^2; {len(world.colliders)} colliders, "
+        f"{len(world.driven)} driven sets",
+        f"grid      spacing {1e3 * body.settings.dx:.4g} mm; frames of {1e3 * twin.frame_dt:.4g} ms",
+    ]
+    return "\n".join(lines)

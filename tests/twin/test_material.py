@@ -1,0 +1,116 @@
+"""A twin's material: read, set, presets, and what the twin says of itself."""
+
+import pytest
+import torch
+from small_bodies import FRAME_DT, NU, STICKY, E, small_body, start
+
+from mosa.errors import ConfigError
+from mosa.modules.adapters.microplane import isotropic_stiffness
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.twin.presets import PRESETS
+from mosa.twin.saved import save_twin
+from mosa.twin.twin import Twin
+
+
+def twin(**options):
+    return Twin(small_body(**options), STICKY, FRAME_DT, None, start(height=0.1, speed=-1.0))
+
+
+def test_values_are_read_in_physical_units():
+    material = twin(modes=True).material
+    assert material.law == "corotated" and material.damping == 0
+    assert (material.E, material.nu, material.density) == (
+        pytest.approx(E),
+        pytest.approx(NU),
+        1000.0,
+    )
+    assert torch.equal(material.field, torch.ones(120).double())
+    mu = E / (2 * (1 + NU))
+    expected = 2 * mu * isotropic_stiffness(torch.tensor(NU).double())
+    assert torch.allclose(material.stiffness, expected, rtol=1e-6, atol=1e-6 * E)
+
+
+def test_stiffness_holds_the_learned_correction():
+    numbers = 0.3 * torch.randn(19, generator=torch.Generator().manual_seed(1))
+    made = twin(numbers=numbers)
+    mu = E / (2 * (1 + NU))
+    expected = 2 * mu * made.body.adapter.stiffness().detach()
+    assert torch.allclose(made.material.stiffness, expected, rtol=1e-6, atol=1e-6 * E)
+    made.body.adapter = StressAdapter()
+    made.body.adapter.switch_on(E, NU)
+    isotropic = 2 * mu * isotropic_stiffness(torch.tensor(NU).double())
+    assert torch.allclose(made.material.stiffness, isotropic, rtol=1e-5, atol=1e-5 * E)
+
+
+def test_what_is_set_is_simulated():
+    soft, stiff = twin(adapter=False), twin(adapter=False, E=4 * E)
+    before = soft.simulate(frames=8)
+    soft.material.E = 4 * E
+    assert soft.material.E == pytest.approx(4 * E)
+    after, expected = soft.simulate(frames=8), stiff.simulate(frames=8)
+    assert torch.allclose(after.x, expected.x, atol=1e-9)
+    assert float((after.x - before.x).abs().max()) > 1e-4
+    soft.material.set(damping=20.0, density=500)
+    assert soft.material.damping == pytest.approx(20) and soft.body.density == 500
+    assert soft.body.material.law == "corotated~damped"
+    assert float((soft.simulate(frames=8).x - after.x).abs().max()) > 1e-5
+    soft.material.damping = 0
+    assert soft.body.material.law == "corotated"
+
+
+def test_a_value_out_of_range_is_named():
+    material = twin(adapter=False).material
+    with pytest.raises(ConfigError, match=r"prior\.parameters\.nu: expected a number between"):
+        material.nu = 0.7
+    with pytest.raises(ConfigError, match="density: expected"):
+        material.density = -1
+    with pytest.raises(ConfigError, match="preset: expected one of jelly, "):
+        material.preset("steel")
+    assert material.nu == pytest.approx(NU)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_can_be_simulated(name):
+    made = twin(modes=True, precision=32)
+    made.material.preset(name)
+    assert made.body.adapter is None and made.material.density == PRESETS[name].density
+    assert made.body.material.law == PRESETS[name].law and len(PRESETS[name].source) > 40
+    assert bool(made.simulate(frames=2).x.isfinite().all())
+
+
+def test_summary_and_reprs_are_short_and_have_units():
+    made = twin()
+    said = made.summary()
+    assert "120 particles" in said and "E = 3e+04 Pa" in said and "sticky" in said
+    assert "(20, 3)" not in said and len(max(said.splitlines(), key=len)) < 120
+    state = made.reset(frames=2)
+    rollout = made.simulate(frames=2)
+    for each in (state, rollout, made.world, made.training_start, made.body, made.worlds(2)):
+        assert len(repr(each)) < 500 and type(each).__name__ in repr(each)
+    assert "x=(2, 120, 3)" in repr(rollout) and repr(made.worlds(2)).startswith(
+        "TwinWorlds(2 worlds"
+    )
+    assert repr(made) == (
+        "Twin(120 particles, 100 mm, TwinMaterial(corotated: E = 3e+04 Pa, nu = 0.35; 1000 kg/m^3))"
+    )
+
+
+def test_a_checkpoint_keeps_what_was_set(tmp_path):
+    body = small_body(precision=32)
+    plain = Twin(body, STICKY, FRAME_DT, None, start(dtype=torch.float32))
+    law = {"law": "auto", "parameters": {"E": 1e4, "nu": 0.3}, "candidates": ["corotated", "stvk"]}
+    settings = {
+        "prior": law,
+        "adapter": {"name": "hyperelastic"},
+        "heterogeneity": {"enabled": False},
+    }
+    record = plain.record.but(settings=settings, law="corotated")
+    for change in (lambda m: m.set(E=5e4, damping=3.0, density=700), lambda m: m.preset("clay")):
+        made = Twin(body, STICKY, FRAME_DT, record, plain.training_start)
+        change(made.material)
+        found = Twin.load(save_twin(made, tmp_path / "last.ckpt"))
+        assert found.material.law == made.material.law and found.body.density == made.body.density
+        assert found.material.parameters == pytest.approx(made.material.parameters)
+        assert (found.body.adapter is None) == (made.body.adapter is None)
+        expected = made.simulate(height=0.02, frames=4)
+        assert torch.allclose(found.simulate(height=0.02, frames=4).x, expected.x, atol=1e-6)
