@@ -28,6 +28,7 @@ from mosa.evaluation.evaluate import (
     test_means,
     true_motion,
 )
+from mosa.evaluation.model_card import FILE, model_card
 from mosa.evaluation.settings import EvaluationSettings
 from mosa.evaluation.uncertainty import determined, predicted_spread
 from mosa.modules.body.body import Body, Start, World
@@ -101,7 +102,7 @@ def write_outputs(
     world: World,
 ) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
-    all; tables in results.md; metrics.json."""
+    all; tables in results.md; a model card beside the checkpoint; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
         motions = {
             prefix: variants[variant] for prefix, variants in kept.items() if variant in variants
@@ -128,6 +129,9 @@ def write_outputs(
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:
         partial.write_text(table + "\n")
+    if (folder / "checkpoints").is_dir():
+        with written_whole(folder / "checkpoints" / FILE) as partial:
+            partial.write_text(model_card(figures, body, evaluated, kept, world))
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
 

@@ -1,0 +1,130 @@
+"""The card beside a checkpoint: what was filmed, what was learned and how surely, where it is valid, how to load it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as Ordered
+
+import torch
+
+from mosa import __version__
+from mosa.evaluation.analysis.tables import (
+    columns_text,
+    continued_text,
+    determined_text,
+    parameter_table,
+    results_table,
+)
+from mosa.evaluation.evaluate import Sequence
+from mosa.modules.body.body import Body
+from mosa.physics.world import World
+from mosa.types import Rollout
+
+FILE = "model_card.md"
+SHARE = 0.001
+"""Of particles and frames at each end that the range of stretches leaves out."""
+
+
+def filmed(sequences: Ordered[Sequence]) -> list[str]:
+    """A line for each sequence."""
+    lines = []
+    for s in sequences:
+        scene, dt = s.scene, float(s.scene.times[1] - s.scene.times[0])
+        learned = s.prefix.startswith("train")
+        cameras = scene.training_cameras if learned else scene.cameras
+        frames = len(scene.training_frames) if learned else scene.frames
+        made = "simulated by this program, no capture" if scene.synthetic else "footage"
+        lines.append(
+            f"- `{s.prefix}`, {'learned from' if learned else 'held out'}: scene {scene.name}, "
+            f"sequence {scene.sequence}; {made}; {len(cameras)} cameras, {frames} frames at "
+            f"{1 / dt:.4g} a second; speed at the start {float(s.start.velocity.norm()):.3g} m/s."
+        )
+    return lines
+
+
+def stretches(rollouts: Ordered[Rollout]) -> tuple[float, float]:
+    """Smallest and largest principal stretch of the motions, but for `SHARE` at each end."""
+    found = torch.cat([torch.linalg.svdvals(r.F_tot.detach().double()).flatten() for r in rollouts])
+    ordered = found[found.isfinite()].sort().values
+    skipped = int(SHARE * len(ordered))
+    return float(ordered[skipped]), float(ordered[len(ordered) - 1 - skipped])
+
+
+def valid(
+    sequences: Ordered[Sequence],
+    kept: Mapping[str, Mapping[str, Rollout]],
+    body: Body,
+    world: World,
+) -> list[str]:
+    """What the motions covered that the law was learned from."""
+    trained = [kept.get(s.prefix, {}) for s in sequences if s.prefix.startswith("train")]
+    seen = [motions["adapted"] for motions in trained if "adapted" in motions]
+    lines = []
+    if seen:
+        low, high = stretches(seen)
+        lines += [
+            f"- Principal stretches from {low:.3g} to {high:.3g} occurred in the motions that were "
+            "learned from. Beyond them the law is extrapolated.",
+            f"- The motions last {max(float(r.times[-1]) for r in seen):.3g} s. Creep, relaxation "
+            "and wear over longer times were not seen.",
+        ]
+    if (ground := world.ground) is not None:
+        lines.append(
+            f"- The ground at {ground.height:.4g} m was met as `{ground.mode}`, with friction "
+            f"{ground.friction:.3g}. Other surfaces may slide differently."
+        )
+    lines += [
+        f"- The density {body.density:.5g} kg/m^3 was given, not measured. Without measured forces, "
+        "films determine moduli divided by density: moduli, masses and forces scale with it.",
+        f"- Grid spacing {1e3 * body.settings.dx:.4g} mm with {len(body.rest)} particles. On another "
+        "grid the same numbers are a slightly different law.",
+    ]
+    return lines
+
+
+LICENCE = (
+    "The program that made this file has the MIT licence. It knows no licence of the films. Shape, "
+    "colours and law come from them: ask whoever made the films before you pass this file on."
+)
+LOADING = """```python
+from mosa import Twin
+
+twin = Twin.load("last.ckpt")
+print(twin.summary())
+rollout = twin.simulate(height=0.2, velocity=(0, 0, 0), angular_velocity=(0, 0, 0), frames=30)
+```"""
+
+
+def model_card(
+    figures: Mapping[str, float],
+    body: Body,
+    sequences: Ordered[Sequence],
+    kept: Mapping[str, Mapping[str, Rollout]],
+    world: World,
+) -> str:
+    """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and
+    variant."""
+    law, name = body.material.law, sequences[0].scene.name
+    correction = "none" if body.adapter is None else type(body.adapter).__name__
+    field = "is the same everywhere" if body.heterogeneity is None else "varies over the body"
+    learned = (
+        f"Law `{law}`, correction {correction}; the stiffness {field}. The body is "
+        f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."
+    )
+    unsure = "This fit keeps no posterior: how sure the law is, is not known."
+    errors = (
+        results_table(figures),
+        columns_text(figures, name),
+        continued_text(figures, law),
+    )
+    parts = {
+        "What was filmed": "\n".join(filmed(sequences)),
+        "What was learned": f"{learned}\n\n{parameter_table(figures, law)}",
+        "What is determined, and what is not": determined_text(figures, law) or unsure,
+        "Errors": "\n\n".join(filter(None, errors)),
+        "Where it is valid": "\n".join(valid(sequences, kept, body, world)),
+        "Licence": LICENCE,
+        "How to load": LOADING,
+    }
+    text = "\n\n".join(f"## {title}\n{part}" for title, part in parts.items())
+    return f"# Model card: {name}\n\nA learned body, by mosa {__version__}.\n\n{text}\n"

@@ -1,0 +1,42 @@
+"""The card beside a checkpoint says what the run knows, and leaves out what it does not."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from small_bodies import FRAME_DT, STICKY, small_body, start
+
+from mosa.evaluation.evaluate import Sequence
+from mosa.evaluation.model_card import model_card, stretches
+
+
+def sequence(prefix, name):
+    scene = SimpleNamespace(name="cube", sequence=name, synthetic=prefix != "train", times=FRAME_DT * torch.arange(6.0),
+                            training_cameras=[0, 1], training_frames=[0, 1, 2, 3], cameras=[0, 1, 2], frames=6)  # fmt: skip
+    return Sequence(prefix, scene, start(), 2)
+
+
+def test_the_card_says_what_was_filmed_what_is_known_and_where_it_holds():
+    body = small_body()
+    with torch.no_grad():
+        moved = body.simulate(start(), STICKY, 6, FRAME_DT)
+    low, high = stretches([moved])
+    assert low < 0.99 and high > 1.01
+    figures = {"id_prior/E": 3.1e4, "id/E": 3e4, "posterior/draws": 12.0, "posterior/E_relative_sd": 0.04,
+               "train/psnr_crop": 30.0, "train/rms_m": 0.002, "posterior/operator_numbers": 19.0,
+               "posterior/operator_determined": 4.2}  # fmt: skip
+    evaluated = [sequence("train", "a"), sequence("test/b", "b")]
+    said = model_card(figures, body, evaluated, {"train": {"adapted": moved}}, STICKY)
+    for part in ("footage; 2 cameras, 4 frames at 60 a second", "simulated by this program, no capture; 3 cameras, 6 frames",
+                 "speed at the start 1.5 m/s", "E = 3e+04 Pa, with a standard deviation of 4.0%", "determine 4.2;",
+                 f"stretches from {low:.3g} to {high:.3g}", "met as `sticky`", "1000 kg/m^3 was given", "Twin.load",
+                 "## Licence", "| rms [mm]"):  # fmt: skip
+        assert part in said, part
+    assert "nan" not in model_card({"id/E": 3e4}, body, evaluated, {}, STICKY)
+    unsure = model_card({}, body, evaluated, {}, STICKY)
+    assert "keeps no posterior" in unsure and "stretches" not in unsure
+
+
+def test_an_affine_motion_has_the_stretches_of_its_gradient():
+    F = torch.diag(torch.tensor([1.2, 1.0, 0.7])).expand(2, 500, 3, 3)
+    assert stretches([SimpleNamespace(F_tot=F)]) == pytest.approx((0.7, 1.2))
