@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from mosa.config.composition import configuration
 from mosa.errors import ConfigError, MosaError
+from mosa.system.console import say_version
 from mosa.system.refused import explained
 from mosa.system.screen import outlived
 from mosa.system.threads import settle_threads
@@ -91,6 +92,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
 
 
 def main(words: list[str] | None = None) -> None:
+    say_version(words)
     settle_threads()
     signal.signal(
         signal.SIGTERM, interrupt

@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 
 from mosa.errors import MosaError
+from mosa.system.console import say_version
 from mosa.system.threads import settle_threads
 
 
 def main(words: list[str] | None = None) -> None:
+    say_version(words)
     settle_threads()
     parser = argparse.ArgumentParser(prog="mosa-export-law", description=__doc__)
     parser.add_argument("source", help="checkpoint of a run, or material.json of mosa-material")

@@ -1,4 +1,4 @@
-"""The card beside a checkpoint: what was filmed, what was learned and how surely, where it is valid, how to load it."""
+"""The card beside a checkpoint: what was filmed, what was learned and how surely, where it holds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Sequence as Ordered
 
 import torch
 
-from mosa import __version__
 from mosa.evaluation.analysis.tables import (
     columns_text,
     continued_text,
@@ -101,9 +100,10 @@ def model_card(
     sequences: Ordered[Sequence],
     kept: Mapping[str, Mapping[str, Rollout]],
     world: World,
+    version: str,
 ) -> str:
     """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and
-    variant."""
+    variant; version: of mosa."""
     law, name = body.material.law, sequences[0].scene.name
     correction = "none" if body.adapter is None else type(body.adapter).__name__
     field = "is the same everywhere" if body.heterogeneity is None else "varies over the body"
@@ -127,4 +127,4 @@ def model_card(
         "How to load": LOADING,
     }
     text = "\n\n".join(f"## {title}\n{part}" for title, part in parts.items())
-    return f"# Model card: {name}\n\nA learned body, by mosa {__version__}.\n\n{text}\n"
+    return f"# Model card: {name}\n\nA learned body, by mosa {version}.\n\n{text}\n"

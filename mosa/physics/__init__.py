@@ -6,11 +6,8 @@ substep; `launching`: what all kernels are launched with; `memory_sums`: sums on
 those that it needs below it, never one above it (tests/physics/engine/test_engine_parts.py).
 """
 
-import warp as wp
+from mosa.system.warp_start import start_warp
 
-wp.config.log_level = (
-    wp.LOG_WARNING
-)  # lines on every small module compiled would drown the program's own
-wp.init()
+start_warp()
 
 from mosa.physics import constitutive  # noqa: E402, F401  the built-in laws register themselves

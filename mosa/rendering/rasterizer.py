@@ -19,8 +19,9 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.rendering import gsplat_backend
 from mosa.rendering.records import SIDE_MAX
-from mosa.rendering.splatting import PRESETS, SCALARS, Geometry, Splat, start_warp
+from mosa.rendering.splatting import PRESETS, SCALARS, Geometry, Splat
 from mosa.system.limits import counted
+from mosa.system.warp_start import start_warp
 from mosa.types import Cameras
 
 BACKENDS = ("warp", "gsplat")

@@ -53,12 +53,6 @@ def _matrix(rows: int, columns: int, scalar: type) -> type:
 
 
 @functools.cache
-def start_warp() -> None:
-    wp.config.log_level = wp.LOG_WARNING
-    wp.init()
-
-
-@functools.cache
 def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
     return wp.stream_from_torch(stream)
 

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import sys
 import warnings
+from collections.abc import Sequence
+
+
+def say_version(words: Sequence[str] | None = None) -> None:
+    """Print mosa's version and end, where the command line (None: of this process) asks for it."""
+    if "--version" in (sys.argv[1:] if words is None else words):
+        print("mosa", importlib.import_module("mosa").__version__)  # beside all layers
+        sys.exit(0)
 
 
 def begin_log() -> None:

@@ -9,6 +9,7 @@ import fcntl
 import hashlib
 import logging
 import os
+import re
 import shutil
 import signal
 import sys
@@ -27,16 +28,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
+from mosa.config.composition import configuration
 from mosa.errors import ConfigError, MosaError
-from mosa.system.console import fail
+from mosa.system.console import fail, say_version
 from mosa.system.refused import explained, let_go
 from mosa.system.screen import outlived
 from mosa.system.threads import settle_threads
+from mosa.training.sweep_table import FAILED, text_of, write_table
 
 log = logging.getLogger(__name__)
 
-FAILED = "failed"
-"""Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
 WRITTEN = (".json", ".log", ".md", ".npz", ".ply", ".png", ".mp4")
 """Endings of the files that a run writes into its folder."""
 LONGEST = 120
@@ -44,8 +45,9 @@ LONGEST = 120
 
 
 def folder_name(overrides: str) -> str:
-    """A job's overrides as one folder's name: a long one is cut and ends in its digest, which keeps names apart."""
-    name = overrides.replace("/", "_").replace("\0", "_")
+    """A job's overrides as one folder's name, of letters that overrides of Hydra take without
+    quotes. A long one is cut and ends in its digest, which keeps names apart."""
+    name = re.sub(r"[^\w.+-]", "_", overrides.replace("=", "-"))
     if len(name.encode()) <= LONGEST:
         return name
     return (
@@ -56,6 +58,18 @@ def folder_name(overrides: str) -> str:
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+
+
+def own_groups(command: str, conf: Path | None = None) -> str:
+    """The groups that conf/<command>.yaml chooses from, with their options: lines of --help."""
+    conf = Path(configuration()) if conf is None else conf
+    chosen = OmegaConf.load(conf / f"{command}.yaml").defaults
+    names = sorted(name for each in chosen if not isinstance(each, str) for name in each)
+    options = {n: sorted(f.stem for f in (conf / n).glob("*.yaml")) for n in names if n != "hydra"}
+    return "\n".join(f"{name}: {', '.join(found)}" for name, found in options.items())
+
+
+OmegaConf.register_new_resolver("own_groups", own_groups, replace=True)
 
 
 def check_arguments(arguments: Sequence[str], conf: Path) -> None:
@@ -198,6 +212,7 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
     """Run Hydra's `run` with what stands on the command line; conf: the folder of its groups.
 
     Exit code 2 too for what Hydra refuses before any job begins: a mistake of the user like all others."""
+    say_version()
     settle_threads()
     sys.argv[1:] = map(quoted, sys.argv[1:])
     with outlived():
@@ -236,9 +251,22 @@ class Failures(Callback):
             (Path(config.hydra.sweep.dir) / FAILED).glob("*.txt"), key=lambda file: int(file.stem)
         )
         Failures.count = len(files)
+        summarize(config.hydra.sweep.dir)
         if files:
             listed = "\n".join(f"  {file.stem}: {file.read_text().strip()}" for file in files)
             print(f"\n{len(files)} jobs of the sweep failed:\n{listed}", file=sys.stderr)
+
+
+def summarize(folder: str | Path) -> None:
+    """The table of a sweep's runs on the screen and in its folder; of other commands there is none."""
+    if not any(Path(folder).glob("*/metrics.json")):
+        return
+    try:
+        rows, files = write_table(folder)
+    except (MosaError, OSError) as error:
+        print(f"no table of this sweep: {error}", file=sys.stderr)
+        return
+    print(f"\n{text_of(rows)}\n\nall figures: {', '.join(map(str, files))}")
 
 
 signals: list[int] = []

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from mosa import __version__
 from mosa.data.io.gaussian_ply import save_ply
 from mosa.data.synthetic.true_geometry import geometry_figures
 from mosa.evaluation.analysis.comparison import TITLES, compare, write_comparisons
@@ -131,7 +132,7 @@ def write_outputs(
         partial.write_text(table + "\n")
     if (folder / "checkpoints").is_dir():
         with written_whole(folder / "checkpoints" / FILE) as partial:
-            partial.write_text(model_card(figures, body, evaluated, kept, world))
+            partial.write_text(model_card(figures, body, evaluated, kept, world, __version__))
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
 

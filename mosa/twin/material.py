@@ -34,9 +34,9 @@ DENSEST = (0.1, 1e5)
 class TwinMaterial:
     """The material of a twin. What is set counts from the next `simulate` or `reset` on.
 
-    Reading: `parameters`, `E`, `nu`, `density`, `damping`, `stiffness`, `field`. Setting: `set(E=2e4, damping=5)`, or an
-    attribute, `twin.material.E = 2e4`; `preset("jelly")` takes a known material.
-    """
+    Reading: `parameters`, `E`, `nu`, `density`, `damping`, `stiffness`, `field`. Setting:
+    `set(E=2e4, damping=5)`, or an attribute, `twin.material.E = 2e4`; `preset("jelly")` takes a
+    known material."""
 
     __slots__ = ("_twin",)
 
@@ -56,13 +56,14 @@ class TwinMaterial:
     @property
     @torch.no_grad()
     def parameters(self) -> dict[str, float]:
-        """Values of the law's parameters, SI units, friction_angle in degrees; of a direction its three components."""
+        """Values of the law's parameters, SI units, friction_angle in degrees; of a direction its
+        three components."""
         return {name: float(value) for name, value in self._body.material.physical().items()}
 
     @property
     def E(self) -> float:
-        """Young's modulus [Pa] at small strain, of the law without its correction; 0 of a fluid. Multiplied by `field` over the
-        body."""
+        """Young's modulus [Pa] at small strain, of the law without its correction; 0 of a fluid.
+        Multiplied by `field` over the body."""
         found = self.parameters
         if "E" in found:
             return found["E"]
@@ -102,24 +103,24 @@ class TwinMaterial:
 
     @property
     def field(self) -> Tensor:
-        """(N,) factor of the stiffness at every particle: E(X) = E * field. Ones where it does not vary."""
+        """(N,) factor of the stiffness at every particle: E(X) = E * field. Ones where it does not
+        vary."""
         with torch.no_grad():
             return self._body.factor(self._body.heterogeneity).detach().clone()
 
     @property
     def stiffness(self) -> Tensor:
-        """(6, 6) float64 [Pa] at rest, prior and correction, where `field` is 1: stress over strain in Mandel scaling, components
-        xx, yy, zz, yz, zx, xy in the axes of the rest shape. Errors: ConfigError for an adapter without a law."""
+        """(6, 6) float64 [Pa] at rest, prior and correction, where `field` is 1: stress over strain
+        in Mandel scaling, components xx, yy, zz, yz, zx, xy in the axes of the rest shape. Errors:
+        ConfigError for an adapter without a law."""
         body = self._body
         with torch.no_grad():
-            C = tangent(
-                in_double(copy.deepcopy(body.material).cpu(), configured=False),
-                None,
-                torch.eye(3).double()[None],
-            )[0]
-            rows, columns = (torch.tensor(each) for each in zip(*PAIRS))
+            alone = in_double(copy.deepcopy(body.material).cpu(), configured=False)
+            C = tangent(alone, None, torch.eye(3).double()[None])[0]
+            i, j = (torch.tensor(each) for each in zip(*PAIRS))
             scale = torch.tensor(MANDEL, dtype=torch.float64)
-            C = 0.5 * (C + C.mT)[rows[:, None], columns[:, None], rows[None], columns[None]] * scale[:, None] * scale  # fmt: skip
+            C = C[i[:, None], j[:, None], i[None], j[None]] * scale[:, None] * scale
+            C = 0.5 * (C + C.mT)
             adapter = body.adapter
             if adapter is None or not adapter.is_on:
                 return C
@@ -142,11 +143,13 @@ class TwinMaterial:
 
     # ---------------------------------------------------------------- setting
     def set(self, law: str | None = None, **values: float) -> None:
-        """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa s], and all of `parameters`.
+        """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa
+        s], and all of `parameters`.
 
-        law: of another one all parameters are needed. The learned correction stays, in proportion to E, and so does `field`.
-        What the run knew about the uncertainty of the law is dropped, and the variants `prior` and `prior_eta` become the material
-        that was set. Errors: ConfigError naming the value."""
+        law: of another one all parameters are needed. The learned correction stays, in proportion
+        to E, and so does `field`. What the run knew about the uncertainty of the law is dropped,
+        and the variants `prior` and `prior_eta` become the material that was set. Errors:
+        ConfigError naming the value."""
         density = values.pop("density", None)
         if density is not None:
             low, high = DENSEST
@@ -170,7 +173,8 @@ class TwinMaterial:
         self._take(Material(law or self.law, given, modulated=modulated), density, new=not same)
 
     def preset(self, name: str) -> None:
-        """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the learned correction.
+        """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the
+        learned correction.
 
         Errors: ConfigError naming the known ones."""
         found = preset(name)
@@ -217,7 +221,8 @@ class TwinMaterial:
 
 @torch.no_grad()
 def values_of(material: Material) -> dict[str, Any]:
-    """What `Material` takes: a number of each parameter, three of a direction; what is held is at its bound exactly."""
+    """What `Material` takes: a number of each parameter, three of a direction; what is held is at
+    its bound exactly."""
     values: dict[str, Any] = {}
     found = material.physical()
     for name in material.names:
@@ -239,13 +244,14 @@ def said(law: str, name: str, value: float) -> str:
 
 @torch.no_grad()
 def summary(twin: Twin) -> str:
-    """What a twin is, in lines of text with units, and how sure its law is where the run kept that."""
+    """What a twin is, in lines of text with units, and how sure its law is where the run kept
+    that."""
     body, world, material = twin.body, twin.world, twin.material
     volume = float(body.volume.sum())
     sure: Mapping[str, float] = {} if twin.posterior is None else determined(body, twin.posterior)
     lines = [
-        f"body      {len(body.rest)} particles, {1e3 * body.size:.4g} mm long, {1e6 * volume:.4g} cm^3, "
-        f"{1e3 * volume * body.density:.4g} g at {body.density:.4g} kg/m^3",
+        f"body      {len(body.rest)} particles, {1e3 * body.size:.4g} mm long, "
+        f"{1e6 * volume:.4g} cm^3, {1e3 * volume * body.density:.4g} g at {body.density:.4g} kg/m^3",
         f"law       {body.material.law}",
     ]
     for name, value in material.parameters.items():
@@ -255,30 +261,28 @@ def summary(twin: Twin) -> str:
         lines.append(f"          {said(body.material.law, name, value)}{spread}")
     adapter = body.adapter
     if adapter is None or not adapter.is_on:
-        lines.append("correction  none")
+        lines.append("learned   no correction of the law")
     else:
-        lines.append(f"correction  {type(adapter).__name__}")
+        lines.append(f"learned   {type(adapter).__name__}, a correction of the law")
         if (stiffness := adapter.stiffness()) is not None:
             axis, ratio = stiffest(stiffness.cpu())
             where = ", ".join(f"{v:.2f}" for v in axis.tolist())
-            lines.append(
-                f"          largest over smallest Young's modulus {float(ratio):.3g}, stiffest along ({where})"
-            )
-    field = material.field
-    if float(field.max() - field.min()) > 1e-6:
-        lines.append(
-            f"field     stiffness varies from {float(field.min()):.3g} to {float(field.max()):.3g} of it"
-        )
+            lines.append(f"          largest over smallest Young's modulus {float(ratio):.3g}")
+            lines.append(f"          stiffest along ({where})")
+    low, high = float(material.field.min()), float(material.field.max())
+    if high - low > 1e-6:
+        lines.append(f"field     {low:.3g} to {high:.3g} times this stiffness over the body")
     if twin.posterior is None:
-        lines.append(
-            "sureness  not known: the run kept no posterior, or the material was set by hand"
-        )
-    ground = "no ground" if world.ground is None else (
-        f"ground at {world.ground.height:.4g} m, {world.ground.mode}, friction {world.ground.friction:.3g}")  # fmt: skip
+        lines.append("sure      not known: no posterior was kept, or the material was set by hand")
+    ground = "none"
+    if (met := world.ground) is not None:
+        ground = f"at {met.height:.4g} m, {met.mode}, friction {met.friction:.3g}"
     up = ", ".join(f"{v:.3g}" for v in world.up.tolist())
     lines += [
-        f"world     {ground}; up ({up}); gravity {float(world.gravity.norm()):.4g} m/s^2; {len(world.colliders)} colliders, "
-        f"{len(world.driven)} driven sets",
-        f"grid      spacing {1e3 * body.settings.dx:.4g} mm; frames of {1e3 * twin.frame_dt:.4g} ms",
+        f"ground    {ground}",
+        f"world     up ({up}), gravity {float(world.gravity.norm()):.4g} m/s^2, "
+        f"{len(world.colliders)} colliders, {len(world.driven)} driven sets",
+        f"grid      spacing {1e3 * body.settings.dx:.4g} mm, frames of "
+        f"{1e3 * twin.frame_dt:.4g} ms",
     ]
     return "\n".join(lines)

@@ -24,6 +24,7 @@ from mosa.viewer.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.viewer.live import Live
 from mosa.viewer.live_viewer import LiveViewer
 from mosa.viewer.pages import add_ground, aim, beside_panel, offered, open_server, view_of
+from mosa.viewer.usage import USAGE
 
 GEOMETRY = ("splats", "particles")
 
@@ -227,22 +228,6 @@ class Viewer:
         self.ended.set()
         self.player.join(timeout=5)
         self.server.stop()
-
-
-USAGE = """usage: mosa-view <folder> [--live] [checkpoint=<file>] [host=127.0.0.1] [port=8080] [device=cpu]
-       (or python -m mosa.viewer run=<folder> ...)
-
-What a run saw, calibrated and learned, side by side in a browser; or with --live its twin, to be dropped and pushed.
-
-  <folder>    of a finished run, as outputs/train/<date>/<time>, or one that Twin.export or eval.py wrote; also as run=<folder>;
-              with --live a checkpoint will do
-  --live      the learned twin in motion: drop, pause, step, reset, and a ball that the mouse pushes it with
-  checkpoint  of the run, where the folder has none: what a motion alone does not say is read from it
-  host        127.0.0.1: to be seen from this machine alone; 0.0.0.0: from everywhere
-  port        the next free one where it is taken
-  device      cpu | cuda: where the twin is simulated (--live)
-
-Needs the package viser: pip install viser."""
 
 
 def options(arguments: Sequence[str]) -> dict[str, str | None]:

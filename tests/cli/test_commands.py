@@ -1,5 +1,6 @@
 """The package away from its repository: configuration inside, commands, version; and what the commands do around a run."""
 
+import importlib
 import logging
 import os
 import shutil
@@ -129,7 +130,28 @@ def test_there_is_one_version_and_every_command_has_its_function():
         "mosa-capture",
         "mosa-environments",
         "mosa-experiment",
+        "mosa-export-law",
+        "mosa-material",
+        "mosa-sweep",
     }
+
+
+@pytest.mark.parametrize(
+    "name", ["train", "eval", "splats", "view", "experiment", "export_law", "sweep"]
+)
+def test_every_command_says_mosas_version(monkeypatch, capsys, name):
+    monkeypatch.setattr(sys, "argv", [f"mosa-{name}", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"mosa.cli.{name}").main()
+    assert not ended.value.code and capsys.readouterr().out == f"mosa {mosa.__version__}\n"
+
+
+def test_help_of_the_viewer_and_a_start_without_a_driver_are_quick_and_quiet():
+    code = "import sys, mosa.cli.view as v; sys.argv[1:] = ['-h']; v.main(); sys.exit('torch' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0 and "usage: mosa-view" in found.stdout and not found.stderr
+    quiet = [sys.executable, "-c", "from mosa.system.warp_start import start_warp; start_warp()"]
+    assert not subprocess.run(quiet, cwd=ROOT, capture_output=True, text=True).stderr
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])

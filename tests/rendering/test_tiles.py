@@ -14,8 +14,9 @@ from mosa.physics import exact_sums
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.records import record_functions
-from mosa.rendering.splatting import PRESETS, Geometry, depth_lists, project, start_warp
+from mosa.rendering.splatting import PRESETS, Geometry, depth_lists, project
 from mosa.rendering.tile_kernels import BLOCK_HEIGHT, BLOCK_WIDTH, reach_function
+from mosa.system.warp_start import start_warp
 
 
 def agree(scene, rtol=1e-10):

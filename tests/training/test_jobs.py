@@ -205,7 +205,10 @@ def test_a_message_about_memory_names_the_checkpoint_that_is_kept(tmp_path):
 
 
 def test_a_long_name_is_cut_and_stays_its_own():
-    assert folder_name("a=1,b=2") == "a=1,b=2"
+    assert folder_name("a=1,b=[2,x]") == "a-1_b-_2_x_"
+    for name in ("prior.parameters.E=1e-3,seed=0", "scene.test=[a, b]", "x=ü{}'"):
+        given = f"ckpt_path=multirun/0_{folder_name(name)}/last.ckpt"
+        assert quoted(given) == given or "ü" in name
     assert "/" not in folder_name("splats=../../x.ply")
     names = {folder_name("x" * 500 + str(i)) for i in range(50)}
     assert len(names) == 50 and all(len(name.encode()) <= LONGEST + 9 for name in names)

@@ -10,8 +10,9 @@ import warp.geometry
 from scipy.spatial import cKDTree
 
 from mosa.data.synthetic.bodies.shapes import Shape
+from mosa.system.warp_start import start_warp
 
-wp.config.log_level = wp.LOG_WARNING
+start_warp()
 
 
 @dataclass(frozen=True)
