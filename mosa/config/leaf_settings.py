@@ -10,6 +10,7 @@ from pydantic import Field
 from mosa.config.command_settings import EvalSettings, Extensions, LawSections, TrainSettings
 from mosa.settings import (
     Count,
+    Entries,
     Expected,
     Folder,
     Four,
@@ -88,6 +89,16 @@ class SplatsSettings(LawSections):
     gravity: Weight = Field(9.81, description="m/s^2")
     height: Weight = Field(0.2, description="m, of the lowest particle above the ground")
     ground: GroundSection = Field(GroundSection(), description="the ground")
+    colliders: Entries | None = Field(
+        [],
+        description=(
+            "obstacles, such as {type: sphere, radius: 0.05, position: [0, 0.05, 0]}: as "
+            "world.colliders of train.py, in the scene's axes and metres"
+        ),
+    )
+    recentre: bool = Field(
+        False, description="the origin becomes the point of the ground below the object's middle"
+    )
     rotation: Four | None = Field(
         None, description="[ax, ay, az, degrees] about the body's centre, before it falls"
     )

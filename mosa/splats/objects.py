@@ -51,6 +51,8 @@ GAP, PART = 0.1, 0.01
 """Of the extent of nine tenths of the Gaussians, and of their number: smaller groups that lie farther away are strays."""
 USUAL = 0.002, 20.0
 """[m] of an object's longest side."""
+PLAUSIBLE = (0.01, 2.0)
+"""[m] of the longest side of an object in a file whose unit nobody stated: others are asked for."""
 NEAR = 3.0
 """Spacings from the nearest particle beyond which a Gaussian does not belong to the body."""
 HALF_CELL = 0.35
@@ -175,6 +177,8 @@ def object_twin(
     share: float = 0.9,
     open_below: bool = False,
     flight: float = 0.0,
+    colliders: Sequence[Mapping[str, Any]] = (),
+    recentre: bool = False,
 ) -> Twin:
     """A twin of the object that Gaussians show.
 
@@ -183,7 +187,8 @@ def object_twin(
     per_cell, most: as `fill_object` takes them; density [kg/m^3]:
     None for the learned one's, or 1000; flight [m]: how far it may fly; up: (3,) in the
     file's axes; height [m] of its lowest particle above the ground; ground:
-    mode and friction. Errors: ConfigError, DataError.
+    mode and friction; colliders: obstacles, as `Twin.simulate` takes them; recentre: move the object
+    so that the point of the ground below its middle is the origin. Errors: ConfigError, DataError.
     """
     direction = numbers("up", up, "a direction (x, y, z)", (3,))
     if not float(direction.norm()) > 0:
@@ -200,10 +205,17 @@ def object_twin(
         open_below=direction if open_below else None,
     )
     rest = tensors["rest"]
+    if recentre:
+        middle = 0.5 * (rest.amin(0) + rest.amax(0))
+        above = float(middle @ direction) - float((rest @ direction).min()) + height
+        origin = middle - above * direction
+        tensors["rest"] = rest = rest - origin
+        means = shown.splats.means - origin.to(shown.splats.means)
+        shown = replace(shown, splats=replace(shown.splats, means=means))
     learned = law if isinstance(law, Twin) else None
     cfg = copy.deepcopy(dict(learned.record.settings if learned is not None else law))
     cfg["heterogeneity"] = {**cfg.get("heterogeneity", {}), "enabled": False}
-    cfg.pop("world", None)
+    cfg["world"] = {"colliders": [dict(each) for each in colliders]}
     room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height + flight
     met = {
         "height": float((rest @ direction).min()) - height,
@@ -223,6 +235,17 @@ def object_twin(
     body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
     return Twin(body.eval(), world_of(record), frame_dt, record, start)
+
+
+def check_size(appearance: Appearance, path: str) -> None:
+    """That metres are plausible for a file without `size`. Errors: ConfigError that asks for it."""
+    means = appearance.splats.means
+    longest, (low, high) = float((means.amax(0) - means.amin(0)).max()), PLAUSIBLE
+    if not low <= longest <= high:
+        raise ConfigError(
+            f"size: {path} has no unit, and in metres its object would be {longest:.3g} m long; "
+            f"expected the length of its longest side [m], as size=0.2 (size={longest:.3g} keeps it)"
+        )
 
 
 @torch.no_grad()
@@ -253,8 +276,10 @@ def drop(cfg: DictConfig) -> None:
     check_splats(values)
     given = {name: values[name] for name in ("box", "opacity", "size", "up")}
     found = read_object(cfg.ply, **given)
+    if cfg.size is None:
+        check_size(found, cfg.ply)
     law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
-    names = ("density", "up", "gravity", "height", "ground", "resolution", "share", "open_below")
+    names = ("density", "up", "gravity", "height", "ground", "resolution", "share", "open_below", "recentre")
     simulation, device = values["simulation"], named_device(cfg.device)
     particles = None if simulation["particles"] == "auto" else simulation["particles"]
     grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
@@ -265,6 +290,7 @@ def drop(cfg: DictConfig) -> None:
         frame_dt=1 / cfg.rate,
         flight=math.hypot(*cfg.velocity) * cfg.frames / cfg.rate,
         **grid,
+        colliders=values["colliders"] or (),
         **{name: values[name] for name in names},
     )
     twin.body.to(device)
@@ -275,6 +301,15 @@ def drop(cfg: DictConfig) -> None:
         len(twin.body.rest),
         1e6 * volume,
         size,
+    )
+    up = ", ".join(f"{v:.3g}" for v in twin.world.up.tolist())
+    middle = ", ".join(f"{v:.4g}" for v in twin.body.center.tolist())
+    log.info(
+        "scene: up (%s), ground at %.4g m along it, the object's centre at (%s) m; %d obstacles",
+        up,
+        twin.world.ground.height,
+        middle,
+        len(twin.world.colliders),
     )
     save_twin(twin, folder / "checkpoints" / "last.ckpt")
     rollout = twin.simulate(

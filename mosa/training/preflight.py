@@ -65,6 +65,7 @@ def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
     if settings.video:
         ffmpeg("video")
     check("formats", settings.formats, Formats)
+    colliders_from_config(settings.colliders or (), "colliders")
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)
     return settings

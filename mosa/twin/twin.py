@@ -54,6 +54,7 @@ from mosa.system.whole_files import written_whole
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.material import TwinMaterial, summary
+from mosa.twin.newton_usd import export_material
 from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
@@ -374,6 +375,13 @@ class Twin:
     def material(self) -> TwinMaterial:
         """Its material, to read and to set in physical units: `twin.material.E = 2e4`, `twin.material.preset("jelly")`."""
         return TwinMaterial(self)
+
+    def export_material(self, folder: str | Path, formats: Sequence[str] = ("json", "npz")) -> Path:
+        """Write the material for other simulators into `folder`: `material.json` (E, nu, density,
+        damping, 6x6 stiffness, and what these leave out), `particles.npz` (points, volume, mass, E
+        and nu of every particle), and with newton_usd in `formats` `newton.usda`. SI units.
+        Errors: ConfigError for an unknown format, or without usd-core."""
+        return export_material(self, folder, formats)
 
     def summary(self) -> str:
         """Body, law, world and grid in lines of text with units, and how sure the law is."""

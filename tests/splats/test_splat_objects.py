@@ -18,7 +18,7 @@ from mosa.data.io.gaussian_ply import save_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.geometry.filling import body_volume
 from mosa.reconstruction.geometry.shell import blocked, solid_of
-from mosa.splats.objects import object_twin, read_object, save_twin
+from mosa.splats.objects import check_size, object_twin, read_object, recentred, save_twin
 from mosa.training.preflight import check_splats
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
@@ -134,6 +134,31 @@ def test_the_object_falls_and_can_be_read_again(tmp_path):
     )
 
 
+def test_it_falls_on_an_obstacle_that_its_checkpoint_keeps(tmp_path):
+    """Placed below its middle in a scene whose origin is there, whatever the file's origin and up."""
+    source = ball()
+    far = replace(source.splats, means=source.splats.means + torch.tensor([3.0, -2.0, 5.0]))
+    moved = recentred(replace(source, splats=far), (0, 0, -2.0), 0.15)
+    middle = 0.5 * (moved.splats.means.amin(0) + moved.splats.means.amax(0))
+    assert torch.allclose(middle, torch.tensor([0.0, 0.0, -0.25]), atol=5e-3)
+    table = {"type": "box", "size": [0.4, 0.4, 0.1], "position": [0, 0, -0.05], "mode": "sticky"}
+    twin = object_twin(moved, LAW, particles=200, height=0.15, up=(0, 0, -2.0), colliders=[table])
+    assert twin.world.ground.height == pytest.approx(0.0, abs=0.01)
+    rollout = twin.simulate(frames=8)
+    assert float(rollout.reactions[..., 2].max()) > 1.0  # N, downwards: along +z here
+    assert float((-rollout.x[:, :, 2]).min()) > 0.07
+    again = Twin.load(save_twin(twin, tmp_path / "last.ckpt"))
+    assert torch.equal(again.simulate(frames=8).x, rollout.x)
+
+
+def test_the_size_is_asked_for_where_metres_are_implausible():
+    source = ball()
+    check_size(source, "a.ply")
+    large = replace(source, splats=replace(source.splats, means=14 * source.splats.means))
+    with pytest.raises(ConfigError, match=r"size: a\.ply has no unit, .* would be 2\.8 m long"):
+        check_size(large, "a.ply")
+
+
 def test_a_learned_law_is_taken_over(tmp_path):
     """Material, contact and operator, not the stiffness field of another body's places."""
 
@@ -157,6 +182,7 @@ def test_the_command_makes_all_of_it(tmp_path):
     source = ball(count=600, scale=0.007)
     path = save_ply(tmp_path / "ball.ply", source.splats, source.harmonics)
     arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply,splat]", "prior=corotated",
+                 "recentre=true", "colliders=[{type:sphere,radius:0.05,position:[0,0.05,0]}]",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True
@@ -183,6 +209,7 @@ def test_the_command_makes_all_of_it(tmp_path):
         ),
         ("box", [[0, 0, 0]], "box: expected two corners"),
         ("up", [0, 1], "up: expected three"),
+        ("colliders", [{"type": "sphere"}], "colliders"),
     ],
 )
 def test_a_wrong_value_is_named(key, value, message):
