@@ -142,7 +142,9 @@ def test_it_falls_on_an_obstacle_that_its_checkpoint_keeps(tmp_path):
     middle = 0.5 * (moved.splats.means.amin(0) + moved.splats.means.amax(0))
     assert torch.allclose(middle, torch.tensor([0.0, 0.0, -0.25]), atol=5e-3)
     table = {"type": "box", "size": [0.4, 0.4, 0.1], "position": [0, 0, -0.05], "mode": "sticky"}
-    twin = object_twin(moved, LAW, particles=200, height=0.15, up=(0, 0, -2.0), colliders=[table])
+    twin = object_twin(
+        moved, LAW, particles=150, height=0.15, up=(0, 0, -2.0), resolution=40, colliders=[table]
+    )
     assert twin.world.ground.height == pytest.approx(0.0, abs=0.01)
     rollout = twin.simulate(frames=8)
     assert float(rollout.reactions[..., 2].max()) > 1.0  # N, downwards: along +z here
