@@ -18,7 +18,7 @@ from mosa.data.io.gaussian_ply import save_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.geometry.filling import body_volume
 from mosa.reconstruction.geometry.shell import blocked, solid_of
-from mosa.splats.objects import check_size, object_twin, read_object, recentred, save_twin
+from mosa.splats.objects import check_size, object_twin, read_object, save_twin
 from mosa.training.preflight import check_splats
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
@@ -138,14 +138,14 @@ def test_it_falls_on_an_obstacle_that_its_checkpoint_keeps(tmp_path):
     """Placed below its middle in a scene whose origin is there, whatever the file's origin and up."""
     source = ball()
     far = replace(source.splats, means=source.splats.means + torch.tensor([3.0, -2.0, 5.0]))
-    moved = recentred(replace(source, splats=far), (0, 0, -2.0), 0.15)
-    middle = 0.5 * (moved.splats.means.amin(0) + moved.splats.means.amax(0))
-    assert torch.allclose(middle, torch.tensor([0.0, 0.0, -0.25]), atol=5e-3)
     table = {"type": "box", "size": [0.4, 0.4, 0.1], "position": [0, 0, -0.05], "mode": "sticky"}
     twin = object_twin(
-        moved, LAW, particles=150, height=0.15, up=(0, 0, -2.0), resolution=40, colliders=[table]
-    )
-    assert twin.world.ground.height == pytest.approx(0.0, abs=0.01)
+        replace(source, splats=far), LAW, particles=150, height=0.15, up=(0, 0, -2.0), resolution=40,
+        colliders=[table], recentre=True,
+    )  # fmt: skip
+    assert twin.world.ground.height == pytest.approx(0.0, abs=1e-5)
+    middle = twin.body.splats.means.mean(0)
+    assert torch.allclose(middle, torch.tensor([0.0, 0.0, -0.15 - RADIUS]), atol=0.02)
     rollout = twin.simulate(frames=8)
     assert float(rollout.reactions[..., 2].max()) > 1.0  # N, downwards: along +z here
     assert float((-rollout.x[:, :, 2]).min()) > 0.07
