@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +22,6 @@ from mosa.physics.engine.law_options import AS_USUAL
 from mosa.settings import is_number
 from mosa.twin.presets import preset
 
-if TYPE_CHECKING:
-    from mosa.twin.twin import Twin
-
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Tensor entries of the six components xx, yy, zz, yz, zx, xy."""
 DENSEST = (0.1, 1e5)
@@ -40,7 +37,7 @@ class TwinMaterial:
 
     __slots__ = ("_twin",)
 
-    def __init__(self, twin: Twin) -> None:
+    def __init__(self, twin: Any) -> None:
         self._twin = twin
 
     @property
@@ -243,7 +240,7 @@ def said(law: str, name: str, value: float) -> str:
 
 
 @torch.no_grad()
-def summary(twin: Twin) -> str:
+def summary(twin: Any) -> str:
     """What a twin is, in lines of text with units, and how sure its law is where the run kept
     that."""
     body, world, material = twin.body, twin.world, twin.material

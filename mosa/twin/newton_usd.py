@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,9 +16,6 @@ from mosa.errors import ConfigError
 from mosa.system.npz import write_npz
 from mosa.system.whole_files import written_whole
 
-if TYPE_CHECKING:
-    from mosa.twin.twin import Twin
-
 FORMATS = ("json", "npz", "newton_usd")
 STEP = 0.01
 """Relative difference of E within which particles share a material: USD has a material a set of
@@ -26,7 +23,7 @@ points."""
 
 
 @torch.no_grad()
-def particles(twin: Twin) -> dict[str, np.ndarray]:
+def particles(twin: Any) -> dict[str, np.ndarray]:
     """Of every particle: points (N, 3) [m] as the training starts, velocities (N, 3) [m/s], volume
     [m^3], mass [kg], E [Pa], nu, damping [Pa s] (N,)."""
     body, start, material = twin.body, twin.training_start, twin.material
@@ -45,7 +42,7 @@ def particles(twin: Twin) -> dict[str, np.ndarray]:
     return {name: value.double().cpu().numpy() for name, value in found.items()}
 
 
-def described(twin: Twin) -> dict[str, Any]:
+def described(twin: Any) -> dict[str, Any]:
     """The material as plain data, SI units, and the parts of it that a simulator of E and nu cannot
     hold."""
     material, lost = twin.material, []
@@ -68,7 +65,7 @@ def described(twin: Twin) -> dict[str, Any]:
     }
 
 
-def export_material(twin: Twin, folder: str | Path, formats: Sequence[str] = FORMATS[:2]) -> Path:
+def export_material(twin: Any, folder: str | Path, formats: Sequence[str] = FORMATS[:2]) -> Path:
     """`Twin.export_material`."""
     if isinstance(formats, str) or (unknown := [name for name in formats if name not in FORMATS]):
         found = formats if isinstance(formats, str) else unknown[0]
@@ -85,7 +82,7 @@ def export_material(twin: Twin, folder: str | Path, formats: Sequence[str] = FOR
     return folder
 
 
-def save_newton(path: Path, twin: Twin) -> Path:
+def save_newton(path: Path, twin: Any) -> Path:
     """Points with masses, widths and velocities, bound to materials of E and nu, in a scene with
     the twin's gravity.
 
