@@ -9,7 +9,6 @@ import torch
 
 from mosa.evaluation.analysis.tables import (
     columns_text,
-    continued_text,
     determined_text,
     parameter_table,
     results_table,
@@ -115,7 +114,6 @@ def model_card(
     errors = (
         results_table(figures),
         columns_text(figures, name),
-        continued_text(figures, law),
     )
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),

@@ -279,7 +279,17 @@ def drop(cfg: DictConfig) -> None:
     if cfg.size is None:
         check_size(found, cfg.ply)
     law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
-    names = ("density", "up", "gravity", "height", "ground", "resolution", "share", "open_below", "recentre")
+    names = (
+        "density",
+        "up",
+        "gravity",
+        "height",
+        "ground",
+        "resolution",
+        "share",
+        "open_below",
+        "recentre",
+    )
     simulation, device = values["simulation"], named_device(cfg.device)
     particles = None if simulation["particles"] == "auto" else simulation["particles"]
     grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
