@@ -185,7 +185,8 @@ def mistake(
     error: ValidationError, model: type[BaseModel], values: Any, where: str = ""
 ) -> ConfigError:
     """The first mistake that pydantic found, as a message with the key, what was expected, what was found and the way out."""
-    first = error.errors(include_url=False, include_context=False)[0]
+    found = error.errors(include_url=False, include_context=False)
+    first = next((each for each in found if each["type"] == "extra_forbidden"), found[0])
     path, wanted, owner = ([where] if where else []), None, model
     for key in first["loc"]:
         step = next_in(owner if wanted is None else wanted, key)

@@ -115,7 +115,7 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
         task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
     with pytest.raises(
-        ConfigError, match="task: expected one of placement, hanging, striking, pushing"
+        ConfigError, match="task: expected placement or hanging or striking or pushing"
     ):
         task_named("juggling", torch.zeros(2, 3))
 
@@ -402,7 +402,7 @@ def test_a_trial_that_diverges_is_lost_and_the_others_go_on(monkeypatch):
 def test_a_simulator_is_named_and_what_is_missing_is_said():
     truth = simulator_named("truth", scene="tiny", spacing=0.03)
     assert truth.variant == "adapted" and len(truth.twin.body.rest) < 300
-    for name, given, message in (("real", {}, "simulator: expected one of learned, isotropic, truth"),
+    for name, given, message in (("real", {}, "simulator: expected learned or isotropic or truth"),
                                  ("learned", {"scene": "tiny"}, "checkpoint: expected a run's checkpoint for simulator=learned"),
                                  ("truth", {}, "or truth.scene=<a built-in scene>")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):

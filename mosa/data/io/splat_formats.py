@@ -26,7 +26,7 @@ from mosa.types import Appearance, Splats
 
 FORMATS = ("ply", "splat", "spz", "usd")
 Formats = Annotated[
-    Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: set(v) <= set(FORMATS))
+    Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: all(name in FORMATS for name in v))
 ]  # fmt: skip
 SPLAT = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]

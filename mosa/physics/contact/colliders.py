@@ -201,7 +201,7 @@ def reach(shape: Shape) -> float:
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
     """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
-    check("world.walls.mode", mode, Literal[MODES])
+    check("world.walls.mode", mode, Literal[tuple(MODES)])
     check("world.walls.friction", friction, Weight)
     if friction > 0 and mode not in RUBBING:
         raise ConfigError(

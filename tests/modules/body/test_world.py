@@ -226,7 +226,7 @@ def test_what_is_set_down_stays(mode, count):
     ({"velocity": [float("inf"), 0, 0]}, "velocity: expected three"), ({"velocity": [1e30, 0, 0]}, "velocity: expected three"),
     ({"angular_velocity": {}}, "angular_velocity: expected three"), ({"frames": 2.5}, "frames: expected a whole number"),
     ({"frames": 0}, "frames: expected a whole number"), ({"frames": True}, "frames: expected a whole number"),
-    ({"frames": 10**12}, "frames: expected at most"), ({"variant": "none"}, "variant: expected one of"),
+    ({"frames": 10**12}, "frames: expected a whole number of at least 1"), ({"variant": "none"}, "variant: expected one of"),
     ({"variant": ["prior"]}, "variant: expected one of"), ({"colliders": "sphere"}, "colliders: expected a list"),
     ({"velocity": [1e5, 0, 0]}, "time step"),
 ])  # fmt: skip
