@@ -287,7 +287,7 @@ def geometry_lines(figures: Mapping[str, float]) -> str:
         )
     elif get("carved_share") is not None:
         lines.append(
-            f"Geometry: the visual hull, {get('carved_share'):.1%} of it rounded away; no colours were asked."
+            f"Geometry: the visual hull, {get('carved_share'):.1%} of it left out; no refinement by colours."
         )
     true = {
         name.rsplit("/", 1)[1]: value

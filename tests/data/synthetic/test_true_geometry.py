@@ -70,6 +70,6 @@ def test_a_person_reads_how_sure_the_body_is(scene, particles):
         "3.1% of the visual hull is air. 7.2% of the surface is not told by the images"
         in geometry_lines(figures)
     )
-    assert "rounded away; no colours were asked" in geometry_lines({"geometry/carved_share": 0.02})
+    assert "left out; no refinement by colours" in geometry_lines({"geometry/carved_share": 0.02})
     assert "0.00% of the particles outside" in geometry_lines(geometry_figures(*particles, scene))
     assert geometry_lines({}) == ""

@@ -338,7 +338,7 @@ def test_geometry_comes_back_from_what_is_stored_and_the_hull_has_no_uncertainty
     assert "geometry/uncertain_share" not in geometry.figures(0.01)
     with pytest.raises(
         ConfigError,
-        match=r"reconstruction\.geometry\.source: expected images or hull, found 'depth'",
+        match=r"reconstruction\.geometry\.source: expected images or hull or gaussians, found 'depth'",
     ):
         GeometrySettings(source="depth")
 
