@@ -65,7 +65,7 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
 
 
 def _sequences(figures: Mapping[str, float]) -> list[str]:
-    names = {key.rsplit("/", 1)[0] for key in figures if key.endswith("/psnr_crop")}
+    names = {key.rsplit("/", 1)[0] for key in figures if key.endswith(("/psnr_crop", "/rms_m"))}
     plain = {
         n for n in names if n.split("/")[0] in ("train", "frames", "camera") and n.count("/") == 0
     }
