@@ -339,7 +339,8 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
 
 
 FIT_SHARE = 0.4
-"""Of a job of 4000 particles and 100 steps of Adam on a GPU: 19 s of 47 s (four networks, rabbit, H200)."""
+"""Assumed share of the fit in a job of 4000 particles and 100 steps of Adam on a GPU. Its fit takes 19 s and its evaluation 19 s
+(`table_time`, H200); the rest was not measured."""
 
 
 def effort(overrides: Sequence[str]) -> float:
