@@ -456,9 +456,9 @@ def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
     assert (
         setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100
     )
-    for change, message in (({"task": "juggling"}, "task: expected one of placement"), ({"trials": 0}, "trials: expected a whole"),
-                            ({"policy": "magic"}, "policy: expected one of gradient, cma, model, sac, ppo"),
-                            ({"options": {"nearr": 1.0}}, "options.nearr: expected one of steps"),
+    for change, message in (({"task": "juggling"}, "task: expected placement or"), ({"trials": 0}, "trials: expected a whole"),
+                            ({"policy": "magic"}, "policy: expected gradient or cma or model"),
+                            ({"options": {"nearr": 1.0}}, "options.nearr: unknown key; expected one of steps"),
                             ({"search": {**values["search"], "rat": 1}}, "search.rat: unknown key")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
             command.setting_of({**values, **change})

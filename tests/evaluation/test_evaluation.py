@@ -19,7 +19,9 @@ def test_the_floor_has_the_frames_and_samples_of_the_models(monkeypatch):
     positions = torch.stack([rest + torch.tensor([0.0, 0.1 * t, 0.0]) for t in range(5)])
     truth = Truth(rest, positions, torch.eye(3), torch.zeros(3))
     # as with scene.holdout_frames=1: the models' figures of the training sequence leave the last frame out
-    scene = SimpleNamespace(truth=truth, particles=None, frames=5, training_frames=[0, 1, 2, 3])
+    scene = SimpleNamespace(
+        truth=truth, markers=None, particles=None, frames=5, training_frames=[0, 1, 2, 3]
+    )
     body = SimpleNamespace(rest=learner)
     x = torch.stack([learner + torch.tensor([0.0, 0.1 * t, 0.01 * t**3]) for t in range(5)])
     monkeypatch.setattr(floor, "floor_rollout", lambda *_: x)

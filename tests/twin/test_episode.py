@@ -470,7 +470,8 @@ def test_errors_of_starts_and_states():
     with pytest.raises(ConfigError, match=r"starts\[1\]: height: expected metres"):
         made.worlds(2).reset([{}, {"height": -1}])
     with pytest.raises(
-        ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor .*found \(3, 5\)"
+        ConfigError,
+        match=r"laws: expected one for each of 2 worlds, a tensor .*found shape \(3, 5\)",
     ):
         made.worlds(2, torch.zeros(3, 5))
     for laws in (torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool()):
@@ -522,7 +523,7 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     """Every block of docs/twin.md, one after another, with a small body in place of the checkpoint's."""
     page = (Path(__file__).parents[2] / "docs" / "twin.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     monkeypatch.setattr(Twin, "load", lambda path: twin(32))
     monkeypatch.chdir(tmp_path)
     names = {}

@@ -212,9 +212,9 @@ def test_errors(vertices, faces, options, match):
 def test_unreadable_files(tmp_path):
     with pytest.raises(ConfigError, match=r"no file .*absent\.obj"):
         field_of_mesh(tmp_path / "absent.obj")
-    (tmp_path / "a.stl").write_text("")
-    with pytest.raises(ConfigError, match=r"a\.stl: expected a file"):
-        field_of_mesh(tmp_path / "a.stl")
+    (tmp_path / "a.3ds").write_text("")
+    with pytest.raises(ConfigError, match=r"a\.3ds: expected a file"):
+        field_of_mesh(tmp_path / "a.3ds")
     (tmp_path / "a.ply").write_text("no ply")
     with pytest.raises(ConfigError, match=r"a\.ply: expected a PLY file"):
         field_of_mesh(tmp_path / "a.ply")

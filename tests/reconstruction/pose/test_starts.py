@@ -27,7 +27,8 @@ def drop(monkeypatch, seen_wrongly, frames=9, last_free_frame=None, height=HEIGH
     corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1])] * 3)
     rest = corners + torch.tensor([0.0, height, 0.0])
     body = SimpleNamespace(rest=rest, center=rest.mean(0), volume=torch.full((8,), 1e-12))
-    scene = SimpleNamespace(name="cube", sequence="train", frames=frames, times=t, gravity=torch.tensor([0, GRAVITY, 0]),
+    scene = SimpleNamespace(name="cube", sequence="train", markers=None, frames=frames, times=t,
+                            gravity=torch.tensor([0, GRAVITY, 0]),
                             up=torch.tensor([0.0, 1, 0]), ground=Ground(0.0), last_free_frame=last_free_frame, start="falling",
                             training_cameras=[0], images=torch.zeros(1, frames, 1, 1, 3), mattes=torch.zeros(1, frames, 1, 1),
                             cameras=SimpleNamespace(select=lambda _: None), background=torch.ones(3))  # fmt: skip
