@@ -481,21 +481,32 @@ class Identification:
     @torch.no_grad()
     def held_back(self) -> dict[str, float]:
         """Error of held-back frames [m] of the law and of each law with fewer of its parts, see
-        `search.parts`. Empty before the first iteration."""
+        `search.parts`. Measured forces are never held back. Empty before the first iteration, and
+        where forces alone are compared."""
         newton, seat = self.newton, self.newton.seats[0]
-        if newton.columns is None or self.noise is None:
+        if newton.columns is None or self.noise is None or not any(self.kinds):
             return {}
         table = torch.cat([newton.columns, seat.residuals()[:, None].to(newton.columns)], 1)
         squares: list[Tensor] = []
         positions: list[tuple[Tensor, float]] = []
         stretches: list[list[int]] = [[] for _ in range(FOLDS * len(self.takes))]
-        rows, first = table.split(3 * len(self.chosen)), 0
         kind = 0 if self.kinds[0] else self.kinds.index(True)
+        width, first = 3 * len(self.chosen), 0
+        fields = 3 * width * sum(len(scales[0]) for scales in self.noise)
+        felt = (len(table) - fields) // sum(i == 0 for i, _ in self.pairs)
+        forces: list[Tensor] = []
         for (i, _), scales in zip(self.pairs, self.noise):
             frames = len(scales[0])
+            own = table[first : first + 3 * frames * width].double().view(3, frames, width, -1)
+            first += 3 * frames * width
+            if (
+                felt and i == 0
+            ):  # the rows of its forces follow those of its fields, as in `whitened`
+                rows = table[first : first + felt].double()
+                forces.append((rows.mT @ rows).cpu())
+                first += felt
             for frame in range(frames):
-                own = [rows[first + k * frames + frame].double() for k in range(3)]
-                grams = [(part.mT @ part).cpu() for part in own]
+                grams = [(part[frame].mT @ part[frame]).cpu() for part in own]
                 after = frame - (self.takes[i].first_contact - 1)
                 if after >= 0:
                     late = frames - self.takes[i].first_contact + 1
@@ -503,11 +514,11 @@ class Identification:
                 count = self._share() * self.kinds[kind]
                 positions.append((grams[kind], float(scales[kind][frame]) / count**0.5))
                 squares.append(grams[0] + grams[1] + grams[2])
-            first += 3 * frames
-        compared = {k: (len(squares) + k, scale) for k, (_, scale) in enumerate(positions)}
+        told = squares + forces
+        compared = {k: (len(told) + k, scale) for k, (_, scale) in enumerate(positions)}
         owners = [block.name for block in newton.blocks for _ in range(block.size)]
         return held_back(
-            squares + [gram for gram, _ in positions], owners, seat.read(), newton.mean(), newton.precision(),
+            told + [gram for gram, _ in positions], owners, seat.read(), newton.mean(), newton.precision(),
             [stretch for stretch in stretches if stretch], compared,
         )  # fmt: skip
 

@@ -97,6 +97,32 @@ def test_the_stiffness_of_a_block_from_a_press_alone(tmp_path):
     assert abs(values["E"] / E - 1) < 3 * spread < 0.1
 
 
+@pytest.mark.parametrize("kinds, told", [((True, False, False), True), ((False,) * 3, False)])
+def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told):
+    """A force that says nothing changes no error, though its rows stand between those of two gains."""
+    times = torch.linspace(0, 1, 5, dtype=torch.float64)
+    numbers = 0.1 * torch.randn(19, generator=torch.Generator().manual_seed(0)).double()
+    begins = pressed()[1]
+    take = take_of(small_body(numbers=numbers), begins, FRAMES, PRESS)
+    found = {}
+    for name, curves in {
+        "with": (ForceCurve("high", times, torch.zeros(5, 3).double(), 1e9),), "without": (),
+    }.items():  # fmt: skip
+        if not (told or curves):
+            continue
+        joint = Identification(
+            small_body(E=1.2 * E), [take], replace(PRESS, forces=curves),
+            Stage(name="joint", iterations=1, lr=0.1), Criterion(name="both"),
+            IdentificationSettings(grid_error=0.0, threads=1), kinds,
+        )  # fmt: skip
+        joint.iterate()
+        found[name] = joint.held_back()
+    if told:
+        assert found["with"] == pytest.approx(found["without"], rel=1e-6)
+    else:
+        assert found["with"] == {}
+
+
 def test_a_force_of_nothing_is_refused(tmp_path):
     curve = ForceCurve("wall", torch.tensor([0.0, 1.0]).double(), torch.ones(2, 3).double())
     _, _, rollout = pressed()

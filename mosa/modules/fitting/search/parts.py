@@ -46,8 +46,8 @@ def held_back(
     """Error [m] of each law's predictions of held-back positions, by `named`: geometric mean over
     frames of the root mean square distance.
 
-    squares: (D + 1, D + 1) matrix [J r]^T [J r] of each frame's whitened residuals, then of each
-    frame's positions alone; compared: of each frame, the index of the latter in `squares` and the
+    squares: (D + 1, D + 1) matrix [J r]^T [J r] of each frame's whitened residuals, of what belongs
+    to no frame, then of each frame's positions alone; compared: of each frame, the index of the latter in `squares` and the
     length [m] of its unit; owners: block of each of the D numbers; numbers, mean, precision: (D,)
     where they stand, and their prior; stretches: frames that are left out together."""
     whole = torch.stack(list(squares[: len(squares) - len(compared)])).sum(0)
