@@ -17,11 +17,10 @@ from mosa.config.record import BodyRecord
 from mosa.data.io.forces import columns_of, forces_from_config
 from mosa.errors import ConfigError
 from mosa.modules.adapters.registry import adapter_class
-from mosa.modules.body.body import Body, SimulationSettings, Start, World
+from mosa.modules.body.body import Body, Start, World
 from mosa.modules.body.heterogeneity import HeterogeneityField
 from mosa.modules.body.material import Material
 from mosa.modules.body.settings import HeterogeneitySettings, PriorSection, names
-from mosa.modules.body.simulation_settings import SimulationSection
 from mosa.modules.body.stiffness_modes import StiffnessModes
 from mosa.modules.fitting.parameters import few_numbers
 from mosa.modules.fitting.stages import STAGES, FitSection, Stage, recalibrations
@@ -32,6 +31,7 @@ from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
+from mosa.physics.world import solids_of
 from mosa.settings import call
 from mosa.types import AUTO, Ground, Scene
 
@@ -152,13 +152,6 @@ def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None
     return None
 
 
-def build_simulation(
-    config: Mapping[str, Any] | SimulationSection, dx: float
-) -> SimulationSettings:
-    """Settings of the rollouts on a grid of spacing dx [m]. Errors: ConfigError naming the key."""
-    return SimulationSection.read(config).on_grid(dx)
-
-
 def build_prior(
     config: Mapping[str, Any] | PriorSection, law: str | None = None
 ) -> tuple[Material, LawOptions]:
@@ -223,10 +216,7 @@ def check_forces(world: Mapping[str, Any]) -> None:
     key, DataError the file."""
     solids = colliders_from_config(world.get("colliders") or ())
     sets = driven_from_config(world.get("driven") or ())
-    none = torch.zeros(3)
-    columns_of(
-        forces_from_config(world.get("forces")), World(None, none, none, none, (), solids, sets)
-    )
+    columns_of(forces_from_config(world.get("forces")), solids_of(solids, sets))
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:

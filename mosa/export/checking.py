@@ -20,7 +20,6 @@ from mosa.evaluation.analysis.law_stress import kirchhoff, tangent
 from mosa.export.source import Source
 from mosa.physics.launching import launch
 
-PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 ABAQUS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 

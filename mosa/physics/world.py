@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -17,6 +17,11 @@ from mosa.types import Ground, in_brief
 
 FASTER = 1.5
 """Times the speed that its energy allows a body, which single particles reach (measured on blocks of 1 to 30 kPa: 0.7 to 1.47)."""
+
+
+def solids_of(colliders: Sequence[Collider], driven: Sequence[Driven]) -> tuple[Collider, ...]:
+    """What takes a reaction, see `World.solids`."""
+    return (*colliders, *(each.solid for each in driven if each.held))
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ class World:
     def solids(self) -> tuple[Collider, ...]:
         """All that has a motion and takes a reaction, in the order of a rollout's reactions: the
         colliders, then what holds driven particles."""
-        return (*self.colliders, *(each.solid for each in self.driven if each.held))
+        return solids_of(self.colliders, self.driven)
 
     def fastest(self, start: Start, size: float, time: float) -> float:
         """Bound of the speeds [m/s] of a body of this size [m] within `time` [s] from `start`: as far as it can fall, and what

@@ -10,20 +10,19 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.evaluation.analysis.law_stress import in_double, tangent
+from mosa.evaluation.analysis.anisotropy import mandel_matrix, mandel_scale
+from mosa.evaluation.analysis.law_stress import in_double, tangent, values_of
 from mosa.evaluation.analysis.stiffness import stiffest
 from mosa.evaluation.uncertainty import determined
-from mosa.modules.adapters.microplane import MANDEL
+from mosa.modules.adapters.microplane import PAIRS
 from mosa.modules.body.body import Body
-from mosa.modules.body.material import FORMS, RELATIVE, Form, Material, unit_of
+from mosa.modules.body.material import RELATIVE, Material, unit_of
 from mosa.physics.constitutive.damping import DAMPED, DAMPING
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import AS_USUAL
 from mosa.settings import is_number
 from mosa.twin.presets import preset
 
-PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-"""Tensor entries of the six components xx, yy, zz, yz, zx, xy."""
 DENSEST = (0.1, 1e5)
 """[kg/m^3] that a record allows."""
 
@@ -115,7 +114,7 @@ class TwinMaterial:
             alone = in_double(copy.deepcopy(body.material).cpu(), configured=False)
             C = tangent(alone, None, torch.eye(3).double()[None])[0]
             i, j = (torch.tensor(each) for each in zip(*PAIRS))
-            scale = torch.tensor(MANDEL, dtype=torch.float64)
+            scale = mandel_scale(C)
             C = C[i[:, None], j[:, None], i[None], j[None]] * scale[:, None] * scale
             C = 0.5 * (C + C.mT)
             adapter = body.adapter
@@ -136,7 +135,7 @@ class TwinMaterial:
             return E_ref * (prior + known.increment(strain[None], prior[None])[0])
 
         J = torch.autograd.functional.jacobian(stress, torch.zeros(6, dtype=torch.float64))
-        return (J * scale[:, None] / scale).detach()
+        return mandel_matrix(J).detach()
 
     # ---------------------------------------------------------------- setting
     def set(self, law: str | None = None, **values: float) -> None:
@@ -214,23 +213,6 @@ class TwinMaterial:
     def __repr__(self) -> str:
         values = ", ".join(said(self._body.material.law, k, v) for k, v in self.parameters.items())
         return f"TwinMaterial({self.law}: {values}; {self.density:.4g} kg/m^3)"
-
-
-@torch.no_grad()
-def values_of(material: Material) -> dict[str, Any]:
-    """What `Material` takes: a number of each parameter, three of a direction; what is held is at
-    its bound exactly."""
-    values: dict[str, Any] = {}
-    found = material.physical()
-    for name in material.names:
-        form = FORMS[name]
-        if name in material.directions or not isinstance(form, Form):
-            values[name] = material.direction(name).tolist()
-            continue
-        values[name] = float(found[name])
-        if name in material.held:
-            values[name] = min(form.held, key=lambda bound: abs(bound - values[name]))
-    return values
 
 
 def said(law: str, name: str, value: float) -> str:

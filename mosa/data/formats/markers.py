@@ -79,15 +79,14 @@ def load_markers(
         )
     before = (times <= begin) & (times >= begin - AT_REST)
     known = {name: None for name in names} if points is None else dict(points)
-    still = np.array([median(each) for each in
-                      np.moveaxis(recording.of(list(known), "scene.points")[before], 1, 0)])  # fmt: skip
+    still = medians(recording.of(list(known), "scene.points")[before])
     R, t = np.eye(3), np.zeros(3)
     if points is not None:
         R, t, off = alignment(still, points, "scene.points")
         log.info("%s: aligned by %d points, %.2g mm off (rms)", Path(path).name, len(points), 1e3 * off)  # fmt: skip
     chosen = [recording.names.index(each) for each in names]
     moving = recording.at(begin + np.arange(frames) / rate)[:, chosen] @ R.T + t
-    rest = np.array([median(each) for each in np.moveaxis(seen[before], 1, 0)]) @ R.T + t
+    rest = medians(seen[before]) @ R.T + t
     if unseen := [each for each, place in zip(names, rest) if not np.isfinite(place).all()]:
         raise DataError(
             f"{path}: expected every tracked point at rest before the release at {begin:.3f} s, "
@@ -131,10 +130,14 @@ def load_markers(
     )
 
 
-def median(places: np.ndarray) -> np.ndarray:
-    """(3,) of places (n, 3) that were seen, NaN where none was."""
-    there = places[np.isfinite(places).all(1)]
-    return np.median(there, 0) if len(there) else np.full(3, np.nan)
+def medians(places: np.ndarray) -> np.ndarray:
+    """(M, 3) of the places (n, M, 3) at which points were seen, NaN of one that never was."""
+    found = np.full(places.shape[1:], np.nan)
+    for m in range(places.shape[1]):
+        there = places[np.isfinite(places[:, m]).all(1), m]
+        if len(there):
+            found[m] = np.median(there, 0)
+    return found
 
 
 def solid_of(body: Mapping[str, Any], folder: Path):

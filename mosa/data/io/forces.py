@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.keys import fits
 from mosa.physics.world import World
 from mosa.settings import Positive, Text
@@ -116,10 +117,10 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     return ForceCurve(of, times, forces, sd)
 
 
-def columns_of(curves: Sequence[ForceCurve], world: World) -> list[int]:
-    """The reactions' columns that the curves are of. Errors: ConfigError naming a curve of nothing
-    that is there."""
-    names = [solid.name or str(i) for i, solid in enumerate(world.solids)]
+def columns_of(curves: Sequence[ForceCurve], solids: Sequence[Collider]) -> list[int]:
+    """The reactions' columns that the curves are of. solids: `World.solids`. Errors: ConfigError
+    naming a curve of nothing that is there."""
+    names = [solid.name or str(i) for i, solid in enumerate(solids)]
     for curve in curves:
         if names.count(curve.of) != 1:
             raise ConfigError(
@@ -139,7 +140,7 @@ def force_residuals(
         raise ConfigError(
             "world.forces: expected a law on a grid, found an adapter without reactions"
         )
-    for curve, column in zip(curves, columns_of(curves, world)):
+    for curve, column in zip(curves, columns_of(curves, world.solids)):
         mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
         felt = rollout.reactions.mean(1)[:, column, :3].double()
         parts.append(((felt - mean) / sd)[torch.isfinite(mean)])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError, DataError
 
@@ -179,10 +180,10 @@ def alignment(
     if there.sum() < 3:
         raise ConfigError(f"{where}: expected three points that are seen at rest, found fewer")
     a, b = seen[there], target[there]
-    U, S, Vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+    p, q = a - a.mean(0), b - b.mean(0)
+    S = np.linalg.svd(p.T @ q, compute_uv=False)
     if S[1] < 1e-6 * S[0]:
         raise ConfigError(f"{where}: expected points that are not on one line")
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = (U @ turn @ Vt).T
+    R = Rotation.align_vectors(q, p)[0].as_matrix()
     t = b.mean(0) - R @ a.mean(0)
     return R, t, float(np.sqrt(((a @ R.T + t - b) ** 2).sum(1).mean()))

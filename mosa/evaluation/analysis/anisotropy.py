@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapters.microplane import MANDEL
+from mosa.modules.adapters.microplane import MANDEL, PAIRS
 from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.physics.adapters.interface import MaterialState
 
@@ -42,8 +42,7 @@ def mandel_matrix(operator: Tensor) -> Tensor:
 def dyads(directions: Tensor) -> Tensor:
     """(K, 6) n n^T in Mandel scaling of unit vectors (K, 3)."""
     n = directions
-    pairs = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
-    return mandel(torch.stack([n[:, i] * n[:, j] for i, j in pairs], -1))
+    return mandel(torch.stack([n[:, i] * n[:, j] for i, j in PAIRS], -1))
 
 
 def directions_in_plane(

@@ -36,23 +36,38 @@ def in_double(material: Material, configured: bool = True) -> Material:
     configured, without the rounding to float32."""
     material.double()
     for name in material.held:
-        buffer, form = getattr(material, f"held_{name}"), FORMS[name]
-        assert isinstance(form, Form)
-        buffer.fill_(min(form.held, key=lambda bound: abs(bound - float(buffer))))
+        buffer = getattr(material, f"held_{name}")
+        buffer.fill_(bound_at(name, float(buffer)))
     for name, value in material.begins.items() if configured else ():
         material.raw[name].fill_(value)
     return material
 
 
+def bound_at(name: str, value: float) -> float:
+    """The bound that a parameter is held at which has this value, rounded."""
+    form = FORMS[name]
+    assert isinstance(form, Form)
+    return min(form.held, key=lambda bound: abs(bound - value))
+
+
+@torch.no_grad()
+def values_of(material: Material) -> dict[str, Any]:
+    """What `Material` takes: a number of each parameter, three of a direction; what is held is at
+    its bound exactly."""
+    values: dict[str, Any] = {}
+    found = material.physical()
+    for name in material.names:
+        if name in material.directions:
+            values[name] = material.direction(name).tolist()
+        else:
+            value = float(found[name])
+            values[name] = bound_at(name, value) if name in material.held else value
+    return values
+
+
 def described(material: Material, adapter: HyperelasticAdapter | None) -> dict[str, Any]:
     """A law as plain data, SI units: what material.json holds, and `mosa.export.source` reads."""
-    parameters: dict[str, Any] = {}
-    for name in material.names:
-        whole = name in material.directions
-        parameters[name] = (
-            material.direction(name).tolist() if whole else material.physical()[name].item()
-        )
-    stiffness = None
+    parameters, stiffness = values_of(material), None
     if adapter is not None:
         stiffness = {"strain": adapter.strain, "numbers": adapter.numbers.tolist()}
     return {"format": FORMAT, "law": material.law, "parameters": parameters, "stiffness": stiffness}

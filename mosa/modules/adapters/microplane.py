@@ -118,6 +118,8 @@ def stepwise_planes(stress: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     return normals, shears
 
 
+PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
+"""Entries of a tensor that are its six components xx, yy, zz, yz, zx, xy."""
 MANDEL = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)
 """Scaling of vech components that turns the double contraction of symmetric tensors into a dot product of 6-vectors."""
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from mosa.modules.adapters.microplane import MANDEL, isotropic_stiffness
+from mosa.modules.adapters.microplane import MANDEL, PAIRS, isotropic_stiffness
 
 ADAPTER_MARGIN = 1.85
 """Adapted modulus over the prior's that every body with an adapter is given, whatever its operator is: a step that jumped with
@@ -56,5 +56,4 @@ def strains(n: Tensor) -> Tensor:
     """(N, 3, 6) sym(n e_j) of directions n (N, 3), j = 1 to 3, as vectors in Mandel scaling."""
     outer = n[:, None, :, None] * torch.eye(3).double()[:, None, :]
     E = 0.5 * (outer + outer.mT)
-    pairs = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
-    return torch.stack([m * E[..., i, j] for m, (i, j) in zip(MANDEL, pairs)], -1)
+    return torch.stack([m * E[..., i, j] for m, (i, j) in zip(MANDEL, PAIRS)], -1)

@@ -95,7 +95,7 @@ class Identification:
                 "losses: identification compares motion cues, and the weights of position, rotation and stretch are "
                 "all 0; use fit=adam, which learns from images too"
             )
-        columns_of(world.forces, world)
+        columns_of(world.forces, world.solids)
         compared = self.takes[0].cues.positions.shape[1] if marked else len(body.rest)
         self.chosen = residuals.sampled(compared, body.rest.device)
         blocks = blocks_of(
