@@ -19,6 +19,8 @@ from mosa.physics.world import World
 from mosa.types import Rollout
 
 FILE = "model_card.md"
+SAME = 1e-6
+"""Relative difference of stiffnesses below which a law has no direction, and a body no field."""
 SHARE = 0.001
 """Of particles and frames at each end that the range of stretches leaves out."""
 
@@ -104,8 +106,12 @@ def model_card(
     """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and
     variant; version: of mosa."""
     law, name = body.material.law, sequences[0].scene.name
-    correction = "none" if body.adapter is None else type(body.adapter).__name__
-    field = "is the same everywhere" if body.heterogeneity is None else "varies over the body"
+    # a fit may leave out parts that the body has: their numbers are then 0
+    unlearned = body.adapter is None or figures.get("id/stiffness_ratio", 2.0) < 1 + SAME
+    correction = "none" if unlearned else type(body.adapter).__name__
+    with torch.no_grad():
+        spread = float(torch.std(body.factor(body.heterogeneity), correction=0))
+    field = "is the same everywhere" if spread < SAME else "varies over the body"
     learned = (
         f"Law `{law}`, correction {correction}; the stiffness {field}. The body is "
         f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."

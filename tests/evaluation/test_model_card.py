@@ -37,6 +37,17 @@ def test_the_card_says_what_was_filmed_what_is_known_and_where_it_holds():
     assert "keeps no posterior" in unsure and "stretches" not in unsure
 
 
+def test_parts_that_a_fit_left_out_are_not_said_to_be_learned():
+    """The body has an adapter and a field, of which all numbers are 0."""
+    body, evaluated = small_body(modes=True), [sequence("train", "a")]
+    said = model_card({"id/stiffness_ratio": 1.0}, body, evaluated, {}, STICKY, "1")
+    assert "correction none; the stiffness is the same everywhere" in said
+    with torch.no_grad():
+        body.heterogeneity.coefficients[0] = 0.3
+    said = model_card({"id/stiffness_ratio": 1.4}, body, evaluated, {}, STICKY, "1")
+    assert "correction HyperelasticAdapter; the stiffness varies over the body" in said
+
+
 def test_an_affine_motion_has_the_stretches_of_its_gradient():
     F = torch.diag(torch.tensor([1.2, 1.0, 0.7])).expand(2, 500, 3, 3)
     assert stretches([SimpleNamespace(F_tot=F)]) == pytest.approx((0.7, 1.2))
