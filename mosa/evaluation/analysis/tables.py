@@ -162,11 +162,14 @@ def form_text(errors: Mapping[str, float]) -> str:
              "operator+stiffness": "anisotropic, of a stiffness that varies over the body"}  # fmt: skip
     listed = "; ".join(f"{words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
     taken = chosen(errors)
-    said = f"The learned law is {words[taken]}. Error of frames that were held back from the fit: {listed}."
+    said = (
+        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, with what the "
+        f"grid gets wrong: {listed}."
+    )
     if taken == named(()) and len(errors) > 1:
         said += (
             f" A richer law is only learned where this error is below {WORTH:g} of the isotropic one, as errors of "
-            "grid and contact alone look like a little of it."
+            "contact and cues look like a little of it."
         )
     return said
 

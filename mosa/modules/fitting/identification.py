@@ -488,15 +488,16 @@ class Identification:
             return {}
         table = torch.cat([newton.columns, seat.residuals()[:, None].to(newton.columns)], 1)
         squares: list[Tensor] = []
-        positions: list[tuple[Tensor, float]] = []
+        positions: list[tuple[Tensor, float, float]] = []
         stretches: list[list[int]] = [[] for _ in range(FOLDS * len(self.takes))]
         kind = 0 if self.kinds[0] else self.kinds.index(True)
         width, first = 3 * len(self.chosen), 0
         fields = 3 * width * sum(len(scales[0]) for scales in self.noise)
         felt = (len(table) - fields) // sum(i == 0 for i, _ in self.pairs)
         forces: list[Tensor] = []
-        for (i, _), scales in zip(self.pairs, self.noise):
+        for k, ((i, _), scales) in enumerate(zip(self.pairs, self.noise)):
             frames = len(scales[0])
+            wrong = self._between_grids(k, kind, frames)
             own = table[first : first + 3 * frames * width].double().view(3, frames, width, -1)
             first += 3 * frames * width
             if (
@@ -512,15 +513,24 @@ class Identification:
                     late = frames - self.takes[i].first_contact + 1
                     stretches[FOLDS * i + FOLDS * after // late].append(len(squares))
                 count = self._share() * self.kinds[kind]
-                positions.append((grams[kind], float(scales[kind][frame]) / count**0.5))
+                unit = float(scales[kind][frame]) / count**0.5
+                positions.append((grams[kind], unit, float(wrong[frame])))
                 squares.append(grams[0] + grams[1] + grams[2])
         told = squares + forces
-        compared = {k: (len(told) + k, scale) for k, (_, scale) in enumerate(positions)}
+        compared = {k: (len(told) + k, *lengths) for k, (_, *lengths) in enumerate(positions)}
         owners = [block.name for block in newton.blocks for _ in range(block.size)]
         return held_back(
-            told + [gram for gram, _ in positions], owners, seat.read(), newton.mean(), newton.precision(),
+            told + [gram for gram, *_ in positions], owners, seat.read(), newton.mean(), newton.precision(),
             [stretch for stretch in stretches if stretch], compared,
         )  # fmt: skip
+
+    def _between_grids(self, pair: int, kind: int, frames: int) -> Tensor:
+        """(frames,) root mean square distance over particles between the predictions on two grids,
+        `grid_error` times; 0 without a second grid."""
+        if self.grid is None:
+            return torch.zeros(frames)
+        field = list(self.grid[pair])[kind]
+        return self.settings.grid_error * field.square().sum(-1).mean(-1).sqrt()
 
     def cost(self) -> float:
         """Minus the logarithm of the posterior at the numbers in use, but for a constant, under the noise in use."""

@@ -19,8 +19,9 @@ OWNERS = ["E", "operator", "operator", "stiffness"]
 FRAMES, ROWS = 8, 40
 
 
-def errors_of(truth: torch.Tensor, noise: float = 0.01) -> dict[str, float]:
-    """Of linear data of numbers `truth` (4,), where the fit stands at 0; the rows are positions in units of 2 mm."""
+def errors_of(truth: torch.Tensor, noise: float = 0.01, grids: float = 0.0) -> dict[str, float]:
+    """Of linear data of numbers `truth` (4,), where the fit stands at 0; the rows are positions in
+    units of 2 mm. grids: distance [m] between the predictions on two grids."""
     generator = torch.Generator().manual_seed(0)
     J = torch.randn(FRAMES, ROWS, 4, generator=generator, dtype=torch.float64)
     r = -J @ truth + noise * torch.randn(FRAMES, ROWS, generator=generator, dtype=torch.float64)
@@ -28,7 +29,7 @@ def errors_of(truth: torch.Tensor, noise: float = 0.01) -> dict[str, float]:
     squares = list(table.mT @ table)
     zero, one = torch.zeros(4, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
     stretches = [[0, 1], [2, 3], [4, 5], [6, 7]]
-    compared = {k: (FRAMES + k, 2e-3) for k in range(FRAMES)}
+    compared = {k: (FRAMES + k, 2e-3, grids) for k in range(FRAMES)}
     return held_back(squares + squares, OWNERS, zero, zero, one, stretches, compared)
 
 
@@ -49,6 +50,14 @@ def test_a_part_that_gains_little_is_left_out():
     assert chosen(errors | {"operator+stiffness": 0.99 * WORTH * 1e-3}) == "operator+stiffness"
 
 
+def test_a_gain_within_the_error_of_the_grid_is_none():
+    truth = torch.tensor([1.0, 1, 1, 0]).double()
+    sharp, blurred = errors_of(truth), errors_of(truth, grids=0.1)
+    assert chosen(sharp).startswith("operator") and chosen(blurred) == "isotropic"
+    for name, error in sharp.items():
+        assert blurred[name] == pytest.approx(math.hypot(error, 0.1), rel=1e-2)
+
+
 def test_a_held_back_frame_is_not_learned_from():
     """One frame says something else than the others: it is predicted as wrongly as it differs, and they are not."""
     J = torch.ones(3, 1, 1, dtype=torch.float64)
@@ -57,7 +66,7 @@ def test_a_held_back_frame_is_not_learned_from():
     squares = list(table.mT @ table)
     zero, loose = torch.zeros(1, dtype=torch.float64), torch.full((1,), 1e-9).double()
     found = held_back(
-        squares * 2, ["E"], zero, zero, loose, [[2]], {k: (3 + k, 1.0) for k in range(3)}
+        squares * 2, ["E"], zero, zero, loose, [[2]], {k: (3 + k, 1.0, 0.0) for k in range(3)}
     )
     assert found == {"isotropic": pytest.approx(2.0)}
 
