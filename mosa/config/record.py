@@ -243,8 +243,10 @@ class RetreatRecord(Settings):
 class FitRecord(Settings):
     """How far a fit is: what it goes on from.
 
-    compared, grounds: mean distances [m] of the candidates for law and contact; ground_gains: of other contacts about the learned
-    law; parts: of laws with some of their parts; cues, responses: of the motion that was found once more."""
+    compared, grounds: mean distances [m] of the candidates for law and contact; ground_gains,
+    law_gains: of other contacts and backbones about what was learned, of the logarithm of the
+    likelihood; parts: errors [m] of held-back frames by `search.parts`; cues, responses: of the
+    motion that was found once more."""
 
     stage: Whole
     steps_done: Whole
@@ -255,6 +257,7 @@ class FitRecord(Settings):
     compared: Distances = {}
     grounds: Distances = {}
     ground_gains: Distances = {}
+    law_gains: Distances = {}
     parts: Distances = {}
     identification: IdentificationRecord | None = None
     retreat: RetreatRecord | None = None

@@ -167,9 +167,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.ground_gains: dict[
             str, float
         ] = {}  # of other contacts about the learned law, once it has been asked
-        self.untouched = (
-            copy.deepcopy(body.state_dict()) if body is not None and self.ground_is_sought else None
-        )
+        self.law_gains: dict[str, float] = {}  # of other backbones, likewise
+        begins_again = body is not None and (self.ground_is_sought or body.material.candidates)
+        self.untouched = copy.deepcopy(body.state_dict()) if begins_again else None
         self.grounds: dict[
             str, float
         ] = {}  # mean distance [m] of the contacts with the ground that were tried
@@ -297,6 +297,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             compared=self.compared,
             grounds=self.grounds,
             ground_gains=self.ground_gains,
+            law_gains=self.law_gains,
             parts=self.parts,
             identification=self.identification.state() if self.identification else None,
             retreat=self.retreat.written(),
@@ -345,13 +346,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                     f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
                     "the checkpoint: it belongs to another configuration"
                 )
-            for material in (
-                self.body.material,
-                *(variant["material"] for variant in self.body.frozen.values()),
-            ):
-                material.choose(law)
-            self.settle_law()
+            self.choose(law)
         self.grounds, self.ground_gains = dict(saved.grounds), dict(saved.ground_gains)
+        self.law_gains = dict(saved.law_gains)
         self.parts = dict(saved.parts)
         if self.ground_is_sought and record.ground is not None and not record.ground_is_sought:
             self.settle_ground(Ground(**record.ground.plain()))
@@ -367,9 +364,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it"
             )
 
-    def settle_law(self) -> None:
-        """The law that was chosen is the run's from now on."""
-        self.record = self.record.but(law=self.body.material.law)
+    def choose(self, law: str) -> None:
+        """This candidate is the run's backbone from now on."""
+        self.body.choose(law)
+        self.record = self.record.but(law=law)
 
     @property
     def ground_is_sought(self) -> bool:
@@ -380,10 +378,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """What is simulated and written from now on meets this ground."""
         self.world, self.record = replace(self.world, ground=ground), self.record.on(ground)
 
-    def begin_again(self, ground: Ground) -> None:
-        """All stages from the start, on another ground, with the motion that was seen at first: the second look was about a body
-        that met the old one."""
-        self.settle_ground(ground)
+    def begin_again(self, ground: Ground | None = None, law: str | None = None) -> None:
+        """All stages from the start, on another ground or about another backbone, with the motion that was seen at first: the
+        second look was about the old ones."""
+        if ground is not None:
+            self.settle_ground(ground)
+        if law is not None:
+            self.choose(law)
         self.body.load_state_dict(self.untouched)
         self.takes, self.informed = list(self.first_takes), False
         self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
@@ -568,8 +569,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """Ends the running stage: the next one follows, or all of them again on another ground."""
         stage = self.stage
         if stage.newton:
-            if (ground := self.better_ground(stage)) is not None:
-                self.begin_again(ground)
+            if self.goes_back(stage):
                 return
             self.keep_posterior(stage)
         else:

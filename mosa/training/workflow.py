@@ -179,6 +179,7 @@ def train(cfg: DictConfig) -> float | None:
         figures |= {
             f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()
         }
+        figures |= {f"id_prior/gain/{law}": gain for law, gain in module.law_gains.items()}
         figures |= {f"held_back/{name}_m": error for name, error in module.parts.items()}
         touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
         touched |= {f"{contact}_gain": gain for contact, gain in module.ground_gains.items()}

@@ -190,25 +190,35 @@ def _guessed(distances: Mapping[str, float], mode: str) -> str:
     )
 
 
+def _backbones(compared: Mapping[str, float], gained: Mapping[str, float]) -> str:
+    """How the backbones compare. compared: error [m] after calibration; gained: how much better than the one that was nearest then
+    others explain the motion once the adapter is learned."""
+    listed = ", ".join(
+        f"{name} {error * 1e3:.2f} mm"
+        for name, error in sorted(compared.items(), key=lambda e: e[1])
+    )
+    said = f"Error of the isotropic laws after calibration: {listed}."
+    if gained:
+        each = ", ".join(f"{name} {gain:+.1f}" for name, gain in gained.items())
+        nearest = min(compared, key=compared.get)
+        said += f" With what was learned about {nearest}, the logarithm of the likelihood changes by: {each}."
+    return said
+
+
 def determined_text(figures: Mapping[str, float], law: str) -> str:
     """What the data determine and what they do not, in sentences; empty where a run kept no posterior. law: of the prior, which
     says what its parameters are measured in."""
-    compared = {
-        k.removeprefix("id_prior/compared/").removesuffix("_m"): v
-        for k, v in figures.items()
-        if k.startswith("id_prior/compared/")
-    }
+    compared, gained = (
+        {
+            k.removeprefix(f"id_prior/{kind}/").removesuffix("_m"): v
+            for k, v in figures.items()
+            if k.startswith(f"id_prior/{kind}/")
+        }
+        for kind in ("compared", "gain")
+    )
     lines = []
     if compared:
-        taken = min(compared, key=compared.get)
-        listed = ", ".join(
-            f"{law} {distance * 1e3:.2f} mm"
-            for law, distance in sorted(compared.items(), key=lambda each: each[1])
-        )
-        lines = [
-            f"Backbone: {taken}, which predicts the training motion best (error after calibration: {listed}).",
-            "",
-        ]
+        lines = [f"Backbone: {law}. {_backbones(compared, gained)}", ""]
     touched, gains = ({k.removeprefix("id_prior/ground/").removesuffix(end): v for k, v in figures.items()
                        if k.startswith("id_prior/ground/") and k.endswith(end)} for end in ("_m", "_gain"))  # fmt: skip
     if touched:

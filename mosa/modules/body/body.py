@@ -137,6 +137,11 @@ class Body(nn.Module):
         )
         return Model(frozen["material"], frozen["contact"], heterogeneity)
 
+    def choose(self, law: str) -> None:
+        """Settle on a candidate for the backbone, here and in what was kept of it."""
+        for material in (self.material, *(kept["material"] for kept in self.frozen.values())):
+            material.choose(law)
+
     def freeze(self, variant: str) -> None:
         """Keep the live parameters as the calibrated backbone `variant` (prior | prior_eta)."""
         for name, module in self.frozen[variant].items():

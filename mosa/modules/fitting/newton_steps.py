@@ -54,7 +54,7 @@ class NewtonSteps:
             self.compared = choose_law(
                 self.body, self.body.material.candidates, lambda: self.identifying(stage)
             )
-            self.settle_law()
+            self.choose(self.body.material.law)
         identification = self.identifying(stage)
         if saved is not None:
             self.go_on(identification, saved)
@@ -115,18 +115,47 @@ class NewtonSteps:
             self.go_to(best, fits[best])
         return best if begins_again else None
 
+    def better_law(self, stage: Stage) -> str | None:
+        """Where the backbone was chosen among candidates by their isotropic forms: another one of them that explains the motion
+        better with what was learned about it. None where there is none, and once the fit has begun again."""
+        if not stage.learns_adapter or not self.compared or self.law_gains:
+            return None
+        own = self.identification.cost()
+        others = [law for law in self.compared if law != self.body.material.law]
+        gains = {law: own - self.fitted_on(self.world.ground, stage, law)[0] for law in others}
+        self.law_gains = {law: gain for law, gain in gains.items() if math.isfinite(gain)}
+        best = max(self.law_gains, key=self.law_gains.get, default=None)
+        if best is None or self.law_gains[best] <= EXPLAINED:
+            return None
+        log.info("prior=auto: about what was learned, %s explains the motion better than %s (by %.1f of the logarithm of the "
+                 "likelihood); the fit begins again", best, self.body.material.law, self.law_gains[best])  # fmt: skip
+        return best
+
+    def goes_back(self, stage: Stage) -> bool:
+        """Begins all stages again where another ground or backbone explains the motion better at the end of `stage`."""
+        ground = self.better_ground(stage)
+        law = self.better_law(stage) if ground is None else None
+        if ground is None and law is None:
+            return False
+        self.begin_again(ground, law)
+        return True
+
     def go_to(self, ground: Ground, fit: Identification) -> None:
         """From now on the fit is another one, which was made on this ground; `body` has its numbers."""
         self.settle_ground(ground)
         self.body.load_state_dict(fit.body.state_dict())
         self.identification = fit
 
-    def fitted_on(self, ground: Ground, stage: Stage) -> tuple[float, Identification]:
+    def fitted_on(
+        self, ground: Ground, stage: Stage, law: str | None = None
+    ) -> tuple[float, Identification]:
         """(cost, fit) of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same
-        noise; infinite where the body cannot be simulated there. The fit itself stays where it stands."""
-        own = self.identification
+        noise; infinite where the body cannot be simulated there. The fit itself stays where it stands. law: of the backbone; None:
+        as it is."""
+        own, body = self.identification, copy.deepcopy(self.body)
+        body.material.law = law or body.material.law
         other = Identification(
-            copy.deepcopy(self.body),
+            body,
             self.takes,
             replace(self.world, ground=ground),
             stage,
@@ -189,8 +218,7 @@ class NewtonSteps:
                 self.identification.iterate()
                 if self.identification.converged:
                     break
-            if (ground := self.better_ground(stage)) is not None:
-                self.begin_again(ground)
+            if self.goes_back(stage):
                 continue
             self.keep_posterior(stage)
             self.end(stage)

@@ -305,6 +305,5 @@ def choose_law(
             "to the body's"
         )
     calibrate_as(body, best[1])
-    for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
-        material.choose(best[2])
+    body.choose(best[2])
     return found
