@@ -1,0 +1,57 @@
+"""prior=auto: the backbone that the isotropic laws choose, and another one that what was learned asks for."""
+
+import pytest
+import torch
+from small_bodies import NU, WORLD, E, small_body, start, take_of
+
+from mosa.config.record import BodyRecord
+from mosa.modules.body.material import AUTO, Material
+from mosa.modules.fitting import newton_steps
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.search.ground_choice import EXPLAINED
+from mosa.modules.fitting.stages import Stage
+from mosa.training.lit_mosa import LitMosa
+
+LAWS = ("corotated", "neo_hookean")
+
+
+@pytest.mark.parametrize("truth", LAWS)
+def test_the_fit_begins_again_about_the_backbone_that_explains_the_learned_law_better(
+    monkeypatch, truth
+):
+    """The isotropic laws have chosen corotated: an anisotropic body may look like another form of law than it has."""
+
+    def corotated(body, candidates, build):
+        body.choose("corotated")
+        return dict.fromkeys(candidates, 1e-3)
+
+    monkeypatch.setattr(newton_steps, "choose_law", corotated)
+    begins = start(turn=0.5, speed=-3.0)
+    numbers = torch.linspace(-0.2, 0.3, 19, dtype=torch.float64)
+    take = take_of(small_body(numbers=numbers, law=truth), begins, 9)
+    take.again = None
+    body = small_body(E=1.1 * E, on=False)
+    body.material = Material(AUTO, {"E": 1.1 * E, "nu": NU}, candidates=LAWS).double()
+    record = BodyRecord.of(body, WORLD, 0.02, begins)
+    stages = [
+        Stage(name=name, iterations=3, lr=0.1, optimizer="gauss_newton")
+        for name in ("prior", "joint")
+    ]
+    module = LitMosa.of_parts(body, takes=[take], world=WORLD, background=torch.ones(3), record=record,
+                              weights={"position": 1.0}, stages=stages, criterion=Criterion(name="corrected"),
+                              settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
+    begun, begin = [], module.begin
+    monkeypatch.setattr(
+        module,
+        "begin",
+        lambda stage: begun.append((stage.name, module.body.material.law)) or begin(stage),
+    )
+    module.identify()
+    again = [("prior", truth), ("joint", truth)] if truth != "corotated" else []
+    assert begun == [("prior", "corotated"), ("joint", "corotated"), *again]
+    assert (module.law_gains["neo_hookean"] > EXPLAINED) == bool(again)
+    assert module.body.material.law == truth and module.record.law == truth
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    assert checkpoint["mosa"]["fit"]["law_gains"] == module.law_gains
