@@ -203,20 +203,24 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
 def determined(
     body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1
 ) -> dict[str, float]:
-    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
-    how many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction:
-    of draws about every form of the law that explains the data, each form as likely as the others."""
+    """What the data say about the law: standard deviations of the global parameters
+    (`posterior/<name>_sd`, relative for moduli; the spread over other forms of the law that explain the
+    data is part of them), how many of the operator's numbers and of the stiffness modes they
+    determine, and the 95 % cone about the stiffest direction: of draws about every form of the law
+    that explains the data, each form as likely as the others."""
     figures: dict[str, float] = {}
+    forms = torch.stack(
+        [posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())]
+    )
     blocks: dict[str, list[int]] = {}
     for i, name in enumerate(posterior.names):
         blocks.setdefault(name.split("[")[0], []).append(i)
     for name, index in blocks.items():
         if name in body.material.raw:
-            raw, own = (
-                posterior.mean[index[0]],
-                float(posterior.covariance[index[0], index[0]].sqrt()) * INFLATION,
-            )
-            sd = physical_sd(name, raw, own)
+            raw = posterior.mean[index[0]]
+            variance = INFLATION**2 * posterior.covariance[index[0], index[0]]
+            variance += FORMS**2 * forms[:, index[0]].var(correction=0)
+            sd = physical_sd(name, raw, float(variance.sqrt()))
             if name in RELATIVE:
                 figures[f"posterior/{name}_relative_sd"] = sd / float(
                     body.material.physical_of(name, raw)
@@ -229,12 +233,7 @@ def determined(
     if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:
         generator = torch.Generator().manual_seed(seed)
         axis, _ = stiffest(body.adapter.stiffness().cpu())
-        stiffnesses, forms = (
-            [],
-            torch.stack(
-                [posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())]
-            ),
-        )
+        stiffnesses = []
         # wider draws than the likelihood's own
         away = INFLATION * (posterior.draws(draws, generator) - posterior.mean)
         for _ in each_law(body, forms[torch.arange(draws) % len(forms)] + away):

@@ -113,7 +113,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             key: (value[0] if value.ndim else value)
             for key, value in hidden.parameters(torch.zeros(1, 3)).items()
         }
-        truths[name, variant] = [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.known["nu"],
+        truths[name, variant] = [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.nu,
                                        density=hidden.density, stiffening=1.0) for k in n]  # fmt: skip
     true, models = truths[name, variant], {}
     for each, model in MODELS.items():

@@ -139,6 +139,21 @@ def test_a_poisson_number_at_its_limit_is_as_unsure_as_what_lies_inside():
     assert slope < 0.05 < 0.1 < said_of_nu(0.02, 2.6) < wide
 
 
+def test_forms_of_a_law_that_explain_the_data_make_its_moduli_less_sure():
+    """Half of the forms have half the modulus: the deviation of that, `FORMS` times, beside the data's own."""
+    body = small_body(adapter=False)
+    numbers, one = read_numbers(body), torch.ones(2).double()
+    own = Posterior(["E", "nu"], numbers, (0.03 / INFLATION) ** 2 * torch.diag(one), one)
+    other = numbers - torch.tensor([math.log(2), 0.0]).double()
+    with_rival = replace(own, rivals={"stvk": other})
+    alone, both = (determined(body, p)["posterior/E_relative_sd"] for p in (own, with_rival))
+    assert alone == pytest.approx(0.03, rel=0.01)
+    assert both == pytest.approx(math.hypot(0.03, FORMS * math.log(2) / 2), rel=0.05)
+    assert (
+        determined(body, with_rival)["posterior/nu_sd"] == determined(body, own)["posterior/nu_sd"]
+    )
+
+
 @pytest.mark.parametrize("name", ["nu", "friction_angle"])
 def test_a_bounded_number_beyond_its_limits_or_known_exactly_has_a_deviation_too(name):
     """A number that is continued to another grid may lie beyond the limits of the fit; from there they are the nearest."""

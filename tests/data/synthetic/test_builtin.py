@@ -267,7 +267,7 @@ def test_keys_of_built_in_scenes(cache, training):
     assert scene.training_cameras == [0, 1, 2, 3, 4]
     assert scene.training_frames == [0, 1, 2, 3]
     assert scene.synthetic
-    assert scene.known_parameters == {"E": 2e5, "nu": 0.3}
+    assert scene.known_parameters == pytest.approx({"E": 217708, "nu": 0.29766}, rel=1e-4)
     assert scene.truth.parameters["E_along"] / scene.truth.parameters["E_across"] == pytest.approx(
         1.6
     )

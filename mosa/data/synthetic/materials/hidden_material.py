@@ -7,6 +7,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.data.synthetic.materials.hidden import Hidden
+from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.constitutive.laws import LawParameters, register_law
 
 LAW = "fibre_neo_hookean"
@@ -108,6 +109,28 @@ class HiddenMaterial(Hidden):
     def isotropic(self) -> "HiddenMaterial":
         """Its twin without fibres and with one stiffness everywhere."""
         return replace(self, ratio=1.0, amplitude=0.0)
+
+    @property
+    def known(self) -> dict[str, float]:
+        """E [Pa] and nu of the isotropic law nearest to this one at small strain, which is what E and
+        nu of a law with an operator are; the matrix's own where there are no fibres.
+
+        The logarithm of the 6x6 stiffness is averaged over all turns of it (log-Euclidean; Moakher
+        and Norris, Journal of Elasticity 85, 2006)."""
+        if self.ratio == 1:
+            return super().known
+        mu, lam = lame(torch.tensor(self.E).double(), torch.tensor(self.nu).double())
+        ones = torch.tensor([1.0, 1, 1, 0, 0, 0]).double()
+        stiffness = 2 * mu * torch.eye(6).double() + lam * torch.outer(ones, ones)
+        stiffness[0, 0] += 4 * fibre_stiffness(self.E, self.nu, self.ratio)
+        moduli, modes = torch.linalg.eigh(stiffness)
+        volumetric = (ones @ modes).square() / 3  # share of each mode
+        bulk = float((volumetric * moduli.log()).sum().exp() / 3)
+        shear = float(((1 - volumetric) * moduli.log()).sum().div(5).exp() / 2)
+        return {
+            "E": 9 * bulk * shear / (3 * bulk + shear),
+            "nu": (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear),
+        }
 
     def parameters(self, rest: Tensor) -> dict[str, Tensor]:
         """What the law `fibre_neo_hookean` takes, per particle."""

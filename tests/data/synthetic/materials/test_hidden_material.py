@@ -1,5 +1,7 @@
 """The truth's material: its stress comes from its energy, and its fibre is as stiff as it says."""
 
+import math
+
 import pytest
 import torch
 import warp as wp
@@ -173,6 +175,28 @@ def test_the_rabbit_is_what_data_formats_fixes():
         15,
         50.0,
     )
+
+
+def test_known_moduli_are_those_of_the_nearest_isotropic_law():
+    """The logarithm of the stiffness, averaged over turns that are drawn, is the isotropic law's."""
+    known, generator = PEANUT.known, torch.Generator().manual_seed(0)
+    fibres = torch.randn(4000, 3, generator=generator, dtype=torch.float64)
+    fibres /= fibres.norm(dim=1, keepdim=True)
+    mu, lam = PEANUT.elastic(torch.ones((), dtype=torch.float64))
+    ones = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
+    i, j = torch.tensor([0, 1, 2, 1, 0, 0]), torch.tensor([0, 1, 2, 2, 2, 1])
+    weight = torch.tensor([1, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64)
+    dyads = fibres[:, i] * fibres[:, j] * weight  # a x a in Mandel scaling
+    kf = fibre_stiffness(PEANUT.E, PEANUT.nu, PEANUT.ratio)
+    matrix = 2 * mu * torch.eye(6).double() + lam * torch.outer(ones, ones)
+    moduli, modes = torch.linalg.eigh(matrix + 4 * kf * dyads[:, :, None] * dyads[:, None])
+    mean = ((modes * moduli.log()[:, None]) @ modes.mT).mean(0)
+    twice_shear = math.exp(float(torch.trace(mean) - ones @ mean @ ones / 3) / 5)
+    three_bulk = math.exp(float(ones @ mean @ ones / 3))
+    E = 3 * three_bulk * twice_shear / (2 * three_bulk + twice_shear)
+    assert known["E"] == pytest.approx(E, rel=1e-3)
+    assert known["nu"] == pytest.approx(E / twice_shear - 1, abs=1e-3)
+    assert RABBIT.isotropic().known == {"E": 2e5, "nu": 0.3}
 
 
 def test_the_twin_has_no_fibre_and_one_stiffness():
