@@ -187,7 +187,7 @@ def learn_black_box(module: LitMosa, body: Body) -> None:
         for gain in module.criterion.gains:
             terms, _ = module.terms(
                 stage,
-                take.observations,
+                SimpleNamespace(observations=take.observations, views=(), extra={}),
                 module.active_frames(stage, iteration, take),
                 take,
                 gain=gain,

@@ -27,6 +27,7 @@ import time
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parent.parent
@@ -108,8 +109,9 @@ class Steps:
         here = hasattr(module, "adam")  # else a version of before the data module served the views
         self.rollout, times = 0.0, [self.clock()]
         optimizer.zero_grad()
-        views = take.observations.select(self.views) if here else self.views
-        terms, _ = module.terms(stage, views, len(take.cues.positions), take)
+        seen = take.observations.select(self.views) if here else None
+        own = SimpleNamespace(observations=seen, views=self.views, extra={}) if here else self.views
+        terms, _ = module.terms(stage, own, len(take.cues.positions), take)
         loss = sum(module.weights.get(name, 0.0) * value for name, value in terms.items())
         times.append(self.clock())
         loss.backward()

@@ -13,6 +13,7 @@ record of a run follow from the models. Nothing is converted: a flag is no numbe
 from __future__ import annotations
 
 import functools
+import importlib
 import inspect
 import math
 import types
@@ -343,6 +344,17 @@ def check_values(values: Mapping[str, Any], kinds: Mapping[str, Any], where: str
     for name, kind in kinds.items():
         if name in values:
             check(f"{where}.{name}", values[name], kind)
+
+
+def imported(where: str, place: str) -> Any:
+    """What another package registered as module:name. Errors: ConfigError beginning with `where`."""
+    module, _, name = place.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"{where} is registered as {place}, which cannot be imported ({error})"
+        ) from error
 
 
 # -------------------------------------------------------------------------------- arguments

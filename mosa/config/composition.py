@@ -12,6 +12,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import COMMANDS
 from mosa.settings import node_of
 
@@ -52,10 +53,13 @@ def configuration() -> str:
 
 def compose(*overrides: str, name: str = "train") -> DictConfig:
     """conf/<name>.yaml with overrides as on the command line: `compose("scene=rabbit", "prior=neo_hookean")`.
+    Imports the modules of `extensions`, as the commands do.
 
-    Errors: Hydra's for an override that it does not know."""
+    Errors: Hydra's for an override that it does not know, ConfigError for an extension."""
     with initialize_config_dir(configuration(), version_base="1.3"):
-        return hydra_compose(name, overrides=list(overrides))
+        cfg = hydra_compose(name, overrides=list(overrides))
+    load_extensions(OmegaConf.to_container(cfg).get("extensions"))  # type: ignore[union-attr]
+    return cfg
 
 
 def composed(

@@ -7,6 +7,9 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 
+from hydra.core.hydra_config import HydraConfig
+
+from mosa.config.command_settings import TrainSettings
 from mosa.modules.fitting.stages import STAGES, Stage
 from mosa.settings import Settings, word
 
@@ -15,7 +18,7 @@ def without_effect(settings: Settings, path: Sequence[str], stages: Sequence[Sta
     """Why the key at a path has no effect beside the others and the stages that run; None where it has one."""
     where: list[str] = []
     for key in path:
-        if key not in type(settings).model_fields:
+        if key not in type(settings).model_fields and key not in (settings.model_extra or ()):
             return None
         for need in needs_of(type(settings), key):
             if (reason := unmet(settings, need, where, stages)) is not None:
@@ -28,7 +31,8 @@ def without_effect(settings: Settings, path: Sequence[str], stages: Sequence[Sta
 
 
 def needs_of(model: type[Settings], key: str) -> list[str]:
-    """What the field needs, by its own model and by those that this one derives from."""
+    """What the field needs, by its own model and by those that this one derives from; `further`: a key that is no field."""
+    key = key if key in model.model_fields else "further"
     stated = [vars(each).get("needs", {}) for each in model.__mro__]
     return [
         need
@@ -49,7 +53,7 @@ def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stag
             runs = "Adam" if need == "newton" else "Gauss-Newton; the rates are Adam's"
             return f"fit.{own} runs {runs}"
         return "no stage runs Gauss-Newton" if need == "newton" else (
-            "all stages run Gauss-Newton, which looks at no image (fit=adam does)")  # fmt: skip
+            "all stages run Gauss-Newton, which compares motion cues alone (fit=adam does not)")  # fmt: skip
     key, unequal, value = need.partition("!=") if "!=" in need else need.partition("=")
     found = word(getattr(settings, key))
     return (
@@ -58,16 +62,21 @@ def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stag
 
 
 def sentences(
-    overrides: Iterable[str], settings: Settings, stages: Sequence[Stage]
+    overrides: Iterable[str], settings: TrainSettings, stages: Sequence[Stage]
 ) -> Iterator[str]:
-    """One for each key of the overrides (KEY=VALUE) that has no effect."""
-    for override in overrides:
-        key = override.partition("=")[0].lstrip("+~").split("@")[0]
+    """One for each key of the overrides (KEY=VALUE), and each weight of another package's loss term, that has no effect."""
+    given = [override.partition("=")[0].lstrip("+~").split("@")[0] for override in overrides]
+    further = settings.losses.model_extra or {}  # without defaults: somebody set them
+    set_ = [f"losses.{name}" for name, weight in further.items() if weight]
+    for key in dict.fromkeys([*given, *set_]):
         if (reason := without_effect(settings, key.split("."), stages)) is not None:
             yield f"{key}: has no effect in this run: {reason}"
 
 
-def warn_of_idle(overrides: Iterable[str], settings: Settings, stages: Sequence[Stage]) -> None:
-    """One warning for each such key."""
-    for sentence in sentences(overrides, settings, stages):
-        warnings.warn(sentence, stacklevel=3)
+def warn_of_idle(
+    settings: TrainSettings, stages: Sequence[Stage], overrides: Iterable[str] = ()
+) -> None:
+    """One warning for each such key of these overrides and those of the command line. It is said once, whoever asks."""
+    task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
+    for sentence in sentences([*task, *overrides], settings, stages):
+        warnings.warn(sentence, stacklevel=1)

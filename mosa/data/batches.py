@@ -8,7 +8,7 @@ print(next(iter(data.train_dataloader())))
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
 
 import torch
@@ -16,7 +16,18 @@ from torch import Tensor
 from torch.utils.data import IterableDataset
 
 from mosa.data.observations import Observations
+from mosa.errors import ConfigError
 from mosa.types import MotionCues
+
+
+def on_device(extra: Mapping[str, Tensor], device: torch.device | str) -> dict[str, Tensor]:
+    """Further cues on a device. Errors: ConfigError naming a cue that is no tensor."""
+    for name, value in extra.items():
+        if not isinstance(value, Tensor):
+            raise ConfigError(
+                f"further_cues: {name}: expected a tensor (torch.as_tensor), found {type(value).__name__}"
+            )
+    return {name: value.to(device) for name, value in extra.items()}
 
 
 class SequenceBatch(SimpleNamespace):
@@ -41,7 +52,7 @@ class SequenceBatch(SimpleNamespace):
         moved = dict(
             vars(self),
             observations=self.observations.to(device),
-            extra={k: v.to(device) for k, v in self.extra.items()},
+            extra=on_device(self.extra, device),
         )
         if self.cues is not None:
             moved["cues"] = self.cues.to(device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import re
 from collections.abc import Callable, Mapping
@@ -11,8 +10,8 @@ from typing import Literal
 
 from mosa.data.checks.validation import validate
 from mosa.data.formats.scene_from_footage import scene_from_footage
-from mosa.errors import ConfigError
-from mosa.settings import Number, Positive, Settings, Weight, check
+from mosa.errors import ConfigError, DataError
+from mosa.settings import Number, Positive, Settings, Weight, check, imported
 from mosa.types import RUBBING, Ground, Scene
 
 FORMATS = {
@@ -34,6 +33,8 @@ def register_format(name: str, place: str) -> None:
     """Make a data format known by the name in scene.format. place: module:function, imported when a configuration asks for it.
 
     Errors: ConfigError if another format has the name."""
+    if not all(place.partition(":")):
+        raise ConfigError(f"scene.format: {name}: expected module:function, found {place!r}")
     if FORMATS.setdefault(name, place) != place:
         raise ConfigError(f"scene.format: there is a format {name!r} already; choose another name")
 
@@ -55,10 +56,10 @@ def load_scene(
     """
     if not isinstance(format, str) or format not in FORMATS:
         raise ConfigError(
-            f"scene.format: expected one of {', '.join(sorted(FORMATS))}, found {format!r}"
+            f"scene.format: expected one of {', '.join(sorted(FORMATS))}, found {format!r}; one of another package is known "
+            "once that is imported (extensions, or register_format before)"
         )
-    module, function = FORMATS[format].split(":")
-    loader = getattr(importlib.import_module(module), function)
+    loader = imported(f"scene.format: {format!r}", FORMATS[format])
     if format == "builtin":
         if given := [
             key for key, value in (("path", path), ("ground", ground)) if value is not None
@@ -89,7 +90,13 @@ def load_scene(
     if keys.get("particles") is not None:
         found = beside(place, keys["particles"])
         arguments["particles"] = under(root, keys["particles"]) if found is None else found
-    return validate(call(loader, {"path": place, **arguments}))
+    found = call(loader, {"path": place, **arguments})
+    if not isinstance(found, Scene):
+        raise DataError(
+            f"scene.format: expected a Scene (scene_from_footage makes it) from {FORMATS[format]}, found "
+            f"{type(found).__name__}"
+        )
+    return validate(found)
 
 
 def check_names(**names) -> None:

@@ -45,6 +45,10 @@ class Sequence:
     start: Start
     contact: int
 
+    def to(self, device: torch.device | str) -> Sequence:
+        """Itself, where Lightning moves a batch: the parts that are needed move later."""
+        return self
+
 
 def sequences(
     body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]

@@ -27,10 +27,11 @@ from mosa.config.build import measured, plain
 from mosa.config.command_settings import DataSections
 from mosa.config.composition import composed
 from mosa.config.record import BodyRecord
-from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule
+from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule, on_device
 from mosa.data.observations import Observations, cropped, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.data.synthetic.films import default_cache
+from mosa.errors import ConfigError
 from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
 from mosa.evaluation.evaluate import sequences
 from mosa.modules.fitting.training_sequences import Take
@@ -92,6 +93,14 @@ class SceneDataModule(L.LightningDataModule):
         scene = dict(self.cfg.scene)
         return f"SceneDataModule(scene={scene.get('name') or scene.get('path')!r})"
 
+    def __init_subclass__(cls, **keys: Any) -> None:
+        super().__init_subclass__(**keys)
+        if "scenes" in vars(cls):  # a checkpoint would name another scene than it was fitted to
+            raise ConfigError(
+                f"{cls.__name__}.scenes: expected scenes that the configuration names, found an override: register_format reads "
+                "films of any format (docs/own_training_script.md, 'Films in a format of your own')"
+            )
+
     # ---------------------------------------------------------------- Lightning's hooks
     def prepare_data(self) -> None:
         """Makes the films of a built-in scene where they are not in the cache, or reads those of a folder. Nothing is kept."""
@@ -125,6 +134,12 @@ class SceneDataModule(L.LightningDataModule):
              "angular_velocity": s.start.angular_velocity, "frames": s.scene.frames} for s in self.sequences
         ]  # fmt: skip
         return served(given)
+
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """Moves a batch of a fit. Sequences and starts stay: the parts that are needed move later."""
+        return batch.to(device) if isinstance(batch, MotionBatch) else batch
 
     # ---------------------------------------------------------------- films
     @cached_property
@@ -278,7 +293,7 @@ class SceneDataModule(L.LightningDataModule):
             start, training_observations(scene, reconstruction, margin=self.settings.rendering.margin, device=device),
             reconstruction.cues.first(frames).to(device), float(scene.times[1] - scene.times[0]),
             first_contact(self.shape, start, scene), self.second_look(scene, reconstruction), scene.sequence,
-            self.further_cues(scene, reconstruction),
+            on_device(self.further_cues(scene, reconstruction) or {}, device),
         )  # fmt: skip
 
     def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
@@ -289,7 +304,8 @@ class SceneDataModule(L.LightningDataModule):
         return SecondLook(scene, reconstruction, settings, self.settings.seed, self.device or "cpu")
 
     def further_cues(self, scene: Scene, reconstruction: Reconstruction) -> dict[str, Tensor]:
-        """Tensors by name that batches carry as `extra`, for loss terms of one's own, frames first. A subclass returns them."""
+        """Tensors by name that batches carry as `extra`, for loss terms of one's own, frames first. A subclass returns them, of
+        `scene.training_frames` and `scene.training_cameras` alone: the others are held out."""
         return {}
 
     @cached_property

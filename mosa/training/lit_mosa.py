@@ -30,10 +30,11 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import build_body, build_stages, plain, world_of
+from mosa.config.build import build_body, build_stages, plain, rehearse, world_of
 from mosa.config.checkpoints import check_same_data, read_checkpoint
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
+from mosa.config.effects import warn_of_idle
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
 from mosa.data.io.forces import forces_from_config
@@ -117,7 +118,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         )
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
         if self.cfg:
-            TrainSettings.read(self.cfg)
+            settings = TrainSettings.read(self.cfg)
+            given = [each for each in (first, *overrides) if isinstance(each, str)]
+            warn_of_idle(settings, rehearse(settings), given)
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
         self._begin(None, None, (), torch.ones(3), (), {})
 
@@ -209,7 +212,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             raise ConfigError(
                 "LitMosa: expected a SceneDataModule, which knows the particles of the body "
                 "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or a module from load_from_checkpoint, "
-                f"found {type(data).__name__ if data is not None else 'neither'}"
+                f"found {type(data).__name__ if data is not None else 'neither'}; a "
+                "loader reads films in a format of your own (docs/extending.md, 'A data format')"
             )
         # what is saved at the end of an epoch belongs to the stage that comes next
         callbacks = self.trainer.callbacks
@@ -239,7 +243,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 f"trainer.accumulate_grad_batches: expected 1, found {self.trainer.accumulate_grad_batches}: "
                 "fit.views says how many views a step reads"
             )
-        return [Stages()]
+        known = any(isinstance(each, Stages) for each in self.trainer.callbacks)
+        return [] if known else [Stages()]
 
     def attach(self, data, fitting: bool = True) -> None:
         """Makes the body of the particles of `data`, a `SceneDataModule`, where there is none yet; fitting: and takes what a fit
@@ -273,12 +278,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.first_takes = list(self.takes)
             if self.saved_cues is not None:
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
-
-    def transfer_batch_to_device(
-        self, batch: Any, device: torch.device, dataloader_idx: int
-    ) -> Any:
-        """Moves a batch of a fit. Sequences and starts stay: the parts that are needed move later."""
-        return batch.to(device) if isinstance(batch, MotionBatch) else batch
 
     # ---------------------------------------------------------------- state
     @property

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
@@ -46,8 +45,7 @@ def check_configuration(values: Mapping[str, Any]) -> TrainSettings:
     if settings.evaluation.video:
         ffmpeg("evaluation.video")
     stages = rehearse(settings)
-    if HydraConfig.initialized():
-        warn_of_idle(HydraConfig.get().overrides.task, settings, stages)
+    warn_of_idle(settings, stages)
     return settings
 
 

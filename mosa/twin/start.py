@@ -102,7 +102,7 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
         return value
     if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:
         raise ConfigError(f"rotation: expected {expected}, found {value.tolist()}")
-    axis = (value[:3].double() / value[:3].double().norm()).numpy()
+    axis = (value[:3].double() / value[:3].double().norm()).cpu().numpy()
     return torch.tensor(
         Rotation.from_rotvec(axis * math.radians(float(value[3]))).as_matrix(), dtype=torch.float32
     )

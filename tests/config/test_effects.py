@@ -6,9 +6,11 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+import mosa
 from mosa.config.build import rehearse
 from mosa.config.command_settings import TrainSettings
 from mosa.config.effects import sentences
+from mosa.modules.fitting import terms
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -21,6 +23,21 @@ def found(*overrides: str) -> list[str]:
         sentence.split(":")[0]
         for sentence in sentences(overrides, TrainSettings.read(values), rehearse(values))
     ]
+
+
+def test_a_weight_of_another_package_s_term_is_said_beside_gauss_newton(monkeypatch):
+    monkeypatch.setattr(terms, "TERMS", {**terms.TERMS, "mine": lambda step: None})
+    assert found("+losses.mine=0.5") == ["losses.mine"]
+    assert found("+losses.mine=0.5", "fit=adam") == found("+losses.mine=0") == []
+
+
+def test_a_script_of_one_s_own_hears_it_too(monkeypatch):
+    monkeypatch.setattr(terms, "TERMS", {**terms.TERMS, "mine": lambda step: None})
+    for given in (["+losses.mine=0.5"], [mosa.compose("+losses.mine=0.5")]):
+        with pytest.warns(UserWarning, match=r"losses\.mine: has no effect .*Gauss-Newton"):
+            mosa.LitMosa(*given)
+    with pytest.warns(UserWarning, match=r"fit\.joint\.lr: has no effect"):
+        mosa.LitMosa("fit.joint.lr=0.1")
 
 
 @pytest.mark.parametrize("overrides, expected", [

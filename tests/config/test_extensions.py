@@ -5,8 +5,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import mosa
 from mosa.baselines import direct
 from mosa.baselines.direct import DirectAdapter
+from mosa.config.build import plain
 from mosa.config.extensions import load_extensions
 from mosa.data import scene
 from mosa.errors import ConfigError
@@ -57,6 +59,25 @@ def test_an_adapter_that_was_registered_and_is_not_there_is_named(monkeypatch):
             adapters.adapter_class({"name": name})
 
 
+def test_compose_imports_what_it_names_and_a_configuration_that_is_handed_on_does_not(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "brings_a_format.py").write_text(
+        "from mosa.data.scene import register_format\nregister_format('brought', 'math:sqrt')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(scene, "FORMATS", dict(scene.FORMATS))
+    given = mosa.compose("debug=default")
+    given.extensions = ["brings_a_format"]  # as of a checkpoint
+    mosa.SceneDataModule(given)
+    mosa.LitMosa(plain(given))
+    assert "brought" not in scene.FORMATS
+    mosa.compose("debug=default", "extensions=[brings_a_format]")
+    assert "brought" in scene.FORMATS
+    with pytest.raises(ConfigError, match="extensions: expected a list of names"):
+        mosa.compose("extensions=brings_a_format")
+
+
 def test_no_extensions_are_none():
     load_extensions(None)
     load_extensions([])
@@ -90,7 +111,7 @@ def test_an_adapter_brings_its_penalties(monkeypatch):
         adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.baselines.direct:Costly"}
     )
     terms.check_terms({"cost": 1.0}, Costly())
-    with pytest.raises(ConfigError, match="cost"):
+    with pytest.raises(ConfigError, match=r"cost.*another package is known once .*extensions"):
         terms.check_terms({"cost": 1.0}, DirectAdapter())
     found = OperatorStatistics(torch.tensor(2.0), torch.zeros(3), torch.ones(3))
     step = SimpleNamespace(operator=found, misfit=0.5, body=SimpleNamespace(adapter=Costly()))

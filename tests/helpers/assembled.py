@@ -7,6 +7,7 @@ from unittest.mock import patch
 import lightning as L
 
 from mosa import compose
+from mosa.data.batches import SequenceBatch
 from mosa.modules.body.body import Start
 from mosa.reconstruction.pose.starts import sequence_start
 from mosa.reconstruction.rest_shape import RestShape
@@ -52,6 +53,12 @@ def assembled(cache: Path, *overrides: str, taught: Collection[str] = ()) -> tup
     """(cfg, training scene, module)."""
     run = made(cache, *overrides, taught=taught)
     return run.cfg, run.scene, run.module
+
+
+def whole(take) -> SequenceBatch:
+    """All that is seen of a take, as its part of a batch."""
+    views = list(range(len(take.observations.cameras)))
+    return SequenceBatch(observations=take.observations, views=views, extra={})
 
 
 def trainer(**options) -> L.Trainer:

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from assembled import assembled
+from assembled import assembled, whole
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def first_step(cache):
             module.begin(joint)
             with torch.no_grad():
                 terms, _ = module.terms(
-                    joint, module.takes[0].observations, scene.frames, module.takes[0]
+                    joint, whole(module.takes[0]), scene.frames, module.takes[0]
                 )
             compute.modules[name] = module
             known[name] = (
@@ -123,7 +123,7 @@ def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexp
     with torch.no_grad():
         take = module.takes[0]
         penalty = [
-            module.terms(module.stages[-1], take.observations, 3, take)[0]["operator"]
+            module.terms(module.stages[-1], whole(take), 3, take)[0]["operator"]
             for module.misfit in (0.01, 0.04)
         ]
     assert float(penalty[0] / penalty[1]) == pytest.approx(16.0, rel=1e-6)

@@ -148,8 +148,10 @@ def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tm
 
 
 def test_what_cannot_be_done_is_named(cfg):
-    with pytest.raises(ConfigError, match="expected a SceneDataModule"):
+    with pytest.raises(ConfigError, match=r"expected a SceneDataModule.*docs/extending\.md"):
         L.Trainer(**QUIET, enable_checkpointing=False).fit(LitMosa(cfg), train_dataloaders=[0])
+    with pytest.raises(ConfigError, match=r"expected scenes that the configuration names"):
+        type("Own", (SceneDataModule,), {"scenes": None})
     with pytest.raises(
         ConfigError, match=r"trainer\.accumulate_grad_batches: expected 1, found 2: fit\.views"
     ):

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from assembled import assembled
+from assembled import assembled, whole
 
 
 @pytest.mark.parametrize("prior", ["herschel_bulkley", "herschel_bulkley_hencky", "newtonian"])
@@ -15,7 +15,7 @@ def test_the_loss_reaches_every_parameter(prior, cache):
     assert {
         n: pytest.approx(float(v.detach()), rel=1e-5) for n, v in body.material.physical().items()
     } == named
-    terms, _ = module.terms(stage, module.takes[0].observations, scene.frames, module.takes[0])
+    terms, _ = module.terms(stage, whole(module.takes[0]), scene.frames, module.takes[0])
     sum(terms.values()).backward()
     for name, raw in body.material.raw.items():
         assert bool(torch.isfinite(raw.grad)) and float(raw.grad.abs()) > 0, name

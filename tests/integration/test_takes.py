@@ -6,7 +6,11 @@ from dataclasses import replace
 import forked
 import pytest
 import torch
-from assembled import assembled, made
+from assembled import assembled, made, whole
+
+from mosa import SceneDataModule
+from mosa.errors import ConfigError
+from mosa.modules.fitting import terms
 
 
 def test_a_step_descends_the_mean_over_the_sequences(cache):
@@ -21,7 +25,7 @@ def test_a_step_descends_the_mean_over_the_sequences(cache):
         frames = stage.active_frames(
             0, min(take.first_contact + 3, len(take.cues.positions)), len(take.cues.positions)
         )
-        terms, _ = module.terms(stage, own.observations, frames, take)
+        terms, _ = module.terms(stage, own, frames, take)
         loss = sum(module.weights[k] * v for k, v in terms.items())
         slope = torch.stack(torch.autograd.grad(loss, parameters))
         return float(loss.detach()), slope
@@ -34,12 +38,52 @@ def test_a_step_descends_the_mean_over_the_sequences(cache):
     assert (found - (g1 + g2) / 2).abs().max() <= 1e-5 * found.abs().max()
 
 
+def test_a_term_reads_what_the_batch_brings(cache, monkeypatch):
+    """Of a data module whose `further_cues` and `sequence_batch` are overridden."""
+
+    class Own(SceneDataModule):
+        more = 0.0
+
+        def further_cues(self, scene, reconstruction):
+            return {"height": torch.ones(len(scene.training_frames))}
+
+        def sequence_batch(self, index, take, views):
+            own = super().sequence_batch(index, take, views)
+            own.extra["height"] = own.extra["height"] + self.more
+            return own
+
+    steps = []
+
+    def mine(step):
+        steps.append(step)
+        return step.extra["height"][: step.frames].mean() + 0 * step.rollout.x.sum()
+
+    monkeypatch.setattr(terms, "TERMS", {**terms.TERMS, "mine": mine})
+    run = made(cache, "fit.prior.optimizer=adam", "+losses.mine=1.0")
+    run.data.__class__ = Own
+    run.module.configure_optimizers()
+    for more in (0.0, 2.0):
+        run.data.more = more
+        run.module.training_step(run.data.batch([1]), 0)
+        assert float(run.module.terms_of_step["mine"]) == pytest.approx(1 + more)
+    step = steps[-1]
+    assert list(step.views) == [1] and step.targets.cameras.names == ("1",)
+    assert step.frame_dt == run.module.takes[0].frame_dt
+    bare = run.data.batch([1])
+    bare.sequences[0].extra.clear()
+    with pytest.raises(ConfigError, match=r"step\.extra: .*'height', found none: further_cues"):
+        run.module.training_step(bare, 0)
+    bare.sequences[0].extra["height"] = torch.ones(3).numpy()
+    with pytest.raises(ConfigError, match=r"further_cues: height: expected a tensor .*ndarray"):
+        bare.to("cpu")
+
+
 def test_a_take_is_simulated_at_its_own_frame_rate(cache):
     _, _, module = assembled(cache)
     take, stage = module.takes[0], module.stages[0]
     longer = replace(take, frame_dt=2 * take.frame_dt)
     with torch.no_grad():
-        _, found = module.terms(stage, take.observations.select([0]), 3, longer)
+        _, found = module.terms(stage, whole(take), 3, longer)
         expected = module.body.simulate(
             take.start,
             module.world,

@@ -13,7 +13,7 @@ from mosa.data.checks.cameras import check_agreement, holes_report
 from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
 from mosa.data.checks.tangents import check_pictures
-from mosa.data.formats.footage import TIME_JITTER
+from mosa.data.formats.footage import TIME_JITTER, Footage
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -27,6 +27,10 @@ below 0.04."""
 DRIFT = 0.15
 """By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
 body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
+OUTSIDE = 1e-3
+"""By which images and mattes may leave [0, 1]: rounding."""
+COMPOSITED = 0.05
+"""Mean distance of colours, of 0 to 1, from the background outside of a matte: compression leaves less, another background more."""
 CORNER = 0.1
 """Share of an image's size from its corner within which a principal point was measured from the image's centre."""
 FARTHEST = 100.0
@@ -45,19 +49,16 @@ def validate(scene: Scene) -> Scene:
     if scene.markers is not None:  # which its reader has checked
         return scene
     V, T = len(scene.cameras), scene.frames
-    H, W = scene.cameras.height, scene.cameras.width
     label = f"scene {scene.name} ({scene.sequence})"
-    for name, found, expected in (
-        ("images", scene.images.shape, (V, T, H, W, 3)), ("mattes", scene.mattes.shape, (V, T, H, W)),
-        ("times", scene.times.shape, (T,)),
-    ):  # fmt: skip
-        if tuple(found) != expected:
-            raise DataError(f"{label}: {name}: expected shape {expected}, found {tuple(found)}")
+    check_types(scene, label)
     for name in ("images", "mattes"):
         value = getattr(scene, name)
-        if value.numel() and all(
-            map(math.isfinite, map(float, value.aminmax()))
-        ):  # of which NaN is the least and the largest
+        low, high = map(float, value.aminmax()) if value.numel() else (math.nan, math.nan)
+        if math.isfinite(low) and math.isfinite(high):  # NaN is the least and the largest
+            if low < -OUTSIDE or high > 1 + OUTSIDE:
+                raise DataError(
+                    f"{label}: {name}: expected numbers in [0, 1], found {low:.4g} to {high:.4g}; divide bytes by 255"
+                )
             continue
         for v in range(V):
             for t in range(T):
@@ -68,6 +69,7 @@ def validate(scene: Scene) -> Scene:
     check_cameras(scene, label)
     check_times(scene, label)
     check_mattes(scene, label)
+    check_background(scene, label)
     check_borders(scene, label)
     learned = scene.training_cameras
     check_film(replace(scene, images=scene.images[learned], mattes=scene.mattes[learned], cameras=scene.cameras.select(learned),
@@ -88,6 +90,39 @@ def validate(scene: Scene) -> Scene:
     if holes:
         warnings.warn(f"{label}: {holes}", stacklevel=2)
     return scene
+
+
+def check_types(film: Scene | Footage, label: str) -> None:
+    """Every array is a tensor of the type and shape that `Footage` states. Errors: DataError."""
+    cameras = film.cameras
+    V, H, W = len(cameras.names), cameras.height, cameras.width
+    T = len(film.frames) if isinstance(film, Footage) else len(film.times)
+    for name, found, shape in (
+        ("images", film.images, (V, T, H, W, 3)), ("mattes", film.mattes, (V, T, H, W)), ("times", film.times, (T,)),
+        ("background", film.background, (3,)), ("cameras.K", cameras.K, (V, 3, 3)), ("cameras.w2c", cameras.w2c, (V, 4, 4)),
+    ):  # fmt: skip
+        if getattr(found, "dtype", None) != torch.float32:
+            kind = f"{type(found).__name__} of {getattr(found, 'dtype', 'no numbers')}"
+            raise DataError(
+                f"{label}: {name}: expected a torch.float32 tensor, found {kind}; torch.as_tensor(..., dtype=torch.float32)"
+            )
+        if tuple(found.shape) != shape:
+            raise DataError(f"{label}: {name}: expected shape {shape}, found {tuple(found.shape)}")
+    if other := [name for name in cameras.names if not isinstance(name, str)]:
+        raise DataError(f"{label}: cameras.names: expected strings, found {other[0]!r}")
+
+
+def check_background(scene: Scene, label: str) -> None:
+    """What the first mattes leave out is background. Errors: DataError."""
+    outside = scene.mattes[:, 0] == 0
+    away = (scene.images[:, 0] - scene.background).abs().mean(-1)
+    for v, name in enumerate(scene.cameras.names):
+        if bool(outside[v].any()) and (found := float(away[v][outside[v]].mean())) > COMPOSITED:
+            raise DataError(
+                f"{label}: images: camera {name}: expected the background {scene.background.tolist()} where the matte is 0, "
+                f"found colours that are {found:.2f} away from it on average: images * mattes[..., None] + background * "
+                "(1 - mattes[..., None]), or state another background (or is the matte inverted?)"
+            )
 
 
 def check_film(scene: Scene, label: str) -> None:

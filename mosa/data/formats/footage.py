@@ -31,7 +31,7 @@ RATE = 0.005
 @dataclass(frozen=True)
 class Footage:
     """cameras: V; frames: T frame numbers as in the files; times: (T,) [s]; images: (V, T, H, W, 3) in [0, 1] composited on
-    `background` (3,); mattes: (V, T, H, W) in [0, 1]."""
+    `background` (3,); mattes: (V, T, H, W) in [0, 1]. All tensors are float32; a pixel's centre is at half integers."""
 
     cameras: Cameras
     frames: tuple[int, ...]

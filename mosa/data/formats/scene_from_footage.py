@@ -12,7 +12,7 @@ from typing import Annotated
 import torch
 from annotated_types import Interval
 
-from mosa.data.checks.validation import fingerprint
+from mosa.data.checks.validation import check_types, fingerprint
 from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
 from mosa.errors import ConfigError
@@ -56,6 +56,7 @@ def scene_from_footage(
     per frame; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
+    check_types(footage, f"scene {name} ({sequence})")
     up = vector(up, "up")
     if not up.norm() > 0:
         raise ConfigError("scene.up: expected a direction, found zero")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from typing import Any
 
 from torch import nn
 
 from mosa.errors import ConfigError
+from mosa.settings import imported
 
 ADAPTERS = {
     "hyperelastic": "mosa.modules.adapters.hyperelastic:HyperelasticAdapter",
@@ -42,12 +42,5 @@ def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
             f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}; one of another package is known "
             "once that is imported (extensions)"
         )
-    module, _, found = ADAPTERS[name].partition(":")
-    try:
-        adapter: type[nn.Module] = getattr(importlib.import_module(module), found)
-        return adapter
-    except (ImportError, AttributeError) as error:  # of another package's registration
-        raise ConfigError(
-            f"adapter.name: {name!r} is registered as {ADAPTERS[name]}, which cannot be imported "
-            f"({error})"
-        ) from error
+    adapter: type[nn.Module] = imported(f"adapter.name: {name!r}", ADAPTERS[name])
+    return adapter

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mosa.data.batches import MotionBatch
-from mosa.data.observations import Observations
+from mosa.data.batches import MotionBatch, SequenceBatch
 from mosa.errors import SimulationDiverged
 from mosa.modules.adapters.penalties import pool
 from mosa.modules.fitting.stages import Stage
-from mosa.modules.fitting.terms import Step, evaluate_terms
+from mosa.modules.fitting.terms import Extra, Step, evaluate_terms
 from mosa.modules.fitting.training_sequences import Take
 from mosa.types import Rollout
 
@@ -158,7 +157,7 @@ class GradientSteps:
         gains = (0.0,) if stage.calibrates else self.criterion.gains
         figures: dict[str, Tensor] = {}
         for gain in gains:
-            terms, rollout = self.terms(stage, own.observations, frames, take, gain)
+            terms, rollout = self.terms(stage, own, frames, take, gain)
             loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items())
             if not torch.isfinite(loss):
                 bad = [name for name, value in terms.items() if not torch.isfinite(value)]
@@ -184,11 +183,11 @@ class GradientSteps:
         return stage.active_frames(iteration, min(take.first_contact + 3, length), length)
 
     def terms(
-        self, stage: Stage, seen: Observations, frames: int, take: Take, gain: float = 0.0
+        self, stage: Stage, own: SequenceBatch, frames: int, take: Take, gain: float = 0.0
     ) -> tuple[dict[str, Tensor], Rollout]:
         """Every loss term that has a weight (raw), over the first `frames` frames, and the rollout of `take` they were computed on.
 
-        seen: targets of the step's views, of at least so many frames; gain: of the criterion's rollout, 0 for a free one."""
+        own: the take's part of the batch, of at least so many frames; gain: of the criterion's rollout, 0 for a free one."""
         body, weights, cues = self.body, self.weights, take.cues
         adapted = stage.learns_adapter and body.adapter is not None
         collected: list = []
@@ -205,7 +204,7 @@ class GradientSteps:
         over_all = (
             pool(collected) if collected else None
         )  # a variance over time as well as over particles
-        targets = seen.select(range(len(seen.cameras)), frames)
+        targets = own.observations.select(range(len(own.observations.cameras)), frames)
         varies = stage.learns_heterogeneity and body.heterogeneity is not None
         step = Step(
             body,
@@ -219,7 +218,9 @@ class GradientSteps:
             over_all,
             self.misfit,
             with_flow=weights.get("flow", 0.0) != 0,
-            extra=take.extra,
+            frame_dt=take.frame_dt,
+            views=own.views,
+            extra=Extra(own.extra),
         )
         terms = evaluate_terms(weights, step)
         if over_all is not None:

@@ -95,7 +95,7 @@ class LossWeights(Settings):
     model_config = ConfigDict(extra="allow")
     where: ClassVar[str] = "losses"
     needs: ClassVar[dict[str, str]] = {
-        "image mask flow heterogeneity operator operator_variance": "adam"
+        "image mask flow heterogeneity operator operator_variance further": "adam"
     }
     __pydantic_extra__: dict[str, Weight] = Field(init=False)
 

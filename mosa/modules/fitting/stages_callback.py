@@ -24,6 +24,7 @@ class Stages(Checkpoint):
         self.begun = -1  # number of the stage that has begun in this process
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: Any) -> None:
+        self.begun = -1
         self.announce(trainer, pl_module)  # the first batch is fetched before the training starts
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Any) -> None:

@@ -5,7 +5,7 @@ A new term is one function and one call of `register_term`. The terms of the pap
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -22,11 +22,23 @@ from mosa.settings import nearest
 from mosa.types import MotionCues, Rollout
 
 
+class Extra(dict[str, Tensor]):
+    """Further cues of a batch by name. Errors: ConfigError naming a cue that it lacks."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise ConfigError(
+            f"step.extra: expected a cue {name!r}, found {', '.join(self) or 'none'}: further_cues of the data module returns "
+            "it (docs/own_training_script.md, 'A cue of your own')"
+        )
+
+
 @dataclass(frozen=True)
 class Step:
-    """What a step sees of one sequence, its first `frames` frames. rollout: of the body from `start`; targets: real images of the
-    step's views; cues: the reconstruction's motion; operator: statistics of the adapter's evaluations, pooled over the rollout,
-    None where it has none; misfit: of the model the joint stage starts from, over the object's size; extra: the batch's own."""
+    """What a step sees of one sequence, its first `frames` frames, `frame_dt` [s] apart. rollout: of the body from `start`;
+    targets: real images of the step's views (`targets.cameras.names`); cues: the reconstruction's motion; operator: statistics
+    of the adapter's evaluations, pooled over the rollout, None where it has none; misfit: of the model the joint stage starts
+    from, over the object's size; views: the step's, as indices into the training cameras; extra: the batch's own, which spans
+    all training frames and, where a cue has views, all training cameras."""
 
     body: Body
     start: Start
@@ -38,6 +50,8 @@ class Step:
     heterogeneous: bool
     operator: OperatorStatistics | None
     misfit: float
+    frame_dt: float
+    views: Sequence[int] = ()
     with_flow: bool = field(default=True)
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
@@ -121,7 +135,8 @@ def check_terms(weights: Mapping[str, float], adapter: AdapterProtocol | None) -
     """Errors: ConfigError naming weights of no term."""
     if unknown := sorted(set(weights) - set(known := term_names(adapter))):
         raise ConfigError(
-            f"losses.{unknown[0]}: unknown key; expected one of {', '.join(known)}{nearest(unknown[0], known, 'losses')}"
+            f"losses.{unknown[0]}: unknown key; expected one of {', '.join(known)}{nearest(unknown[0], known, 'losses')}; one "
+            "of another package is known once that is imported (extensions)"
         )
 
 
