@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import pickletools
 import zipfile
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,19 @@ def check_archive(path: Path) -> None:
                         f"ckpt_path: {path} refers to {named or 'a function or class'}; a run's checkpoint holds "
                         "numbers, texts and tensors only, and nothing else is loaded"
                     )
+
+
+def check_plain(where: str, value: Any) -> None:
+    """What is to be saved can be read again as data. Errors: ConfigError naming the part."""
+    if type(value) in (dict, OrderedDict, list, tuple):
+        pairs = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, part in pairs:
+            check_plain(f"{where}.{key}".strip("."), part)
+    elif type(value) not in (str, int, float, bool, type(None)) and not isinstance(value, Tensor):
+        raise ConfigError(
+            f"{where}: expected numbers, texts, lists, dictionaries and tensors, which a checkpoint can be read with, found "
+            f"{type(value).__name__} (docs/safety.md): give state_dict() plain values"
+        )
 
 
 def check_containers(checkpoint: Any, path: Path) -> None:
@@ -339,6 +353,19 @@ def check_same_scene(record: RunRecord, values: Mapping[str, Any], path: str | P
         raise ConfigError(
             f"ckpt_path: expected in {path} a fit to this scene, found one to another ({listed(found)}); a law is "
             "taken to another object with python eval.py or python -m mosa.splats"
+        )
+
+
+def check_same_size(record: RunRecord, values: Mapping[str, Any], path: str | Path) -> None:
+    """The fit is to go on with as many particles. Errors: ConfigError naming the keys that say other numbers."""
+    stored, here = (
+        {key: (each.get("simulation") or {}).get(key) for key in ("particles", "dx")}
+        for each in (record.settings, values)
+    )
+    if found := list(differing(stored, here, where="simulation")):
+        raise ConfigError(
+            f"ckpt_path: expected a body of as many particles as {path} has, found other keys ({listed(found)}): leave them "
+            "as the run had them"
         )
 
 

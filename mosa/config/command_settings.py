@@ -118,7 +118,7 @@ class TrainSettings(BodySections, DataSections):
         False,
         description=(
             "the same bits in every run on the same GPU; slower there. On a CPU a run's"
-            " bits are always the same"
+            " bits are always the same. This key, not trainer.deterministic"
         ),
     )
     extensions: Extensions = []

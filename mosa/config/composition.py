@@ -24,7 +24,10 @@ CHOSEN = ("adapter", "trainer", "callbacks", "logger")
 
 def current_folder() -> str:
     """Of the job that Hydra runs, for ${run_folder:} in conf/; outputs where there is none, as in a script or a notebook."""
-    return HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "outputs"
+    if not HydraConfig.initialized():
+        return "outputs"
+    hydra: Any = HydraConfig.get()
+    return OmegaConf.select(hydra, "runtime.output_dir") or "outputs"  # --cfg has none
 
 
 OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)

@@ -12,6 +12,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import LambdaCallback
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
@@ -21,11 +22,14 @@ from mosa.modules.fitting.parameters import read_numbers
 from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
-from mosa.training.lit_mosa import LitMosa
+from mosa.training.lit_mosa import LitMosa, check_trainer
 from mosa.training.loggers import DescribingLogger
 from mosa.training.run_folder import VALIDATION
 
 log = logging.getLogger(__name__)
+
+
+KINDS = {"callbacks": L.Callback, "logger": Logger}
 
 
 def instantiated(cfg: DictConfig, section: str) -> list[Any]:
@@ -39,6 +43,10 @@ def instantiated(cfg: DictConfig, section: str) -> list[Any]:
                 f"{section}.{name}: expected a section with _target_, the class to make, found {str(entry)[:80]!r}"
             )
         found.append(made(f"{section}.{name}", entry))
+        if not isinstance(found[-1], KINDS[section]):
+            raise ConfigError(
+                f"{section}.{name}: expected a {KINDS[section].__name__} of Lightning, found {type(found[-1]).__name__}"
+            )
     return found
 
 
@@ -53,11 +61,12 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
             if isinstance(error, InstantiationException) and error.__cause__ is not None
             else error
         )
-        lines = [
-            line
-            for line in str(cause).splitlines()
-            if line.strip() and not line.startswith("full_key")
-        ]
+        if str(error).startswith("Error locating target"):
+            raise ConfigError(
+                f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found "
+                f"{entry.get('_target_')} ({cause.__cause__ or cause})"
+            ) from error
+        lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
         way = (
             f"; pip install {cause.name}"
             if isinstance(cause, ModuleNotFoundError) and cause.name
@@ -82,11 +91,7 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
         default_root_dir=str(folder),
         plugins=[AtomicCheckpointIO(), LightningEnvironment()],
     )
-    if trainer.num_devices * trainer.num_nodes != 1:
-        raise ConfigError(
-            f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.num_devices}: a fit "
-            "runs on one device, and the runs of a sweep on several (docs/sweeps.md)"
-        )
+    check_trainer(trainer)
     check_monitors(cfg, callbacks)
     return trainer
 
@@ -104,8 +109,9 @@ def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
             )
 
 
-def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: str | None) -> None:
-    """The staged optimisation under Lightning; goes on from ckpt_path. Errors: DataError for a checkpoint of another run."""
+def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: str | None) -> str:
+    """The staged optimisation under Lightning; goes on from ckpt_path. What is to be said of stages that did not end, else "".
+    Errors: DataError for a checkpoint of another run."""
     if ckpt_path is not None:
         stored = read_checkpoint(ckpt_path)
         record = check_same(stored, module, ckpt_path)
@@ -146,11 +152,13 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
         ) from error
     if trainer.interrupted:
         raise KeyboardInterrupt
-    if module.stage is not None:
-        log.warning(
-            "the trainer ended the fit after %d steps, in stage %s of %s: what follows is of the law as it stands",
-            module.steps_done,
-            module.stage.name,
-            ", ".join(stage.name for stage in module.stages),
-        )
     module.body.to(device)
+    if module.stage is None:
+        return ""
+    cut = (
+        f"the trainer ended the fit after {module.steps_done} steps, in stage {module.stage.name} of "
+        f"{', '.join(stage.name for stage in module.stages)}: what follows is of the law as it stands, and of the priors "
+        "as they were before stages that did not end"
+    )
+    log.warning(cut)
+    return cut

@@ -377,7 +377,10 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         ):
             return job(cfg)
     except KeyboardInterrupt:
-        resume = "stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun"
+        where = folder or "<run folder>"
+        resume = (
+            f"stopped; resume with ckpt_path={where}/checkpoints/last.ckpt, where the fit had begun"
+        )
         leave(resume, 143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"

@@ -31,7 +31,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_stages, plain, rehearse, world_of
-from mosa.config.checkpoints import check_same_data, read_checkpoint
+from mosa.config.checkpoints import check_plain, check_same_data, read_checkpoint
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
@@ -81,6 +81,25 @@ def body_of(shape: RestShape, record: BodyRecord) -> Body:
     body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
     body.splats = shape.splats
     return body.to(shape.rest.device)
+
+
+def check_trainer(trainer: L.Trainer) -> None:
+    """Errors: ConfigError naming an argument that no fit can do with."""
+    if trainer.world_size != 1:
+        raise ConfigError(
+            f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.world_size}: a fit "
+            "runs on one device, and the runs of a sweep on several (docs/sweeps.md)"
+        )
+    if trainer.precision not in PRECISIONS:
+        raise ConfigError(
+            f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {trainer.precision!r}: the "
+            "simulation is single precision, or double by simulation.precision=64"
+        )
+    if trainer.accumulate_grad_batches != 1:  # the schedule of views counts a batch as a step
+        raise ConfigError(
+            f"trainer.accumulate_grad_batches: expected 1, found {trainer.accumulate_grad_batches}: "
+            "fit.views says how many views a step reads"
+        )
 
 
 def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
@@ -226,23 +245,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     def configure_callbacks(self) -> list[L.Callback]:
         """Asked for first of all, before the data take their time."""
-        if self.trainer.world_size > 1:
-            raise ConfigError(
-                f"trainer.devices: expected one, found {self.trainer.world_size}: a fit runs on one device, and "
-                "the runs of a sweep on several (docs/sweeps.md)"
-            )
-        if self.trainer.precision not in PRECISIONS:
-            raise ConfigError(
-                f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
-                "simulation is single precision, or double by simulation.precision=64"
-            )
-        if (
-            self.trainer.accumulate_grad_batches != 1
-        ):  # the schedule of views counts a batch as a step
-            raise ConfigError(
-                f"trainer.accumulate_grad_batches: expected 1, found {self.trainer.accumulate_grad_batches}: "
-                "fit.views says how many views a step reads"
-            )
+        check_trainer(self.trainer)
         known = any(isinstance(each, Stages) for each in self.trainer.callbacks)
         return [] if known else [Stages()]
 
@@ -312,6 +315,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             posterior=self.posterior.written() if self.posterior else None,
             splats=self.body.splats.written() if self.body.splats is not None else None,
         )
+        check_plain("", checkpoint)  # with what callbacks and data modules of anyone's added
         checkpoint["mosa"] = record.plain()
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:

@@ -101,9 +101,10 @@ def write_outputs(
     figures: dict,
     kept: dict,
     world: World,
+    note: str = "",
 ) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
-    all; tables in results.md; a model card beside the checkpoint; metrics.json."""
+    all; tables in results.md, below the note; a model card beside the checkpoint; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
         motions = {
             prefix: variants[variant] for prefix, variants in kept.items() if variant in variants
@@ -125,7 +126,7 @@ def write_outputs(
         if shown:
             write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
     law = body.material.law
-    parts = (results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
+    parts = (note, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
              determined_text(figures, law), geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:

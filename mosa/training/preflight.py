@@ -9,7 +9,12 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
-from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
+from mosa.config.checkpoints import (
+    check_resumed,
+    check_same_scene,
+    check_same_size,
+    read_checkpoint,
+)
 from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
@@ -98,6 +103,7 @@ def check_begin(cfg: DictConfig) -> RunRecord | None:
         )
         raise DataError(f"{error}{again}") from error
     check_same_scene(record, plain(cfg), cfg.ckpt_path)
+    check_same_size(record, plain(cfg), cfg.ckpt_path)
     return record
 
 

@@ -162,7 +162,7 @@ def train(cfg: DictConfig) -> float | None:
             len(module.takes[0].cues.positions),
             sum(stage.iterations for stage in module.stages),
         )
-        fit(trainer, module, data, cfg.ckpt_path)
+        cut = fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
     if filmed:
@@ -196,7 +196,7 @@ def train(cfg: DictConfig) -> float | None:
         k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith(VALIDATION)
     }
     log_outcome(trainer.loggers, plain(cfg), figures)
-    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world, cut)
     return optimized(figures, cfg.optimized_metric)
 
 
