@@ -10,6 +10,7 @@ import tomllib
 import warnings
 from pathlib import Path
 
+import forked
 import pytest
 from omegaconf import OmegaConf
 
@@ -19,6 +20,14 @@ from mosa.system import console
 from mosa.viewer import recorded as viewer
 
 ROOT = Path(__file__).parents[2]
+
+
+def test_a_configuration_is_shown_with_what_would_be_the_run_folder():
+    words = ["train.py", "callbacks=[default,model_checkpoint]", "logger=[csv,tensorboard]"]
+    result = forked.call(*words, "--cfg", "job", "--resolve")
+    assert result.returncode == 0, result.stderr[-900:]
+    assert result.stdout.count("save_dir: outputs") == 2
+    assert "dirpath: outputs/checkpoints" in result.stdout
 
 
 @pytest.fixture(scope="module")

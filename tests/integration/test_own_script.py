@@ -1,6 +1,9 @@
 """docs/own_training_script.md: a plain Trainer with callbacks of Lightning's does what train.py does."""
 
 import json
+import os
+import re
+from pathlib import Path
 
 import forked
 import lightning as L
@@ -13,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger
 from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
 
+ROOT = Path(__file__).parents[2]
 HELD = [
     "scene.holdout_cameras=[1]",
     "scene.holdout_frames=1",
@@ -87,13 +91,22 @@ def test_the_data_stand_alone(cache):
 
 def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
     _, _, module, trainer = fitted
-    words = ["train.py", f"hydra.run.dir={tmp_path}", "debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.views=1",
+    page = (ROOT / "docs" / "own_training_script.md").read_text()
+    for name, text in re.findall(r"```\w+\n# ([\w/]+\.(?:py|yaml))\n(.*?)```", page, re.S):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    words = ["train.py", "--config-dir", f"{tmp_path}/my_conf", f"hydra.run.dir={tmp_path}", "debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.views=1",
              "fit.joint.iterations=5", *HELD, "evaluation.video=false", "evaluation.floor=false", "evaluation.samples=64",
              "evaluation.assignment=16", "logger=none", "+trainer.profiler=simple",
-             "callbacks=[default,early_stopping,learning_rate]", "callbacks.early_stopping.patience=50",
+             "callbacks=[default,early_stopping,learning_rate,young]", "+callbacks.young.digits=6", "callbacks.early_stopping.patience=50",
              "callbacks.learning_rate=null"]  # fmt: skip
-    result = forked.call(*words)
+    path = os.pathsep.join(map(str, (tmp_path, ROOT)))
+    result = forked.call(*words, environment=os.environ | {"PYTHONPATH": path})
     assert result.returncode == 0, result.stderr[-3000:]
+    found = (tmp_path / "young.txt").read_text().split()  # the callback of the page
+    assert len(found) == module.steps_done and float(found[-1]) == pytest.approx(
+        float(trainer.callback_metrics["id/E"]), rel=1e-5
+    )
     theirs = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
     for name, value in module.state_dict().items():
         assert torch.equal(value, theirs["state_dict"][name]), name
@@ -120,6 +133,19 @@ def test_what_lightning_s_callbacks_left(fitted):
     )
     assert (folder / "best.ckpt").is_file() and (folder / "last.ckpt").is_file()
     assert trainer.current_epoch >= sum(stage.iterations for stage in module.stages if stage.newton)
+
+
+def test_a_callback_whose_state_could_not_be_read_is_named(fitted, tmp_path):
+    trainer = fitted[3]
+
+    class Mine(L.Callback):
+        def state_dict(self):
+            return {"where": tmp_path}
+
+    trainer.callbacks.append(mine := Mine())
+    with pytest.raises(ConfigError, match=r"callbacks\.Mine\.where: expected .*found PosixPath"):
+        trainer.save_checkpoint(tmp_path / "a.ckpt")
+    trainer.callbacks.remove(mine)
 
 
 def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tmp_path):

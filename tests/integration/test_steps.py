@@ -5,6 +5,7 @@ import torch
 from assembled import made, trainer
 
 from mosa.errors import SimulationDiverged
+from mosa.training.fitting import fit
 
 
 def test_a_step_that_cannot_be_simulated_is_taken_back_and_the_fit_goes_on(cache):
@@ -48,6 +49,12 @@ def test_a_step_that_cannot_be_simulated_is_taken_back_and_the_fit_goes_on(cache
     assert len(losses[-1]) == 4 and losses[-1][1] == losses[-1][0]
     assert module.stage is None  # the last step was taken back too
     assert all(torch.equal(a, b.detach()) for a, b in zip(weights[3], adapter.parameters()))
+
+
+def test_a_fit_that_its_trainer_cuts_short_says_so(cache):
+    run = made(cache, "fit.prior.newton_iterations=3")
+    cut = fit(trainer(max_epochs=1), run.module, run.data, None)
+    assert "after 1 steps, in stage prior of prior, " in cut and "stages that did not end" in cut
 
 
 def test_without_a_step_to_take_back_the_fit_stops(cache):

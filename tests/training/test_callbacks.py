@@ -1,13 +1,21 @@
 """What the callbacks of a fit say and log, on a module that does nothing else."""
 
 import logging
+from collections import OrderedDict, defaultdict
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from mosa import compose
+from mosa.config.checkpoints import check_plain
+from mosa.errors import ConfigError
 from mosa.modules.fitting.stages import Stage
 from mosa.training.callbacks import Pace, StageNotes
+from mosa.training.fitting import build_trainer
+from mosa.training.run_folder import quiet
 
 
 class Fit:
@@ -74,3 +82,28 @@ def test_stages_are_noted_when_they_begin_and_end(caplog):
         " s: loss 0.25000, E 2e+05"
     )
     assert said[3].startswith("stage joint: ended after 1 steps, ") and len(said) == 4
+
+
+@pytest.mark.parametrize("value", [Path("a"), np.float64(1), np.ones(1), {1.0}, defaultdict(int)])
+def test_a_state_that_a_checkpoint_could_not_be_read_with_is_named(value):
+    plain = OrderedDict(seen=[1, 2.0, "text", None, True, (torch.ones(1),)], more={})
+    check_plain("", {"callbacks": {"Mine": plain}})
+    with pytest.raises(
+        ConfigError, match=rf"callbacks\.Mine\.more\.0: expected .*{type(value).__name__}"
+    ):
+        check_plain("", {"callbacks": {"Mine": plain | {"more": [value]}}})
+
+
+@pytest.mark.parametrize("override, message", [
+    ("+trainer.precision=64-true", r"trainer\.precision: expected 32-true, found '64-true'"),
+    ("+trainer.accumulate_grad_batches=2", r"trainer\.accumulate_grad_batches: expected 1, found 2"),
+])  # fmt: skip
+def test_a_trainer_that_no_fit_can_do_with_is_refused_before_the_data(tmp_path, override, message):
+    with pytest.raises(ConfigError, match=message):
+        build_trainer(compose("debug=default", "logger=none", override), tmp_path)
+
+
+def test_a_profiler_that_was_asked_for_is_heard():
+    quiet()
+    assert not logging.getLogger("lightning.pytorch.trainer").isEnabledFor(logging.INFO)
+    assert logging.getLogger("lightning.pytorch.profilers.profiler").isEnabledFor(logging.INFO)

@@ -74,6 +74,14 @@ def going_on(**changes):
     return stored | {"mosa": known | {"fit": fit}}
 
 
+def test_a_body_of_another_size_is_refused_before_the_reconstruction(tmp_path):
+    torch.save(going_on(), path := tmp_path / "last.ckpt")
+    for override, said in (("simulation.particles=100", "particles"), ("simulation.dx=0.05", "dx")):
+        cfg = OmegaConf.create(composed("debug=default", override) | {"ckpt_path": str(path)})
+        with pytest.raises(ConfigError, match=rf"as many particles as .*simulation\.{said}: "):
+            check_begin(cfg)
+
+
 RUNNING = {
     "iteration": 1,
     "factors": [1.0],

@@ -64,7 +64,7 @@ def test_what_is_no_film_is_refused(change, said):
     ("own_rig:nothing", DataError, "expected a Scene .* from own_rig:nothing, found NoneType"),
 ])  # fmt: skip
 def test_a_loader_that_is_none_is_named(tmp_path, monkeypatch, place, error, said):
-    (tmp_path / "own_rig.py").write_text("def nothing(path, **world): return None\n")
+    (tmp_path / "own_rig.py").write_text("def nothing(path, ground): return None\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
     register_format("rig", place)
