@@ -345,27 +345,15 @@ def check_same_run(record: RunRecord, values: Mapping[str, Any], folder: str | P
 
 def check_same_scene(record: RunRecord, values: Mapping[str, Any], path: str | Path) -> None:
     """The checkpoint that ckpt_path names was fitted to the data that the fit is to go on with: a body of as many particles would
-    take another's law for its own. Other keys may differ. Errors: ConfigError naming those of the scene that do."""
+    take another's law for its own. Other keys may differ. Errors: ConfigError naming those that must not."""
     without = (*BESIDE, "scene.test")
-    if found := list(
-        differing(record.settings.get("scene"), values.get("scene"), without, "scene")
-    ):
+    found = list(differing(record.settings.get("scene"), values.get("scene"), without, "scene"))
+    sizes = [{k: v for k, v in (each.get("simulation") or {}).items() if k in ("particles", "dx")}
+             for each in (record.settings, values)]  # fmt: skip
+    if found := [*found, *differing(*sizes, where="simulation")]:
         raise ConfigError(
-            f"ckpt_path: expected in {path} a fit to this scene, found one to another ({listed(found)}); a law is "
-            "taken to another object with python eval.py or python -m mosa.splats"
-        )
-
-
-def check_same_size(record: RunRecord, values: Mapping[str, Any], path: str | Path) -> None:
-    """The fit is to go on with as many particles. Errors: ConfigError naming the keys that say other numbers."""
-    stored, here = (
-        {key: (each.get("simulation") or {}).get(key) for key in ("particles", "dx")}
-        for each in (record.settings, values)
-    )
-    if found := list(differing(stored, here, where="simulation")):
-        raise ConfigError(
-            f"ckpt_path: expected a body of as many particles as {path} has, found other keys ({listed(found)}): leave them "
-            "as the run had them"
+            f"ckpt_path: expected in {path} a fit to this scene, found one to another or of other particles "
+            f"({listed(found)}); a law is taken to another object with python eval.py or python -m mosa.splats"
         )
 
 

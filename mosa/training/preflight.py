@@ -12,7 +12,6 @@ from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import (
     check_resumed,
     check_same_scene,
-    check_same_size,
     read_checkpoint,
 )
 from mosa.config.command_settings import EvalSettings, TrainSettings
@@ -103,7 +102,6 @@ def check_begin(cfg: DictConfig) -> RunRecord | None:
         )
         raise DataError(f"{error}{again}") from error
     check_same_scene(record, plain(cfg), cfg.ckpt_path)
-    check_same_size(record, plain(cfg), cfg.ckpt_path)
     return record
 
 

@@ -10,7 +10,6 @@ import tomllib
 import warnings
 from pathlib import Path
 
-import forked
 import pytest
 from omegaconf import OmegaConf
 
@@ -22,12 +21,12 @@ from mosa.viewer import recorded as viewer
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_configuration_is_shown_with_what_would_be_the_run_folder():
-    words = ["train.py", "callbacks=[default,model_checkpoint]", "logger=[csv,tensorboard]"]
-    result = forked.call(*words, "--cfg", "job", "--resolve")
-    assert result.returncode == 0, result.stderr[-900:]
-    assert result.stdout.count("save_dir: outputs") == 2
-    assert "dirpath: outputs/checkpoints" in result.stdout
+def test_a_configuration_is_shown_where_there_is_no_run_folder(monkeypatch):
+    monkeypatch.setattr(composition.HydraConfig, "initialized", lambda: True)
+    for folder, found in (("???", "outputs"), ("own_run", "own_run")):  # of --cfg job, and of a run
+        hydra = OmegaConf.create({"runtime": {"output_dir": folder}})
+        monkeypatch.setattr(composition.HydraConfig, "get", lambda hydra=hydra: hydra)
+        assert composition.current_folder() == found
 
 
 @pytest.fixture(scope="module")

@@ -95,11 +95,11 @@ def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
     for name, text in re.findall(r"```\w+\n# ([\w/]+\.(?:py|yaml))\n(.*?)```", page, re.S):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    words = ["train.py", "--config-dir", f"{tmp_path}/my_conf", f"hydra.run.dir={tmp_path}", "debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.views=1",
-             "fit.joint.iterations=5", *HELD, "evaluation.video=false", "evaluation.floor=false", "evaluation.samples=64",
-             "evaluation.assignment=16", "logger=none", "+trainer.profiler=simple",
-             "callbacks=[default,early_stopping,learning_rate,young]", "+callbacks.young.digits=6", "callbacks.early_stopping.patience=50",
-             "callbacks.learning_rate=null"]  # fmt: skip
+    words = ["train.py", "--config-dir", f"{tmp_path}/my_conf", f"hydra.run.dir={tmp_path}", "debug=default",
+             f"scene.cache={cache}", "adapter=mosa", "fit.views=1", "fit.joint.iterations=5", *HELD, "evaluation.video=false",
+             "evaluation.floor=false", "evaluation.samples=64", "evaluation.assignment=16", "logger=none",
+             "+trainer.profiler=simple", "callbacks=[default,early_stopping,learning_rate,young]", "+callbacks.young.digits=6",
+             "callbacks.early_stopping.patience=50", "callbacks.learning_rate=null"]  # fmt: skip
     path = os.pathsep.join(map(str, (tmp_path, ROOT)))
     result = forked.call(*words, environment=os.environ | {"PYTHONPATH": path})
     assert result.returncode == 0, result.stderr[-3000:]
@@ -143,7 +143,7 @@ def test_a_callback_whose_state_could_not_be_read_is_named(fitted, tmp_path):
             return {"where": tmp_path}
 
     trainer.callbacks.append(mine := Mine())
-    with pytest.raises(ConfigError, match=r"callbacks\.Mine\.where: expected .*found PosixPath"):
+    with pytest.raises(ConfigError, match=r"callbacks\..*Mine\.where: expected .*found PosixPath"):
         trainer.save_checkpoint(tmp_path / "a.ckpt")
     trainer.callbacks.remove(mine)
 
