@@ -96,7 +96,7 @@ def check_types(film: Scene | Footage, label: str) -> None:
     """Every array is a tensor of the type and shape that `Footage` states. Errors: DataError."""
     cameras = film.cameras
     V, H, W = len(cameras.names), cameras.height, cameras.width
-    T = len(film.frames) if isinstance(film, Footage) else len(film.times)
+    T = film.frames if isinstance(film, Scene) else len(film.frames)
     for name, found, shape in (
         ("images", film.images, (V, T, H, W, 3)), ("mattes", film.mattes, (V, T, H, W)), ("times", film.times, (T,)),
         ("background", film.background, (3,)), ("cameras.K", cameras.K, (V, 3, 3)), ("cameras.w2c", cameras.w2c, (V, 4, 4)),
