@@ -48,24 +48,20 @@ def validate(scene: Scene) -> Scene:
     """
     if scene.markers is not None:  # which its reader has checked
         return scene
-    V, T = len(scene.cameras), scene.frames
     label = f"scene {scene.name} ({scene.sequence})"
     check_types(scene, label)
     for name in ("images", "mattes"):
         value = getattr(scene, name)
-        low, high = map(float, value.aminmax()) if value.numel() else (math.nan, math.nan)
-        if math.isfinite(low) and math.isfinite(high):  # NaN is the least and the largest
-            if low < -OUTSIDE or high > 1 + OUTSIDE:
-                raise DataError(
-                    f"{label}: {name}: expected numbers in [0, 1], found {low:.4g} to {high:.4g}; divide bytes by 255"
-                )
-            continue
-        for v in range(V):
-            for t in range(T):
-                if not bool(torch.isfinite(value[v, t]).all()):
-                    raise DataError(
-                        f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
-                    )
+        low, high = map(float, value.aminmax()) if value.numel() else (0.0, 0.0)
+        if not math.isfinite(low) or not math.isfinite(high):  # NaN is the least and the largest
+            v, t = (~value.isfinite()).flatten(2).any(2).nonzero()[0].tolist()
+            raise DataError(
+                f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
+            )
+        if low < -OUTSIDE or high > 1 + OUTSIDE:
+            raise DataError(
+                f"{label}: {name}: expected numbers in [0, 1], found {low:.4g} to {high:.4g}; divide bytes by 255"
+            )
     check_cameras(scene, label)
     check_times(scene, label)
     check_mattes(scene, label)

@@ -2,16 +2,15 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from blocks_film import WORLD, assert_same_footage, clouds_of
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from mosa import compose
 from mosa.data.formats.export import export_particles, export_spring_gaus
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
@@ -72,10 +71,7 @@ def test_true_particles_are_found_beside_the_pictures(blocks, folder):
 
 
 def test_the_scene_of_the_configuration_reads_it(folder):
-    with initialize_config_dir(str(Path(__file__).parents[3] / "conf"), version_base=None):
-        composed = compose(
-            "train", overrides=["scene=spring_gaus", f"scene.path={folder}", "scene.scale=1"]
-        )
+    composed = compose("scene=spring_gaus", f"scene.path={folder}", "scene.scale=1")
     keys = OmegaConf.to_container(composed.scene, resolve=True)
     assert keys["ground"]["height"] == 0.3 and keys["holdout_frames"] == 10
     assert (
