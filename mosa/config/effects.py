@@ -76,7 +76,7 @@ def sentences(
 def warn_of_idle(
     settings: TrainSettings, stages: Sequence[Stage], overrides: Iterable[str] = ()
 ) -> None:
-    """One warning for each such key of these overrides and those of the command line. It is said once, whoever asks."""
+    """One warning for each such key of these overrides and those of the command line."""
     task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
     for sentence in sentences([*task, *overrides], settings, stages):
-        warnings.warn(sentence, stacklevel=1)
+        warnings.warn(sentence, stacklevel=3)

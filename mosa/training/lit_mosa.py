@@ -138,8 +138,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
         if self.cfg:
             settings = TrainSettings.read(self.cfg)
-            given = [each for each in (first, *overrides) if isinstance(each, str)]
-            warn_of_idle(settings, rehearse(settings), given)
+            if not isinstance(first, dict):  # the command line's, which preflight has seen
+                given = [each for each in (first, *overrides) if isinstance(each, str)]
+                warn_of_idle(settings, rehearse(settings), given)
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
         self._begin(None, None, (), torch.ones(3), (), {})
 
