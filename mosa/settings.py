@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -316,7 +316,8 @@ def numbers_described(kind: Any, told: list[Any]) -> str | None:
 # -------------------------------------------------------------------------------- single values
 def is_number(value: Any) -> bool:
     """A finite number that is no flag."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and abs(value) <= sys.float_info.max  # a whole number may be beyond
 
 
 @functools.cache
