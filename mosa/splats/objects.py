@@ -52,6 +52,8 @@ GAP, PART = 0.1, 0.01
 """Of the extent of nine tenths of the Gaussians, and of their number: smaller groups that lie farther away are strays."""
 PLAUSIBLE = (0.01, 2.0)
 """[m] of an object's longest side: without `size` others are asked for, with it a warning."""
+WIDE = 0.25
+"""Of the object's longest side: most Gaussians are smaller by far, their standard deviations."""
 ANYWHERE = 1e4
 """[m] from the origin, how far the command lets the object fly."""
 NEAR = 3.0
@@ -104,6 +106,11 @@ def read_object(
         harmonics[chosen],
     )
     longest = float((splats.means.amax(0) - splats.means.amin(0)).max())
+    if (wide := float(splats.scales.amax(1).median())) > WIDE * longest:
+        raise DataError(
+            f"{path}: field scale_*: expected logarithms of standard deviations, found half of the Gaussians wider "
+            f"than {wide / longest:.0%} of the object: another encoding of the scales?"
+        )
     usual = PLAUSIBLE[0] <= (longest if size is None else size) <= PLAUSIBLE[1]
     if size is None and not usual:
         raise ConfigError(
