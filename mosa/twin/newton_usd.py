@@ -18,11 +18,8 @@ from mosa.system.npz import write_npz
 from mosa.system.whole_files import made_folder, written_whole
 
 FORMATS = ("json", "npz", "newton_usd")
-Formats = Annotated[
-    Sequence[str],
-    Expected(f"a list of some of {', '.join(FORMATS)}"),
-    such(lambda v: all(name in FORMATS for name in v)),
-]
+Formats = Annotated[Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"),
+                    such(lambda v: all(name in FORMATS for name in v))]  # fmt: skip
 STEP = 0.01
 """Relative difference of E within which particles share a material: USD has a material a set of
 points."""

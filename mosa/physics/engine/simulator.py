@@ -58,18 +58,12 @@ Substeps = Annotated[int, Ge(1), Le(MOST_SUBSTEPS)]
 Planes = Annotated[Sequence[InstanceOf[Plane]], Expected("a list of Planes")]
 Colliders = Annotated[Sequence[InstanceOf[Collider]], Expected("a list of Colliders")]
 Motions = Annotated[Sequence[Any], Expected("a motion for each collider, or such a list a world")]
-State = Annotated[
-    ParticleState,
-    InstanceOf,
-    such(lambda state: all(isinstance(part, Tensor) for part in vars(state).values())),
-    Expected("a ParticleState of tensors"),
-]
+State = Annotated[ParticleState, InstanceOf, such(lambda state: all(isinstance(part, Tensor) for part in vars(state).values())),
+                  Expected("a ParticleState of tensors")]  # fmt: skip
 Values = Annotated[dict[str, Any], Expected("values of a law by their names")]
 Array = Annotated[Tensor, InstanceOf, Expected("a tensor")]
-Asked = Annotated[
-    Callable[[MaterialState], AdapterOperator] | Sequence[Callable[..., Any]],
-    Expected("a function of a MaterialState, or one for each world"),
-]
+Asked = Annotated[Callable[[MaterialState], AdapterOperator] | Sequence[Callable[..., Any]],
+                  Expected("a function of a MaterialState, or one for each world")]  # fmt: skip
 Timing = Annotated[InstanceOf[Adaptive] | InstanceOf[Replay], Expected("an Adaptive or a Replay")]
 Handed = Annotated[Held, InstanceOf, Expected("a Held")]
 NEAR = 8
