@@ -72,11 +72,7 @@ def pack_parameters(
         value = parameters[name]
         if not isinstance(value, Tensor):  # a copy from the host would wait for CUDA
             value = numbers(f"parameters.{name}", value, "finite numbers", dtype=like.dtype)
-            value = (
-                torch.full((), float(value), dtype=like.dtype, device=like.device)
-                if value.ndim == 0
-                else value
-            )
+            value = value if value.ndim else like.new_full((), float(value))
         value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
         if name == "yield_stress" and "von_mises" in law.name.split("+"):
             value = value * yield_factor  # the other laws that yield have their radius fixed
