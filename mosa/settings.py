@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-import math
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -265,6 +265,8 @@ def described(kind: Any) -> str:
             if isinstance(each, Expected):
                 return each.text
         return numbers_described(inner, list(flattened(told))) or described(inner)
+    if Callable in (origin, kind):
+        return "a function"
     if origin is Literal:
         return " or ".join(word(each) for each in inside)
     if origin in (Union, types.UnionType):
@@ -315,7 +317,8 @@ def numbers_described(kind: Any, told: list[Any]) -> str | None:
 # -------------------------------------------------------------------------------- single values
 def is_number(value: Any) -> bool:
     """A finite number that is no flag."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and abs(value) <= sys.float_info.max  # a whole number may be beyond
 
 
 @functools.cache
@@ -384,7 +387,7 @@ def call(where: str, build: Callable[..., Any], keys: Mapping[str, Any], **given
 
 def typed(function: Public) -> Public:
     """A public function whose arguments are of the types that it says, as keys of a configuration are: numbers, texts, flags, and
-    types with metadata. Tensors, solids and functions it reads by itself. Errors: ConfigError naming the argument."""
+    functions, types with metadata. Tensors and solids it reads by itself. Errors: ConfigError naming the argument."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -404,7 +407,7 @@ def _untold(function: Callable[..., Any]) -> tuple[str, ...]:
         if get_origin(kind) in (Union, types.UnionType):
             return all(map(told, get_args(kind)))
         plain = (int, float, str, bool, Path, type(None))
-        return get_origin(kind) in (Annotated, Literal) or kind in plain
+        return get_origin(kind) in (Annotated, Literal, Callable) or kind in (*plain, Callable)
 
     hints = typing.get_type_hints(function, include_extras=True)
     return tuple(n for n in inspect.signature(function).parameters if not told(hints.get(n, Any)))

@@ -80,8 +80,8 @@ def model_folder(place: Path) -> Path | None:
     places = [
         place,
         place / "sparse",
-        *sorted(place.glob("[0-9]")),
-        *sorted(place.glob("sparse/[0-9]")),
+        *sorted(place.glob("[0-9]*")),
+        *sorted(place.glob("sparse/[0-9]*")),
     ]
     return max(filter(is_model, places), key=lambda f: len(read_model(f)), default=None)
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from mosa.config.build import build_body, plain, world_of
 from mosa.config.extensions import load_extensions
 from mosa.config.record import BodyRecord
+from mosa.data.formats.scene_from_footage import check_density
 from mosa.data.io.gaussian_ply import read_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
@@ -49,10 +50,12 @@ ROOM = 4.0
 """Of the object's size, to each side of what it falls through."""
 GAP, PART = 0.1, 0.01
 """Of the extent of nine tenths of the Gaussians, and of their number: smaller groups that lie farther away are strays."""
-USUAL = 0.002, 20.0
-"""[m] of an object's longest side."""
 PLAUSIBLE = (0.01, 2.0)
-"""[m] of the longest side of an object in a file whose unit nobody stated: others are asked for."""
+"""[m] of an object's longest side: without `size` others are asked for, with it a warning."""
+WIDE = 0.25
+"""Of the object's longest side: most Gaussians are smaller by far, their standard deviations."""
+ANYWHERE = 1e4
+"""[m] from the origin, how far the command lets the object fly."""
 NEAR = 3.0
 """Spacings from the nearest particle beyond which a Gaussian does not belong to the body."""
 HALF_CELL = 0.35
@@ -70,7 +73,8 @@ def read_object(
     """The Gaussians of a 3DGS PLY that are the object.
 
     box: two corners in the file's units; opacity: the least that is kept; size [m] that the longest side gets, None where the file
-    is in metres; up: compared with the file's header. Strays away from the object are left out before it is sized.
+    is in metres, which is refused where that is implausible; up: compared with the file's header.
+    Strays away from the object are left out before it is sized.
     Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument.
     """
     splats, harmonics, offset, vertical = read_ply(path, centred=True)
@@ -102,12 +106,26 @@ def read_object(
         harmonics[chosen],
     )
     longest = float((splats.means.amax(0) - splats.means.amin(0)).max())
+    if (wide := float(splats.scales.amax(1).median())) > WIDE * longest:
+        raise DataError(
+            f"{path}: field scale_*: expected logarithms of standard deviations, found half of the Gaussians wider "
+            f"than {wide / longest:.0%} of the object: another encoding of the scales?"
+        )
+    usual = PLAUSIBLE[0] <= (longest if size is None else size) <= PLAUSIBLE[1]
+    if size is None and not usual:
+        raise ConfigError(
+            f"size: {path} has no unit, and in metres its object would be {longest:.3g} m long; "
+            f"expected the length of its longest side [m], as size=0.2 (size={longest:.3g} keeps it)"
+        )
     if size is not None:
-        factor, longest = size / longest, size
+        factor = size / longest
         splats = replace(splats, means=factor * splats.means, scales=factor * splats.scales)
-    if not USUAL[0] <= longest <= USUAL[1]:
-        said = f"{path}: the object is {longest:.3g} m long; size= says its longest side in metres"
-        warnings.warn(said, stacklevel=2)
+        if not usual:
+            warnings.warn(
+                f"size: {size:g} m is unusually {'large' if size > 1 else 'small'} for the longest side; "
+                "was it meant in another unit?",
+                stacklevel=2,
+            )
     return Appearance(splats, harmonics)
 
 
@@ -176,7 +194,6 @@ def object_twin(
     resolution: int = 80,
     share: float = 0.9,
     open_below: bool = False,
-    flight: float = 0.0,
     colliders: Sequence[Mapping[str, Any]] = (),
     recentre: bool = False,
 ) -> Twin:
@@ -185,11 +202,15 @@ def object_twin(
     law: configuration with seed, simulation, prior, heterogeneity and adapter, as conf/splats.yaml composes it; or a learned twin,
     of which material, adapter and contact are taken, and no stiffness field, which is of another body's places. particles, dx,
     per_cell, most: as `fill_object` takes them; density [kg/m^3]:
-    None for the learned one's, or 1000; flight [m]: how far it may fly; up: (3,) in the
+    None for the learned one's, or 1000; up: (3,) in the
     file's axes; height [m] of its lowest particle above the ground; ground:
     mode and friction; colliders: obstacles, as `Twin.simulate` takes them; recentre: move the object
     so that the point of the ground below its middle is the origin. Errors: ConfigError, DataError.
     """
+    learned = law if isinstance(law, Twin) else None
+    if density is None:
+        density = 1000.0 if learned is None else learned.body.density
+    check_density("density", density)
     direction = numbers("up", up, "a direction (x, y, z)", (3,))
     if not float(direction.norm()) > 0:
         raise ConfigError(f"up: expected a direction (x, y, z), found {list(up)}")
@@ -212,11 +233,10 @@ def object_twin(
         tensors["rest"] = rest = rest - origin
         means = shown.splats.means - origin.to(shown.splats.means)
         shown = replace(shown, splats=replace(shown.splats, means=means))
-    learned = law if isinstance(law, Twin) else None
     cfg = copy.deepcopy(dict(learned.record.settings if learned is not None else law))
     cfg["heterogeneity"] = {**cfg.get("heterogeneity", {}), "enabled": False}
     cfg["world"] = {"colliders": [dict(each) for each in colliders]}
-    room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height + flight
+    room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height
     met = {
         "height": float((rest @ direction).min()) - height,
         "mode": "sticky",
@@ -225,8 +245,6 @@ def object_twin(
     }
     world = {"gravity": (-gravity * direction).tolist(), "up": direction.tolist(),
              "box": [(rest.amin(0) - room).tolist(), (rest.amax(0) + room).tolist()]}  # fmt: skip
-    if density is None:
-        density = learned.body.density if learned is not None else 1000.0
     chosen = learned.record.law if learned is not None else None
     record = BodyRecord(settings=cfg, law=chosen, ground=met, world=world, density=density, dx=cell, frame_dt=frame_dt)  # fmt: skip
     body = build_body(record, tensors)
@@ -235,17 +253,6 @@ def object_twin(
     body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
     return Twin(body.eval(), world_of(record), frame_dt, record, start)
-
-
-def check_size(appearance: Appearance, path: str) -> None:
-    """That metres are plausible for a file without `size`. Errors: ConfigError that asks for it."""
-    means = appearance.splats.means
-    longest, (low, high) = float((means.amax(0) - means.amin(0)).max()), PLAUSIBLE
-    if not low <= longest <= high:
-        raise ConfigError(
-            f"size: {path} has no unit, and in metres its object would be {longest:.3g} m long; "
-            f"expected the length of its longest side [m], as size=0.2 (size={longest:.3g} keeps it)"
-        )
 
 
 @torch.no_grad()
@@ -276,8 +283,6 @@ def drop(cfg: DictConfig) -> None:
     check_splats(values)
     given = {name: values[name] for name in ("box", "opacity", "size", "up")}
     found = read_object(cfg.ply, **given)
-    if cfg.size is None:
-        check_size(found, cfg.ply)
     law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
     names = (
         "density",
@@ -298,7 +303,6 @@ def drop(cfg: DictConfig) -> None:
         found,
         law,
         frame_dt=1 / cfg.rate,
-        flight=math.hypot(*cfg.velocity) * cfg.frames / cfg.rate,
         **grid,
         colliders=values["colliders"] or (),
         **{name: values[name] for name in names},
@@ -325,6 +329,7 @@ def drop(cfg: DictConfig) -> None:
     rollout = twin.simulate(
         frames=cfg.frames,
         progress=True,
+        box=[[-ANYWHERE] * 3, [ANYWHERE] * 3],
         **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")},
     )
     twin.export(rollout, folder, video=cfg.video, title="object", formats=values["formats"])

@@ -8,6 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mosa.errors import ConfigError
+
+
+def made_folder(folder: str | Path) -> Path:
+    """Of an export, made with its parents. Errors: ConfigError where it cannot be written."""
+    try:
+        made = Path(folder)
+        made.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
+        ) from error
+    return made
+
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:

@@ -18,6 +18,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import NoneType
 from typing import NoReturn
 
 from hydra.core.hydra_config import HydraConfig
@@ -30,6 +31,7 @@ from yaml import YAMLError
 
 from mosa.config.composition import configuration
 from mosa.errors import ConfigError, MosaError
+from mosa.settings import shown
 from mosa.system.console import fail, say_version
 from mosa.system.refused import explained, let_go
 from mosa.system.screen import outlived
@@ -73,22 +75,30 @@ OmegaConf.register_new_resolver("own_groups", own_groups, replace=True)
 
 
 def check_arguments(arguments: Sequence[str], conf: Path) -> None:
-    """Exit with 2 and a message for <group>=null, to which Hydra answers with a traceback; conf: the folder of the groups."""
+    """Exit with 2 and a message for what Hydra answers with a traceback, or with thousands of digits: a group (a folder in conf)
+    that is given no name, and numbers that no float holds."""
     for argument in arguments:
         group, mark, value = argument.lstrip("+").partition("=")
-        if (
-            mark
-            and value in ("", "null", "Null", "NULL", "~")
-            and "." not in group
-            and group
-            and (conf / group).is_dir()
-        ):
-            options = ", ".join(sorted(file.stem for file in (conf / group).glob("*.yaml")))
+        expected = None
+        if re.search(r"\d{310}", value):
+            expected = "numbers within 1e308"
+        elif mark and "." not in group and group and (conf / group).is_dir() and unnamed(argument):
+            expected = "one of " + ", ".join(sorted(f.stem for f in (conf / group).glob("*.yaml")))
+        if expected is not None:
             print(
-                f"\nConfigError: {group}: expected one of {options}, found {argument!r}",
+                f"\nConfigError: {group}: expected {expected}, found {shown(argument)}",
                 file=sys.stderr,
             )
             sys.exit(2)
+
+
+def unnamed(argument: str) -> bool:
+    """Whether an override has a number, a flag, a mapping or nothing as its value."""
+    try:
+        value = OverridesParser.create().parse_override(argument).value()
+    except HydraException:  # said by Hydra
+        return False
+    return value in ("", "~") or isinstance(value, (NoneType, int, float, dict))
 
 
 def quoted(argument: str) -> str:

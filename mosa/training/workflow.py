@@ -22,6 +22,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
 from mosa.evaluation.likeness import warn_of_others
 from mosa.modules.body.body import Body, Start
+from mosa.modules.fitting.parameters import warn_of_ends
 from mosa.physics import exact_sums
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.driven import driven_from_config
@@ -163,6 +164,7 @@ def train(cfg: DictConfig) -> float | None:
             sum(stage.iterations for stage in module.stages),
         )
         cut = fit(trainer, module, data, cfg.ckpt_path)
+        warn_of_ends(body.material)
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
     if filmed:

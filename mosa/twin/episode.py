@@ -214,7 +214,7 @@ class Episode:
         if not self.differentiable:
             check_wants_no_gradients(action=action)
         with self._gradients():
-            commands = self._checked(action or {})
+            commands = self._checked({} if action is None else action)
             driven = self._driven.clone()
             driven[list(commands)] = True
             speed = None if not bool(driven.any()) else self._speed(commands, driven)

@@ -7,16 +7,19 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
 from mosa.errors import ConfigError
+from mosa.settings import Expected, such
 from mosa.system.npz import write_npz
-from mosa.system.whole_files import written_whole
+from mosa.system.whole_files import made_folder, written_whole
 
 FORMATS = ("json", "npz", "newton_usd")
+Formats = Annotated[Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"),
+                    such(lambda v: all(name in FORMATS for name in v))]  # fmt: skip
 STEP = 0.01
 """Relative difference of E within which particles share a material: USD has a material a set of
 points."""
@@ -67,11 +70,7 @@ def described(twin: Any) -> dict[str, Any]:
 
 def export_material(twin: Any, folder: str | Path, formats: Sequence[str] = FORMATS[:2]) -> Path:
     """`Twin.export_material`."""
-    if isinstance(formats, str) or (unknown := [name for name in formats if name not in FORMATS]):
-        found = formats if isinstance(formats, str) else unknown[0]
-        raise ConfigError(f"formats: expected a list of {', '.join(FORMATS)}, found {found!r}")
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = made_folder(folder)
     if "json" in formats:
         with written_whole(folder / "material.json") as partial:
             partial.write_text(json.dumps(described(twin), indent=1))

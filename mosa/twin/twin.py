@@ -50,10 +50,11 @@ from mosa.rendering.cameras import look_at
 from mosa.settings import Count, Expected, Number, Seed, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
-from mosa.system.whole_files import written_whole
+from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.material import TwinMaterial, summary
+from mosa.twin.newton_usd import Formats as MaterialFormats
 from mosa.twin.newton_usd import export_material
 from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
@@ -348,13 +349,7 @@ class Twin:
         images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`. colliders: those that
         the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
         solids = self._met(rollout, colliders)
-        try:
-            folder = Path(folder)
-            (folder / "ply").mkdir(parents=True, exist_ok=True)
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
-            ) from error
+        folder = made_folder(Path(folder) / "ply").parent
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
         write_frames(folder / "ply", rollout.x.cpu().numpy(), self.body.colors.cpu().numpy())
@@ -376,7 +371,10 @@ class Twin:
         """Its material, to read and to set in physical units: `twin.material.E = 2e4`, `twin.material.preset("jelly")`."""
         return TwinMaterial(self)
 
-    def export_material(self, folder: str | Path, formats: Sequence[str] = ("json", "npz")) -> Path:
+    @typed
+    def export_material(
+        self, folder: str | Path, formats: MaterialFormats = ("json", "npz")
+    ) -> Path:
         """Write the material for other simulators into `folder`: `material.json` (E, nu, density,
         damping, 6x6 stiffness, and what these leave out), `particles.npz` (points, volume, mass, E
         and nu of every particle), and with newton_usd in `formats` `newton.usda`. SI units.

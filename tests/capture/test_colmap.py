@@ -236,6 +236,7 @@ def test_poses_that_do_not_fit_the_videos_are_named(tmp_path):
         ("sparse/0", "sparse/1"),
         ("0", "1"),
         ("sparse/0", "sparse/2"),
+        ("sparse/0", "sparse/10"),
         ("sparse", "sparse/1"),
         (".", "sparse/0"),
     ],

@@ -7,7 +7,7 @@ from plyfile import PlyData, PlyElement
 from test_splat_objects import BALL, RADIUS, ball
 
 from mosa.data.io.gaussian_ply import load_ply, save_ply
-from mosa.errors import DataError
+from mosa.errors import ConfigError, DataError
 from mosa.splats.objects import fill_object, read_object
 
 
@@ -161,7 +161,24 @@ def test_a_comment_in_any_language_is_no_damage(tmp_path):
     assert len(load_ply(path)[0].means) == 1500
 
 
-@pytest.mark.parametrize("size, warns", [(200.0, True), (0.001, True), (0.2, False)])
-def test_an_unlikely_size_is_one_warning(tmp_path, recwarn, size, warns):
+@pytest.mark.parametrize("change", [
+    lambda v: np.exp(2 * v), lambda v: v / np.log(10), lambda v: np.exp(-v), lambda v: 0 * v, np.expm1,
+])  # fmt: skip
+def test_scales_in_an_encoding_that_nobody_knows_are_refused(tmp_path, change):
+    """Variances, decadic logarithms, inverses, none, and differences from 1: wider than the object they show."""
+    scales = lambda d: d | {f"scale_{i}": change(d[f"scale_{i}"]) for i in range(3)}  # noqa: E731
+    with pytest.raises(DataError, match=r"scale_\*: expected logarithms .* another encoding"):
+        read_object(written(tmp_path / "a.ply", scales))
+
+
+@pytest.mark.parametrize("size, said", [(200.0, "large"), (0.001, "small"), (0.2, None)])
+def test_an_unlikely_size_is_one_warning(tmp_path, recwarn, size, said):
     read_object(written(tmp_path / "a.ply"), size=size)
-    assert [("m long" in str(w.message)) for w in recwarn] == [True] * warns
+    assert [str(w.message).split(" unusually ")[1][:5] for w in recwarn] == [said] * bool(said)
+
+
+@pytest.mark.parametrize("factor", [14.0, 1000.0, 0.01])
+def test_the_size_is_asked_for_where_metres_are_implausible(tmp_path, factor):
+    large = written(tmp_path / "a.ply", times(factor))
+    with pytest.raises(ConfigError, match=r"^size: .*a\.ply has no unit, .* m long; .*size=0\.2"):
+        read_object(large)

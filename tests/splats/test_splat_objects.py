@@ -14,11 +14,12 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 from strangers import ROOT, checkpoint
 
+from mosa.data.formats.scene_from_footage import check_density
 from mosa.data.io.gaussian_ply import save_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.geometry.filling import body_volume
 from mosa.reconstruction.geometry.shell import blocked, solid_of
-from mosa.splats.objects import check_size, object_twin, read_object, save_twin
+from mosa.splats.objects import object_twin, read_object, save_twin
 from mosa.training.preflight import check_splats
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
@@ -153,12 +154,12 @@ def test_it_falls_on_an_obstacle_that_its_checkpoint_keeps(tmp_path):
     assert torch.equal(again.simulate(frames=8).x, rollout.x)
 
 
-def test_the_size_is_asked_for_where_metres_are_implausible():
-    source = ball()
-    check_size(source, "a.ply")
-    large = replace(source, splats=replace(source.splats, means=14 * source.splats.means))
-    with pytest.raises(ConfigError, match=r"size: a\.ply has no unit, .* would be 2\.8 m long"):
-        check_size(large, "a.ply")
+def test_a_density_of_nothing_is_refused_and_an_unlikely_one_is_said():
+    for density in (0.01, 1e-9, 1e6, math.nan, -1.0, True):
+        with pytest.raises(ConfigError, match=r"^density: expected a number of at least 0\.1"):
+            object_twin(ball(), LAW, particles=100, density=density)
+    with pytest.warns(UserWarning, match=r"^density: 1 kg/m\^3 is lighter .* in g/cm\^3"):
+        check_density("density", 1.0)
 
 
 def test_a_learned_law_is_taken_over(tmp_path):
@@ -185,6 +186,7 @@ def test_the_command_makes_all_of_it(tmp_path):
     path = save_ply(tmp_path / "ball.ply", source.splats, source.harmonics)
     arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply,splat]", "prior=corotated",
                  "recentre=true", "colliders=[{type:sphere,radius:0.05,position:[0,0.05,0]}]",
+                 "velocity=[60,0,0]",  # farther than any box around the object
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True

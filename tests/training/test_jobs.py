@@ -25,6 +25,7 @@ from mosa.training.jobs import (
     LONGEST,
     Failures,
     attempt,
+    check_arguments,
     check_files,
     check_folders,
     folder_name,
@@ -299,6 +300,26 @@ def test_what_is_no_file_of_a_run_is_said_before_it_begins(tmp_path, capsys, nam
         ended.value.code == 2
         and f"{name}: expected what a run has there" in capsys.readouterr().err
     )
+
+
+HUGE = "9" * 4000
+
+
+@pytest.mark.parametrize("argument, expected", [
+    ("rendering=5", "one of gsplat, warp"), ("+rendering=true", "one of"), ("rendering={a:1}", "one of"),
+    ("~rendering=1.5", None), ("rendering=null", "one of"), ("rendering=", "one of"), ("rendering='~'", "one of"),
+    (f"scene.density={HUGE}", "numbers within 1e308"), (f"a.b=[[{HUGE},0,0]]", "numbers within 1e308"),
+    (f"seed=-{HUGE}", "numbers within 1e308"), ("seed=1e400", None), ("rendering=warp,gsplat", None),
+    ("rendering=warp", None), ("rendering=[warp,gsplat]", None), ("rendering=glob(*)", None),
+])  # fmt: skip
+def test_what_hydra_has_no_message_for_is_said_before(capsys, argument, expected):
+    if expected is None:
+        return check_arguments([argument], ROOT / "conf")
+    with pytest.raises(SystemExit) as ended:
+        check_arguments(["seed=0", argument], ROOT / "conf")
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and f": expected {expected}" in said and len(said) < 400
+    return None
 
 
 @pytest.mark.parametrize("arguments", [["banana"], ["banana=3"], ["scene=banana"]])

@@ -16,12 +16,23 @@ TWIN = functools.cache(twin)
 MOTION = functools.cache(lambda: TWIN().simulate(frames=2))
 
 
+def begun(made):
+    made.reset()
+    return made
+
+
 @pytest.mark.parametrize("name, wrong, call", [
     ("size", (0, -1, 2.5, "a", True, 10**6, None), lambda v: TWIN().render(MOTION(), size=v)),
     ("rollout", (5, None, "a", {}, [1]), lambda v: TWIN().render(v)),
     ("rollout", (5, None, "a", {}, [1]), lambda v: TWIN().export(v, "nowhere")),
     ("folder", (5, None, True, [], 1.5), lambda v: TWIN().export(MOTION(), v)),
     ("formats", (5, "ply", ["obj"], [1], None), lambda v: TWIN().export(MOTION(), "nowhere", formats=v)),
+    ("folder", (5, None, True, [], 1.5), lambda v: TWIN().export_material(v)),
+    ("formats", (5, "npz", ["obj"], [1], None), lambda v: TWIN().export_material("nowhere", v)),
+    ("export", ("/proc/nowhere", "/dev/null/a", "a\0b"), lambda v: TWIN().export(MOTION(), v)),
+    ("export", ("/proc/nowhere", "/dev/null/a", "a\0b"), lambda v: TWIN().export_material(v)),
+    ("action", (5, 0, "a", torch.zeros(3), [{}], {"a"}), lambda v: begun(TWIN()).step(v)),
+    ("action", (5, 0, "a", torch.zeros(3), [{}], {"a"}), lambda v: begun(TWIN().worlds(2)).step(v)),
     ("video", (1, "no", None, [], 0.0), lambda v: TWIN().export(MOTION(), "nowhere", video=v)),
     ("draws", (-1, 1, 2.5, "a", True, 10**12), lambda v: TWIN().predict(draws=v)),
     ("seed", (-1, 0.5, "a", True, 2**32), lambda v: TWIN().predict(seed=v)),
@@ -62,21 +73,31 @@ GRID = {"dx": 0.05, "substeps": 40, "frame_dt": 1 / 30}
     ("law", (5, None, True, [], 1.0)), ("dx", (0, -1, math.nan, "a", True)), ("substeps", (0, 2.5, "a", True, 10**9)),
     ("frame_dt", (0, -1, math.inf, "a", None)), ("strain", ("foo", 5, True, [], "")),
     ("gravity", ("abc", (0, 1), (0, math.nan, 0), 5, None, (0, 1e9, 0))),
+    ("up", ("abc", (0, 1), (0, math.nan, 0), 5, [[0, 1, 0]])), ("ground", (5, "sticky", {}, True, [0.0])),
+    (r"ground\.height", (Ground("a"), Ground(math.nan), Ground(True), Ground(10**400), Ground(None))),
+    ("plane 0: friction", (Ground(0.0, "separate", "a"), Ground(0.0, "touch", -1), Ground(0.0, "touch", math.nan))),
+    ("planes", (5, [5], "ab", {}, [None])), ("colliders", (5, [5], "ab", [{"type": "sphere"}], [None])),
+    ("box", (5, "ab", [[0, 0, 0]], [[1, 1, 1], [0, 2, 2]], torch.full((2, 3), math.nan))),
+    ("options", (5, None, {}, "a", True)), ("device", ("foo", "cuda:99", 5, None, "")),
 ])  # fmt: skip
 def test_a_wrong_argument_of_a_simulator_is_named(name, wrong):
+    key = "ground" if isinstance(wrong[0], Ground) else name
     for value in wrong:
         with pytest.raises(ConfigError, match=f"^{name}: expected"):
-            Simulator(**{"law": "neo_hookean", **GRID, name: value})
+            Simulator(**{"law": "neo_hookean", **GRID, key: value})
 
 
-def rolled(count=4, volume=1e-6, density=1000.0, **keys):
-    made = Simulator("corotated", ground=Ground(0.0), **GRID)
+def rolled(count=4, volume=1e-6, density=1000.0, mu=1e4, ground=0.0, **keys):
+    made = Simulator("corotated", ground=Ground(ground), **GRID)
     F, x = torch.eye(3).repeat(count, 1, 1), torch.rand(count, 3) + 0.1
-    state = ParticleState(x=x, v=0 * x, C_affine=0 * F, F=F, F_tot=F)
-    volumes = torch.full((count,), 1e-6)
-    volumes[:1] = volume
-    parameters = dict.fromkeys(made.law.parameters, 1e4)
-    return made.rollout(state, parameters, volumes, density, **{"frames": 2} | keys)
+    given = {"state": ParticleState(x=x, v=0 * x, C_affine=0 * F, F=F, F_tot=F)}
+    given |= {
+        "volume": torch.full((count,), 1e-6),
+        "parameters": {"mu": mu, "lam": 1e4},
+        "frames": 2,
+    }
+    given["volume"][:1] = volume
+    return made.rollout(**given | {"density": density} | keys)
 
 
 @pytest.mark.parametrize("keys, message", [
@@ -85,6 +106,14 @@ def rolled(count=4, volume=1e-6, density=1000.0, **keys):
     ({"start_time": math.nan}, "start_time: "),
     ({"count": 0}, "x: expected one particle"), ({"volume": math.inf}, "volume: "), ({"volume": 0.0}, "volume: "),
     ({"volume": math.nan}, "volume: "), ({"volume": -1.0}, "volume: "), ({"density": math.inf}, "density: "),
+    ({"density": "a"}, "density: "), ({"density": None}, "density: "), ({"density": True}, "density: "),
+    ({"density": [1e3] * 4}, "density: "), ({"density": -1}, "density: "),
+    ({"mu": "a"}, r"parameters\.mu: "), ({"mu": None}, r"parameters\.mu: "), ({"mu": 1j}, r"parameters\.mu: "),
+    ({"mu": math.nan}, r"parameters\.mu: "), ({"mu": True}, r"parameters\.mu: "), ({"parameters": 5}, "parameters: "),
+    ({"state": 5}, "state: "), ({"state": None}, "state: "), ({"state": ParticleState(*[[0.0]] * 5)}, "state: "),
+    ({"timing": 5}, "timing: "), ({"motions": 5}, "motions: "), ({"held": 5}, "held: "), ({"adapter": 5}, "adapter: "),
+    ({"progress": 5}, "progress: "), ({"collect": "a"}, "collect: "),
+    ({"ground": 2.0}, "x: expected a body above the ground"), ({"ground": 1.11}, "x: expected a body above"),
 ])  # fmt: skip
 def test_a_wrong_argument_of_a_rollout_is_named(keys, message):
     with pytest.raises(ConfigError, match=f"^{message}"):

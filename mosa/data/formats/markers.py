@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mosa.data.formats.scene_from_footage import check_density
 from mosa.data.io.markers import AT_REST, alignment, read_markers, released
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Box, collider_of
@@ -55,6 +56,7 @@ def load_markers(
     many last frames are not learned from.
     Errors: ConfigError naming the key, DataError naming the file.
     """
+    check_density("scene.density", density)
     recording = read_markers(Path(path))
     names = recording.names if tracked is None else tuple(tracked)
     seen = recording.of(names, "scene.tracked")

@@ -29,6 +29,18 @@ WIDEST = 1e5
 """[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
 
 
+def check_density(key: str, density: float) -> None:
+    """density [kg/m^3] of the setting `key`; one that is unusually small is a warning. Errors:
+    ConfigError."""
+    check(key, density, Annotated[float, Interval(ge=DENSITIES[0], le=DENSITIES[1])])
+    if density < LIGHT:
+        warnings.warn(
+            f"{key}: {density:g} kg/m^3 is lighter than nearly all solids; was it meant in g/cm^3? Moduli scale "
+            "with it",
+            stacklevel=5,
+        )
+
+
 def scene_from_footage(
     footage: Footage,
     *,
@@ -76,7 +88,7 @@ def scene_from_footage(
         raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
     if float(box.abs().max()) > WIDEST:
         raise ConfigError(f"scene.box: expected metres within {WIDEST:g}, found {box.tolist()}")
-    check("scene.density", density, Annotated[float, Interval(ge=DENSITIES[0], le=DENSITIES[1])])
+    check_density("scene.density", density)
     times = footage.times
     if fps is not None:
         check("scene.fps", fps, Positive)
@@ -99,12 +111,6 @@ def scene_from_footage(
             )
         last_free_frame = footage.frames.index(last_free_frame)
     check_ground(ground, up / up.norm(), pull, box)
-    if density < LIGHT:
-        warnings.warn(
-            f"scene.density: {density:g} kg/m^3 is lighter than nearly all solids; was it meant in g/cm^3? Moduli scale "
-            "with it",
-            stacklevel=4,
-        )
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
         gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),

@@ -17,7 +17,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import friction_alpha
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
-from mosa.settings import LARGEST, is_number
+from mosa.settings import LARGEST, is_number, shown
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 AUTO = "auto"
@@ -252,8 +252,8 @@ class Material(nn.Module):
         if isinstance(form, Direction):
             self._add_direction(name, value, learned)
             return
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ConfigError(f"prior.parameters.{name}: expected a number, found {value!r}")
+        if not is_number(value):
+            raise ConfigError(f"prior.parameters.{name}: expected a number, found {shown(value)}")
         value = float(value)
         if value in form.held:
             self.held.append(name)

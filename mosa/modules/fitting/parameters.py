@@ -6,6 +6,7 @@ They are the prior's global parameters, the contact offset, the adapter's number
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.modules.body.body import Body, ContactOffset
-from mosa.modules.body.material import FORMS, NU_MAX
+from mosa.modules.body.material import FORMS, NU_MAX, Form, Material, unit_of
 from mosa.modules.fitting.gauss_newton import Block, Seat
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.types import Ground
@@ -22,6 +23,9 @@ FINER = 0.25
 """Steps of the joint stage's differences over those of a calibration, which begins further from its end. What one-sided differences
 get wrong falls with their step, and on two drops it had stopped the fit: the rabbit's ended at a cost of 675, with these steps at
 585, and its held-out error fell from 0.56 to 0.51 of the prior's (docs/identification.md)."""
+
+END = 0.005
+"""Of a parameter's range: nearer to its end, a fit ended there."""
 
 
 def few_numbers(module: torch.nn.Module | None) -> bool:
@@ -37,6 +41,27 @@ def limits_of(name: str) -> tuple[float, float]:
         if name == "nu"
         else (-math.inf, math.inf)
     )
+
+
+def warn_of_ends(material: Material) -> None:
+    """A warning for numbers that a fit took to the end of their range, as it does where a body has
+    another law."""
+    ends = []
+    for name, raw in material.raw.items():
+        form, raw = FORMS.get(name), raw.detach()
+        moved = not math.isclose(float(raw), material.begins[name], rel_tol=1e-6)
+        if not (moved and isinstance(form, Form) and math.isfinite(form.high)):
+            continue
+        low, high = map(form.physical, map(torch.tensor, limits_of(name)))
+        value, room = float(form.physical(raw)), END * float(high - low)
+        if not low + room < value < high - room:
+            ends.append(f"{name} = {value:.3g} {unit_of(material.law, name)}".strip())
+    if ends:
+        warnings.warn(
+            f"prior.parameters: {', '.join(ends)}: at the end of what the law {material.law} allows; the film probably "
+            "shows a body of another law, and then the other numbers are wrong as well (prior=auto compares laws)",
+            stacklevel=2,
+        )
 
 
 def blocks_of(

@@ -14,7 +14,6 @@ approaches is slowed before it is stopped. Only what is slow: an impact would be
 amount that depends on dx. The price is that slow rolling is damped as well.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.touch import TOUCH
+from mosa.settings import is_number
 from mosa.types import RUBBING, Ground
 
 NODE_MODES = {"sticky": 0, "slip": 1, "separate": 2}
@@ -59,6 +59,8 @@ def ground_plane(ground: Ground, up: Tensor) -> Plane:
     """The plane of a ground; up: (3,) unit vector."""
     up = torch.as_tensor(up, dtype=torch.float64).cpu()
     up = up / up.norm()
+    if not is_number(ground.height):
+        raise ConfigError(f"ground.height: expected a finite number [m], found {ground.height!r}")
     return Plane(
         tuple((ground.height * up).tolist()), tuple(up.tolist()), ground.mode, ground.friction
     )
@@ -80,7 +82,7 @@ def pack_planes(
             raise ConfigError(
                 f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}"
             )
-        if isinstance(plane.friction, bool) or not 0 <= plane.friction < math.inf:
+        if not (is_number(plane.friction) and plane.friction >= 0):
             raise ConfigError(
                 f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}"
             )
@@ -91,7 +93,7 @@ def pack_planes(
         thickness = plane.thickness
         if thickness is None:
             thickness = THICKNESS * dx if plane.friction > 0 and plane.mode != "touch" else 0.0
-        if isinstance(thickness, bool) or not 0 <= thickness < math.inf:
+        if not (is_number(thickness) and thickness >= 0):
             raise ConfigError(
                 f"plane {i}: thickness: expected a finite number >= 0 [m], found {thickness}"
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -71,10 +70,9 @@ def pack_parameters(
             columns.append(rotation.detach().reshape(*shape, 9))
             continue
         value = parameters[name]
-        if isinstance(value, int | float):
-            value = torch.full(
-                (), value, dtype=like.dtype, device=like.device
-            )  # a copy from the host would wait for CUDA
+        if not isinstance(value, Tensor):  # a copy from the host would wait for CUDA
+            value = numbers(f"parameters.{name}", value, "finite numbers", dtype=like.dtype)
+            value = value if value.ndim else like.new_full((), float(value))
         value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
         if name == "yield_stress" and "von_mises" in law.name.split("+"):
             value = value * yield_factor  # the other laws that yield have their radius fixed
@@ -112,14 +110,27 @@ def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> Non
             )
 
 
+def check_above(numerics: Numerics, x: Tensor) -> None:
+    """x: (..., N, 3) in the axes of the planes. Errors: ConfigError for a body that lies wholly behind
+    the ground or another plane, which would hold it for ever."""
+    planes = numerics.planes[: numerics.plane_count].to(x)
+    highest = (x.detach() @ planes[:, :3].T - planes[:, 3]).amax(-2)
+    if bool((highest < 0).any()):
+        raise ConfigError(
+            "x: expected a body above the ground and in front of the other planes, found all of it "
+            f"{-float(highest.min()):.3g} m or more behind one"
+        )
+
+
 def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Tensor, float]:
     """(density, mean mass of a particle [kg]), also checks the volumes: one look at the host for all.
 
     A number stays one: arithmetic, and so every bit, is that of a body of one material. Errors: ConfigError."""
     if not isinstance(density, Tensor) or density.ndim == 0:
-        density = float(density)
-        if not (math.isfinite(density) and density > 0):
-            raise ConfigError(f"density: expected a positive number [kg/m^3], found {density}")
+        expected = "a positive number [kg/m^3], or one for each particle as a tensor"
+        density = float(numbers("density", density, expected, (), dtype=torch.float64))
+        if not density > 0:
+            raise ConfigError(f"density: expected {expected}, found {density}")
         valid = torch.ones((), dtype=torch.bool, device=volume.device)
     else:
         if density.shape != volume.shape:
@@ -186,9 +197,11 @@ def corners(box: Tensor | None, margin: float = 0.0) -> tuple[tuple[float, ...],
     Errors: ConfigError."""
     if box is None:
         return (-UNBOUNDED,) * 3, (UNBOUNDED,) * 3
-    low, high = (tuple(corner) for corner in torch.as_tensor(box).double().tolist())
+    expected = "two corners (2, 3) [m], min < max on every axis"
+    box = numbers("box", box, expected, (2, 3), dtype=torch.float64)
+    low, high = map(tuple, box.tolist())
     if not all(a < b for a, b in zip(low, high)):
-        raise ConfigError(f"box: expected min < max on every axis, found {low} and {high}")
+        raise ConfigError(f"box: expected {expected}, found {low} and {high}")
     return tuple(a - margin for a in low), tuple(b + margin for b in high)
 
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Le
+from pydantic import InstanceOf
 from torch import Tensor
 
 from mosa.errors import ConfigError
@@ -28,6 +29,7 @@ from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.axes import Axes, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.inputs import (
+    check_above,
     check_state,
     checked_density,
     corners,
@@ -48,11 +50,22 @@ from mosa.physics.launching import SCALARS
 from mosa.physics.time.adaptive_steps import StepChooser, check_counts
 from mosa.physics.time.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.time.time_step import MOST_SUBSTEPS
-from mosa.settings import Count, Number, Positive, Text, typed
-from mosa.system.limits import counted
+from mosa.settings import Count, Expected, Number, Positive, Text, such, typed
+from mosa.system.limits import counted, named_device
 from mosa.types import Ground, ParticleState, Rollout
 
 Substeps = Annotated[int, Ge(1), Le(MOST_SUBSTEPS)]
+Planes = Annotated[Sequence[InstanceOf[Plane]], Expected("a list of Planes")]
+Colliders = Annotated[Sequence[InstanceOf[Collider]], Expected("a list of Colliders")]
+Motions = Annotated[Sequence[Any], Expected("a motion for each collider, or such a list a world")]
+State = Annotated[ParticleState, InstanceOf, such(lambda state: all(isinstance(part, Tensor) for part in vars(state).values())),
+                  Expected("a ParticleState of tensors")]  # fmt: skip
+Values = Annotated[dict[str, Any], Expected("values of a law by their names")]
+Array = Annotated[Tensor, InstanceOf, Expected("a tensor")]
+Asked = Annotated[Callable[[MaterialState], AdapterOperator] | Sequence[Callable[..., Any]],
+                  Expected("a function of a MaterialState, or one for each world")]  # fmt: skip
+Timing = Annotated[InstanceOf[Adaptive] | InstanceOf[Replay], Expected("an Adaptive or a Replay")]
+Handed = Annotated[Held, InstanceOf, Expected("a Held")]
 NEAR = 8
 """Cells from the origin within which driven particles of float32 may move before the origin follows
 them, with new buffers."""
@@ -78,18 +91,19 @@ class Simulator:
         substeps: Substeps,
         frame_dt: Positive,
         gravity: Sequence[float] | Tensor = (0.0, -9.8, 0.0),
-        ground: Ground | None = None,
+        ground: Annotated[Ground, InstanceOf, Expected("a Ground")] | None = None,
         up: Sequence[float] | Tensor | None = None,
-        planes: Sequence[Plane] = (),
-        colliders: Sequence[Collider] = (),
+        planes: Planes = (),
+        colliders: Colliders = (),
         box: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
         strain: Literal[tuple(STRAINS)] | None = None,  # type: ignore[valid-type]
-        options: LawOptions = AS_USUAL,
+        options: Annotated[LawOptions, InstanceOf, Expected("LawOptions")] = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
         vector("gravity", gravity)
+        vector("up", gravity if up is None else up)
         if strain is not None and not self.law.sheared:
             raise ConfigError(
                 f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
@@ -101,7 +115,7 @@ class Simulator:
             float(frame_dt),
             float(frame_dt) / int(substeps),
         )
-        self.dtype, self.device = dtype, torch.device(device)
+        self.dtype, self.device = dtype, torch.device(named_device(device))
         self.options = options
         gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
         if up is None:
@@ -163,22 +177,22 @@ class Simulator:
     @typed
     def rollout(
         self,
-        state: ParticleState,
-        parameters: dict[str, Tensor],
-        volume: Tensor,
+        state: State,
+        parameters: Values,
+        volume: Array,
         density: float | Tensor,
         frames: Count,
-        adapter: Callable[[MaterialState], AdapterOperator] | Sequence[Callable] | None = None,
+        adapter: Asked | None = None,
         stride: Count | None = 1,
         progress: Callable[[int], None] | None = None,
         started: bool = False,
-        motions: Sequence | None = None,
+        motions: Motions | None = None,
         start_time: Number = 0.0,
-        timing: Adaptive | Replay | None = None,
+        timing: Timing | None = None,
         collect: Callable[[Any], None] | None = None,
         gravity: Tensor | Sequence | None = None,
         together: int | None = None,
-        held: Held | None = None,
+        held: Handed | None = None,
     ) -> Rollout:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated), of a body, or of B worlds at once.
 
@@ -252,20 +266,20 @@ class Simulator:
     @typed
     def stepper(
         self,
-        state: ParticleState,
-        parameters: dict[str, Tensor],
-        volume: Tensor,
+        state: State,
+        parameters: Values,
+        volume: Array,
         density: float | Tensor,
-        adapter: Callable | Sequence[Callable] | None = None,
+        adapter: Asked | None = None,
         stride: Count | None = 1,
         *,
         started: bool = False,
-        motions: Sequence | None = None,
+        motions: Motions | None = None,
         gravity: Tensor | Sequence | None = None,
         together: int | None = None,
-        timing: Adaptive | None = None,
+        timing: Timing | None = None,
         steps: Count = 30,
-        held: Held | None = None,
+        held: Handed | None = None,
     ) -> tuple[Stepper, Moment]:
         """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout`.
 
@@ -300,6 +314,8 @@ class Simulator:
             self._move(shift)
         axes = self._axes
         state = axes.state(state, self.dtype)
+        if not started:
+            check_above(self.numerics, state.x)
         gravities = (
             None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         )

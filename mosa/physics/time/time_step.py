@@ -56,10 +56,13 @@ def required_substeps(
         1, math.ceil(min(1e9, frame_dt * step_rate(speed, viscosity, density, dx, v_max, courant)))
     )
     if count > limit:
+        fast = v_max / 0.5 > speed / courant + viscosity / (VISCOUS_NUMBER * density * dx)
+        way = ("a slower start or slower solids, fewer frames where no ground ends the fall" if fast
+               else "a softer or denser body")  # fmt: skip
         viscous = f", viscosity {viscosity:.3g} Pa s" if viscosity else ""
         raise ConfigError(
             f"time step: {count} substeps per frame needed (wave speed {speed:.3g} m/s, modulus {modulus_max:.3g} Pa, density "
             f"{density:.4g} kg/m^3, dx {dx:.3g} m, frame {frame_dt:.3g} s, speed {v_max:.3g} m/s{viscous}), the limit is {limit}: "
-            "use a coarser grid (dx), a slower start, fewer frames where no ground ends the fall, or raise simulation.max_substeps"
+            f"use a coarser grid (dx), {way}, or raise simulation.max_substeps"
         )
     return count

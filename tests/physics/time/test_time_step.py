@@ -27,6 +27,8 @@ def test_bounds():
     "changes, match",
     [
         ({"limit": 10}, "substeps per frame needed.*limit is 10"),
+        ({"density": 1.0, "limit": 90}, "density 1 kg/m.*, a softer or denser body, or raise"),
+        ({"v_max": 1e3, "limit": 90}, "speed 1e.03 m/s.*, a slower start or slower solids, fewer"),
         ({"density": 0.0}, "density"),
         ({"modulus_max": float("nan")}, "modulus_max"),
         ({"v_max": float("inf")}, "v_max"),
