@@ -50,10 +50,10 @@ class Cell:
     sd: float | None
     count: int
 
-    def text(self, decimals: int, plus: str = "±") -> str:
+    def text(self, decimals: int) -> str:
         if not math.isfinite(self.mean):
             return "failed" if math.isnan(self.mean) else "diverged"
-        spread = "" if self.sd is None else f" {plus} {self.sd:.{decimals}f}"
+        spread = "" if self.sd is None else f" ± {self.sd:.{decimals}f}"
         return f"{self.mean:.{decimals}f}{spread}"
 
 

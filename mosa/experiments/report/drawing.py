@@ -11,7 +11,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from mosa.experiments.collecting import Cell
@@ -52,12 +51,6 @@ AXES: Mapping[str, str] = {
     "scene": "object",
 }
 """What a stranger is told of an axis, where its name does not say it."""
-
-MARKED: Mapping[tuple[str, str], Mapping[str, tuple[float, float]]] = {
-    ("alpha", "alpha_normal"): {"default": (0.1, 0.1), "the paper's": (0.15, 0.15)}
-}
-"""{(rows, columns): {what it is: (value of the row, of the column)}} of the cells of a map that have a frame. The default is
-that of conf/adapter/mosa.yaml."""
 
 BETTER = {"most": ", more is better", "least": ", less is better", None: ""}
 MARKS = {"x": "diverged", "+": "failed"}
@@ -343,7 +336,7 @@ def heat_map(
     styles: Mapping[str, Mapping],
 ) -> None:
     """Rows downwards, columns to the right, each cell with its number, the better the lighter; what was not run stays white, what
-    diverged or failed says so. The cells of MARKED have a frame and their name."""
+    diverged or failed says so."""
     options = experiment.axes[experiment.columns]
     cells = [[of.get(option.name) for option in options] for of in rows.values()]
     values = np.array(
@@ -379,26 +372,6 @@ def heat_map(
                     fontsize=8,
                     color="0.3",
                 )
-    down, right = (
-        experiment.axes[experiment.rows],
-        {option.value: j for j, option in enumerate(options)},
-    )
-    for what, (of_row, of_column) in MARKED.get((experiment.rows, experiment.columns), {}).items():
-        for i, option in enumerate(down):
-            if option.value == of_row and of_column in right:
-                j = right[of_column]
-                place.add_patch(
-                    Rectangle(
-                        (j - 0.48, i - 0.47),
-                        0.96,
-                        0.94,
-                        fill=False,
-                        edgecolor="#d4111f",
-                        linewidth=2.2,
-                    )
-                )
-                place.annotate(what, (j, i + 0.34), ha="center", va="center", fontsize=7.5, color="black",
-                               bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
     place.set_xticks(range(len(options)), [option.name for option in options], fontsize=9)
     place.set_yticks(range(len(rows)), list(rows), fontsize=9)
     place.set_xlabel(AXES.get(experiment.columns, experiment.columns), fontsize=9)
