@@ -27,8 +27,6 @@ from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.driven import driven_from_config
 from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
-from mosa.rendering.rasterizer import use_backend
-from mosa.rendering.settings import RenderingSettings
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import assemble, scenes
@@ -214,10 +212,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     exact_sums.use(cfg.deterministic)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
-    # as the run rendered; a machine without it renders the same pictures by warp
-    use_backend(
-        RenderingSettings.part(twin.record.settings.get("rendering") or {}).backend, required=False
-    )
     if cfg.plan is not None:
         ranked = plan(twin, count=cfg.plan)
         log.info("\n%s", plan_text(ranked))

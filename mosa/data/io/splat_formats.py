@@ -77,36 +77,6 @@ def save_splat(path: str | Path, splats: Splats) -> Path:
     return path
 
 
-def load_splat(path: str | Path) -> Splats:
-    """Gaussians of a `.splat` file, float32. Errors: DataError naming the file: not whole, or not of such numbers."""
-    path = Path(path)
-    if not path.is_file() or path.stat().st_size == 0 or path.stat().st_size % SPLAT.itemsize:
-        raise DataError(
-            f"{path}: expected a .splat file of {SPLAT.itemsize} bytes a Gaussian, found "
-            f"{f'{path.stat().st_size} bytes' if path.is_file() else 'no file'}"
-        )
-    rows = np.fromfile(path, SPLAT)
-    finite = (
-        np.isfinite(rows["position"]).all()
-        and np.isfinite(rows["scale"]).all()
-        and (rows["scale"] > 0).all()
-    )
-    rotation = (rows["rotation"].astype(np.float32) - 128) / 128
-    length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    if not finite or not (length > 0.5).all():
-        raise DataError(
-            f"{path}: expected finite positions, standard deviations above 0, unit quaternions; another format?"
-        )
-    color = torch.from_numpy(rows["color"].astype(np.float32) / 255)
-    return Splats(
-        torch.from_numpy(rows["position"].copy()),
-        torch.from_numpy(rows["scale"].copy()),
-        torch.from_numpy(rotation / length),
-        color[:, 3],
-        color[:, :3],
-    )
-
-
 def save_spz(path: str | Path, appearance: Appearance) -> Path:
     """Write a `.spz` file (Niantic's compressed Gaussians) with the package gsply. Errors: ConfigError without it."""
     try:

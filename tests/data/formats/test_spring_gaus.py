@@ -11,8 +11,8 @@ import torch
 from blocks_film import WORLD, assert_same_footage, clouds_of
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from written_scenes import export_particles, export_spring_gaus
 
-from mosa.data.formats.export import export_particles, export_spring_gaus
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
 
