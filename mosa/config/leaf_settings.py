@@ -108,9 +108,7 @@ class SplatsSettings(LawSections):
     rate: Positive = Field(30, description="frames per second")
     formats: Names = Field(
         ["ply"],
-        description=(
-            "for each frame: ply, splat, spz (needs gsply); usd (needs usd-core) is one file"
-        ),
+        description=("ply, a file for each frame; usd (needs usd-core) is one file"),
     )
     video: bool = Field(True, description="film it")
 
@@ -221,10 +219,7 @@ class TruthSection(Settings):
         None, description="a built-in one; null: the one that the run learned from"
     )
     spacing: Spacing | None = Field(
-        None, description="m, of the truth's particles in tests; null: those of the films"
-    )
-    train_spacing: Spacing | None = Field(
-        None, description="m, where a policy is trained in the truth; coarser is quicker"
+        None, description="m, of the truth's particles; null: those of the films"
     )
 
 

@@ -44,7 +44,7 @@ TEST_SEED = 20_000_000
 @dataclass(frozen=True)
 class Setting:
     """What a study needs: the bodies, the task, and the sizes. worlds: trials tested at a time; spacing [m]: of the truth's
-    particles in tests; train_spacing: where policies are trained in the truth; None: the films' own."""
+    particles, None for the films' own."""
 
     task: str
     checkpoint: str | None
@@ -55,7 +55,6 @@ class Setting:
     trials: int
     worlds: int
     spacing: float | None
-    train_spacing: float | None
     options: Mapping[str, Any]
 
 
@@ -64,20 +63,17 @@ class Bench:
 
     def __init__(self, setting: Setting) -> None:
         self.setting = setting
-        self._simulators: dict[tuple[str, bool], Simulator] = {}
-        self._arenas: dict[tuple[str, bool, int], Arena] = {}
+        self._simulators: dict[str, Simulator] = {}
+        self._arenas: dict[tuple[str, int], Arena] = {}
         self._task: Task | None = None
 
-    def simulator(self, name: str, training: bool = False) -> Simulator:
+    def simulator(self, name: str) -> Simulator:
         s = self.setting
-        training = training and name == "truth" and s.train_spacing != s.spacing
-        key = (name, training)
-        if key not in self._simulators:
-            spacing = s.train_spacing if training else s.spacing
-            self._simulators[key] = simulator_named(
-                name, s.checkpoint, scene=s.scene, device=s.device, spacing=spacing
+        if name not in self._simulators:
+            self._simulators[name] = simulator_named(
+                name, s.checkpoint, scene=s.scene, device=s.device, spacing=s.spacing
             )
-        return self._simulators[key]
+        return self._simulators[name]
 
     def task(self, name: str) -> Task:
         """One for all simulators, from the truth's size where it is known: `name` is the simulator to ask where it is not."""
@@ -89,11 +85,10 @@ class Bench:
             self._task = task_named(self.setting.task, rest, **self.setting.options)
         return self._task
 
-    def arena(self, name: str, worlds: int, training: bool = False) -> Arena:
-        key = (name, training, worlds)
-        if key not in self._arenas:
-            self._arenas[key] = Arena(self.simulator(name, training), self.task(name), worlds)
-        return self._arenas[key]
+    def arena(self, name: str, worlds: int) -> Arena:
+        if (name, worlds) not in self._arenas:
+            self._arenas[name, worlds] = Arena(self.simulator(name), self.task(name), worlds)
+        return self._arenas[name, worlds]
 
 
 def train(bench: Bench, simulator: str, seed: int) -> Found:
@@ -101,8 +96,8 @@ def train(bench: Bench, simulator: str, seed: int) -> Found:
     s = bench.setting
     torch.manual_seed(seed)
     worlds = s.search.batch * (s.search.candidates if s.policy == "model" else 1)
-    arena = bench.arena(simulator, worlds, training=True)
-    check = bench.arena(simulator, min(s.worlds, s.search.validation), training=True)
+    arena = bench.arena(simulator, worlds)
+    check = bench.arena(simulator, min(s.worlds, s.search.validation))
 
     def say(line: str) -> None:
         log.info("%s, %s, seed %d: %s", s.task, simulator, seed, line)
@@ -123,22 +118,20 @@ def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) 
     """Train in one simulator, test there and in the truth where it is known; result.json and films of that many trials in
     `folder`."""
     record = _record(bench, simulator, seed)
-    tested = dict.fromkeys([simulator, *(["truth"] if record["truth"] is not None else [])])
-    for name in tested:
-        count = sum(record["truth" if name == "truth" else "own"]["success"])
-        log.info(
-            "%s, trained in %s: %d of %d in %s",
-            bench.setting.task,
-            simulator,
-            count,
-            bench.setting.trials,
-            name,
-        )
+    where = simulator if record["truth"] is None else "truth"
+    for name, result in ((simulator, record["own"]), ("truth", record["truth"])):
+        if result is not None:
+            said(bench, simulator, seed, result, name)
     write_whole(folder / "result.json", json.dumps(record))
     policy = LinearPolicy.read(bench.task(simulator), record["policy"])
-    where = "truth" if record["truth"] is not None else simulator
     films(bench, {f"trained in {simulator}": policy}, where, folder, filmed)
     return record
+
+
+def said(bench: Bench, simulator: str, seed: int, result: Mapping[str, Any], where: str) -> None:
+    """How often a policy succeeded, as a line of the log."""
+    s, won = bench.setting, sum(result["success"])
+    log.info("%s, trained in %s, seed %d: %d of %d in %s", s.task, simulator, seed, won, s.trials, where)  # fmt: skip
 
 
 def make_jobs(
@@ -154,14 +147,7 @@ def make_jobs(
             record = _record(bench, name, seed)
             file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, json.dumps(record))
-        log.info(
-            "%s, trained in %s, seed %d: %d of %d in the truth",
-            bench.setting.task,
-            name,
-            seed,
-            sum(record["truth"]["success"]),
-            bench.setting.trials,
-        )
+        said(bench, name, seed, record["truth"], "truth")
         records[name, seed] = record
     return records
 
@@ -310,23 +296,21 @@ def write_table(
     about: str = "",
 ) -> Path:
     """<task>.md and <task>.csv. Every row is one simulator to train in. about: a sentence on the twin."""
-    names = list(dict.fromkeys(name for name, _ in records))
-    header = [
-        "trained in",
-        "success in the truth",
-        "mean",
-        "in its own simulator",
-        "mean loss in the truth",
-        "seconds of training",
-    ]
-    lines = []
-    for name in names:
+    lines, rows = [], []
+    for name in dict.fromkeys(name for name, _ in records):
         found = [r for (n, _), r in sorted(records.items()) if n == name]
         counts = [sum(r["truth"]["success"]) for r in found]
-        own = [sum(r["own"]["success"]) for r in found if r["own"] is not None]
-        loss = [sum(r["truth"]["loss"]) / len(r["truth"]["loss"]) for r in found]
-        lines.append([name, ", ".join(map(str, counts)), _mean(counts, setting.trials), ", ".join(map(str, own)) or "",
-                      f"{sum(loss) / len(loss):.3f}", f"{sum(r['seconds'] for r in found) / len(found):.0f}"])  # fmt: skip
+        own = ", ".join(str(sum(r["own"]["success"])) for r in found if r["own"] is not None)
+        loss = statistics.fmean(statistics.fmean(r["truth"]["loss"]) for r in found)
+        seconds = statistics.fmean(r["seconds"] for r in found)
+        shown = ", ".join(map(str, counts))
+        lines.append([name, shown, _mean(counts, setting.trials), own, f"{loss:.3f}", f"{seconds:.0f}"])  # fmt: skip
+    for (name, seed), record in sorted(records.items()):
+        for tested, where in (("truth", "truth"), ("own", name)):
+            for trial, pair in enumerate(zip(*record[tested].values()) if record[tested] else ()):
+                rows.append([task.name, name, seed, where, trial, int(pair[0]), pair[1]])
+    header = ["trained in", "success in the truth", "mean", "in its own simulator", "mean loss in the truth",
+              "seconds of training"]  # fmt: skip
     seeds = sorted({seed for name, seed in records if name != UNTRAINED})
     text = [
         f"# {task.name}: policies tested in the hidden truth",
@@ -342,18 +326,9 @@ def write_table(
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{task.name}.md"
     write_whole(page, "\n\n".join(text) + "\n")
-    with (
-        written_whole(folder / f"{task.name}.csv") as partial,
-        open(partial, "w", newline="") as file,
-    ):
-        writer = csv.writer(file)
-        writer.writerow(["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"])
-        for (name, seed), record in sorted(records.items()):
-            for tested in ("truth", "own"):
-                if (result := record[tested]) is not None:
-                    where = "truth" if tested == "truth" else name
-                    for trial, (won, loss) in enumerate(zip(result["success"], result["loss"])):
-                        writer.writerow([task.name, name, seed, where, trial, int(won), loss])
+    columns = ["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"]
+    with written_whole(page.with_suffix(".csv")) as partial, open(partial, "w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
     return page
 
 

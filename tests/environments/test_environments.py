@@ -330,7 +330,7 @@ def small_bench(tmp_path, monkeypatch, **changes):
     """A study of which no simulator comes from a file: the truth is softer than what was learned."""
     search = Search(iterations=1, batch=2, rate=0.1, every=1, validation=2)
     values = {"task": "placement", "checkpoint": None, "scene": "tiny", "device": "cpu", "policy": "gradient", "search": search,
-              "trials": 3, "worlds": 2, "spacing": None, "train_spacing": None,
+              "trials": 3, "worlds": 2, "spacing": None,
               "options": {"steps": 4}}  # fmt: skip
     made = {
         "learned": simulator(),
