@@ -139,12 +139,9 @@ class CaptureSettings(Settings):
             "ground) this one gets"
         ),
     )
-    mattes: Literal["plates", "rembg", "masks"] = Field(
+    mattes: Literal["plates", "masks"] = Field(
         "plates",
-        description=(
-            "plates: empty backgrounds; rembg: a network (pip install 'mosa[rembg]'); "
-            "masks: videos of them"
-        ),
+        description=("plates: empty backgrounds; masks: videos of masks, of any other program"),
     )
     plates: Folder | None = Field(
         None,

@@ -203,8 +203,8 @@ def directions(
         largest = "" if w is None else f"{float(w.max()):.3f}"
         lines.append([column, name, largest, *ranges, f"{float(axis):.0f}"])
     for response, ratios, moduli in grid.T:
-        largest = max([float(line.get_ydata().max()) for line in response.lines], default=0.0)
-        top = 1.05 * max(NEARLY, largest)
+        highest = max([float(line.get_ydata().max()) for line in response.lines], default=0.0)
+        top = 1.05 * max(NEARLY, highest)
         response.set_ylim(-0.04 * top, top)  # a w of 0 is a line of its own beside the axis
         low, high = ratios.get_ylim()
         ratios.set_ylim(np.floor(100 * min(low, 1 - NEARLY) + 1e-6) / 100, max(high, 1 + NEARLY))

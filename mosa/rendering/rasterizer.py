@@ -29,19 +29,18 @@ def _check(
     state_index: Tensor,
 ) -> None:
     """Shapes, types and devices of `rasterize`; ConfigError names the first that is off."""
-    states, count = (means.shape[0], means.shape[1]) if means.dim() == 3 else (-1, -1)
-    images = len(cameras)
+    states, count = means.shape[:2] if means.dim() == 3 else (-1, -1)
+    images, channels = len(cameras), features.shape[-1]
+    numbers = {"means": means, "covariances": covariances, "opacities": opacities, "features": features}  # fmt: skip
     wanted = {
-        "means": (means, [(states, count, 3)]),
-        "covariances": (covariances, [(states, count, 3, 3)]),
-        "opacities": (opacities, [(count,), (states, count)]),
-        "features": (
-            features,
-            [(images, count, features.shape[-1]), (1, count, features.shape[-1])],
-        ),
-        "state_index": (state_index, [(images,)]),
+        "means": [(states, count, 3)],
+        "covariances": [(states, count, 3, 3)],
+        "opacities": [(count,), (states, count)],
+        "features": [(images, count, channels), (1, count, channels)],
+        "state_index": [(images,)],
     }
-    for name, (value, shapes) in wanted.items():
+    for name, shapes in wanted.items():
+        value = numbers.get(name, state_index)
         if tuple(value.shape) not in shapes or 0 in value.shape:
             raise ConfigError(
                 f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty"
@@ -50,26 +49,18 @@ def _check(
             raise ConfigError(
                 f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device"
             )
-        if name != "state_index" and (value.dtype != means.dtype or value.dtype not in SCALARS):
+        if name in numbers and (value.dtype != means.dtype or value.dtype not in SCALARS):
             raise ConfigError(
                 f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all"
             )
-    numbers = {
-        "means": means,
-        "covariances": covariances,
-        "opacities": opacities,
-        "features": features,
-    }
     # largest magnitudes: nan and inf come through, in one pass over each and one wait for the GPU
-    largest = torch.stack(
-        [torch.linalg.vector_norm(value.detach(), torch.inf) for value in numbers.values()]
-    ).tolist()
-    if not all(map(math.isfinite, largest)):
-        name = next(name for name, size in zip(numbers, largest) if not math.isfinite(size))
-        where = (~numbers[name].detach().isfinite()).nonzero()[0].tolist()
-        raise DataError(
-            f"rasterize: {name}{where} is not finite; it would silently vanish from the image"
-        )
+    sizes = [torch.linalg.vector_norm(value.detach(), torch.inf) for value in numbers.values()]
+    for (name, value), size in zip(numbers.items(), torch.stack(sizes).tolist()):
+        if not math.isfinite(size):
+            where = (~value.detach().isfinite()).nonzero()[0].tolist()
+            raise DataError(
+                f"rasterize: {name}{where} is not finite; it would silently vanish from the image"
+            )
     for name, value, size in (("K", cameras.K, 3), ("w2c", cameras.w2c, 4)):
         if tuple(value.shape) != (images, size, size):
             raise ConfigError(
@@ -79,11 +70,8 @@ def _check(
         raise ConfigError(
             f"rasterize: images of {cameras.width} x {cameras.height} px; no side may be longer than {SIDE_MAX}"
         )
-    counted(
-        "rasterize: numbers",
-        (images, cameras.height, cameras.width, features.shape[-1] + 1),
-        "render fewer or smaller images",
-    )
+    pixels = (images, cameras.height, cameras.width, channels + 1)
+    counted("rasterize: numbers", pixels, "render fewer or smaller images")
     if not means.is_cuda and (int(state_index.min()) < 0 or int(state_index.max()) >= states):
         raise ConfigError(f"rasterize: state_index reaches outside the {states} states")
 
@@ -115,21 +103,11 @@ def rasterize(
         raise ConfigError(f"rasterize: unknown scan '{scan}', expected gaussian or tile")
     _check(means, covariances, opacities, features, cameras, state_index)
     start_warp()
-    geometry = Geometry(
-        state_index.to(torch.int32).contiguous(),
-        cameras.width,
-        cameras.height,
-        scan or ("tile" if means.is_cuda else "gaussian"),
-    )
-    image, alpha = Splat.apply(
-        means,
-        covariances,
-        opacities,
-        features,
-        cameras.K.to(means),
-        cameras.w2c.to(means),
-        geometry,
-    )
+    order = scan or ("tile" if means.is_cuda else "gaussian")
+    index = state_index.to(torch.int32).contiguous()
+    geometry = Geometry(index, cameras.width, cameras.height, order)
+    views = cameras.K.to(means), cameras.w2c.to(means)
+    image, alpha = Splat.apply(means, covariances, opacities, features, *views, geometry)
     if background is not None:
         image = image + (1 - alpha)[..., None] * background.to(image)
     return image, alpha

@@ -25,10 +25,12 @@ class Lines:
         self.stream.flush()
 
 
-def tqdm(*args, **options) -> bar:
+class tqdm(bar):
     """tqdm's bar, with its arguments. Where its file is no terminal: a line at the start, every `LINE_SECONDS`, and at the end."""
-    stream = options.get("file") or sys.stderr
-    if not stream.isatty():  # ncols=0: figures without the bar
-        options |= {"file": Lines(stream), "mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS,
-                    "ncols": 0, "dynamic_ncols": False, "leave": True}  # fmt: skip
-    return bar(*args, **options)
+
+    def __init__(self, *args, **options) -> None:
+        stream = options.get("file") or sys.stderr
+        if not stream.isatty():  # ncols=0: figures without the bar
+            options |= {"file": Lines(stream), "mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS,
+                        "ncols": 0, "dynamic_ncols": False, "leave": True}  # fmt: skip
+        super().__init__(*args, **options)
