@@ -44,12 +44,12 @@ from mosa.training.preflight import check_capture
 
 log = logging.getLogger(__name__)
 
-TURNED = {0: "down", 90: "left", 180: "up", 270: "right"}
-"""Degrees by which a video is turned to be shown -> where the sensor's next row lies in it then."""
-OWN = ("fps", "scan", "readout")
-"""What one phone may have otherwise than the others."""
-APART = 0.12
-"""Radii of the object from where the others see it, from which on a phone is suspected."""
+READOUT_DIRECTIONS = {0: "down", 90: "left", 180: "up", 270: "right"}
+"""Rotation of a video for display [degrees] -> direction of the sensor's readout in the displayed picture."""
+PHONE_KEYS = ("fps", "scan", "readout")
+"""Keys that may be set for one phone."""
+MAX_PHONE_OFFSET = 0.12
+"""Disagreement with the other phones, in object radii, above which a phone is reported."""
 CORRECTIONS = 4
 """Times that the fall is fitted again, with the outlines that its hull has. Each time the poses' errors become smaller, and with
 them those of the hull: of the rabbit's film 1.3 px at first, then 0.6, 0.5, 0.4 and 0.4."""
@@ -80,7 +80,7 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     folder = output_folder(values)
     files = find_videos(values["videos"])
     clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in files]
-    refuse_unknown_phones(values, [clip.path.stem for clip in clips])
+    check_phone_names(values, [clip.path.stem for clip in clips])
     sizes = {clip.path.name: clip.size for clip in clips}
     given = read_phones(values["videos"], values["poses"], sizes)
     plates, masks = plates_folder(values), values["masks"]
@@ -240,13 +240,13 @@ def of_phone(values: Mapping[str, Any], name: str, key: str):
     return ((values["phones"] or {}).get(name) or {}).get(key, values[key])
 
 
-def refuse_unknown_phones(values: Mapping[str, Any], names: list[str]) -> None:
+def check_phone_names(values: Mapping[str, Any], names: list[str]) -> None:
     for name, section in (values["phones"] or {}).items():
         if name not in names:
             raise ConfigError(f"phones.{name}: no video of that name; there are {', '.join(names)}")
-        if unknown := sorted(set(section) - set(OWN)):
+        if unknown := sorted(set(section) - set(PHONE_KEYS)):
             raise ConfigError(
-                f"phones.{name}.{unknown[0]}: expected the keys {', '.join(OWN)} only"
+                f"phones.{name}.{unknown[0]}: expected the keys {', '.join(PHONE_KEYS)} only"
             )
 
 
@@ -274,7 +274,7 @@ def known(values: Mapping[str, Any], clips: list[Clip], world: World | None) -> 
     scans = {}
     for clip, name in zip(clips, names):
         scan = of_phone(values, name, "scan")
-        scans[name] = TURNED.get(clip.turned, "down") if scan == "auto" else scan
+        scans[name] = READOUT_DIRECTIONS.get(clip.turned, "down") if scan == "auto" else scan
         if scans[name] not in SCANS:
             raise ConfigError(
                 f"phones.{name}.scan: expected auto, {', '.join(SCANS)}, found {scan!r}"
@@ -377,7 +377,7 @@ def warnings_of(
                 f"{record['name']}: the fall does not tell how long its sensor takes to be read ({1e3 * record['readout']:.0f} +- "
                 f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale"
             )
-        if np.hypot(*record["shift"]) > APART * record["radius_px"]:
+        if np.hypot(*record["shift"]) > MAX_PHONE_OFFSET * record["radius_px"]:
             said.append(
                 f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or "
                 "a matte that is off?"

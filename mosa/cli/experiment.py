@@ -14,7 +14,7 @@ from mosa.config.composition import configuration
 from mosa.errors import ConfigError, MosaError
 from mosa.system.console import say_version
 from mosa.system.refused import explained
-from mosa.system.screen import outlived
+from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def main(words: list[str] | None = None) -> None:
     signal.signal(
         signal.SIGTERM, interrupt
     )  # or the jobs would go on without anyone who waits for them
-    with outlived():  # hours of jobs do not end with whoever read their lines
+    with tolerant_output():  # hours of jobs do not end with whoever read their lines
         code = code_of(words)
     sys.exit(code)
 

@@ -71,8 +71,8 @@ class Found:
     trials: int
 
 
-class Looks:
-    """Looks at a policy that is being found, every so often on the same trials, which the search is not made on; the best it was.
+class PolicyChecks:
+    """Periodic evaluation of the policy during a search, on trials of their own; keeps the best policy.
 
     check: the arena that the trials are played in; say: told a line of each look."""
 
@@ -93,7 +93,7 @@ class Looks:
         self.began, self.played = time.perf_counter(), 0
 
     def last(self, iteration: int) -> bool:
-        """Looks where that is due before an iteration; whether the search is over."""
+        """Evaluate if due before an iteration. Returns whether the search is over."""
         over = iteration == self.search.iterations
         if over or iteration % self.search.every == 0:
             loss, success = play_all(self.check, self.trials, self.policy)
@@ -136,7 +136,7 @@ def by_gradient(
     """The mean loss descended through the simulator, contact and all. train, check: of the same simulator and task."""
     task, generator = train.task, torch.Generator().manual_seed(seed)
     policy = LinearPolicy(task)
-    looks = Looks(policy, check, search, seed, say)
+    checks = PolicyChecks(policy, check, search, seed, say)
     optimiser = torch.optim.Adam(policy.parameters(), lr=search.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimiser, search.iterations, 0.1 * search.rate
@@ -148,10 +148,10 @@ def by_gradient(
         return action
 
     for iteration in range(search.iterations + 1):
-        if looks.last(iteration):
+        if checks.last(iteration):
             break
         outcome = play(train, task.draw(train.count, generator), bounded, differentiable=True)
-        looks.played += train.count
+        checks.played += train.count
         optimiser.zero_grad()
         kept = (~outcome.diverged).to(outcome.loss)
         if bool(kept.any()):
@@ -160,7 +160,7 @@ def by_gradient(
                 parameter.grad /= train.count
             optimiser.step()
         schedule.step()
-    return looks.found()
+    return checks.found()
 
 
 class OutcomeModel(nn.Module):
@@ -248,10 +248,10 @@ def by_model(
     train, check: of the same simulator and task, the former with `search.candidates` times `search.batch` worlds."""
     task = train.task
     generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
-    looks = Looks(policy, check, search, seed, say)
+    checks = PolicyChecks(policy, check, search, seed, say)
     tried: list[tuple[Tensor, Tensor, Tensor]] = []
     for iteration in range(search.iterations + 1):
-        if looks.last(iteration):
+        if checks.last(iteration):
             break
         trials = task.draw(train.count, generator)
         seen = policy.scaled(trials.observed)
@@ -259,13 +259,13 @@ def by_model(
         wide = search.spread / (1 + iteration)
         action = (about + wide * torch.randn(about.shape, generator=generator)).clamp(-1, 1)
         outcome = play(train, trials, lambda _, action=action: action)
-        looks.played += train.count
+        checks.played += train.count
         whole = ~outcome.diverged
         tried.append((seen[whole], action[whole], _outcome(train.view)[whole]))
         seen, action, ends = (torch.cat(part) for part in zip(*tried))
         model = _fitted_model(torch.cat([seen, action], 1), ends, generator)
         _descend(policy, model, task, generator)
-    return looks.found()
+    return checks.found()
 
 
 @torch.enable_grad()

@@ -121,14 +121,16 @@ def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) 
     where = simulator if record["truth"] is None else "truth"
     for name, result in ((simulator, record["own"]), ("truth", record["truth"])):
         if result is not None:
-            said(bench, simulator, seed, result, name)
+            log_successes(bench, simulator, seed, result, name)
     write_whole(folder / "result.json", json.dumps(record))
     policy = LinearPolicy.read(bench.task(simulator), record["policy"])
     films(bench, {f"trained in {simulator}": policy}, where, folder, filmed)
     return record
 
 
-def said(bench: Bench, simulator: str, seed: int, result: Mapping[str, Any], where: str) -> None:
+def log_successes(
+    bench: Bench, simulator: str, seed: int, result: Mapping[str, Any], where: str
+) -> None:
     """How often a policy succeeded, as a line of the log."""
     s, won = bench.setting, sum(result["success"])
     log.info("%s, trained in %s, seed %d: %d of %d in %s", s.task, simulator, seed, won, s.trials, where)  # fmt: skip
@@ -147,7 +149,7 @@ def make_jobs(
             record = _record(bench, name, seed)
             file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, json.dumps(record))
-        said(bench, name, seed, record["truth"], "truth")
+        log_successes(bench, name, seed, record["truth"], "truth")
         records[name, seed] = record
     return records
 

@@ -153,15 +153,15 @@ def redistribution(body: Body, directions: Tensor) -> Tensor | None:
     return redistribution_response(stress_jacobian(adapter, zero, zero)[0], directions.double())
 
 
-NEARLY = 0.05
-"""What E over its mean is drawn around 1 at least."""
+MIN_RANGE = 0.05
+"""Smallest half range of the axis of E over its mean, around 1."""
 
 
 def directions(
     experiment: Experiment, records: Sequence[Record], stem: Path
 ) -> tuple[str, list[Path]]:
     """w(theta) and E(theta) in the plane of the true fibres (or xy), theta from the fibres; beside the truth where it is known. E
-    is drawn over its mean, on axes that show NEARLY at least, so that what is isotropic is a level line, and in kPa from 0."""
+    is drawn over its mean, on axes that show MIN_RANGE at least, so that what is isotropic is a level line, and in kPa from 0."""
     found = []
     for record, twin in loaded(records):
         scene = twin.record.settings["scene"]
@@ -204,10 +204,12 @@ def directions(
         lines.append([column, name, largest, *ranges, f"{float(axis):.0f}"])
     for response, ratios, moduli in grid.T:
         highest = max([float(line.get_ydata().max()) for line in response.lines], default=0.0)
-        top = 1.05 * max(NEARLY, highest)
+        top = 1.05 * max(MIN_RANGE, highest)
         response.set_ylim(-0.04 * top, top)  # a w of 0 is a line of its own beside the axis
         low, high = ratios.get_ylim()
-        ratios.set_ylim(np.floor(100 * min(low, 1 - NEARLY) + 1e-6) / 100, max(high, 1 + NEARLY))
+        ratios.set_ylim(
+            np.floor(100 * min(low, 1 - MIN_RANGE) + 1e-6) / 100, max(high, 1 + MIN_RANGE)
+        )
         moduli.set_ylim(0, 1.05 * moduli.get_ylim()[1])
         what = ("w, response without the prior's", "E over its mean", "E [kPa]")
         for each, said in zip((response, ratios, moduli), what):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -133,6 +133,15 @@ class Job:
         )
 
 
+def section(kind: Callable[..., Any], where: str, keys: Mapping[str, Any]) -> Any:
+    """A dataclass made of a section of an experiment's file. Errors: ConfigError naming the section."""
+    try:
+        return kind(**keys)
+    except TypeError as error:
+        fields = ", ".join(kind.__dataclass_fields__)
+        raise ConfigError(f"{where}: expected fields of {fields} ({error})") from error
+
+
 def experiment_names(folder: Path) -> list[str]:
     return sorted(file.stem for file in folder.glob("*.yaml") if not file.stem.startswith("_"))
 
@@ -190,12 +199,7 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
         raise ConfigError(
             f"{name}: plot: expected bars, lines, map or null, found {keys['plot']!r}"
         )
-    try:
-        keys["figures"] = tuple(Figure(**figure) for figure in keys["figures"])
-    except TypeError as error:
-        raise ConfigError(
-            f"{name}: figures: expected sections of {', '.join(Figure.__dataclass_fields__)} ({error})"
-        ) from error
+    keys["figures"] = tuple(section(Figure, f"{name}: figures", each) for each in keys["figures"])
     keys["claims"] = tuple(
         claim_of(f"{name}: claims[{i}]", each, keys["figures"])
         for i, each in enumerate(keys.get("claims", ()))
@@ -206,12 +210,7 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
 
 def claim_of(where: str, found: Any, figures: Sequence[Figure]) -> Claim:
     """Errors: ConfigError naming the key."""
-    try:
-        claim = Claim(**{k: tuple(v) if isinstance(v, list) else v for k, v in found.items()})
-    except (TypeError, AttributeError) as error:
-        raise ConfigError(
-            f"{where}: expected fields of {', '.join(Claim.__dataclass_fields__)} ({error})"
-        ) from error
+    claim = section(Claim, where, found | {"against": tuple(found.get("against", ()))})
     labels = [figure.label for figure in figures]
     for key in ("figure", "unless"):
         if (label := getattr(claim, key)) is not None and label not in labels:
@@ -237,18 +236,9 @@ def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Optio
         raise ConfigError(f"{where}: expected a section of options, found {found!r}")
     options = []
     for name, content in found.items():
-        section = (
-            {"overrides": content}
-            if isinstance(content, (list, tuple)) or content is None
-            else dict(content)
-        )
-        section["overrides"] = tuple(str(each) for each in section.get("overrides") or ())
-        try:
-            options.append(Option(str(name), **section))
-        except TypeError as error:
-            raise ConfigError(
-                f"{where}.{name}: expected fields of {', '.join(Option.__dataclass_fields__)} ({error})"
-            ) from error
+        keys = dict(content) if isinstance(content, Mapping) else {"overrides": content}
+        keys["overrides"] = tuple(str(each) for each in keys.get("overrides") or ())
+        options.append(section(Option, f"{where}.{name}", {"name": str(name), **keys}))
     return chosen(where, tuple(options), only)
 
 

@@ -20,7 +20,7 @@ from mosa.config.composition import with_defaults
 from mosa.config.extensions import load_extensions
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
-from mosa.evaluation.likeness import warn_of_others
+from mosa.evaluation.same_body import warn_of_other_bodies
 from mosa.modules.body.body import Body, Start
 from mosa.physics import exact_sums
 from mosa.physics.contact.colliders import colliders_from_config
@@ -148,7 +148,7 @@ def train(cfg: DictConfig) -> float | None:
         body = module.body
         check_starts(world, body, starts)
         warn_of_little(world, body, starts, [scene, *others])
-        warn_of_others(body, starts, [scene, *others])
+        warn_of_other_bodies(body, starts, [scene, *others])
         if not filmed and not all(stage.newton for stage in module.stages):
             raise ConfigError(
                 "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
@@ -255,7 +255,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
             touched = replace(twin.world.ground, height=scene.ground.height)  # as the run found it
             world = replace(world, ground=touched)
-        warn_of_others(body, found, [scene, *held_out])
+        warn_of_other_bodies(body, found, [scene, *held_out])
     else:
         found = {k: Start.read(s.plain(), body.rest) for k, s in twin.record.starts.items()}
         if len(found) != 1 + len(held_out):

@@ -21,7 +21,7 @@ from mosa.data.formats.footage import (
     read_json,
     same_camera,
     scaled,
-    told_rate,
+    warn_of_other_rate,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -85,7 +85,7 @@ def read_transforms(
     times, table = synchronise(by_camera, fps)
     wanted = frame_range(list(range(len(times))), frames, str(file))
     if fps is not None and all(entry.get("time") is not None for entry in document["frames"]):
-        told_rate([times[f] for f in wanted], fps, str(file))
+        warn_of_other_rate([times[f] for f in wanted], fps, str(file))
         times = [i / fps for i in range(len(times))]
     remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
     even_times([times[f] for f in wanted], wanted, str(file), remedy)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import mosa
 from mosa.evaluation.analysis.tables import markdown
-from mosa.experiments.collecting import Cell, Record, best_of, records_of, said_below, table
+from mosa.experiments.collecting import Cell, Record, best_of, footnotes, records_of, table
 from mosa.experiments.commits import commit
 from mosa.experiments.report.drawing import BETTER, draw, save
 from mosa.experiments.report.page import write_json
@@ -64,7 +64,7 @@ def markdown_page(
         parts.append(
             f"{figure.label}{BETTER[figure.best]} (`{figure.figure}`)\n\n" + markdown(header, body)
         )
-    parts += [said] if (said := said_below(tables)) else []
+    parts += [said] if (said := footnotes(tables)) else []
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
