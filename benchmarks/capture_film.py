@@ -17,11 +17,10 @@ from pathlib import Path
 import cv2
 import imageio.v2 as iio
 import numpy as np
-import torch
 import warp as wp
+from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
-from mosa.data.formats.export import export_particles
 from mosa.data.formats.footage import OPENGL_TO_OPENCV
 from mosa.data.synthetic.bodies.objects import drop_named, object_named
 from mosa.data.synthetic.drop import GRAVITY, simulate
@@ -426,7 +425,10 @@ def perfect(
         positions = np.stack([fall.at(float(t)) for t in times])[
             :, :: max(1, len(fall.particles) // 8000)
         ]
-        export_particles(
-            torch.from_numpy(positions @ world[:3, :3].T + world[:3, 3]).float(), folder / "truth"
-        )
+        (folder / "truth").mkdir(exist_ok=True)
+        for t, points in enumerate((positions @ world[:3, :3].T + world[:3, 3]).astype("f4")):
+            vertices = np.rec.fromarrays(points.T, names="x,y,z")
+            PlyData([PlyElement.describe(vertices, "vertex")]).write(
+                folder / "truth" / f"{t:03d}.ply"
+            )
     return folder

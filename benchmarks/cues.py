@@ -25,10 +25,7 @@ from pathlib import Path
 
 import torch
 import yaml
-
-from mosa.data.synthetic import load_builtin
-from mosa.data.synthetic.bodies.objects import drop_named
-from mosa.evaluation.analysis.cue_error import (
+from cue_error import (
     USUAL_STRETCH,
     TrueMotion,
     cue_errors,
@@ -36,6 +33,9 @@ from mosa.evaluation.analysis.cue_error import (
     strain_direction_error,
     true_motion,
 )
+
+from mosa.data.synthetic import load_builtin
+from mosa.data.synthetic.bodies.objects import drop_named
 from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues
 from mosa.reconstruction.pipeline import reconstruct, spacing_for
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings

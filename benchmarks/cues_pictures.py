@@ -14,11 +14,11 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
+from cue_error import rotation_error, true_motion
 from cues import CONDITIONS, reconstructed
 from PIL import Image
 from torch import Tensor
 
-from mosa.evaluation.analysis.cue_error import rotation_error, true_motion
 from mosa.reconstruction.motion.cues import neighbourhood, polar
 from mosa.types import MotionCues, Splats
 

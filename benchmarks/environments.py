@@ -1,7 +1,7 @@
 """What the tasks of `mosa.environments` ask, measured on hidden truths alone: no learned twin is read, so that a task's
 parameters can be chosen before any comparison.
 
-    OMP_NUM_THREADS=1 python benchmarks/environments.py [--task placement hanging striking pushing] [--scene rabbit] [--device cuda]
+    OMP_NUM_THREADS=1 python benchmarks/environments.py [--task placement hanging] [--scene rabbit] [--device cuda]
         [--trials 64] [--candidates 32] [--spacing 0.0125] [--set low=0.1 high=0.15 ...] [--heights 0.1:0.2 0.15:0.25 --choose FILE]
 
 For each task, over trials drawn as in training:
@@ -9,7 +9,7 @@ For each task, over trials drawn as in training:
 - `law` and `noise`: how far [mm], in the median, the true body ends from its isotropic twin (the same matrix, without fibres and
   with one stiffness) under that policy, and how far from itself where only the hidden part of the trial is drawn anew. Where the
   law does not move it more than chance does, no simulator can be better than another.
-- `best of truth`, `best of isotropic` (tasks of one decision): of so many random actions a trial, the one with the least loss in
+- `best of truth`, `best of isotropic` : of so many random actions a trial, the one with the least loss in
   either law, tested in the true body with the hidden part drawn anew: what the right law is worth.
 
 `--heights` measures each range of dropping heights; `--choose` writes the one that its rule names into a file, as
@@ -30,7 +30,7 @@ from torch import Tensor
 from mosa.environments.arena import Arena, Played, Simulator, play
 from mosa.environments.policies import LinearPolicy
 from mosa.environments.task import Trials
-from mosa.environments.tasks import TASKS, Release, task_named
+from mosa.environments.tasks import TASKS, task_named
 from mosa.environments.truth import true_twin
 
 CHOSEN = (0.1, 0.9)
@@ -68,7 +68,7 @@ def measured(
     )
     law, noise = (float(1e3 * (there - end).norm(dim=1).median()) for end in (other, again))
     best = ["", ""]
-    if task.once and options.candidates:
+    if options.candidates:
         count = options.candidates
         many = Trials(
             trials.observed.repeat_interleave(count, 0),
@@ -88,7 +88,7 @@ def measured(
                 f"{100 * ends(truth, anew, lambda _, action=action: action)[0].success.float().mean():.0f} %"
             )
     succeeded = float(played.success.float().mean())
-    heights = f"{task.low:g} to {task.high:g}" if isinstance(task, Release) else ""
+    heights = f"{task.low:g} to {task.high:g}"
     row = (f"| {name} | {heights} | {100 * succeeded:.0f} % | {law:.0f} | {noise:.0f} | {best[0]} | {best[1]} | "
            f"{time.perf_counter() - began:.0f} |")  # fmt: skip
     return row, succeeded, law / max(noise, 1e-3)
@@ -120,11 +120,7 @@ def main() -> None:
         "--choose", type=Path, metavar="FILE", help="of one task: write the chosen heights"
     )
     options = parser.parse_args()
-    if options.choose and (
-        not options.heights
-        or len(options.task) != 1
-        or not issubclass(TASKS[options.task[0]], Release)
-    ):
+    if options.choose and (not options.heights or len(options.task) != 1):
         parser.error("--choose: expected --heights, and one of placement, hanging as --task")
     torch.set_num_threads(1)
     values = {
@@ -137,7 +133,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for name in options.task:
         found = []
-        for low, high in ranges if ranges and issubclass(TASKS[name], Release) else [(None, None)]:
+        for low, high in ranges or [(None, None)]:
             row, plain, ratio = measured(
                 name, options, values | ({} if low is None else {"low": low, "high": high})
             )

@@ -57,10 +57,8 @@ def assembled(overrides: list[str], device: str):
 def assembled_from_parts(cfg, device: str):
     """The module of f7484c1 and later commits without `mosa.training.assembly`, by their functions."""
     from mosa.config.build import plain, run_config
-    from mosa.rendering.rasterizer import use_backend
     from mosa.training import workflow as pipeline
 
-    use_backend(cfg.rendering.backend)
     scene, _ = pipeline.scenes(cfg)
     reconstruction, dx = pipeline.reconstruct_scene(cfg, scene, device)
     config = run_config(plain(cfg), scene, dx)

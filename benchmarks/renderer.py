@@ -18,12 +18,14 @@ import platform
 import statistics
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
+import gsplat_adapter
 import torch
 import warp as wp
 
-from mosa.rendering import gsplat_backend, splatting
+from mosa.rendering import splatting
 from mosa.rendering.cameras import look_at
 from mosa.rendering.covariance import covariance_from, project_gaussians
 from mosa.rendering.flow import flow_features
@@ -31,6 +33,7 @@ from mosa.rendering.rasterizer import rasterize
 from mosa.types import Cameras
 
 SIZE, FOCAL, DISTANCE = 400, 500.0, 2.0
+WAYS = {"warp": rasterize, "gsplat": gsplat_adapter.splat}
 
 
 def ring(views: int) -> Cameras:
@@ -91,7 +94,7 @@ def step(kind: str, count: int, views: int, channels: int, device: str, backend:
     )
 
     def run() -> None:
-        image, alpha = rasterize(*leaves, cameras, index, backend=backend)
+        image, alpha = WAYS[backend](*leaves, cameras, index)
         torch.autograd.grad((image * weight).sum() + alpha.sum(), leaves)
 
     return run
@@ -131,12 +134,12 @@ def on_cpu(counts: list[int], repeats: int) -> None:
 
 
 def on_cuda(counts: list[int], repeats: int, views: int) -> None:
-    backends = ["warp"] + (["gsplat"] if gsplat_backend.why_unavailable() is None else [])
+    backends = ["warp"] + (["gsplat"] if gsplat_adapter.why_unavailable() is None else [])
     print(
         f"\nCUDA, {views} images of {SIZE}x{SIZE} in one batch, 9 channels, forward + backward, median (least to most) of {repeats}"
     )
     if len(backends) == 1:
-        print(f"  gsplat is left out: {gsplat_backend.why_unavailable()}")
+        print(f"  gsplat is left out: {gsplat_adapter.why_unavailable()}")
     for kind in ("object", "cloud"):
         for count in counts:
             for backend in backends:
@@ -163,7 +166,7 @@ def parts(kind: str, count: int, views: int) -> tuple[dict, int]:
     """The stages of one forward and backward pass as functions of no arguments, by name, and the entries of the tile lists."""
     (means, covariances, opacities, features), cameras = inputs(kind, count, views, 9, "cuda")
     index = torch.zeros(views, dtype=torch.int32, device="cuda")
-    g = splatting.Geometry(index, SIZE, SIZE, splatting.PRESETS["gsplat"], "tile")
+    g = splatting.Geometry(index, SIZE, SIZE, "tile")
     splatting.start_warp()
     gaussians = (means, covariances, opacities, cameras.K, cameras.w2c)
     records, depths = splatting.project(*gaussians, g)
@@ -226,14 +229,16 @@ def print_parity() -> None:
         for name in (*NAMES, "background", "state_index", "cameras"):
             setattr(drawn, name, getattr(drawn, name).to("cuda"))
         clear = clear.to("cuda")
-    reason = gsplat_backend.why_unavailable()
-    ways = {"warp": {"backend": "warp"}, "gsplat": {"backend": "gsplat"}}
+    reason = gsplat_adapter.why_unavailable()
+    ways = WAYS
     if reason:
         print(f"gsplat is left out: {reason}")
-        ways = {"pixel by pixel": {"scan": "tile"}, "Gaussian by Gaussian": {"scan": "gaussian"}}
+        ways = {
+            "pixel by pixel": partial(rasterize, scan="tile"),
+            "Gaussian by Gaussian": partial(rasterize, scan="gaussian"),
+        }
     (image, alpha, gradients), (wanted, wanted_alpha, wanted_gradients) = (
-        outcome(drawn, clear, lambda *x, options=options: rasterize(*x, **options))
-        for options in ways.values()
+        outcome(drawn, clear, way) for way in ways.values()
     )
     share = float(clear.float().mean())
     print(

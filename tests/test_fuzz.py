@@ -12,9 +12,9 @@ from drawn_mistakes import changed, examples, numbers, places, plain, values
 from hypothesis import given
 from hypothesis import strategies as st
 from strangers import ROOT, saved
+from written_scenes import export_pacnerf, export_spring_gaus, export_transforms
 
 from mosa.config.build import rehearse
-from mosa.data.formats.export import export_pacnerf, export_spring_gaus, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.system.npz import read_npz, write_npz

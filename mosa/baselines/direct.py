@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
 from mosa.modules.adapters.stress import Hidden, RestFree, Scale, StressBound, rested
@@ -16,25 +15,18 @@ class DirectAdapter(Adapter):
     """tau_hat = tau + E_ref R mat(l_max tanh net(w, s)) R^T, exactly the prior at initialisation.
 
     l_max: bound in units of E_ref, None for an unbounded network; rest_free, input_scale, hidden: as `StressAdapter`.
-    no_C, no_pre, no_post, no_prior_stress: ablations of the paper's adapter that have no meaning here.
-    Errors: ConfigError naming the key for values out of range, or for an ablation of parts it has not.
+    Errors: ConfigError naming the key for values out of range.
     """
 
     def __init__(
-        self, *, l_max: StressBound = 0.1, input_scale: Scale = 10.0, hidden: Hidden = 64, rest_free: RestFree = True,
-        no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        *,
+        l_max: StressBound = 0.1,
+        input_scale: Scale = 10.0,
+        hidden: Hidden = 64,
+        rest_free: RestFree = True,
+    ) -> None:
         super().__init__()
-        switches = {
-            "no_C": no_C,
-            "no_pre": no_pre,
-            "no_post": no_post,
-            "no_prior_stress": no_prior_stress,
-        }
-        if on := [name for name, value in switches.items() if value]:
-            raise ConfigError(
-                f"adapter=direct: {', '.join(on)} ablates parts of adapter=mosa that a black box has not"
-            )
         self.l_max, self.scale, self.rest_free = l_max, input_scale, rest_free
         self.net = TwoHiddenLayers(12, 6, hidden)
         zero_outputs(self.net[-1])

@@ -19,8 +19,8 @@ FINEST = 0.004
 """[s] of it: no phone's films need a finer one to begin with."""
 LOST = 0.5
 """Share of a track that may find no partner."""
-NEARLY = 0.1
-"""Of a share: offsets that do worse by less are as good."""
+COST_TOLERANCE = 0.1
+"""Difference of cost (a share) below which two time offsets count as equal."""
 
 
 def moving_frames(track: Track) -> np.ndarray:
@@ -93,7 +93,10 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
             costs[v] = cost / (2 * len(placed))
         v = min(
             costs,
-            key=lambda v: (costs[v].min() > LOST, int((costs[v] < costs[v].min() + NEARLY).sum())),
+            key=lambda v: (
+                costs[v].min() > LOST,
+                int((costs[v] < costs[v].min() + COST_TOLERANCE).sum()),
+            ),
         )
         best = int(costs[v].argmin())
         if costs[v][best] > LOST:

@@ -26,8 +26,8 @@ MODELS = {
 BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
 POINTS = re.compile(r"[-+.\deE\s]+")
 """A line of an image's points: numbers by threes."""
-MOST = 100_000
-"""Cameras or images of a model: of a damaged file the count is any number."""
+MAX_ENTRIES = 100_000
+"""Cameras or images of a model. The count of a damaged file may be any number."""
 
 Intrinsics = tuple[np.ndarray, dict[str, float], bool, tuple[int, int]]
 
@@ -206,7 +206,7 @@ def read_points(folder: Path) -> np.ndarray:
     if binary.is_file():
         data, at, found = binary.read_bytes(), 8, []
         try:
-            for _ in range(counted(data, binary, 100 * MOST)):
+            for _ in range(counted(data, binary, 100 * MAX_ENTRIES)):
                 found.append(struct.unpack_from("<3d", data, at + 8))
                 at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
         except (struct.error, OverflowError) as error:
@@ -229,7 +229,7 @@ def point(words: list[str], where: str) -> list[float]:
     return numbers(words[1:4], where)
 
 
-def counted(data: bytes, file: Path, most: int = MOST) -> int:
+def counted(data: bytes, file: Path, most: int = MAX_ENTRIES) -> int:
     (count,) = struct.unpack_from("<Q", data, 0)
     if count > most:
         raise DataError(

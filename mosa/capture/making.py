@@ -44,12 +44,12 @@ from mosa.training.preflight import check_capture
 
 log = logging.getLogger(__name__)
 
-TURNED = {0: "down", 90: "left", 180: "up", 270: "right"}
-"""Degrees by which a video is turned to be shown -> where the sensor's next row lies in it then."""
-OWN = ("fps", "scan", "readout")
-"""What one phone may have otherwise than the others."""
-APART = 0.12
-"""Radii of the object from where the others see it, from which on a phone is suspected."""
+READOUT_DIRECTIONS = {0: "down", 90: "left", 180: "up", 270: "right"}
+"""Rotation of a video for display [degrees] -> direction of the sensor's readout in the displayed picture."""
+PHONE_KEYS = ("fps", "scan", "readout")
+"""Keys that may be set for one phone."""
+MAX_PHONE_OFFSET = 0.12
+"""Disagreement with the other phones, in object radii, above which a phone is reported."""
 CORRECTIONS = 4
 """Times that the fall is fitted again, with the outlines that its hull has. Each time the poses' errors become smaller, and with
 them those of the hull: of the rabbit's film 1.3 px at first, then 0.6, 0.5, 0.4 and 0.4."""
@@ -78,40 +78,33 @@ def make(cfg: DictConfig) -> dict[str, Any]:
 def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     """From the keys of conf/capture.yaml. Errors: ConfigError, DataError."""
     folder = output_folder(values)
-    clips = [
-        open_clip(file, of_phone(values, file.stem, "fps"))
-        for file in find_videos(values["videos"])
-    ]
-    refuse_unknown_phones(values, [clip.path.stem for clip in clips])
-    phones = read_phones(
-        values["videos"], values["poses"], {clip.path.name: clip.size for clip in clips}
-    )
-    plates = plates_folder(values)
-    mattings = [matting_of(values["mattes"], clip, plates=plates, plate_seconds=values["plate_seconds"],
-                           masks=None if values["masks"] is None else Path(values["masks"])) for clip in clips]  # fmt: skip
+    files = find_videos(values["videos"])
+    clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in files]
+    check_phone_names(values, [clip.path.stem for clip in clips])
+    sizes = {clip.path.name: clip.size for clip in clips}
+    given = read_phones(values["videos"], values["poses"], sizes)
+    plates, masks = plates_folder(values), values["masks"]
+    how = {
+        "plates": plates,
+        "plate_seconds": values["plate_seconds"],
+        "masks": masks and Path(masks),
+    }
+    mattings = [matting_of(values["mattes"], clip, **how) for clip in clips]
     tracks = followed(clips, mattings)
-    world = None if values["like"] is None else read_world(values["like"])
-    knowledge = known(values, clips, world)
+    like = None if values["like"] is None else read_world(values["like"])
+    knowledge = known(values, clips, like)
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
-    given = phones
-    fall, phones = found_fall(phones, tracks, knowledge, float(values["max_offset"]), flight)
-    log.info(
-        "fall: %.3f to %.3f s on the clock of %s, %d centres",
-        *fall.window,
-        phones[0].name,
-        fall.frames,
-    )
+    fall, phones = found_fall(given, tracks, knowledge, float(values["max_offset"]), flight)
+    span = fall.window
+    log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *span, phones[0].name, fall.frames)  # fmt: skip
     common = common_path(phones, tracks, fall, knowledge)
-    exposures = [
-        exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))
-    ]
-    times = common_times(
-        exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"]
-    )
+    exposures = [exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))]  # fmt: skip
+    written = {key: values[key] for key in ("before", "after", "rate")}
+    times = common_times(exposures, span, **written)
     ground = None if values["ground"] is None else np.array(values["ground"], float)
-    own = world is None
-    free = check_known_world(fall, knowledge, phones, tracks, flight, ground if own else None)
-    world = world_of(fall, phones, ground) if own else world
+    own = None if like is not None else ground
+    free = check_known_world(fall, knowledge, phones, tracks, flight, own)
+    world = world_of(fall, phones, ground) if like is None else like
     gains = gains_of(values, phones, clips, plates, world, tracks, fall)
     for v, phone in enumerate(tqdm(phones, desc="frames at common times", unit="phone")):
         pictures = resampled(exposures[v], tracks[v], mattings[v], times, values["interpolation"])
@@ -121,60 +114,47 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     write_transforms(folder, phones, times, world)
     centres = world.points(centres_of(exposures, phones, times))
     radius = radius_of(phones, tracks, fall) * world.scale
-    floor = {"from": "like" if not own else "ground", "sd": None, "tilt_degrees": None}
-    if own and ground is None:
-        scale = min(1.0, COARSE / max(phones[0].camera.size))
-        pixel = world.scale * np.mean(
-            [np.linalg.norm(p.camera.centre - fall.position) / p.camera.K[0, 0] for p in phones]
-        )
-        height, error = ground_height(lowest_points(folder, centres, radius, scale), float(pixel))
-        floor = {"from": "lowest contact", "sd": error, "tilt_degrees": None}
-        level = floor_of_points(
-            world.points(scene_points(values["poses"])),
-            radius,
-            height,
-            max(3 * error, 0.3 * radius),
-        )
-        if level is not None:
-            height, floor = (
-                level[0],
-                {"from": "points of the model", "sd": level[1], "tilt_degrees": level[2]},
-            )
+    floor = {"from": "ground" if like is None else "like", "sd": None, "tilt_degrees": None}
+    if like is None and ground is None:
+        height, floor = found_floor(values, folder, phones, fall, world, centres, radius)
         world = world.lowered(height)
         centres = centres - [0, height, 0]
         write_transforms(folder, phones, times, world)
-    beside = np.stack(
-        [now.camera.K[:2, 2] - then.camera.K[:2, 2] for now, then in zip(phones, given)]
-    )
-    told = replace(fall, shifts=fall.shifts + beside)
-    found = figures(
-        values,
-        phones,
-        clips,
-        tracks,
-        told,
-        free,
-        knowledge,
-        world,
-        times,
-        centres,
-        radius,
-        floor,
-        gains,
-    )
+    moved = [now.camera.K[:2, 2] - then.camera.K[:2, 2] for now, then in zip(phones, given)]
+    told = replace(fall, shifts=fall.shifts + np.stack(moved))
+    found = {
+        "phones": [
+            phone_figures(v, *parts, told, knowledge, gains)
+            for v, parts in enumerate(zip(phones, clips, tracks))
+        ]
+    }
+    found |= figures(values, told, free, knowledge, world, times, centres, radius, floor)
+    found["warnings"] = warnings_of(found, values, knowledge, phones)
     write_whole(folder / FILE, json.dumps(found, indent=1))
     write_report(folder, found, phones, fall, exposures, world, times)
     for line in found["warnings"]:
         log.warning("warning: %s", line)
     log.info(
         "%d frames of %d phones in %s; what was found is in %s\n%s",
-        len(times),
-        len(phones),
-        folder,
-        folder / "capture.md",
-        found["command"],
-    )
+        len(times), len(phones), folder, folder / "capture.md", found["command"],
+    )  # fmt: skip
     return found
+
+
+def found_floor(
+    values, folder: Path, phones: list[Phone], fall: Fall, world: World, centres, radius: float
+) -> tuple[float, dict[str, Any]]:
+    """(height [m], where it is from and what it may be off by) of the floor, which nobody has said: that among the points of the
+    poses' model, else the lowest contact of the hull."""
+    scale = min(1.0, COARSE / max(phones[0].camera.size))
+    away = [np.linalg.norm(p.camera.centre - fall.position) / p.camera.K[0, 0] for p in phones]
+    lowest = lowest_points(folder, centres, radius, scale)
+    height, error = ground_height(lowest, float(world.scale * np.mean(away)))
+    points, apart = world.points(scene_points(values["poses"])), max(3 * error, 0.3 * radius)
+    level = floor_of_points(points, radius, height, apart)
+    if level is None:
+        return height, {"from": "lowest contact", "sd": error, "tilt_degrees": None}
+    return level[0], {"from": "points of the model", "sd": level[1], "tilt_degrees": level[2]}
 
 
 def output_folder(values: Mapping[str, Any]) -> Path:
@@ -260,13 +240,13 @@ def of_phone(values: Mapping[str, Any], name: str, key: str):
     return ((values["phones"] or {}).get(name) or {}).get(key, values[key])
 
 
-def refuse_unknown_phones(values: Mapping[str, Any], names: list[str]) -> None:
+def check_phone_names(values: Mapping[str, Any], names: list[str]) -> None:
     for name, section in (values["phones"] or {}).items():
         if name not in names:
             raise ConfigError(f"phones.{name}: no video of that name; there are {', '.join(names)}")
-        if unknown := sorted(set(section) - set(OWN)):
+        if unknown := sorted(set(section) - set(PHONE_KEYS)):
             raise ConfigError(
-                f"phones.{name}.{unknown[0]}: expected the keys {', '.join(OWN)} only"
+                f"phones.{name}.{unknown[0]}: expected the keys {', '.join(PHONE_KEYS)} only"
             )
 
 
@@ -294,7 +274,7 @@ def known(values: Mapping[str, Any], clips: list[Clip], world: World | None) -> 
     scans = {}
     for clip, name in zip(clips, names):
         scan = of_phone(values, name, "scan")
-        scans[name] = TURNED.get(clip.turned, "down") if scan == "auto" else scan
+        scans[name] = READOUT_DIRECTIONS.get(clip.turned, "down") if scan == "auto" else scan
         if scans[name] not in SCANS:
             raise ConfigError(
                 f"phones.{name}.scan: expected auto, {', '.join(SCANS)}, found {scan!r}"
@@ -319,11 +299,21 @@ def centres_of(exposures, phones: list[Phone], times: np.ndarray) -> np.ndarray:
     return centres_at(phones, tracks, np.zeros(len(phones)), times)
 
 
+def phone_figures(
+    v: int, phone: Phone, clip: Clip, track: Track, fall: Fall, knowledge: Knowledge, gains
+) -> dict[str, Any]:
+    """What capture.json says of phone number v of a fall."""
+    return {
+        "name": phone.name, "size": list(clip.size), "fps": round(1 / clip.interval, 4), "frames": len(clip.times),
+        "seen": int(track.seen.sum()), "offset": float(fall.offsets[v]), "offset_sd": float(fall.offsets_sd[v]),
+        "readout": float(fall.readouts[v]), "readout_sd": float(fall.readouts_sd[v]), "scan": knowledge.scan[phone.name],
+        "shift": fall.shifts[v].tolist(), "jitter": clip.jitter, "radius_px": float(np.median(track.radii[track.seen])),
+        "gain": None if gains is None else gains[v].tolist(),
+    }  # fmt: skip
+
+
 def figures(
     values,
-    phones,
-    clips,
-    tracks,
     fall: Fall,
     free: Fall,
     knowledge: Knowledge,
@@ -332,42 +322,25 @@ def figures(
     centres,
     radius,
     floor,
-    gains,
 ) -> dict[str, Any]:
-    """All that capture.json says. free: the fall without what was known of scale and up, which it so checks."""
+    """What capture.json says beside the phones. free: the fall without what was known of scale and up, which it so checks."""
     box = box_of(centres, radius)
-    folder = Path(values["output"])
-    acceleration = float(np.linalg.norm(free.acceleration)) * world.scale
-    turned = float(
-        np.degrees(
-            np.arccos(
-                np.clip(-free.acceleration @ fall.up / np.linalg.norm(free.acceleration), -1, 1)
-            )
-        )
-    )
-    per_phone = []
-    for v, (phone, clip, track) in enumerate(zip(phones, clips, tracks)):
-        per_phone.append({
-            "name": phone.name, "size": list(clip.size), "fps": round(1 / clip.interval, 4), "frames": len(clip.times),
-            "seen": int(track.seen.sum()), "offset": float(fall.offsets[v]), "offset_sd": float(fall.offsets_sd[v]),
-            "readout": float(fall.readouts[v]), "readout_sd": float(fall.readouts_sd[v]), "scan": knowledge.scan[phone.name],
-            "shift": fall.shifts[v].tolist(), "jitter": clip.jitter, "radius_px": float(np.median(track.radii[track.seen])),
-            "gain": None if gains is None else gains[v].tolist(),
-        })  # fmt: skip
+    size = float(np.linalg.norm(free.acceleration))
+    along = np.clip(-free.acceleration @ fall.up / size, -1, 1)
+    drawn = json.dumps(box, separators=(",", ":"))
     command = (
-        f"python train.py scene=transforms scene.path={folder} scene.up=[0,1,0] "
-        f"scene.gravity=[0,-{values['gravity']:g},0] 'scene.box={json.dumps(box, separators=(',', ':'))}' prior=neo_hookean"
+        f"python train.py scene=transforms scene.path={Path(values['output'])} scene.up=[0,1,0] "
+        f"scene.gravity=[0,-{values['gravity']:g},0] 'scene.box={drawn}' prior=neo_hookean"
     )
-    free = int((times <= fall.window[1]).sum())
-    found = {
-        "phones": per_phone, "fall": {"window": list(fall.window), "centres": fall.frames, "noise_px": fall.noise,
-                                      "acceleration": acceleration, "turned_degrees": turned},
+    return {
+        "fall": {"window": list(fall.window), "centres": fall.frames, "noise_px": fall.noise, "acceleration": size * world.scale,
+                 "turned_degrees": float(np.degrees(np.arccos(along)))},
         "scale": world.scale, "scale_sd": None if knowledge.scale is not None else fall.scale_sd,
         "up": fall.up.tolist(), "up_sd_degrees": None if knowledge.up is not None else fall.up_sd, "ground": floor,
-        "radius": radius, "frames": len(times), "free_frames": free, "rate": float(1 / np.diff(times).mean()), "box": box,
-        "start": float(times[0]), "interpolation": values["interpolation"], "world": world.written(), "command": command,
+        "radius": radius, "frames": len(times), "free_frames": int((times <= fall.window[1]).sum()),
+        "rate": float(1 / np.diff(times).mean()), "box": box, "start": float(times[0]), "interpolation": values["interpolation"],
+        "world": world.written(), "command": command,
     }  # fmt: skip
-    return found | {"warnings": warnings_of(found, values, knowledge, phones)}
 
 
 SIZES = 0.005, 0.75
@@ -404,7 +377,7 @@ def warnings_of(
                 f"{record['name']}: the fall does not tell how long its sensor takes to be read ({1e3 * record['readout']:.0f} +- "
                 f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale"
             )
-        if np.hypot(*record["shift"]) > APART * record["radius_px"]:
+        if np.hypot(*record["shift"]) > MAX_PHONE_OFFSET * record["radius_px"]:
             said.append(
                 f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or "
                 "a matte that is off?"

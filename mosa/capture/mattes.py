@@ -15,8 +15,6 @@ from mosa.data.images.matting import SPECK, matte_from_plate
 from mosa.data.images.reading import fill_holes
 from mosa.errors import ConfigError, DataError
 
-REMBG = "isnet-general-use"
-"""Network of rembg: of those it brings, one that is trained on objects of any kind."""
 DARK = 0.1
 """Plate values below say nothing about the exposure."""
 SMALLEST = 30
@@ -56,12 +54,10 @@ class Track:
 def matting_of(
     kind: str, clip: Clip, *, plates: Path | None, plate_seconds, masks: Path | None
 ) -> Matting:
-    """How the frames of a clip are matted. kind: plates | rembg | masks. Errors: ConfigError, DataError."""
+    """How the frames of a clip are matted. kind: plates | masks. Errors: ConfigError, DataError."""
     if kind == "plates":
         plate = plate_of(plates, clip, plate_seconds)
         return lambda i, picture: matte_from_plate(same_exposure(picture, plate), plate)
-    if kind == "rembg":
-        return by_network()
     if masks is None:
         raise ConfigError(
             "masks: expected the folder of mask videos (white: the object), found none; or choose mattes=plates"
@@ -82,23 +78,6 @@ def same_exposure(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
             else 1.0
         )
     return np.clip(picture / np.maximum(gains, 0.1), 0, 1).astype(np.float32)
-
-
-def by_network() -> Matting:
-    """rembg (MIT): a network that separates foreground from background in one picture. Errors: ConfigError where it is missing."""
-    try:
-        from rembg import new_session, remove
-    except ImportError as error:
-        raise ConfigError(
-            "mattes: rembg is not installed; pip install 'mosa[rembg]', or mattes=plates or masks"
-        ) from error
-    session = new_session(REMBG)
-
-    def matted(_: int, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        mask = remove(np.round(255 * picture).astype(np.uint8), session=session, only_mask=True)
-        return picture, np.asarray(mask, np.float32).reshape(picture.shape[:2]) / 255
-
-    return matted
 
 
 def from_videos(folder: Path, clip: Clip) -> Matting:

@@ -23,8 +23,8 @@ VIEWS = 3
 """Frames of each phone that carve it."""
 SAMPLES = 9
 """Times of the fall at which the outline is looked at; a parabola in time goes through them."""
-MOST = 0.3
-"""Radii: an outline's centre further from the body's says that the hull is none."""
+MAX_CENTRE_OFFSET = 0.3
+"""Distance of an outline's centre from the body's, in radii, above which the hull is rejected."""
 
 
 def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:
@@ -101,7 +101,7 @@ def corrected(
         off = np.stack(
             [outline_centre(phone, points + c, PITCH * radius) for c in places]
         ) - phone.camera.project(places + middle)
-        if np.abs(off).max() > MOST * float(np.median(track.radii[track.seen])):
+        if np.abs(off).max() > MAX_CENTRE_OFFSET * float(np.median(track.radii[track.seen])):
             return None
         curve = np.polyfit(times - fall.origin, off, 2)
         t = np.clip(track.times + fall.offsets[v], *fall.window) - fall.origin

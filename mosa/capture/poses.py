@@ -11,8 +11,9 @@ import numpy as np
 
 from mosa.capture.colmap import is_model, read_model, read_points
 from mosa.capture.phones import Camera, Phone, plausible
-from mosa.data.formats.footage import matrix, number, read_json, world_to_camera
-from mosa.data.images.lens import COEFFICIENTS, is_fisheye
+from mosa.data.formats.footage import read_json
+from mosa.data.formats.transforms import camera_matrix, entries_of, shot_of
+from mosa.data.images.lens import COEFFICIENTS
 from mosa.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
@@ -94,56 +95,17 @@ def scene_points(path: str | Path) -> np.ndarray:
 
 def read_transforms_poses(file: Path) -> dict[str, Camera]:
     """Poses and lenses of a transforms.json; its images are not read. Errors: DataError naming entry and key."""
-    document = read_json(file)
-    if (
-        not isinstance(document, dict)
-        or not isinstance(document.get("frames"), list)
-        or not document["frames"]
-    ):
-        raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
-    found = {}
-    for i, entry in enumerate(document["frames"]):
-        where = f"{file}, frames[{i}]"
-        for key in ("file_path", "transform_matrix"):
-            if not isinstance(entry, dict) or key not in entry:
-                raise DataError(f"{where}: expected the key {key}")
-        keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
-        both = {**document, **entry}
-        known = {
-            key: number(both[key], f"{where}, {key}") for key in keys if both.get(key) is not None
-        }
-        if not {"w", "h"} <= set(known):
+    document, found = read_json(file), {}
+    for where, entry in entries_of(file, document):
+        shot = shot_of(where, entry, document)
+        width, height = (int(shot.intrinsics.get(key, 0)) for key in ("w", "h"))
+        if min(width, height) < 1:
             raise DataError(
-                f"{where}: expected the images' size in pixels, w and h, found {sorted(known)}"
+                f"{where}: expected w and h, an image size w, h of at least 1 px, found {width}, {height}"
             )
-        if min(known["w"], known["h"]) < 1:
-            raise DataError(
-                f"{where}: expected an image size w, h of at least 1 px, found {known['w']:g}x{known['h']:g}"
-            )
-        if "fl_x" not in known and not 0 < known.get("camera_angle_x", 0) < math.pi:
-            raise DataError(
-                f"{where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither"
-            )
-        focal = (
-            known["fl_x"]
-            if "fl_x" in known
-            else 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
-        )
-        K = np.array(
-            [
-                [focal, 0, known.get("cx", known["w"] / 2)],
-                [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)],
-                [0, 0, 1],
-            ]
-        )
-        fisheye = is_fisheye(both.get("camera_model"), both.get("is_fisheye"), where)
-        w2c = world_to_camera(
-            matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix"), where
-        )
-        lens = {name: known[name] for name in COEFFICIENTS if name in known}
-        found[str(entry["file_path"])] = Camera(
-            K, w2c, (int(known["w"]), int(known["h"])), where, lens, fisheye
-        )
+        K = camera_matrix(shot, width, height)
+        lens = {name: shot.intrinsics[name] for name in COEFFICIENTS if name in shot.intrinsics}
+        found[str(entry["file_path"])] = Camera(K, shot.w2c, (width, height), where, lens, shot.fisheye)  # fmt: skip
     return found
 
 

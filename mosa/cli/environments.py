@@ -1,4 +1,4 @@
-"""Policies trained in a twin and tested in the hidden truth:  mosa-environments task=pushing checkpoint=..."""
+"""Policies trained in a twin and tested in the hidden truth:  mosa-environments task=placement checkpoint=..."""
 
 from mosa.cli.configured import command
 

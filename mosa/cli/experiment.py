@@ -6,8 +6,6 @@ import argparse
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +14,7 @@ from mosa.config.composition import configuration
 from mosa.errors import ConfigError, MosaError
 from mosa.system.console import say_version
 from mosa.system.refused import explained
-from mosa.system.screen import outlived
+from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 
 if TYPE_CHECKING:
@@ -78,7 +76,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
         action="append",
         default=[],
         metavar="AXIS=NAME,NAME",
-        help="these of an axis; EXPERIMENT:AXIS=NAME,NAME of one experiment's alone",
+        help="these of an axis alone",
     )
     parser.add_argument(
         "--set",
@@ -97,7 +95,7 @@ def main(words: list[str] | None = None) -> None:
     signal.signal(
         signal.SIGTERM, interrupt
     )  # or the jobs would go on without anyone who waits for them
-    with outlived():  # hours of jobs do not end with whoever read their lines
+    with tolerant_output():  # hours of jobs do not end with whoever read their lines
         code = code_of(words)
     sys.exit(code)
 
@@ -115,7 +113,10 @@ def code_of(words: list[str] | None) -> int:
         print(f"\n{reason}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
-        print("\nstopped; the same command goes on from here", file=sys.stderr)
+        print(
+            "\nstopped; the same command goes on from here, and --collect writes what is complete",
+            file=sys.stderr,
+        )
         code = 130
     return code
 
@@ -165,81 +166,29 @@ def run(options: argparse.Namespace) -> int:
             wanted.setdefault(job.folder, replace(job, turn=turns[name]))
     jobs = list(wanted.values())
     check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
-    lines, minutes = estimate(jobs, devices, options.jobs)
-    for line in lines:
+    for line in estimate(jobs, devices, options.jobs):
         print(line, flush=True)
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0
     writable("--runs", options.runs)
     writable("--results", results)
-    from mosa.experiments.report.writer import Writer
+    command, failed = shown(options), {}
+    if not options.collect:
+        from mosa.experiments.running import run_jobs
 
-    by_name, command = {experiment.name: experiment for experiment in experiments}, shown(options)
+        failed = run_jobs(jobs, devices, options.jobs)
+    from mosa.experiments.report.writing import write_results
 
-    def write(name: str) -> None:
-        from mosa.experiments.report.writing import (
-            write_results,
-        )  # which imports the simulator: jobs do not wait for it
-
-        page = write_results(by_name[name], planned[name], results, command)
-        print(f"{name}: {page}, {total_minutes(planned[name]):.1f} minutes of jobs", flush=True)
-
-    with Writer(planned, write) as writer:
-        failed = (
-            {} if options.collect else run_counted(options, jobs, devices, minutes, writer.ended)
-        )
-        writer.finish()
+    for experiment in experiments:
+        page = write_results(experiment, planned[experiment.name], results, command)
+        taken = total_minutes(planned[experiment.name])
+        print(f"{experiment.name}: {page}, {taken:.1f} minutes of jobs", flush=True)
     if options.page:
         print(write_the_page(folder, options))
     for where, reason in failed.items():
         print(f"failed: {where}: {reason}", file=sys.stderr)
     return 1 if failed else 0
-
-
-def run_counted(
-    options: argparse.Namespace,
-    jobs: Sequence[Job],
-    devices: Sequence[int | None],
-    minutes: float,
-    ended: Callable[[Job], None],
-) -> dict[str, str]:
-    """`run_jobs`, with a row in the runs' `goes.csv` and a line at its end that says how long all goes of this command have taken.
-
-    minutes: as estimated; ended: told of each job that has, whether it failed or not."""
-    from mosa.experiments.commits import commit
-    from mosa.experiments.goes import Clock, Go, now, said_of
-    from mosa.experiments.running import run_jobs
-
-    left = sum(not job.finished for job in jobs)
-    if not left:
-        return {}
-    clock = Clock(
-        options.runs,
-        Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)),
-    )
-
-    def told(job: Job, job_failed: bool) -> None:
-        with only_said():
-            clock.ended(job_failed)
-        ended(job)
-
-    try:
-        return run_jobs(jobs, devices, options.jobs, told)
-    finally:
-        with only_said():
-            print(
-                said_of([go for go in clock.write() if go.command == clock.go.command]), flush=True
-            )
-
-
-@contextmanager
-def only_said() -> Iterator[None]:
-    """What goes wrong in keeping count is a line on the screen: it ends no jobs."""
-    try:
-        yield
-    except (MosaError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
 
 
 def write_the_page(folder: Path, options: argparse.Namespace) -> Path:

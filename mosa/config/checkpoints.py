@@ -37,7 +37,7 @@ NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_
          *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte",
                                                "Bool"))}  # fmt: skip
 """Functions and classes that a checkpoint of this program refers to; torch knows some more, of which a few make large objects."""
-BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "callbacks", "trainer", "evaluation", "rendering.backend",
+BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "callbacks", "trainer", "evaluation",
           "scene.cache", "scene.root", "identification.threads", "extensions")  # fmt: skip
 """Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
 `scene.path` the last part counts."""

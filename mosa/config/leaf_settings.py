@@ -108,9 +108,7 @@ class SplatsSettings(LawSections):
     rate: Positive = Field(30, description="frames per second")
     formats: Names = Field(
         ["ply"],
-        description=(
-            "for each frame: ply, splat, spz (needs gsply); usd (needs usd-core) is one file"
-        ),
+        description=("ply, a file for each frame; usd (needs usd-core) is one file"),
     )
     video: bool = Field(True, description="film it")
 
@@ -141,12 +139,9 @@ class CaptureSettings(Settings):
             "ground) this one gets"
         ),
     )
-    mattes: Literal["plates", "rembg", "masks"] = Field(
+    mattes: Literal["plates", "masks"] = Field(
         "plates",
-        description=(
-            "plates: empty backgrounds; rembg: a network (pip install 'mosa[rembg]'); "
-            "masks: videos of them"
-        ),
+        description=("plates: empty backgrounds; masks: videos of masks, of any other program"),
     )
     plates: Folder | None = Field(
         None,
@@ -221,15 +216,12 @@ class TruthSection(Settings):
         None, description="a built-in one; null: the one that the run learned from"
     )
     spacing: Spacing | None = Field(
-        None, description="m, of the truth's particles in tests; null: those of the films"
-    )
-    train_spacing: Spacing | None = Field(
-        None, description="m, where a policy is trained in the truth; coarser is quicker"
+        None, description="m, of the truth's particles; null: those of the films"
     )
 
 
 class SearchSection(Settings):
-    """policy=gradient, cma, model"""
+    """policy=gradient, model"""
 
     where: ClassVar[str] = "search"
 
@@ -247,23 +239,17 @@ class SearchSection(Settings):
         32,
         ge=4,
         le=10**9,
-        description=(
-            "cma: policies of an iteration, each on the whole batch; model: so many "
-            "batches an iteration"
-        ),
+        description="model: so many batches an iteration",
     )
     spread: Positive = Field(
         0.4,
-        description=(
-            "first standard deviation: cma: of the policy's numbers; model: of actions "
-            "about the policy's"
-        ),
+        description="model: first standard deviation of actions about the policy's",
     )
 
 
 OPTIONS = (
     "steps low high near lean still tilt aim askew far close aside free leaning hardest before grip shut closing squeeze "
-    "fastest slowest across turning stroke apart unsteady_tilt unsteady_aim unsteady_throw"
+    "unsteady_tilt unsteady_aim unsteady_throw"
 ).split()
 """Fields of the tasks' classes (docs/environments.md)."""
 
@@ -271,7 +257,7 @@ OPTIONS = (
 class EnvironmentsSettings(Settings):
     """python -m mosa.environments"""
 
-    task: Text = Field("pushing", description="placement, hanging, striking or pushing")
+    task: Text = Field("placement", description="placement or hanging")
     checkpoint: Text | None = Field(
         None, description="of a run: what the learned and the isotropic twin are read from"
     )
@@ -294,7 +280,7 @@ class EnvironmentsSettings(Settings):
     )
     policy: Text = Field(
         "gradient",
-        description="gradient, cma, model, sac or ppo (cma, sac and ppo need '.[environments]')",
+        description="gradient or model",
     )
     trials: Count = Field(100, description="tested, in the truth and in the simulator trained in")
     device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
@@ -307,13 +293,6 @@ class EnvironmentsSettings(Settings):
         description=(
             "of a list: its jobs without the table, for several processes that share "
             "one `out`; `none` is one too"
-        ),
-    )
-    page: Text | None = Field(
-        None,
-        description=(
-            "a Markdown file into which the table goes, between its lines <!-- table: "
-            "<task> --> and <!-- end -->"
         ),
     )
     films: int = Field(
@@ -329,12 +308,6 @@ class EnvironmentsSettings(Settings):
     )
     truth: TruthSection = Field(TruthSection(), description="the hidden truth")
     search: SearchSection = Field(SearchSection(), description="the search of a policy")
-    decisions: Count = Field(
-        4000,
-        description=(
-            "policy=sac, ppo: actions in all worlds together (search.batch of them step at a time)"
-        ),
-    )
 
 
 class MaterialSettings(LawSections):

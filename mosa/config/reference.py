@@ -28,7 +28,6 @@ command line.
 | `fit` | `fast`, `adam`, `paper`, `tiny` | optimisers, iterations, rates |
 | `simulation` | `fast`, `paper` | particles, grid, time step |
 | `reconstruction` | `fast`, `paper` | hull, Gaussians, motion |
-| `rendering` | `warp`, `gsplat` | rasteriser |
 | `trainer` | `cpu`, `gpu` | Lightning's Trainer |
 | `callbacks`, `logger` | `default`, ...; `tensorboard`, `csv`, `wandb`, `none` | Lightning's callbacks and loggers |
 | `ablation`, `debug`, `experiment` | `full`, ...; `default`; `bird`, ... | sets of keys that belong together |

@@ -59,25 +59,10 @@ class SequenceBatch(SimpleNamespace):
         return SequenceBatch(**moved)
 
     def __repr__(self) -> str:
-        seen, cues = self.observations, self.cues
-        shapes = {
-            "images": seen.images,
-            "mattes": seen.mattes,
-            "flow": seen.flow,
-            "cameras.K": seen.cameras.K,
-        }
-        if cues is not None:
-            shapes |= {
-                f"cues.{name}": getattr(cues, name)
-                for name in ("positions", "rotation", "stretch", "weight")
-            }
-        shapes |= {f"extra.{name}": value for name, value in self.extra.items()}
-        shown = ", ".join(
-            f"{name} {tuple(value.shape)}" for name, value in shapes.items() if value is not None
-        )
-        return (
-            f"SequenceBatch({self.name!r}, views {self.views}, {len(self.frames)} frames: {shown})"
-        )
+        parts = {**vars(self.observations), **(vars(self.cues) if self.cues else {}), **self.extra}
+        shapes = [f"{k} {tuple(v.shape)}" for k, v in parts.items() if isinstance(v, Tensor)]
+        seen = f"views {self.views}, {len(self.frames)} frames: {', '.join(shapes)}"
+        return f"SequenceBatch({self.name!r}, {seen})"
 
 
 class MotionBatch(SimpleNamespace):

@@ -85,18 +85,13 @@ def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
     return known
 
 
-def look(state: TwinState, weights: Tensor, tool: int | None) -> View:
-    """weights: (N,) shares of the body's mass; tool: number of the driven solid."""
+def look(state: TwinState, weights: Tensor) -> View:
+    """weights: (N,) shares of the body's mass."""
     x, v = state.positions, state.v.to(weights)
     share = weights.to(x)[:, None]
     turned = (share[..., None] * state.F_tot.to(x)).sum(1)[:, :, 1]
-    held = (None, None)
-    if tool is not None:
-        axis = state.rotation[:, tool, :, 0]
-        held = state.position[:, tool], torch.atan2(axis[:, 2], axis[:, 0])
-    return View(
-        (share * x).sum(1), (share * v).sum(1), torch.nn.functional.normalize(turned, dim=1), x[..., 1].amin(1), *held,
-    )  # fmt: skip
+    upright = torch.nn.functional.normalize(turned, dim=1)
+    return View((share * x).sum(1), (share * v).sum(1), upright, x[..., 1].amin(1))
 
 
 @dataclass(frozen=True)
@@ -111,7 +106,7 @@ class Played:
 
 
 class Arena:
-    """`worlds` copies of a simulator's body at a task. One after the other: `reset` with trials, then `step` with actions."""
+    """`worlds` copies of a simulator's body at a task. One after the other: `reset` with trials, then `act`."""
 
     def __init__(self, simulator: Simulator, task: Task, worlds: int) -> None:
         self.simulator, self.task, self.count = simulator, task, worlds
@@ -121,35 +116,33 @@ class Arena:
         self.gravity = float(twin.world.gravity.norm())
         self.weights = (self.body.volume / self.body.volume.sum()).detach()
         self.rest = (self.body.rest - self.body.center).detach()
-        names = [solid["name"] for solid in task.solids()]
-        self.tool = None if task.tool is None else names.index(task.tool)
         self.trials: Trials | None = None
         self.states: list[tuple[Tensor, Tensor, Tensor]] | None = None
 
     def reset(
         self, trials: Trials, *, differentiable: bool = False, record: bool = False
     ) -> Tensor:
-        """Begin these trials, one a world; the first observation (B, O). Errors: ConfigError."""
+        """Begin these trials, one a world; what is observed of them (B, O). Errors: ConfigError."""
         if len(trials) != self.count:
             raise ConfigError(
                 f"trials: expected one for each of {self.count} worlds, found {len(trials)}"
             )
-        self.trials, self.differentiable, self.done = trials, differentiable, 0
+        self.trials, self.differentiable = trials, differentiable
         self.diverged = torch.zeros(self.count, dtype=torch.bool)
         self.last: list[Tensor] = []
         self.states = [] if record else None
-        self.view: View | None = None
-        if self.task.tool is not None:
-            self._begin(None)
-        return self.task.observe(trials, self.view).cpu()
+        return trials.observed.cpu()
 
-    def step(self, action: Tensor) -> tuple[Tensor, bool]:
-        """(observation (B, O), whether the episode is over) after actions (B, A) in [-1, 1]; a task of one decision then is."""
-        if self.task.tool is None:
-            self._begin(action)
-        for _ in range(self.task.steps if self.task.once else 1):
-            self._advance(self.task.command(action, self.done))
-        return self.task.observe(self.trials, self.view).cpu(), self.done >= self.task.steps
+    def act(self, action: Tensor) -> None:
+        """Let go as actions (B, A) in [-1, 1] say, and play to the end of the episode."""
+        starts = self.task.starts(self.trials, action, self.rest, self.gravity)
+        state = self.worlds.reset(
+            starts, colliders=self.task.solids(), variant=self.simulator.variant, control_dt=self.task.control_dt,
+            frames=self.task.steps, differentiable=self.differentiable,
+        )  # fmt: skip
+        self._see(state)
+        for step in range(self.task.steps):
+            self._advance(self.task.command(step))
 
     def loss(self) -> Tensor:
         """(B,) of the moments seen last; of a world that diverged the loss of a body far away."""
@@ -171,19 +164,10 @@ class Arena:
         return self.trials
 
     def success(self) -> Tensor:
-        """(B,) bool, now."""
+        """(B,) bool, at the end."""
         return self.task.succeeded(self.trials, self.view).cpu() & ~self.diverged
 
-    def _begin(self, action: Tensor | None) -> None:
-        starts = self.task.starts(self.trials, action, self.rest, self.gravity)
-        state = self.worlds.reset(
-            starts, colliders=self.task.solids(), variant=self.simulator.variant, control_dt=self.task.control_dt,
-            frames=self.task.steps, differentiable=self.differentiable,
-        )  # fmt: skip
-        self._see(state)
-
     def _advance(self, command) -> None:
-        self.done += 1
         for _ in range(self.count + 1):
             try:
                 state = self.worlds.step(command).state
@@ -199,7 +183,7 @@ class Arena:
         self.last.append(self.task.loss(self.trials, self.view))
 
     def _see(self, state: TwinState) -> None:
-        self.view = look(state, self.weights, self.tool)
+        self.view = look(state, self.weights)
         if self.states is not None:
             places = torch.cat([state.rotation, state.position[..., None]], 3)
             self.states.append(
@@ -225,11 +209,9 @@ def play(
     differentiable: bool = False,
     record: bool = False,
 ) -> Played:
-    """All steps of one episode in each world. policy: observations (B, O) to actions (B, A) in [-1, 1]."""
+    """One episode in each world. policy: observations (B, O) to actions (B, A) in [-1, 1]."""
     with torch.set_grad_enabled(differentiable):
-        seen, over = arena.reset(trials, differentiable=differentiable, record=record), False
-        while not over:
-            seen, over = arena.step(policy(seen))
+        arena.act(policy(arena.reset(trials, differentiable=differentiable, record=record)))
         states = None
         if record:
             states = tuple(torch.stack(parts) for parts in zip(*arena.states))

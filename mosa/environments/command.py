@@ -14,10 +14,11 @@ from omegaconf import DictConfig
 
 from mosa.config.build import plain
 from mosa.environments.arena import SIMULATORS
-from mosa.environments.policies import METHODS, Search
-from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, put_into, table
+from mosa.environments.policies import SEARCHES, Search
+from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, table
 from mosa.environments.tasks import TASKS
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.settings import arguments_of, check
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_environments
@@ -35,13 +36,13 @@ def setting_of(values: dict) -> Setting:
     if worlds == "auto":
         worlds = AT_A_TIME if device == "cpu" else values["trials"]
     check("task", values["task"], Literal[tuple(TASKS)])
-    check("policy", values["policy"], Literal[METHODS])
+    check("policy", values["policy"], Literal[tuple(SEARCHES)])
     values["options"] = {
         key: value for key, value in values["options"].items() if value is not None
     }
     arguments_of(TASKS[values["task"]], "options", "extents").read(values["options"])
     return Setting(
-        **{key: values[key] for key in ("task", "checkpoint", "policy", "decisions", "trials", "options")}, **values["truth"],
+        **{key: values[key] for key in ("task", "checkpoint", "policy", "trials", "options")}, **values["truth"],
         device=device, search=Search(**values["search"]), worlds=min(worlds, values["trials"]),
     )  # fmt: skip
 
@@ -56,10 +57,6 @@ def train_and_test(cfg: DictConfig) -> None:
         raise ConfigError(
             f"jobs_only: expected a list of simulators with it, found simulator={values['simulator']!r}"
         )
-    if values["page"] is not None and (not many or values["jobs_only"]):
-        raise ConfigError(
-            "page: expected a list of simulators and jobs_only=false with it: it takes the table"
-        )
     if values["jobs_only"]:
         known = (*SIMULATORS, UNTRAINED)
     for name in names:
@@ -68,6 +65,8 @@ def train_and_test(cfg: DictConfig) -> None:
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1").split(",")[0]))
     # a body that rolls off the box may fold over itself for a moment; the trial is lost either way
     warnings.filterwarnings("ignore", message=".*det F <= 0.*")
+    if values["films"]:
+        ffmpeg("films")
     folder = Path(values["out"] or HydraConfig.get().runtime.output_dir)
     folder.mkdir(
         parents=True, exist_ok=True
@@ -78,8 +77,6 @@ def train_and_test(cfg: DictConfig) -> None:
         return
     if many:
         page = table(bench, names, values["seeds"], folder, values["films"])
-        if values["page"] is not None:
-            put_into(Path(values["page"]), page, setting.task)
         log.info("\n%s", page.read_text())
         return
     one(bench, names[0], values["seed"], folder, values["films"])

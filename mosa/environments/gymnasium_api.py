@@ -1,10 +1,10 @@
 """The tasks by the conventions of Gymnasium, and its vector environments over worlds. Needs the extra `environments`.
 
     from mosa.environments.gymnasium_api import TwinEnv, TwinVectorEnv
-    env = TwinVectorEnv("pushing", worlds=32, simulator="learned", checkpoint="outputs/train/.../checkpoints/last.ckpt")
+    env = TwinVectorEnv("hanging", worlds=32, simulator="learned", checkpoint="outputs/train/.../checkpoints/last.ckpt")
     observations, _ = env.reset(seed=0)
 
-or, after importing this module, gymnasium.make("mosa/Pushing-v0", checkpoint=...).
+or, after importing this module, gymnasium.make("mosa/Hanging-v0", checkpoint=...).
 """
 
 from __future__ import annotations
@@ -36,18 +36,6 @@ except ImportError as error:
     ) from error
 
 
-def reinforcement_library():
-    """stable_baselines3. Errors: ConfigError where it is not installed."""
-    try:
-        import stable_baselines3
-    except ImportError as error:
-        raise ConfigError(
-            "policy: expected stable-baselines3 for sac and ppo, found none; pip install 'mosa[environments]', or "
-            "policy=gradient, which needs nothing more"
-        ) from error
-    return stable_baselines3
-
-
 def arena_of(
     task: str | Task,
     worlds: int,
@@ -75,9 +63,7 @@ def action_space(task: Task) -> spaces.Box:
 
 
 def observation_space(task: Task) -> spaces.Box:
-    """Of a start its drawn ranges, a little wider than rounding; of a motion no bounds, as a body may fly anywhere."""
-    if not task.once:
-        return spaces.Box(-np.inf, np.inf, (len(task.observations),), np.float32)
+    """The ranges that a start is drawn from, a little wider than rounding."""
     low, high = (
         np.array([getattr(q, side) for q in task.observations], np.float32)
         for side in ("low", "high")
@@ -96,12 +82,10 @@ class _Worlds:
         return _array(self.arena.reset(task.draw(self.arena.count, generator), record=record))
 
     @torch.no_grad()
-    def _step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """(observations (B, O), rewards (B,), whether the episodes are over)."""
-        arena = self.arena
-        seen, over = arena.step(arena.taken(actions))
-        loss = arena.loss() if arena.task.once else arena.last[-1] / arena.task.steps
-        return _array(seen), -_array(loss).astype(np.float64), over
+    def _step(self, actions: np.ndarray) -> np.ndarray:
+        """Rewards (B,) of actions; the episodes are over then."""
+        self.arena.act(self.arena.taken(actions))
+        return -_array(self.arena.loss()).astype(np.float64)
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -111,12 +95,11 @@ def _array(tensor: Tensor) -> np.ndarray:
 class TwinEnv(gymnasium.Env, _Worlds):
     """One body at a task.
 
-    task: placement | hanging | striking | pushing, or a `Task`; simulator: learned | isotropic (of `checkpoint`) | truth (of the
-    built-in scene that it learned from, or of `scene`); spacing [m]: of the truth's particles; options: of the task.
-    Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad] and aims [m], or velocities [m/s]); observations:
-    `self.task.observations`, in their units. A hand that lets go or strikes decides once: its episode has one step, which plays the
-    motion to its end and terminates. A push has `task.steps` steps and is truncated. Reward: minus log(1 + squared misses in
-    tolerances), 0 is the most; of a push its share in every step. `info["success"]`: what the table counts.
+    task: placement | hanging, or a `Task`; simulator: learned | isotropic (of `checkpoint`) | truth (of the built-in scene that it
+    learned from, or of `scene`); spacing [m]: of the truth's particles; options: of the task.
+    Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad], aims [m], speed [m/s]); observations:
+    `self.task.observations`, in their units. A hand decides once: an episode has one step, which plays the motion to its end and
+    terminates. Reward: minus log(1 + squared misses in tolerances), 0 is the most. `info["success"]`: what the table counts.
     Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode.
     """
 
@@ -124,7 +107,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
 
     @typed
     def __init__(
-        self, task: str | Task = "pushing", *, simulator: str = "learned", checkpoint: str | Path | None = None,
+        self, task: str | Task = "placement", *, simulator: str = "learned", checkpoint: str | Path | None = None,
         scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
         render_mode: Literal["rgb_array", "rgb_array_list"] | None = None, size: Pixels = 240,
     ) -> None:  # fmt: skip
@@ -143,12 +126,9 @@ class TwinEnv(gymnasium.Env, _Worlds):
         return self._draw(self.np_random, self.render_mode is not None)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        seen, reward, over = self._step(
-            action[None] if isinstance(action, np.ndarray) else [action]
-        )
-        decided = self.task.once
+        reward = self._step(action[None] if isinstance(action, np.ndarray) else [action])
         info = {"success": bool(self.arena.success()[0]), "diverged": bool(self.arena.diverged[0])}
-        return seen[0], float(reward[0]), over and decided, over and not decided, info
+        return _array(self.arena.begun.observed)[0], float(reward[0]), True, False, info
 
     def render(self) -> np.ndarray | list[np.ndarray] | None:
         if self.render_mode is None:
@@ -181,8 +161,9 @@ class TwinVectorEnv(VectorEnv, _Worlds):
 
     @typed
     def __init__(
-        self, task: str | Task = "pushing", worlds: Count = 8, *, simulator: str = "learned", checkpoint: str | Path | None = None,
-        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
+        self, task: str | Task = "placement", worlds: Count = 8, *, simulator: str = "learned",
+        checkpoint: str | Path | None = None, scene: str | None = None, device: str = "cpu", spacing: float | None = None,
+        options: Section | None = None,
     ) -> None:  # fmt: skip
         self.arena = arena_of(task, worlds, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.num_envs, self.render_mode = self.arena.task, worlds, None
@@ -204,27 +185,20 @@ class TwinVectorEnv(VectorEnv, _Worlds):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
-        seen, rewards, over = self._step(actions)
-        ended, never = np.full(self.num_envs, over), np.zeros(self.num_envs, bool)
+        rewards = self._step(actions)
+        ended, never = np.ones(self.num_envs, bool), np.zeros(self.num_envs, bool)
+        last = np.empty(self.num_envs, dtype=object)
+        last[:] = list(_array(self.arena.begun.observed))
         info: dict[str, Any] = {
-            "success": self.arena.success().numpy(),
-            "diverged": self.arena.diverged.numpy().copy(),
+            "final_obs": last,
+            "_final_obs": ended.copy(),
+            "final_info": {
+                "success": self.arena.success().numpy(),
+                "diverged": self.arena.diverged.numpy().copy(),
+            },
+            "_final_info": ended.copy(),
         }
-        if over:
-            last = np.empty(self.num_envs, dtype=object)
-            last[:] = list(seen)
-            info = {
-                "final_obs": last,
-                "_final_obs": ended.copy(),
-                "final_info": info,
-                "_final_info": ended.copy(),
-            }
-            seen = self._draw(self.np_random, False)
-        return (
-            (seen, rewards, ended, never, info)
-            if self.task.once
-            else (seen, rewards, never, ended, info)
-        )
+        return self._draw(self.np_random, False), rewards, ended, never, info
 
 
 for _name in TASKS:
@@ -235,58 +209,3 @@ for _name in TASKS:
 def _vector(num_envs: int = 8, **arguments) -> TwinVectorEnv:
     """What gymnasium.make_vec calls."""
     return TwinVectorEnv(worlds=num_envs, **arguments)
-
-
-def library_worlds(arena: Arena, seed: int):
-    """The arena as stable-baselines3's own kind of vector environment (`VecEnv`), whose `finished` keeps (decisions so far, reward,
-    success) of every episode."""
-    reinforcement_library()
-    from stable_baselines3.common.vec_env import VecEnv
-
-    class LibraryWorlds(VecEnv, _Worlds):
-        def __init__(self) -> None:
-            self.arena, self.render_mode, self.finished, self.decisions = arena, None, [], 0
-            super().__init__(arena.count, observation_space(arena.task), action_space(arena.task))
-            self.random, self.earned = np.random.default_rng(seed), np.zeros(arena.count)
-
-        def reset(self) -> np.ndarray:
-            self.earned[:] = 0
-            return self._draw(self.random, False)
-
-        def step_async(self, actions: np.ndarray) -> None:
-            self.actions = actions
-
-        def step_wait(self):
-            seen, rewards, over = self._step(self.actions)
-            self.decisions += self.num_envs
-            self.earned += rewards
-            infos: list[dict] = [{} for _ in range(self.num_envs)]
-            if over:
-                success = self.arena.success().tolist()
-                self.finished += [
-                    (self.decisions, value, won)
-                    for value, won in zip(self.earned.tolist(), success)
-                ]
-                infos = [
-                    {"terminal_observation": last, "TimeLimit.truncated": not self.arena.task.once}
-                    for last in seen
-                ]
-                seen = self.reset()
-            return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
-
-        def close(self) -> None:
-            pass
-
-        def get_attr(self, attr_name: str, indices=None) -> list:
-            return [getattr(self, attr_name)] * self.num_envs
-
-        def set_attr(self, attr_name: str, value, indices=None) -> None:
-            raise NotImplementedError("the worlds share one arena")
-
-        def env_method(self, method_name: str, *args, indices=None, **kwargs) -> list:
-            raise NotImplementedError("the worlds share one arena")
-
-        def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
-            return [False] * self.num_envs
-
-    return LibraryWorlds()

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import numpy as np
 import torch
 from torch import Tensor
 
 from mosa.environments.arena import Arena
-from mosa.evaluation.analysis.figures import label, to_uint8, write_strip, write_video
+from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_strip, write_video
 from mosa.physics.contact.colliders import Collider, colliders_from_config
 from mosa.rendering.appearance.carried_splats import Seen, seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
@@ -25,7 +24,7 @@ PITCH = 0.011
 """[m] between the Gaussians of a solid."""
 GROUND, TILE = 0.6, 0.03
 """Half width of the ground that is drawn [m], and its pitch."""
-COLORS = {"box": (0.96, 0.96, 0.95), "paddle": (0.25, 0.45, 0.75), "jaw left": (0.25, 0.45, 0.75), "jaw right": (0.25, 0.45, 0.75),
+COLORS = {"box": (0.96, 0.96, 0.95), "jaw left": (0.25, 0.45, 0.75), "jaw right": (0.25, 0.45, 0.75),
           "column": (0.45, 0.47, 0.52)}  # fmt: skip
 SKY = (0.80, 0.86, 0.92)
 MARK, THIN = (0.85, 0.20, 0.20), 0.004
@@ -74,12 +73,10 @@ def scenery(
 
 
 def camera_of(arena: Arena, size: int) -> Cameras:
-    """One camera that sees what the body falls on, or the way that it is pushed."""
+    """One camera that sees what the body falls on."""
     focal = 1.5 * size
-    height = getattr(arena.task, "top", 0.0) + 0.05
-    target = torch.tensor(
-        [arena.task.watched, height if height > 0.05 else arena.task.watched_height, 0.0]
-    )
+    top = arena.task.top
+    target = torch.tensor([0.05, top + 0.05 if top > 0 else arena.task.watched_height, 0.0])
     eye = target + torch.tensor([0.55, 0.42, 1.05])
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     device = arena.rest.device
@@ -121,25 +118,10 @@ def film(
 
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
-    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other; where no ffmpeg is
-    installed its frames, `<name>/00.png` and so on. The paths written."""
+    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other. The paths written."""
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
-    written = [write_strip(folder / f"{name}.png", rows, frames=6)]
-    frames = [
-        np.concatenate([label(rows[title][t], title) for title in rows], 1) for t in range(count)
+    return [
+        write_strip(folder / f"{name}.png", rows, frames=6),
+        write_video(folder / f"{name}.mp4", side_by_side(rows), fps=12),
     ]
-    try:
-        written.append(write_video(folder / f"{name}.mp4", frames, fps=12))
-    except (
-        ImportError,
-        RuntimeError,
-        ValueError,
-        OSError,
-    ):  # imageio without ffmpeg says it in several ways
-        (folder / f"{name}.mp4").unlink(missing_ok=True)
-        (folder / name).mkdir(exist_ok=True)
-        for t, frame in enumerate(frames):
-            written.append(folder / name / f"{t:02d}.png")
-            imageio.imwrite(written[-1], frame)
-    return written

@@ -1,5 +1,4 @@
-"""Policies of few numbers, and how they are found: by gradients through the simulator, by a model of what was tried in it, or by
-reinforcement learning."""
+"""Policies of few numbers, and how they are found: by gradients through the simulator, or by a model of what was tried in it."""
 
 from __future__ import annotations
 
@@ -10,23 +9,18 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mosa.config.leaf_settings import SearchSection
 from mosa.environments.arena import Arena, play, play_all
 from mosa.environments.task import Task, View
-from mosa.errors import ConfigError, DataError
-
-METHODS = ("gradient", "cma", "model", "sac", "ppo")
-REINFORCEMENT = ("sac", "ppo")
+from mosa.errors import DataError
 
 
 class LinearPolicy(nn.Module):
-    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a placement, 20 for a
-    throw, 9 for a stroke and 30 for a push. It begins as the task says: with weights 0, at the middle of what may be asked of a
-    hand."""
+    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a placement and 20 for a
+    throw. It begins with weights 0, at the middle of what may be asked of a hand."""
 
     def __init__(self, task: Task) -> None:
         super().__init__()
@@ -35,8 +29,8 @@ class LinearPolicy(nn.Module):
         )
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("spread", 0.5 * (high - low))
-        weight, bias = task.starting_weights()
-        self.weight, self.bias = nn.Parameter(weight.clone()), nn.Parameter(bias.clone())
+        self.weight = nn.Parameter(torch.zeros(len(task.actions), len(task.observations)))
+        self.bias = nn.Parameter(torch.zeros(len(task.actions)))
 
     def scaled(self, observation: Tensor) -> Tensor:
         """(B, O) in [-1, 1] where a trial is within its ranges."""
@@ -77,8 +71,8 @@ class Found:
     trials: int
 
 
-class Looks:
-    """Looks at a policy that is being found, every so often on the same trials, which the search is not made on; the best it was.
+class PolicyChecks:
+    """Periodic evaluation of the policy during a search, on trials of their own; keeps the best policy.
 
     check: the arena that the trials are played in; say: told a line of each look."""
 
@@ -99,7 +93,7 @@ class Looks:
         self.began, self.played = time.perf_counter(), 0
 
     def last(self, iteration: int) -> bool:
-        """Looks where that is due before an iteration; whether the search is over."""
+        """Evaluate if due before an iteration. Returns whether the search is over."""
         over = iteration == self.search.iterations
         if over or iteration % self.search.every == 0:
             loss, success = play_all(self.check, self.trials, self.policy)
@@ -142,7 +136,7 @@ def by_gradient(
     """The mean loss descended through the simulator, contact and all. train, check: of the same simulator and task."""
     task, generator = train.task, torch.Generator().manual_seed(seed)
     policy = LinearPolicy(task)
-    looks = Looks(policy, check, search, seed, say)
+    checks = PolicyChecks(policy, check, search, seed, say)
     optimiser = torch.optim.Adam(policy.parameters(), lr=search.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimiser, search.iterations, 0.1 * search.rate
@@ -154,10 +148,10 @@ def by_gradient(
         return action
 
     for iteration in range(search.iterations + 1):
-        if looks.last(iteration):
+        if checks.last(iteration):
             break
         outcome = play(train, task.draw(train.count, generator), bounded, differentiable=True)
-        looks.played += train.count
+        checks.played += train.count
         optimiser.zero_grad()
         kept = (~outcome.diverged).to(outcome.loss)
         if bool(kept.any()):
@@ -166,54 +160,7 @@ def by_gradient(
                 parameter.grad /= train.count
             optimiser.step()
         schedule.step()
-    return looks.found()
-
-
-@torch.no_grad()
-def by_evolution(
-    train: Arena,
-    check: Arena,
-    search: Search,
-    seed: int,
-    say: Callable[[str], None] = lambda line: None,
-) -> Found:
-    """The covariance matrix adaptation of the library cma, its matrix diagonal: candidates are compared on the same trials, and
-    gradients are not used. train, check: of the same simulator and task, the former with `search.candidates` times `search.batch`
-    worlds. Errors: ConfigError for another number of worlds, or where cma is not installed."""
-    task, count = train.task, search.candidates
-    if train.count != count * search.batch:
-        raise ConfigError(
-            f"search: expected {count} candidates times {search.batch} trials as worlds, found {train.count}"
-        )
-    try:
-        import cma
-    except ImportError as error:
-        raise ConfigError(
-            "policy: cma needs the package of that name: pip install '.[environments]'"
-        ) from error
-    generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
-    looks = Looks(policy, check, search, seed, say)
-    start = torch.nn.utils.parameters_to_vector(policy.parameters())
-    # a diagonal matrix adapts within tens of iterations, a full one of 30 numbers within hundreds; seed 0 is none to the library
-    strategy = cma.CMAEvolutionStrategy(start.tolist(), search.spread, {
-        "popsize": count, "seed": seed + 1, "CMA_diagonal": True, "verbose": -9, "verb_log": 0})  # fmt: skip
-    for iteration in range(search.iterations + 1):
-        torch.nn.utils.vector_to_parameters(
-            torch.tensor(strategy.mean).to(start), policy.parameters()
-        )
-        if looks.last(iteration):
-            break
-        drawn = strategy.ask()
-        numbers = torch.tensor(np.array(drawn)).to(start)
-        trials = task.draw(search.batch, generator)
-        outcome = play(
-            train,
-            trials.select(torch.arange(search.batch).repeat(count)),
-            _side_by_side(policy, numbers, search.batch),
-        )
-        looks.played += train.count
-        strategy.tell(drawn, outcome.loss.cpu().view(count, search.batch).mean(1).tolist())
-    return looks.found()
+    return checks.found()
 
 
 class OutcomeModel(nn.Module):
@@ -298,18 +245,13 @@ def by_model(
 ) -> Found:
     """A model of how trials end is fitted to all that was tried in the simulator, and the policy is descended on the model; then
     more is tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over many.
-    train, check: of the same simulator and a task of one decision, the former with `search.candidates` times `search.batch` worlds.
-    Errors: ConfigError for a task that decides in every step."""
+    train, check: of the same simulator and task, the former with `search.candidates` times `search.batch` worlds."""
     task = train.task
-    if not task.once:
-        raise ConfigError(
-            f"policy: expected a task of one decision with policy=model, found task={task.name}"
-        )
     generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
-    looks = Looks(policy, check, search, seed, say)
+    checks = PolicyChecks(policy, check, search, seed, say)
     tried: list[tuple[Tensor, Tensor, Tensor]] = []
     for iteration in range(search.iterations + 1):
-        if looks.last(iteration):
+        if checks.last(iteration):
             break
         trials = task.draw(train.count, generator)
         seen = policy.scaled(trials.observed)
@@ -317,13 +259,13 @@ def by_model(
         wide = search.spread / (1 + iteration)
         action = (about + wide * torch.randn(about.shape, generator=generator)).clamp(-1, 1)
         outcome = play(train, trials, lambda _, action=action: action)
-        looks.played += train.count
+        checks.played += train.count
         whole = ~outcome.diverged
         tried.append((seen[whole], action[whole], _outcome(train.view)[whole]))
         seen, action, ends = (torch.cat(part) for part in zip(*tried))
         model = _fitted_model(torch.cat([seen, action], 1), ends, generator)
         _descend(policy, model, task, generator)
-    return looks.found()
+    return checks.found()
 
 
 @torch.enable_grad()
@@ -344,19 +286,6 @@ def _descend(
         schedule.step()
 
 
-def _side_by_side(policy: LinearPolicy, numbers: Tensor, batch: int) -> Callable[[Tensor], Tensor]:
-    """Policies of numbers (P, (O + 1) A), the first in the first `batch` worlds, and so on."""
-    actions, seen = policy.weight.shape
-    weight = numbers[:, : actions * seen].view(-1, actions, seen).repeat_interleave(batch, 0)
-    bias = numbers[:, actions * seen :].repeat_interleave(batch, 0)
-
-    def act(observation: Tensor) -> Tensor:
-        scaled = (observation.to(weight) - policy.middle) / policy.spread
-        return torch.tanh((weight @ scaled[..., None])[..., 0] + bias)
-
-    return act
-
-
 def _clipped(gradient: Tensor, most: float) -> Tensor:
     """Rows (B, A) of at most that norm; 0 where one is not finite."""
     gradient = torch.where(
@@ -365,35 +294,5 @@ def _clipped(gradient: Tensor, most: float) -> Tensor:
     return gradient * (most / gradient.norm(dim=1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
 
 
-def by_reinforcement(
-    method: str, train: Arena, steps: int, seed: int, options: Mapping[str, Any] | None = None
-) -> Found:
-    """stable-baselines3's SAC or PPO on the arena's worlds. steps: decisions in all worlds together; options: of the algorithm.
-
-    Errors: ConfigError for another method, or where stable-baselines3 is not installed."""
-    if method not in REINFORCEMENT:
-        raise ConfigError(f"policy: expected one of {', '.join(REINFORCEMENT)}, found {method!r}")
-    from mosa.environments.gymnasium_api import library_worlds, reinforcement_library
-
-    library = reinforcement_library()
-    began = time.perf_counter()
-    worlds = library_worlds(train, seed)
-    given = {"sac": {"learning_starts": 4 * train.count, "batch_size": 64, "gradient_steps": -1, "train_freq": 1,
-                     "policy_kwargs": {"net_arch": [64, 64]}},
-             "ppo": {"n_steps": max(2, 4 if train.task.once else train.task.steps), "batch_size": 64,
-                     "policy_kwargs": {"net_arch": [64, 64]}}}[method] | dict(options or {})  # fmt: skip
-    model = getattr(library, method.upper())(
-        "MlpPolicy", worlds, seed=seed, device="cpu", verbose=0, **given
-    )
-    model.learn(steps)
-
-    def policy(observation: Tensor) -> Tensor:
-        action, _ = model.predict(observation.detach().cpu().numpy(), deterministic=True)
-        return torch.as_tensor(action).clamp(-1, 1)
-
-    episodes = worlds.finished
-    history = [
-        {"iteration": k, "loss": float(-value), "success": float(success)}
-        for k, value, success in episodes
-    ]
-    return Found(policy, history, time.perf_counter() - began, len(episodes))
+SEARCHES = {"gradient": by_gradient, "model": by_model}
+"""By the name in `policy`."""

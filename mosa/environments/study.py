@@ -7,8 +7,7 @@ import hashlib
 import json
 import logging
 import math
-import os
-import time
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,21 +26,12 @@ from mosa.environments.arena import (
     truth_of,
 )
 from mosa.environments.pictures import film, write_films
-from mosa.environments.policies import (
-    Found,
-    LinearPolicy,
-    Search,
-    by_evolution,
-    by_gradient,
-    by_model,
-    by_reinforcement,
-)
+from mosa.environments.policies import SEARCHES, Found, LinearPolicy, Search
 from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.tables import markdown
 from mosa.system.whole_files import write_whole, written_whole
-from mosa.training.costs import duration
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +44,7 @@ TEST_SEED = 20_000_000
 @dataclass(frozen=True)
 class Setting:
     """What a study needs: the bodies, the task, and the sizes. worlds: trials tested at a time; spacing [m]: of the truth's
-    particles in tests; train_spacing: where policies are trained in the truth; None: the films' own."""
+    particles, None for the films' own."""
 
     task: str
     checkpoint: str | None
@@ -62,11 +52,9 @@ class Setting:
     device: str
     policy: str
     search: Search
-    decisions: int
     trials: int
     worlds: int
     spacing: float | None
-    train_spacing: float | None
     options: Mapping[str, Any]
 
 
@@ -75,20 +63,17 @@ class Bench:
 
     def __init__(self, setting: Setting) -> None:
         self.setting = setting
-        self._simulators: dict[tuple[str, bool], Simulator] = {}
-        self._arenas: dict[tuple[str, bool, int], Arena] = {}
+        self._simulators: dict[str, Simulator] = {}
+        self._arenas: dict[tuple[str, int], Arena] = {}
         self._task: Task | None = None
 
-    def simulator(self, name: str, training: bool = False) -> Simulator:
+    def simulator(self, name: str) -> Simulator:
         s = self.setting
-        training = training and name == "truth" and s.train_spacing != s.spacing
-        key = (name, training)
-        if key not in self._simulators:
-            spacing = s.train_spacing if training else s.spacing
-            self._simulators[key] = simulator_named(
-                name, s.checkpoint, scene=s.scene, device=s.device, spacing=spacing
+        if name not in self._simulators:
+            self._simulators[name] = simulator_named(
+                name, s.checkpoint, scene=s.scene, device=s.device, spacing=s.spacing
             )
-        return self._simulators[key]
+        return self._simulators[name]
 
     def task(self, name: str) -> Task:
         """One for all simulators, from the truth's size where it is known: `name` is the simulator to ask where it is not."""
@@ -100,70 +85,24 @@ class Bench:
             self._task = task_named(self.setting.task, rest, **self.setting.options)
         return self._task
 
-    def arena(self, name: str, worlds: int, training: bool = False) -> Arena:
-        key = (name, training, worlds)
-        if key not in self._arenas:
-            self._arenas[key] = Arena(self.simulator(name, training), self.task(name), worlds)
-        return self._arenas[key]
-
-
-SEARCHES = {"gradient": by_gradient, "cma": by_evolution, "model": by_model}
-"""Of a linear policy's numbers, by `Search`; other policies are a library's."""
+    def arena(self, name: str, worlds: int) -> Arena:
+        if (name, worlds) not in self._arenas:
+            self._arenas[name, worlds] = Arena(self.simulator(name), self.task(name), worlds)
+        return self._arenas[name, worlds]
 
 
 def train(bench: Bench, simulator: str, seed: int) -> Found:
-    """A policy found in that simulator. Errors: ConfigError."""
+    """A policy found in that simulator."""
     s = bench.setting
     torch.manual_seed(seed)
-    worlds = s.search.batch * (s.search.candidates if s.policy in ("cma", "model") else 1)
-    arena = bench.arena(simulator, worlds, training=True)
+    worlds = s.search.batch * (s.search.candidates if s.policy == "model" else 1)
+    arena = bench.arena(simulator, worlds)
+    check = bench.arena(simulator, min(s.worlds, s.search.validation))
 
     def say(line: str) -> None:
         log.info("%s, %s, seed %d: %s", s.task, simulator, seed, line)
 
-    if s.policy in SEARCHES:
-        check = bench.arena(simulator, min(s.worlds, s.search.validation), training=True)
-        return SEARCHES[s.policy](arena, check, s.search, seed, say)
-    return by_reinforcement(s.policy, arena, s.decisions, seed)
-
-
-BACKWARD = 4.0
-"""Time of an episode with its gradient over that of one without."""
-
-
-def expected(bench: Bench, simulator: str) -> str:
-    """What a job takes on this machine, from one step that is played in the simulator: a line for the log."""
-    s = bench.setting
-    arena = bench.arena(simulator, min(s.worlds, s.search.validation), training=True)
-    task, search = arena.task, s.search
-    with torch.no_grad():
-        arena.reset(task.draw(arena.count, torch.Generator().manual_seed(0)))
-        still = torch.zeros(arena.count, len(task.actions))
-        if task.tool is None:
-            arena._begin(still)
-        for _ in range(2):  # of the first, kernels are compiled
-            began = time.perf_counter()
-            arena._advance(task.command(still, 0))
-            arena.view.center.sum().item()  # a GPU is done
-            taken = time.perf_counter() - began
-    looks = search.validation * (1 + math.ceil(search.iterations / search.every))
-    drawn = search.iterations * search.batch
-    episodes = {
-        "gradient": looks + drawn,
-        "cma": looks + drawn * search.candidates,
-        "model": looks + drawn * search.candidates,
-    }
-    searched = episodes.get(s.policy, s.decisions / (1 if task.once else task.steps))
-    slower = (BACKWARD - 1) * drawn if s.policy == "gradient" else 0
-    tested = s.trials * (1 if simulator == "truth" else 2)
-    seconds = (searched + slower + tested) * task.steps * taken / arena.count
-    shorter = "; search.iterations=, search.batch=, search.validation= and trials= make it shorter, device=cuda quicker"
-    return (f"{task.name}, {simulator}: about {duration(seconds)}: {searched:.0f} episodes of {task.steps} steps to "
-            f"search, {tested} to test{shorter if seconds > PATIENCE else ''}")  # fmt: skip
-
-
-PATIENCE = 900
-"""[s] from which on the log says what makes a job shorter."""
+    return SEARCHES[s.policy](arena, check, s.search, seed, say)
 
 
 def test(bench: Bench, simulator: str, policy: Callable[[Tensor], Tensor]) -> dict[str, Any]:
@@ -178,29 +117,23 @@ def test(bench: Bench, simulator: str, policy: Callable[[Tensor], Tensor]) -> di
 def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) -> dict[str, Any]:
     """Train in one simulator, test there and in the truth where it is known; result.json and films of that many trials in
     `folder`."""
-    log.info(expected(bench, simulator))
     record = _record(bench, simulator, seed)
-    tested = dict.fromkeys([simulator, *(["truth"] if record["truth"] is not None else [])])
-    for name in tested:
-        count = sum(record["truth" if name == "truth" else "own"]["success"])
-        log.info(
-            "%s, trained in %s: %d of %d in %s",
-            bench.setting.task,
-            simulator,
-            count,
-            bench.setting.trials,
-            name,
-        )
-    _write(folder / "result.json", record)
-    if record["policy"] is not None:
-        films(
-            bench,
-            {f"trained in {simulator}": LinearPolicy.read(bench.task(simulator), record["policy"])},
-            "truth" if record["truth"] is not None else simulator,
-            folder,
-            filmed,
-        )
+    where = simulator if record["truth"] is None else "truth"
+    for name, result in ((simulator, record["own"]), ("truth", record["truth"])):
+        if result is not None:
+            log_successes(bench, simulator, seed, result, name)
+    write_whole(folder / "result.json", json.dumps(record))
+    policy = LinearPolicy.read(bench.task(simulator), record["policy"])
+    films(bench, {f"trained in {simulator}": policy}, where, folder, filmed)
     return record
+
+
+def log_successes(
+    bench: Bench, simulator: str, seed: int, result: Mapping[str, Any], where: str
+) -> None:
+    """How often a policy succeeded, as a line of the log."""
+    s, won = bench.setting, sum(result["success"])
+    log.info("%s, trained in %s, seed %d: %d of %d in %s", s.task, simulator, seed, won, s.trials, where)  # fmt: skip
 
 
 def make_jobs(
@@ -213,18 +146,10 @@ def make_jobs(
         file = folder / "jobs" / f"{bench.setting.task}_{name}_{seed}.json"
         record = _read(file, _identity(bench, name))
         if record is None:
-            if name != UNTRAINED:
-                log.info(expected(bench, name))
             record = _record(bench, name, seed)
-            _write(file, record)
-        log.info(
-            "%s, trained in %s, seed %d: %d of %d in the truth",
-            bench.setting.task,
-            name,
-            seed,
-            sum(record["truth"]["success"]),
-            bench.setting.trials,
-        )
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(file, json.dumps(record))
+        log_successes(bench, name, seed, record["truth"], "truth")
         records[name, seed] = record
     return records
 
@@ -239,14 +164,13 @@ def table(
         bench, [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)], folder
     )
     page = write_table(bench.setting, records, bench.task("truth"), folder, about_twin(bench))
-    shown = {f"trained in {name}": records[name, seeds[0]] for name in simulators}
     policies = {
-        title: LinearPolicy.read(bench.task("truth"), r["policy"])
-        for title, r in shown.items()
-        if r["policy"] is not None
+        f"trained in {name}": LinearPolicy.read(
+            bench.task("truth"), records[name, seeds[0]]["policy"]
+        )
+        for name in simulators
     }
-    if policies:
-        films(bench, policies, "truth", folder, filmed)
+    films(bench, policies, "truth", folder, filmed)
     return page
 
 
@@ -259,9 +183,8 @@ def _record(bench: Bench, simulator: str, seed: int) -> dict[str, Any]:
     known = s.scene is not None or _of_builtin(bench)
     own = None if simulator in (UNTRAINED, "truth") else test(bench, simulator, found.policy)
     truth = test(bench, "truth", found.policy) if known else None
-    written = found.policy.written() if isinstance(found.policy, LinearPolicy) else None
     return {
-        "setting": _identity(bench, simulator), "simulator": simulator, "seed": seed, "policy": written,
+        "setting": _identity(bench, simulator), "simulator": simulator, "seed": seed, "policy": found.policy.written(),
         "history": found.history[-200:], "seconds": round(found.seconds, 1), "played": found.trials, "own": own, "truth": truth,
     }  # fmt: skip
 
@@ -328,14 +251,6 @@ def _read(file: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
     return record
 
 
-def _write(file: Path, record: Mapping[str, Any]) -> None:
-    """Whole or not at all: its presence says that the job is complete."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(f".{os.getpid()}.partial")
-    partial.write_text(json.dumps(record))
-    partial.replace(file)
-
-
 def films(
     bench: Bench,
     policies: Mapping[str, Callable[[Tensor], Tensor]],
@@ -383,23 +298,21 @@ def write_table(
     about: str = "",
 ) -> Path:
     """<task>.md and <task>.csv. Every row is one simulator to train in. about: a sentence on the twin."""
-    names = list(dict.fromkeys(name for name, _ in records))
-    header = [
-        "trained in",
-        "success in the truth",
-        "mean",
-        "in its own simulator",
-        "mean loss in the truth",
-        "seconds of training",
-    ]
-    lines = []
-    for name in names:
+    lines, rows = [], []
+    for name in dict.fromkeys(name for name, _ in records):
         found = [r for (n, _), r in sorted(records.items()) if n == name]
         counts = [sum(r["truth"]["success"]) for r in found]
-        own = [sum(r["own"]["success"]) for r in found if r["own"] is not None]
-        loss = [sum(r["truth"]["loss"]) / len(r["truth"]["loss"]) for r in found]
-        lines.append([name, ", ".join(map(str, counts)), _mean(counts, setting.trials), ", ".join(map(str, own)) or "",
-                      f"{sum(loss) / len(loss):.3f}", f"{sum(r['seconds'] for r in found) / len(found):.0f}"])  # fmt: skip
+        own = ", ".join(str(sum(r["own"]["success"])) for r in found if r["own"] is not None)
+        loss = statistics.fmean(statistics.fmean(r["truth"]["loss"]) for r in found)
+        seconds = statistics.fmean(r["seconds"] for r in found)
+        shown = ", ".join(map(str, counts))
+        lines.append([name, shown, _mean(counts, setting.trials), own, f"{loss:.3f}", f"{seconds:.0f}"])  # fmt: skip
+    for (name, seed), record in sorted(records.items()):
+        for tested, where in (("truth", "truth"), ("own", name)):
+            for trial, pair in enumerate(zip(*record[tested].values()) if record[tested] else ()):
+                rows.append([task.name, name, seed, where, trial, int(pair[0]), pair[1]])
+    header = ["trained in", "success in the truth", "mean", "in its own simulator", "mean loss in the truth",
+              "seconds of training"]  # fmt: skip
     seeds = sorted({seed for name, seed in records if name != UNTRAINED})
     text = [
         f"# {task.name}: policies tested in the hidden truth",
@@ -415,18 +328,9 @@ def write_table(
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{task.name}.md"
     write_whole(page, "\n\n".join(text) + "\n")
-    with (
-        written_whole(folder / f"{task.name}.csv") as partial,
-        open(partial, "w", newline="") as file,
-    ):
-        writer = csv.writer(file)
-        writer.writerow(["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"])
-        for (name, seed), record in sorted(records.items()):
-            for tested in ("truth", "own"):
-                if (result := record[tested]) is not None:
-                    where = "truth" if tested == "truth" else name
-                    for trial, (won, loss) in enumerate(zip(result["success"], result["loss"])):
-                        writer.writerow([task.name, name, seed, where, trial, int(won), loss])
+    columns = ["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"]
+    with written_whole(page.with_suffix(".csv")) as partial, open(partial, "w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
     return page
 
 
@@ -440,28 +344,8 @@ def _listed(values: Mapping[str, Any]) -> str:
     )
 
 
-def put_into(page: Path, table: Path, task: str) -> None:
-    """The table of a task, without its title, into a Markdown file, between its lines `<!-- table: <task> -->` and `<!-- end -->`.
-
-    Errors: DataError where the file has no such lines."""
-    begin, end = f"<!-- table: {task} -->\n", "<!-- end -->"
-    text = page.read_text() if page.is_file() else ""
-    head, found, rest = text.partition(begin)
-    _, closed, tail = rest.partition(end)
-    if not found or not closed:
-        raise DataError(
-            f"page: {page}: expected a line '{begin.strip()}' and after it a line '{end}', found none"
-        )
-    content = table.read_text().split("\n", 2)[2]
-    write_whole(page, f"{head}{begin}{content}{end}{tail}")
-
-
 def _mean(counts: Sequence[int], trials: int) -> str:
     """Per hundred, with the standard deviation over seeds."""
     shares = [100 * count / trials for count in counts]
-    mean = sum(shares) / len(shares)
-    if len(shares) < 2:
-        return f"{mean:.0f} %"
-    return (
-        f"{mean:.0f} ± {math.sqrt(sum((s - mean) ** 2 for s in shares) / (len(shares) - 1)):.0f} %"
-    )
+    spread = f" ± {statistics.stdev(shares):.0f}" if len(shares) > 1 else ""
+    return f"{statistics.fmean(shares):.0f}{spread} %"

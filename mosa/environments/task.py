@@ -16,6 +16,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.contact.motion import exponential
 from mosa.physics.world import World
 from mosa.settings import Expected, check, is_number, such
 from mosa.system.limits import counted
@@ -46,8 +47,7 @@ RANGES: dict[str, Any] = {
         is_number(x) and 0 <= x <= ROOM for x in v))],
     "steps": _whole(1, 10**5), "control_dt": _number(1e-4, 1), "low": _number(CLEARANCE, ROOM), "high": _number(CLEARANCE, ROOM),
     "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": _number(1e-3, math.pi), "near": _SOME,
-    "still": _number(1e-4, 100), "fastest": _number(1e-4, 100), "turning": _number(0, 100),
-    "slowest": _number(1e-4, 100), "across": _number(0, 100), "stroke": _whole(1, 10**5), "leaning": _number(-math.pi, math.pi),
+    "still": _number(1e-4, 100), "leaning": _number(-math.pi, math.pi),
     "hardest": _number(0, 100), "unsteady_throw": _number(0, 100),
     "shut": _whole(0, 10**5), "closing": _whole(1, 10**5), "squeeze": _number(0, 0.9),
 }  # fmt: skip
@@ -72,15 +72,12 @@ class Trials:
 @dataclass(frozen=True)
 class View:
     """Of B bodies. center, velocity: (B, 3) mass centre [m] and its velocity [m/s]; upright: (B, 3) unit, where the rest shape's up
-    axis points; lowest: (B,) height of the lowest particle [m]; tool: (B, 3) position of a driven solid [m]; tool_turn: (B,) [rad]
-    how far its own x axis is turned towards z; both None without one."""
+    axis points; lowest: (B,) height of the lowest particle [m]."""
 
     center: Tensor
     velocity: Tensor
     upright: Tensor
     lowest: Tensor
-    tool: Tensor | None = None
-    tool_turn: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -95,28 +92,33 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """extents: (3,) of the body at rest [m], from which sizes follow; steps: control steps of an episode of `control_dt` [s]."""
+    """A hand lets go: it chooses the tilt, and where the body's centre shall be when it arrives. What follows is the body's law.
+
+    The hand holds the body without deforming it, its lowest particle `low` to `high` [m] above what it falls on. extents: (3,) of
+    the body at rest [m], from which sizes follow; steps: control steps of an episode of `control_dt` [s]; tilt [rad], aim [m]: the
+    most that an action may ask for; unsteady_tilt, unsteady_aim: by how much the hand is off at most.
+    """
 
     extents: tuple[float, float, float]
     steps: int = 50
     control_dt: float = 0.02
+    tilt: float = 0.4
+    aim: float = 0.12
+    low: float = 0.3
+    high: float = 0.5
+    unsteady_tilt: float = 0.02
+    unsteady_aim: float = 0.005
     name: ClassVar[str] = ""
-    tool: ClassVar[str | None] = None
-    """Name of the solid that actions drive; None without one: the decision is how the body starts."""
-    once: ClassVar[bool] = True
-    """Whether a policy decides once, at the start; else in every control step."""
     ground_friction: ClassVar[float] = 0.3
-    watched: ClassVar[float] = 0.05
-    """x [m] of what pictures look at."""
     watched_height: ClassVar[float] = 0.15
-    """Its height [m], where nothing lies under the body."""
+    """Height [m] of what pictures look at, where nothing lies under the body."""
 
     def __post_init__(self) -> None:
         """Errors: ConfigError naming the field that is out of its range."""
         for field in fields(self):
             kind = RANGES.get(field.name, LENGTH)
             check(f"options.{field.name}", getattr(self, field.name), kind)
-        for low, high in (("low", "high"), ("close", "far"), ("slowest", "fastest")):
+        for low, high in (("low", "high"), ("close", "far")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):
                 raise ConfigError(
                     f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
@@ -124,30 +126,45 @@ class Task(ABC):
                 )
 
     @property
-    @abstractmethod
     def actions(self) -> tuple[Quantity, ...]:
         """What an action of numbers in [-1, 1] says, in this order; -1 is `low` and 1 is `high`."""
+        return (Quantity("tilt about x", "rad", -self.tilt, self.tilt), Quantity("tilt about z", "rad", -self.tilt, self.tilt),
+                Quantity("aim x", "m", -self.aim, self.aim), Quantity("aim z", "m", -self.aim, self.aim))  # fmt: skip
 
     @property
-    @abstractmethod
     def observations(self) -> tuple[Quantity, ...]:
-        """Of a policy's observation, in this order; a number may leave its range where a body flies away."""
+        """Of a policy's observation, in this order: all that a trial draws and does not hide."""
+        return self.drawn[0]
 
     @property
-    @abstractmethod
+    def unsteady(self) -> tuple[float, ...]:
+        """By how much the hand is off at most, in what an action asks."""
+        return self.unsteady_tilt, self.unsteady_tilt, self.unsteady_aim, self.unsteady_aim
+
+    @property
     def drawn(self) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
         """What a trial draws, uniformly in these ranges: (what is observed, what is hidden)."""
+        limits = zip(self.actions, self.unsteady)
+        hidden = tuple(Quantity(f"unsteady {q.name}", q.unit, -limit, limit) for q, limit in limits)
+        return (Quantity("height", "m", self.low, self.high), *self.situation), hidden
+
+    @property
+    @abstractmethod
+    def situation(self) -> tuple[Quantity, ...]:
+        """What is drawn and observed beside the height."""
+
+    @abstractmethod
+    def release(self, trials: Trials, given: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+        """(tilts (B, 2) [rad], horizontal velocity (B, 2) [m/s]) of what the hand does (B, A), with falling times (B,) [s]."""
+
+    @property
+    @abstractmethod
+    def top(self) -> float:
+        """Height [m] of what the body falls on."""
 
     @abstractmethod
     def solids(self) -> list[Mapping[str, Any]]:
         """Colliders beside the ground, as `colliders_from_config` takes them."""
-
-    @abstractmethod
-    def starts(
-        self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float
-    ) -> list[dict]:
-        """Of `TwinWorlds.reset`, for each trial. action: (B, A) in [-1, 1] of a task of one decision; rest: (N, 3) [m] about the
-        centre; gravity [m/s^2]."""
 
     @abstractmethod
     def miss(self, trials: Trials, view: View) -> Tensor:
@@ -157,23 +174,41 @@ class Task(ABC):
     def succeeded(self, trials: Trials, view: View) -> Tensor:
         """(B,) bool, of the last moment."""
 
-    def observe(self, trials: Trials, view: View | None) -> Tensor:
-        """(B, O) of a policy. view: None before a start that the action decides."""
-        return trials.observed
+    @property
+    def held(self) -> Tensor:
+        """(3, 3) how the body is held before it is tilted, relative to its rest shape."""
+        return torch.eye(3, dtype=torch.float64)
+
+    def thrown(self, given: Tensor) -> Tensor:
+        """(B,) downward speed [m/s] with which the hand lets go."""
+        return torch.zeros_like(given[:, 0])
+
+    def command(self, step: int) -> Mapping[str, Any] | None:
+        """Velocities [m/s] of driven solids in a control step."""
+        return None
 
     def targets(self, trials: Trials) -> Tensor | None:
         """(B, 3) [m] where the body's middle shall stand, on what lies under it, to be marked in pictures; None without such."""
         return None
 
-    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
-        """Velocities [m/s], [rad/s] of the tool in a control step, of actions (B, A)."""
-        return None
-
-    def starting_weights(self) -> tuple[Tensor, Tensor]:
-        """(A, O), (A,) of the policy that a search begins from; zeros: the aim without any knowledge of how the body bounces."""
-        return torch.zeros(len(self.actions), len(self.observations)), torch.zeros(
-            len(self.actions)
-        )
+    def starts(self, trials: Trials, action: Tensor, rest: Tensor, gravity: float) -> list[dict]:
+        """Of `TwinWorlds.reset`, for each trial. action: (B, A) in [-1, 1]; rest: (N, 3) [m] about the centre; gravity [m/s^2]."""
+        given = self.physical(action).cpu() + trials.hidden
+        down = self.thrown(given)
+        fallen = (down.square() + 2 * gravity * (trials.observed[:, 0] - CLEARANCE)).sqrt()
+        time = (fallen - down) / gravity
+        tilts, flight = self.release(trials, given, time)
+        found = []
+        for b in range(len(trials)):
+            turn = torch.stack([tilts[b, 0], 0 * tilts[b, 0], tilts[b, 1]]).double()
+            found.append({
+                "rotation": (exponential(turn) @ self.held).to(given),
+                "position": torch.stack([given[b, 2], 0 * given[b, 2], given[b, 3]]),
+                "height": self.top + CLEARANCE,
+                "velocity": torch.stack([flight[b, 0], -fallen[b].to(flight), flight[b, 1]]),
+                "angular_velocity": (0.0, 0.0, 0.0),
+            })  # fmt: skip
+        return found
 
     def world(self, world: World) -> World:
         """The same gravity over a ground at height 0 with friction, in a wide box, whatever the scene's own are."""

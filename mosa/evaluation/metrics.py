@@ -135,11 +135,6 @@ def chamfer_distances(
     }
 
 
-def chamfer(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
-    """`cd_m` alone."""
-    return chamfer_distances(a, b, samples=samples, seed=seed)["cd_m"]
-
-
 def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> float:
     """`emd_m`: mean distance [m] of the exact assignment between equally many random points of (N, 3) and (M, 3) [m]."""
     count = min(samples, len(a), len(b))

@@ -49,23 +49,17 @@ MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}
 def errors_by_frame(record: Record) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """{held-out sequence: (times (T,) [s], root mean square distance of the particles from the true motion (T,) [m])}."""
     folder, name = record.job.folder, MOTIONS.get(prefix(record))
-    if (
-        record.figures is None
-        or name is None
-        or not (folder / name).is_file()
-        or not (folder / "truth.npz").is_file()
-    ):
+    files = [folder / (name or ""), folder / "truth.npz"]
+    if record.figures is None or not all(file.is_file() for file in files):
         return {}
     found = {}
-    with np.load(folder / name) as motions, np.load(folder / "truth.npz") as truth:
+    with np.load(files[0]) as motions, np.load(files[1]) as truth:
         for key in truth.files:
             sequence = key.removesuffix("/x")
             if sequence.startswith("test/") and f"{sequence}/x" in motions.files:
                 distance = motions[f"{sequence}/x"] - truth[key]
-                found[sequence] = (
-                    motions[f"{sequence}/times"],
-                    np.sqrt(np.square(distance).sum(-1).mean(-1)),
-                )
+                rms = np.sqrt(np.square(distance).sum(-1).mean(-1))
+                found[sequence] = motions[f"{sequence}/times"], rms
     return found
 
 
@@ -79,14 +73,11 @@ def long_term(
     times: dict[str, np.ndarray] = {}
     drops: dict[str, int] = {}
     for record in records:
-        found = errors_by_frame(record)
-        if found:
+        if found := errors_by_frame(record):
             column = record.place[experiment.columns].name
-            times[column] = next(iter(found.values()))[0]
-            drops[column] = len(found)
-            curves[column].setdefault(label(experiment, record), []).append(
-                np.mean([e for _, e in found.values()], 0)
-            )
+            times[column], drops[column] = next(iter(found.values()))[0], len(found)
+            mean = np.mean([e for _, e in found.values()], 0)
+            curves[column].setdefault(label(experiment, record), []).append(mean)
     shown = [column for column in columns if curves[column]]
     if not shown:
         return "", []
@@ -94,31 +85,19 @@ def long_term(
     places = canvas.subplots(1, len(shown), squeeze=False, sharey=True)[0]
     names, rows, drawn = [option.name for option in experiment.axes[experiment.rows]], [], []
     for place, column in zip(places, shown):
+        t = times[column]
         for name in sorted(curves[column], key=names.index):  # whatever the order of the jobs is
-            seeds, style = curves[column][name], style_of(name, names)
-            mean, sd = (
-                1e3 * np.mean(seeds, 0),
-                1e3 * np.std(seeds, 0, ddof=1) if len(seeds) > 1 else 0 * seeds[0],
-            )
-            place.plot(times[column], mean, label=name, **style)
-            if len(seeds) > 1:
-                place.fill_between(
-                    times[column],
-                    mean - sd,
-                    mean + sd,
-                    alpha=0.2,
-                    color=style["color"],
-                    linewidth=0,
-                )
+            seeds, style = 1e3 * np.array(curves[column][name]), style_of(name, names)
+            mean, several = seeds.mean(0), len(seeds) > 1
+            sd = seeds.std(0, ddof=1) if several else 0 * mean
+            place.plot(t, mean, label=name, **style)
+            if several:
+                band = {"alpha": 0.2, "color": style["color"], "linewidth": 0}
+                place.fill_between(t, mean - sd, mean + sd, **band)
             drawn += mean.tolist()
-            rows += [
-                [column, name, f"{t:.4f}", f"{m:.4f}", f"{s:.4f}"]
-                for t, m, s in zip(times[column], mean, sd)
-            ]
-        place.set_title(
-            f"{column}, mean of {drops[column]} held-out drop{'s' * (drops[column] != 1)}",
-            fontsize=9,
-        )
+            rows += [[column, name, *(f"{v:.4f}" for v in row)] for row in zip(t, mean, sd)]
+        count = f"{drops[column]} held-out drop{'s' * (drops[column] != 1)}"
+        place.set_title(f"{column}, mean of {count}", fontsize=9)
         place.set_xlabel("time [s]")
     places[0].set_ylabel("rms error [mm]", fontsize=9)
     if wide(drawn):
@@ -129,11 +108,8 @@ def long_term(
     say_cut(places[0])
     legend(canvas, names, without="no motion kept")
     frames = stem.with_name(stem.name + "_frames")
-    write_table(
-        frames.with_suffix(".csv"),
-        [experiment.columns, experiment.rows, "time_s", "rms_mm", "sd_mm"],
-        rows,
-    )
+    header = [experiment.columns, experiment.rows, "time_s", "rms_mm", "sd_mm"]
+    write_table(frames.with_suffix(".csv"), header, rows)
     return f"Error of every frame on held-out drops: `{frames.name}.csv`.", [save(canvas, frames)]
 
 
@@ -177,15 +153,15 @@ def redistribution(body: Body, directions: Tensor) -> Tensor | None:
     return redistribution_response(stress_jacobian(adapter, zero, zero)[0], directions.double())
 
 
-NEARLY = 0.05
-"""What E over its mean is drawn around 1 at least."""
+MIN_RANGE = 0.05
+"""Smallest half range of the axis of E over its mean, around 1."""
 
 
 def directions(
     experiment: Experiment, records: Sequence[Record], stem: Path
 ) -> tuple[str, list[Path]]:
     """w(theta) and E(theta) in the plane of the true fibres (or xy), theta from the fibres; beside the truth where it is known. E
-    is drawn over its mean, on axes that show NEARLY at least, so that what is isotropic is a level line, and in kPa from 0."""
+    is drawn over its mean, on axes that show MIN_RANGE at least, so that what is isotropic is a level line, and in kPa from 0."""
     found = []
     for record, twin in loaded(records):
         scene = twin.record.settings["scene"]
@@ -201,143 +177,96 @@ def directions(
     names = list(dict.fromkeys(record.place[experiment.columns].name for record, *_ in found))
     canvas = Canvas(figsize=(WIDTH, 8.4), layout="constrained")
     grid, rows, lines = canvas.subplots(3, len(names), squeeze=False, sharex=True), [], []
-    methods = [option.name for option in experiment.axes[experiment.rows]]
+    methods, known = [option.name for option in experiment.axes[experiment.rows]], set()
     for record, angles, n, w, E, truth in found:
-        column = names.index(record.place[experiment.columns].name)
-        name = label(experiment, record)
+        column, name = record.place[experiment.columns].name, label(experiment, record)
+        response, ratios, moduli = grid[:, names.index(column)]
         style = style_of(name, methods)
         if w is not None:
-            grid[0, column].plot(angles, w, label=name, **style)
-        grid[1, column].plot(angles, E / E.mean(), label=name, **style)
-        grid[2, column].plot(angles, E / 1e3, label=name, **style)
-        if truth is not None and not any(
-            line.get_label() == "truth" for line in grid[1, column].lines
-        ):
-            grid[1, column].plot(angles, truth / truth.mean(), label="truth", **style_of("truth"))
-            grid[2, column].plot(angles, truth / 1e3, label="truth", **style_of("truth"))
-        grid[0, column].set_title(names[column], fontsize=10)
-        grid[2, column].set_xlabel("angle from the fibres [degrees]")
-        given = ["" if x is None else x for x in (w, truth)]
+            response.plot(angles, w, label=name, **style)
+        curves = [(E, name, style)]
+        if truth is not None and column not in known:
+            known.add(column)
+            curves.append((truth, "truth", style_of("truth")))
+        for values, said, how in curves:
+            ratios.plot(angles, values / values.mean(), label=said, **how)
+            moduli.plot(angles, values / 1e3, label=said, **how)
+        response.set_title(column, fontsize=10)
+        moduli.set_xlabel("angle from the fibres [degrees]")
         for i, angle in enumerate(angles):
-            rows.append([names[column], name, f"{float(angle):.1f}", *(x if isinstance(x, str) else f"{float(x[i]):.6g}"
-                                                                     for x in (given[0], E, given[1]))])  # fmt: skip
-        spread = float((E.max() - E.min()) / E.mean())
+            parts = ["" if x is None else f"{float(x[i]):.6g}" for x in (w, E, truth)]
+            rows.append([column, name, f"{float(angle):.1f}", *parts])
         axis = angle_between(n[int(E.argmax())], n[0])
-        ratio = "" if truth is None else f"{float((truth.max() - truth.min()) / truth.mean()):.3f}"
-        lines.append(
-            [
-                names[column],
-                name,
-                "" if w is None else f"{float(w.max()):.3f}",
-                f"{spread:.3f}",
-                ratio,
-                f"{float(axis):.0f}",
-            ]
-        )
-    for place, ratios, moduli in grid.T:
-        largest = max([float(line.get_ydata().max()) for line in place.lines], default=0.0)
-        top = 1.05 * max(NEARLY, largest)
-        place.set_ylim(-0.04 * top, top)  # a w of 0 is a line of its own beside the axis
+        ranges = [
+            "" if x is None else f"{float((x.max() - x.min()) / x.mean()):.3f}" for x in (E, truth)
+        ]
+        largest = "" if w is None else f"{float(w.max()):.3f}"
+        lines.append([column, name, largest, *ranges, f"{float(axis):.0f}"])
+    for response, ratios, moduli in grid.T:
+        highest = max([float(line.get_ydata().max()) for line in response.lines], default=0.0)
+        top = 1.05 * max(MIN_RANGE, highest)
+        response.set_ylim(-0.04 * top, top)  # a w of 0 is a line of its own beside the axis
         low, high = ratios.get_ylim()
-        ratios.set_ylim(np.floor(100 * min(low, 1 - NEARLY) + 1e-6) / 100, max(high, 1 + NEARLY))
+        ratios.set_ylim(
+            np.floor(100 * min(low, 1 - MIN_RANGE) + 1e-6) / 100, max(high, 1 + MIN_RANGE)
+        )
         moduli.set_ylim(0, 1.05 * moduli.get_ylim()[1])
-        for each, what in (
-            (place, "w, response without the prior's"),
-            (ratios, "E over its mean"),
-            (moduli, "E [kPa]"),
-        ):
-            each.set_ylabel(what, fontsize=9)
+        what = ("w, response without the prior's", "E over its mean", "E [kPa]")
+        for each, said in zip((response, ratios, moduli), what):
+            each.set_ylabel(said, fontsize=9)
             say_cut(each)
     grid[0, 0].set_xticks(range(0, 181, 30))
     legend(canvas, [*methods, "truth"], without="not known")
-    path = stem.with_name(stem.name + "_directions")
-    write_table(
-        path.with_suffix(".csv"),
-        [experiment.columns, experiment.rows, "degrees", "w", "E_Pa", "true_E_Pa"],
-        rows,
-    )
-    header = [
-        experiment.columns,
-        experiment.rows,
-        "largest w",
-        "range of E over its mean",
-        "of the truth",
-        "stiffest from the fibres [deg]",
-    ]
-    return "Directions in a plane with the fibres, first seed:\n\n" + markdown(header, lines), [
-        save(canvas, path)
-    ]
+    path, axes = stem.with_name(stem.name + "_directions"), [experiment.columns, experiment.rows]
+    write_table(path.with_suffix(".csv"), [*axes, "degrees", "w", "E_Pa", "true_E_Pa"], rows)
+    measures = ["largest w", "range of E over its mean", "of the truth", "stiffest from the fibres [deg]"]  # fmt: skip
+    text = "Directions in a plane with the fibres, first seed:\n\n"
+    return text + markdown([*axes, *measures], lines), [save(canvas, path)]
 
 
 def heterogeneity(
     experiment: Experiment, records: Sequence[Record], stem: Path
 ) -> tuple[str, list[Path]]:
     """Learned and true stiffness factor over the body, seen from the side."""
-    found = [
-        (record, twin) for record, twin in loaded(records) if twin.body.heterogeneity is not None
-    ]
+    every = list(loaded(records))
+    found = [(record, twin) for record, twin in every if twin.body.heterogeneity is not None]
     if not found:
         return "", []
     canvas = Canvas(figsize=(WIDTH, 6.4), layout="constrained")
     grid, lines, shown = canvas.subplots(2, len(found), squeeze=False), [], []
     several = len(experiment.axes[experiment.rows]) > 1
-    for column, (record, twin) in enumerate(found):
+    for places, (record, twin) in zip(grid.T, found):
         body, scene = twin.body, twin.record.settings["scene"]
-        learned = body.factor(body.model().heterogeneity).detach()
-        hidden = (
-            OBJECTS[scene["name"]].material.variant(scene.get("material", "anisotropic"))
-            if scene.get("name") in OBJECTS
-            else None
-        )
-        true = None if hidden is None else hidden.factor(body.rest.float())
-        title = record.place[experiment.columns].name
-        grid[0, column].set_title(
-            f"{title}, {label(experiment, record)}" if several else title, fontsize=10
-        )
-        for place, values in zip(grid[:, column], (learned, true)):
+        learned, true = body.factor(body.model().heterogeneity).detach(), None
+        if scene.get("name") in OBJECTS:
+            hidden = OBJECTS[scene["name"]].material.variant(scene.get("material", "anisotropic"))
+            true = hidden.factor(body.rest.float())
+        title, name = record.place[experiment.columns].name, label(experiment, record)
+        places[0].set_title(f"{title}, {name}" if several else title, fontsize=10)
+        order = body.rest[:, 2].argsort()
+        across, up = body.rest[order, 0], body.rest[order, 1]
+        for place, values in zip(places, (learned, true)):
             place.set(xticks=[], yticks=[], aspect="equal")
             place.spines[:].set_visible(False)
-            if values is None:
-                continue
-            order = body.rest[:, 2].argsort()
-            across, up = body.rest[order, 0], body.rest[order, 1]
-            shown.append(
-                place.scatter(across, up, c=values[order], s=7, cmap="coolwarm", linewidths=0)
-            )
-        same = (
-            ""
-            if true is None or float(true.std()) < 1e-6 or float(learned.std()) < 1e-6
-            else (f"{float(torch.corrcoef(torch.stack([learned.float(), true]))[0, 1]):.2f}")
-        )
-        lines.append(
-            [
-                record.place[experiment.columns].name,
-                label(experiment, record),
-                f"{float(learned.std()):.3f}",
-                same,
-            ]
-        )
+            if values is not None:
+                dots = {"c": values[order], "s": 7, "cmap": "coolwarm", "linewidths": 0}
+                shown.append(place.scatter(across, up, **dots))
+        same = ""
+        if true is not None and min(float(true.std()), float(learned.std())) > 1e-6:
+            same = f"{float(torch.corrcoef(torch.stack([learned.float(), true]))[0, 1]):.2f}"
+        lines.append([title, name, f"{float(learned.std()):.3f}", same])
     for place, what in zip(grid[:, 0], ("learned", "truth")):
         place.set_ylabel(what, fontsize=11)
     most = max(float(np.abs(part.get_array() - 1).max()) for part in shown)
     for part in shown:  # one range for all bodies, whose middle colour is 1
         part.set_clim(1 - most, 1 + most)
-    bar = canvas.colorbar(
-        shown[0], ax=grid.ravel().tolist(), location="bottom", shrink=0.6, aspect=40
-    )
-    bar.set_label(
-        "factor on the stiffness, 1: as the calibrated law (truth: as its law without the variation)",
-        fontsize=9,
-    )
-    header = [
-        experiment.columns,
-        experiment.rows,
-        "standard deviation of the factor",
-        "correlation with the truth",
-    ]
-    return "Stiffness over the body:\n\n" + markdown(header, lines), [
-        save(canvas, stem.with_name(stem.name + "_factor"))
-    ]
+    bar = canvas.colorbar(shown[0], ax=grid.ravel().tolist(), location="bottom", shrink=0.6, aspect=40)  # fmt: skip
+    said = "factor on the stiffness, 1: as the calibrated law (truth: as its law without the variation)"  # fmt: skip
+    bar.set_label(said, fontsize=9)
+    measures = ["standard deviation of the factor", "correlation with the truth"]
+    text = markdown([experiment.columns, experiment.rows, *measures], lines)
+    picture = save(canvas, stem.with_name(stem.name + "_factor"))
+    return "Stiffness over the body:\n\n" + text, [picture]
 
 
 ANALYSES: dict[str, Callable[[Experiment, Sequence[Record], Path], tuple[str, list[Path]]]] = {

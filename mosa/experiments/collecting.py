@@ -50,10 +50,10 @@ class Cell:
     sd: float | None
     count: int
 
-    def text(self, decimals: int, plus: str = "±") -> str:
+    def text(self, decimals: int) -> str:
         if not math.isfinite(self.mean):
             return "failed" if math.isnan(self.mean) else "diverged"
-        spread = "" if self.sd is None else f" {plus} {self.sd:.{decimals}f}"
+        spread = "" if self.sd is None else f" ± {self.sd:.{decimals}f}"
         return f"{self.mean:.{decimals}f}{spread}"
 
 
@@ -61,8 +61,8 @@ FAILED = Cell(math.nan, None, 0)
 """Of a place of which no run is complete, and one has failed."""
 
 
-def said_below(tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
-    """What its words mean that stand in place of figures, and what a mean is; empty where there is neither."""
+def footnotes(tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
+    """Notes of a table: the meaning of words in place of figures, and of the means; empty if it has neither."""
     cells = [
         (column, cell)
         for rows in tables.values()

@@ -31,85 +31,39 @@ def parameters(
               for f in experiment.figures if f.figure.startswith("id/")}  # fmt: skip
     rows, lines = [], []
     for option in experiment.axes[experiment.rows]:
-        runs = [
-            r
-            for r in records
-            if r.place[experiment.rows].name == option.name and r.figures is not None
-        ]
-        if not runs:
-            continue
-        name = setting(runs[0].job.overrides, "scene.name") or setting(
-            runs[0].job.overrides, "scene"
-        )
+        runs = [r for r in records if r.place[experiment.rows] == option and r.figures is not None]
+        overrides = runs[0].job.overrides if runs else ()
+        name = setting(overrides, "scene.name") or setting(overrides, "scene")
         if name not in OBJECTS:
             continue
         material = OBJECTS[name].material.variant(
-            setting(runs[0].job.overrides, "scene.material") or "anisotropic"
+            setting(overrides, "scene.material") or "anisotropic"
         )
         for parameter, truth in material.known.items():
+            relative = parameter in RELATIVE
+            deviation = f"posterior/{parameter}_{'relative_' if relative else ''}sd"
             found = [r.figures.get(f"id/{parameter}") for r in runs]
-            sds = [
-                r.figures.get(
-                    f"posterior/{parameter}_{'relative_' if parameter in RELATIVE else ''}sd"
-                )
-                for r in runs
-            ]
+            sds = [r.figures.get(deviation) for r in runs]
             if not all(isinstance(value, (int, float)) for value in [*found, *sds]):
                 continue
-            mean, sd = (
-                statistics.fmean(found),
-                statistics.fmean(sds) / (1.0 if parameter in RELATIVE else abs(truth)),
-            )
+            mean, sd = statistics.fmean(found), statistics.fmean(sds)
+            sd = sd if relative else sd / abs(truth)
+            over = statistics.stdev(found) if len(found) > 1 else None
             off = statistics.fmean(abs(value / truth - 1) for value in found)
-            step = (
-                statistics.fmean(abs(math.log(value / truth)) for value in found)
-                if parameter in RELATIVE
-                else off
-            )
+            step = statistics.fmean(abs(math.log(v / truth)) for v in found) if relative else off
             said = verdict(100 * off, 100 * step, 100 * sd, limits.get(parameter))
-            spread = f" ± {statistics.stdev(found):.2g}" if len(found) > 1 else ""
             unit = unit_of(material.law, parameter)
-            lines.append(
-                [
-                    option.name,
-                    f"{parameter} [{unit}]" if unit else parameter,
-                    f"{truth:g}",
-                    f"{mean:.3g}{spread}",
-                    f"{100 * (mean / truth - 1):+.1f}",
-                    f"{100 * sd:.1f}",
-                    said,
-                ]
-            )
-            rows.append(
-                [
-                    option.name,
-                    parameter,
-                    unit,
-                    truth,
-                    mean,
-                    statistics.stdev(found) if len(found) > 1 else "",
-                    len(found),
-                    sd,
-                    said,
-                ]
-            )
+            named = f"{parameter} [{unit}]" if unit else parameter
+            spread = "" if over is None else f" ± {over:.2g}"
+            away, sure = f"{100 * (mean / truth - 1):+.1f}", f"{100 * sd:.1f}"
+            lines.append([option.name, named, f"{truth:g}", f"{mean:.3g}{spread}", away, sure, said])  # fmt: skip
+            deviations = ["" if over is None else over, len(found), sd]
+            rows.append([option.name, parameter, unit, truth, mean, *deviations, said])
     if not lines:
         return "", []
-    write_table(
-        stem.with_name(stem.name + "_parameters").with_suffix(".csv"),
-        [
-            experiment.rows,
-            "parameter",
-            "unit",
-            "truth",
-            "found",
-            "sd_over_seeds",
-            "seeds",
-            "posterior_sd",
-            "verdict",
-        ],
-        rows,
-    )
+    columns = "parameter unit truth found sd_over_seeds seeds posterior_sd verdict".split()
+    file = stem.with_name(stem.name + "_parameters").with_suffix(".csv")
+    write_table(file, [experiment.rows, *columns], rows)
     header = [experiment.rows, "parameter", "truth", "found", "off [%]", "posterior sd [%]", ""]
     return (
         "Every parameter, ± over the seeds. *met*: as near as asked, and *by chance* where twice its posterior's deviation is "

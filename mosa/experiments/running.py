@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 from mosa.experiments.commits import commit
@@ -25,13 +25,9 @@ def words_of(job: Job) -> list[str]:
 
 
 def run_jobs(
-    jobs: Sequence[Job],
-    devices: Sequence[int | None],
-    side_by_side: int,
-    ended: Callable[[Job, bool], None] = lambda job, failed: None,
+    jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int
 ) -> dict[str, str]:
-    """Run the jobs that are not complete; {folder: reason} of those that failed. devices: GPUs, [None] for the CPU; ended: called
-    with each job and whether it failed.
+    """Run the jobs that are not complete; {folder: reason} of those that failed. devices: GPUs, [None] for the CPU.
 
     Of jobs that share their films, or a reconstruction, the first runs without the others until these are made; the others find
     them in the cache."""
@@ -75,7 +71,6 @@ def run_jobs(
                 free[device] += reversed(places)
                 outcome = "failed" if job_failed else "complete"
                 print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)  # fmt: skip
-                ended(job, job_failed)
     finally:
         at_work = [places[0] for _, _, places, _ in running.values()]
         for worker in at_work:  # Ctrl-C: each job writes its checkpoint and ends

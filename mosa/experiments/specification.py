@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from typing import Any
 import yaml
 
 from mosa.errors import ConfigError, DataError
-from mosa.modules.fitting.stages import STAGES, FitSection
 
 PLOTS = ("bars", "lines", "map", None)
 SPECIFICATIONS = Path(__file__).with_name("specifications")
@@ -134,6 +133,15 @@ class Job:
         )
 
 
+def section(kind: Callable[..., Any], where: str, keys: Mapping[str, Any]) -> Any:
+    """A dataclass made of a section of an experiment's file. Errors: ConfigError naming the section."""
+    try:
+        return kind(**keys)
+    except TypeError as error:
+        fields = ", ".join(kind.__dataclass_fields__)
+        raise ConfigError(f"{where}: expected fields of {fields} ({error})") from error
+
+
 def experiment_names(folder: Path) -> list[str]:
     return sorted(file.stem for file in folder.glob("*.yaml") if not file.stem.startswith("_"))
 
@@ -191,12 +199,7 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
         raise ConfigError(
             f"{name}: plot: expected bars, lines, map or null, found {keys['plot']!r}"
         )
-    try:
-        keys["figures"] = tuple(Figure(**figure) for figure in keys["figures"])
-    except TypeError as error:
-        raise ConfigError(
-            f"{name}: figures: expected sections of {', '.join(Figure.__dataclass_fields__)} ({error})"
-        ) from error
+    keys["figures"] = tuple(section(Figure, f"{name}: figures", each) for each in keys["figures"])
     keys["claims"] = tuple(
         claim_of(f"{name}: claims[{i}]", each, keys["figures"])
         for i, each in enumerate(keys.get("claims", ()))
@@ -207,12 +210,7 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
 
 def claim_of(where: str, found: Any, figures: Sequence[Figure]) -> Claim:
     """Errors: ConfigError naming the key."""
-    try:
-        claim = Claim(**{k: tuple(v) if isinstance(v, list) else v for k, v in found.items()})
-    except (TypeError, AttributeError) as error:
-        raise ConfigError(
-            f"{where}: expected fields of {', '.join(Claim.__dataclass_fields__)} ({error})"
-        ) from error
+    claim = section(Claim, where, found | {"against": tuple(found.get("against", ()))})
     labels = [figure.label for figure in figures]
     for key in ("figure", "unless"):
         if (label := getattr(claim, key)) is not None and label not in labels:
@@ -238,18 +236,9 @@ def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Optio
         raise ConfigError(f"{where}: expected a section of options, found {found!r}")
     options = []
     for name, content in found.items():
-        section = (
-            {"overrides": content}
-            if isinstance(content, (list, tuple)) or content is None
-            else dict(content)
-        )
-        section["overrides"] = tuple(str(each) for each in section.get("overrides") or ())
-        try:
-            options.append(Option(str(name), **section))
-        except TypeError as error:
-            raise ConfigError(
-                f"{where}.{name}: expected fields of {', '.join(Option.__dataclass_fields__)} ({error})"
-            ) from error
+        keys = dict(content) if isinstance(content, Mapping) else {"overrides": content}
+        keys["overrides"] = tuple(str(each) for each in keys.get("overrides") or ())
+        options.append(section(Option, f"{where}.{name}", {"name": str(name), **keys}))
     return chosen(where, tuple(options), only)
 
 
@@ -266,16 +255,14 @@ def chosen(
 
 
 def pairs(words: Sequence[str], experiments: Sequence[Experiment]) -> dict[str, list[str]]:
-    """{axis: names} of words AXIS=NAME,NAME, {experiment:axis: names} of words EXPERIMENT:AXIS=NAME,NAME. Errors: ConfigError."""
+    """{axis: names} of words AXIS=NAME,NAME. Errors: ConfigError."""
     axes = dict.fromkeys(axis for each in experiments for axis in each.axes)
-    known = [*axes, *(f"{each.name}:{axis}" for each in experiments for axis in each.axes)]
     found = {}
     for word in words:
         axis, mark, names = word.partition("=")
-        if not mark or axis not in known:
+        if not mark or axis not in axes:
             raise ConfigError(
-                f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(axes)}, or EXPERIMENT:AXIS=NAME,NAME, "
-                f"found {word!r}"
+                f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(axes)}, found {word!r}"
             )
         found[axis] = names.split(",")
     return found
@@ -284,11 +271,9 @@ def pairs(words: Sequence[str], experiments: Sequence[Experiment]) -> dict[str, 
 def narrowed(
     experiment: Experiment, only: Mapping[str, Sequence[str]], seeds: tuple[int, ...] | None
 ) -> Experiment:
-    """With these options (of `pairs`; those that name the experiment go first) and seeds alone."""
+    """With these options (of `pairs`) and seeds alone."""
     axes = {
-        axis: chosen(
-            f"--only {axis}", options, only.get(f"{experiment.name}:{axis}", only.get(axis))
-        )
+        axis: chosen(f"--only {axis}", options, only.get(axis))
         for axis, options in experiment.axes.items()
     }
     return replace(experiment, axes=axes, seeds=experiment.seeds if seeds is None else seeds)
@@ -308,7 +293,6 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
                 *more,
                 f"seed={seed}",
             )
-            longer = effort(overrides) / effort([each for each in overrides if each not in more])
             folder = runs / (ALONE * experiment.alone + folder_name(overrides))
             known = found.get(folder)
             if known is not None:
@@ -322,7 +306,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             ]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
             minutes = {
-                device: value * longer * math.prod(option.cost_on(device) for option in options)
+                device: value * math.prod(option.cost_on(device) for option in options)
                 for device, value in experiment.minutes.items()
             }
             found[folder] = Job(
@@ -336,32 +320,6 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
                 experiment.alone,
             )
     return list(found.values())
-
-
-FIT_SHARE = 0.4
-"""Assumed share of the fit in a job of 4000 particles and 100 steps of Adam on a GPU. Its fit takes 19 s and its evaluation 19 s
-(`table_time`, H200); the rest was not measured."""
-
-
-def effort(overrides: Sequence[str]) -> float:
-    """Time of a job over one of 4000 particles and Adam's default steps, from the particles and the
-    steps of stages that its overrides name; 1 where they name none. Where particles are too few to
-    fill a GPU it is too much."""
-    said = dict(each.split("=", 1) for each in overrides if "=" in each)
-    usual = FitSection()
-    stages = {stage: getattr(usual, stage).iterations for stage in STAGES}
-    steps = sum(number(said.get(f"fit.{s}.iterations"), n) for s, n in stages.items())
-    grown = 1 + FIT_SHARE * (steps / sum(stages.values()) - 1)
-    return max(grown * number(said.get("simulation.particles"), 4000) / 4000, 1e-3)
-
-
-def number(text: str | None, usual: float) -> float:
-    """What an override says, the usual value where it says no positive number (auto, null)."""
-    try:
-        value = usual if text is None else float(text)
-    except ValueError:
-        return usual
-    return value if 0 <= value < math.inf else usual
 
 
 USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])
@@ -422,11 +380,6 @@ def total_minutes(jobs: Sequence[Job]) -> float:
     return sum(minutes_taken(job) or 0.0 for job in jobs)
 
 
-CROWD = 0.065
-"""By how much each further job on a GPU makes all of them slower: of what takes half a minute alone, fourteen side by side on an
-H100 with sixteen cores, under MPS, took 0.9 to 1.0."""
-
-
 def in_turn(jobs: Sequence[Job], devices: Sequence[int | None]) -> list[Job]:
     """In the order in which they run: that of their turns, of one turn the longest first, so that none of them is waited for in the
     end; then what runs alone."""
@@ -439,42 +392,22 @@ def device_kind(devices: Sequence[int | None]) -> str:
     return "cpu" if list(devices) == [None] else "gpu"
 
 
-def estimate(
-    jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int
-) -> tuple[list[str], float]:
-    """A line for each job and one for all of them, in the order and places that they run in (`running.run_jobs`), and the minutes
-    until they are complete. Minutes of jobs to come are scaled by those that are complete; a GPU's also by how many jobs it has at
-    a time."""
+def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> list[str]:
+    """A line for each job, in the order in which they run, and one for all of them with the minutes until they are complete: those
+    of the experiments' files for the jobs that are left, which share all places evenly."""
     device, slots = device_kind(devices), len(devices) * side_by_side
-    taken = {job.folder: minutes_taken(job) for job in jobs}
-    left = [job for job in jobs if taken[job.folder] is None]
-    beside = min(side_by_side, -(-sum(not job.alone for job in left) // len(devices)))
-    crowd = 1 + CROWD * (beside - 1) if device == "gpu" and beside else 1.0
-    scale = {True: 1.0, False: crowd}  # of jobs that run alone, and of all others
-    for kind in scale:
-        done = [
-            (taken[job.folder], job.minutes[device])
-            for job in jobs
-            if taken[job.folder] is not None and job.alone == kind
-        ]
-        if done:
-            scale[kind] = sum(t for t, _ in done) / sum(m for _, m in done)
-    lines, ends = [], [0.0] * slots
-    alone: list[float] = []  # of each device, the end of what ran alone there
+    lines, left = [], []
     for job in in_turn(jobs, devices):
-        known, expected = taken[job.folder], job.minutes[device] * scale[job.alone]
-        if known is None and job.alone:
-            alone = alone or [max(ends)] * len(devices)
-            alone[alone.index(min(alone))] += expected
-        elif known is None:
-            ends[ends.index(min(ends))] += expected
-        state = f"complete, {known:.1f} min" if known is not None else f"about {expected:.1f} min"
+        taken = minutes_taken(job)
+        if taken is None:
+            left.append(job.minutes[device])
+        state = f"about {left[-1]:.1f} min" if taken is None else f"complete, {taken:.1f} min"
         lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
-    minutes = max(alone or ends)
+    minutes = max(sum(left) / slots, max(left, default=0.0))
     return [
         *lines,
         f"{len(jobs)} jobs, {len(left)} to run, about {minutes:.1f} minutes with {slots} side by side",
-    ], minutes
+    ]
 
 
 def read_job(job: Job) -> dict[str, float | str] | None:

@@ -8,7 +8,7 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -142,97 +142,69 @@ def compression(
     """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical; a row
     of the picture for each column of the table: E, and how far it is from the truth's."""
     truths: Truths = {}
-    laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]]] = {}
+    laws: dict[str, dict[str, Law]] = {}
     for record in first_seeds(records, tuple(MODELS), [pressed_file, checkpoint]):
         found = measured(record, truths)
         if found is None or prefix(record) not in found["models"]:
             continue
-        column = record.place[experiment.columns].name
-        laws.setdefault(column, {})[label(experiment, record)] = (
-            found["degrees"],
-            found["truth_Pa"],
-            found["models"][prefix(record)],
-        )
+        model = found["models"][prefix(record)]
+        column = laws.setdefault(record.place[experiment.columns].name, {})
+        column[label(experiment, record)] = Law(found["degrees"], found["truth_Pa"], model)
     if not laws:
         return "", []
     order = [option.name for option in experiment.axes[experiment.rows]]
     rows, lines = [], []
     for column, of in laws.items():
         for name in sorted(of, key=order.index):
-            degrees, truth, model = of[name]
-            if model is None:
+            law = of[name]
+            if law.model is None:
                 lines.append([column, name, "diverged", "", ""])
                 continue
-            off = [
-                100 * abs(e / t - 1)
-                for a, e, t in zip(degrees, model["modulus_Pa"], truth)
-                if a < 180
-            ]
-            lines.append(
-                [
-                    column,
-                    name,
-                    f"{sum(off) / len(off):.1f}",
-                    f"{max(off):.1f}",
-                    f"{100 * model['force_off']:.1f}",
-                ]
-            )
-            rows += [
-                [column, name, f"{a:.1f}", f"{e:.6g}", f"{t:.6g}"]
-                for a, e, t in zip(degrees, model["modulus_Pa"], truth)
-            ]
+            off = [abs(e) for a, e in zip(law.degrees, law.off) if a < 180]
+            force = f"{100 * law.model['force_off']:.1f}"
+            lines.append([column, name, f"{sum(off) / len(off):.1f}", f"{max(off):.1f}", force])
+            rows += [[column, name, f"{a:.1f}", f"{e:.6g}", f"{t:.6g}"]
+                     for a, e, t in zip(law.degrees, law.model["modulus_Pa"], law.truth)]  # fmt: skip
     path = stem.with_name(stem.name + "_plates")
-    write_table(
-        path.with_suffix(".csv"),
-        [experiment.columns, experiment.rows, "degrees", "E_Pa", "true_E_Pa"],
-        rows,
-    )
-    header = [
-        experiment.columns,
-        experiment.rows,
-        "E off, mean [%]",
-        "E off, largest [%]",
-        "force at 4 % strain off, largest [%]",
-    ]
-    text = "A specimen between plates, first seed, against the true law:\n\n" + markdown(
-        header, lines
-    )
-    return text, [save(drawn(laws, order), path)]
+    axes = [experiment.columns, experiment.rows]
+    write_table(path.with_suffix(".csv"), [*axes, "degrees", "E_Pa", "true_E_Pa"], rows)
+    measures = ["E off, mean [%]", "E off, largest [%]", "force at 4 % strain off, largest [%]"]
+    text = "A specimen between plates, first seed, against the true law:\n\n"
+    return text + markdown([*axes, *measures], lines), [save(drawn(laws, order), path)]
 
 
-def drawn(
-    laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]]], order: Sequence[str]
-) -> Canvas:
-    """laws: {column: {model: (degrees, truth [Pa], measured)}}; order: of the models."""
+class Law(NamedTuple):
+    """degrees: (K,) of the directions; truth: (K,) [Pa] of the true law; model: of `measured`, None where it diverged."""
+
+    degrees: list[float]
+    truth: list[float]
+    model: dict[str, Any] | None
+
+    @property
+    def off(self) -> list[float]:
+        """(K,) [%] by which the model's E is too large."""
+        return [100 * (e / t - 1) for e, t in zip(self.model["modulus_Pa"], self.truth)]
+
+
+def drawn(laws: dict[str, dict[str, Law]], order: Sequence[str]) -> Canvas:
+    """laws: {column: {model: its law}}; order: of the models."""
     canvas = Canvas(figsize=(WIDTH, 3.4 * len(laws) + 0.6), layout="constrained")
     grid = canvas.subplots(len(laws), 2, squeeze=False)
+    axis = "direction of loading, from x towards y [degrees]; dotted: stiffest of the truth"
     for (column, of), (left, right) in zip(laws.items(), grid):
         degrees, truth, _ = next(iter(of.values()))
         left.plot(degrees, [t / 1e3 for t in truth], label="truth", **style_of("truth"))
         right.axhspan(-ASKED, ASKED, color="0.9", label=f"within {ASKED:g} %")
         for name in sorted(of, key=order.index):
-            degrees, truth, model = of[name]
-            if model is not None:
-                left.plot(
-                    degrees, [e / 1e3 for e in model["modulus_Pa"]], label=name, **style_of(name)
-                )
-                right.plot(
-                    degrees,
-                    [100 * (e / t - 1) for e, t in zip(model["modulus_Pa"], truth)],
-                    **style_of(name),
-                )
-        stiffest = degrees[max(range(len(truth)), key=truth.__getitem__)]
-        for part, title, unit in (
-            (left, column, "E between plates [kPa]"),
-            (right, f"{column}: error", "E off the truth [%]"),
-        ):
+            if (model := of[name].model) is not None:
+                style, kilo = style_of(name), [e / 1e3 for e in model["modulus_Pa"]]
+                left.plot(of[name].degrees, kilo, label=name, **style)
+                right.plot(of[name].degrees, of[name].off, **style)
+        stiffest = degrees[int(np.argmax(truth))]
+        left.set(title=column, ylabel="E between plates [kPa]", ylim=(0, 1.05 * left.get_ylim()[1]))
+        right.set(title=f"{column}: error", ylabel="E off the truth [%]")
+        for part in (left, right):
             part.axvline(stiffest, color="0.6", linewidth=0.8, linestyle=":")
-            part.set_title(title, fontsize=10)
-            part.set_ylabel(unit)
-            part.set_xlabel(
-                "direction of loading, from x towards y [degrees]; dotted: stiffest of the truth"
-            )
-            part.xaxis.label.set_size(8)
-        left.set_ylim(0, 1.05 * left.get_ylim()[1])
+            part.set_xlabel(axis, fontsize=8)
     legend(canvas, ["truth", *order])
     return canvas

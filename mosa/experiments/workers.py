@@ -17,7 +17,7 @@ from loky.process_executor import ProcessPoolExecutor
 
 from mosa.system.refused import let_go
 
-IDLE = 300.0
+IDLE_SECONDS = 300.0
 """Seconds without a job after which a worker process ends. One whose command was killed finishes its job first."""
 
 
@@ -47,7 +47,7 @@ class Worker:
 
     def started(self) -> ProcessPoolExecutor:
         if self.pool is None:
-            self.pool = ProcessPoolExecutor(1, timeout=IDLE, env=self.environment, initializer=await_jobs)  # fmt: skip
+            self.pool = ProcessPoolExecutor(1, timeout=IDLE_SECONDS, env=self.environment, initializer=await_jobs)  # fmt: skip
         self.number = self.pool.submit(os.getpid)
         return self.pool
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.data.checks.silhouettes import left_open, whole_views
+from mosa.data.checks.silhouettes import uncovered_share, whole_views
 from mosa.data.hull import Volume, hull_bounds, occupancy, visual_hull
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
@@ -238,7 +238,7 @@ def check_place(path: str, splats: Splats, scene: Scene) -> None:
         / splats.opacities.sum()
     )
     filled = 1 - float(
-        left_open(splats.means, 2 * float(splats.scales.mean()), mattes, cameras).median()
+        uncovered_share(splats.means, 2 * float(splats.scales.mean()), mattes, cameras).median()
     )
     said = (
         f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "

@@ -23,12 +23,10 @@ ALPHA_MIN = 1.0 / 255.0
 
 @functools.cache
 def projection_kernels(dtype: type):
-    """(project, project_backward, camera_backward) for one Warp scalar type.
+    """(project, project_backward) for one Warp scalar type.
 
     Arrays are flat: `means`, `covariances` over S * N, records and their moments (records.py) over B * N. `settings` holds
-    near plane, clamp margin (0.3), largest extent in standard deviations and 1 for the square INRIA extent.
-    camera_backward is launched only where cameras are learned: it repeats the work of project_backward instead of
-    storing it per image and Gaussian.
+    near plane, clamp margin (0.3) and largest extent in standard deviations.
     """
     vec2 = wp.types.vector(length=2, dtype=dtype)
     vec3 = wp.types.vector(length=3, dtype=dtype)
@@ -36,7 +34,6 @@ def projection_kernels(dtype: type):
     mat22 = wp.types.matrix(shape=(2, 2), dtype=dtype)
     mat23 = wp.types.matrix(shape=(2, 3), dtype=dtype)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=dtype)
-    mat34 = wp.types.matrix(shape=(3, 4), dtype=dtype)
     mat44 = wp.types.matrix(shape=(4, 4), dtype=dtype)
     record = record_type(dtype)
     load, store, pack, _, conic, _ = record_functions(dtype)
@@ -128,33 +125,6 @@ def projection_kernels(dtype: type):
             gz += sy * gty
         return vec3(gx, gy, gz)
 
-    @wp.func
-    def intrinsics_gradient(K: mat33, p: vec3, limits: vec4, gc: vec2, gJ: mat23):
-        """dL/dK of a pixel and of J, the limits of the clamp included: d limit/d cx = -1/fx, d limit/d fx = -limit/fx."""
-        zero = dtype(0.0)
-        fx = K[0, 0]
-        sk = K[0, 1]
-        fy = K[1, 1]
-        z = p[2]
-        u = p[0] / z
-        v = p[1] / z
-        sx = wp.clamp(u, limits[0], limits[1])
-        sy = wp.clamp(v, limits[2], limits[3])
-        gfx = u * gc[0] + (gJ[0, 0] - sx * gJ[0, 2]) / z
-        gsk = v * gc[0] + (gJ[0, 1] - sy * gJ[0, 2]) / z
-        gfy = v * gc[1] + (gJ[1, 1] - sy * gJ[1, 2]) / z
-        gcx = gc[0]
-        gcy = gc[1]
-        if u != sx:
-            gs = -fx / z * gJ[0, 2]
-            gcx -= gs / fx
-            gfx -= gs * sx / fx
-        if v != sy:
-            gs = -sk / z * gJ[0, 2] - fy / z * gJ[1, 2]
-            gcy -= gs / fy
-            gfy -= gs * sy / fy
-        return mat33(gfx, gsk, gcx, zero, gfy, gcy, zero, zero, zero)
-
     @wp.kernel(enable_backward=False, module="unique")
     def project(
         means: wp.array(dtype=vec3),
@@ -164,7 +134,7 @@ def projection_kernels(dtype: type):
         K: wp.array(dtype=mat33),
         w2c: wp.array(dtype=mat44),
         state_index: wp.array(dtype=wp.int32),
-        settings: vec4,
+        settings: vec3,
         count: int,
         width: int,
         height: int,
@@ -191,33 +161,17 @@ def projection_kernels(dtype: type):
                 u = (K[b][0, 0] * p[0] + K[b][0, 1] * p[1]) / p[2] + K[b][0, 2]
                 v = K[b][1, 1] * p[1] / p[2] + K[b][1, 2]
                 depth = p[2]
-                rect = wp.vec4i(0, 0, 0, 0)
                 w = dtype(width)
                 h = dtype(height)
                 zero = dtype(0.0)
-                if settings[3] > zero:
-                    # INRIA: square extent, and every pixel of a touched tile sees the Gaussian
-                    mid = dtype(0.5) * (sxx + syy)
-                    top = mid + wp.sqrt(wp.max(dtype(0.1), mid * mid - det))
-                    r = wp.ceil(settings[2] * wp.sqrt(top))
-                    t = dtype(TILE)
-                    half = dtype(0.5)
-                    x0 = t * wp.floor((wp.clamp(u - half - r, zero, w + t)) / t)
-                    x1 = t * wp.floor((wp.clamp(u - half + r + t - dtype(1.0), zero, w + t)) / t)
-                    y0 = t * wp.floor((wp.clamp(v - half - r, zero, h + t)) / t)
-                    y1 = t * wp.floor((wp.clamp(v - half + r + t - dtype(1.0), zero, h + t)) / t)
-                    rect = wp.vec4i(
-                        int(x0), wp.min(int(x1), width), int(y0), wp.min(int(y1), height)
-                    )
-                else:
-                    e = wp.min(settings[2], wp.sqrt(dtype(2.0) * wp.log(dtype(255.0) * o)))
-                    rx = wp.ceil(e * wp.sqrt(sxx))
-                    ry = wp.ceil(e * wp.sqrt(syy))
-                    x0 = wp.clamp(wp.floor(u - rx), zero, w)
-                    x1 = wp.clamp(wp.ceil(u + rx), zero, w)
-                    y0 = wp.clamp(wp.floor(v - ry), zero, h)
-                    y1 = wp.clamp(wp.ceil(v + ry), zero, h)
-                    rect = wp.vec4i(int(x0), int(x1), int(y0), int(y1))
+                e = wp.min(settings[2], wp.sqrt(dtype(2.0) * wp.log(dtype(255.0) * o)))
+                rx = wp.ceil(e * wp.sqrt(sxx))
+                ry = wp.ceil(e * wp.sqrt(syy))
+                x0 = wp.clamp(wp.floor(u - rx), zero, w)
+                x1 = wp.clamp(wp.ceil(u + rx), zero, w)
+                y0 = wp.clamp(wp.floor(v - ry), zero, h)
+                y1 = wp.clamp(wp.ceil(v + ry), zero, h)
+                rect = wp.vec4i(int(x0), int(x1), int(y0), int(y1))
                 result = pack(vec2(u, v), o, vec3(syy / det, -sxy / det, sxx / det), rect)
         store(records, i, result)
         depths[i] = depth
@@ -230,7 +184,7 @@ def projection_kernels(dtype: type):
         K: wp.array(dtype=mat33),
         w2c: wp.array(dtype=mat44),
         state_index: wp.array(dtype=wp.int32),
-        settings: vec4,
+        settings: vec3,
         count: int,
         width: int,
         height: int,
@@ -278,56 +232,4 @@ def projection_kernels(dtype: type):
                 gm = vec3()
                 go = dtype(0.0)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def camera_backward(
-        means: wp.array(dtype=vec3),
-        covariances: wp.array(dtype=mat33),
-        K: wp.array(dtype=mat33),
-        w2c: wp.array(dtype=mat44),
-        state_index: wp.array(dtype=wp.int32),
-        settings: vec4,
-        count: int,
-        width: int,
-        height: int,
-        chunks: int,
-        records: wp.array(dtype=record),
-        moments: wp.array(dtype=record),
-        # out: partial sums over every `chunks`-th Gaussian, (B * chunks)
-        grad_w2c: wp.array(dtype=mat34),
-        grad_K: wp.array(dtype=mat33),
-    ):
-        b, first = wp.tid()
-        R = rotation(w2c[b])
-        limits = slope_limits(K[b], width, height, settings[1])
-        gw = mat34()
-        gk = mat33()
-        for n in range(first, count, chunks):
-            i = b * count + n
-            moment = load(moments, i)
-            if wp.max(wp.abs(moment)) > dtype(0.0):
-                r = load(records, i)
-                s = state_index[b] * count + n
-                m = means[s]
-                p = to_camera(w2c[b], m)
-                J = jacobian(K[b], p, limits)
-                # Sigma_2D = T A T^T with T = J R
-                gT = (
-                    dtype(2.0)
-                    * covariance_gradient(conic(r), conic_gradient(moment))
-                    * (J * R)
-                    * symmetric(covariances[s])
-                )
-                gJ = gT * wp.transpose(R)
-                gc = center_gradient(r, moment)
-                gp = point_gradient(K[b], p, limits, gc, gJ)
-                gR = wp.transpose(J) * gT + wp.outer(gp, m)
-                gw += mat34(
-                    gR[0, 0], gR[0, 1], gR[0, 2], gp[0],
-                    gR[1, 0], gR[1, 1], gR[1, 2], gp[1],
-                    gR[2, 0], gR[2, 1], gR[2, 2], gp[2],
-                )  # fmt: skip
-                gk += intrinsics_gradient(K[b], p, limits, gc, gJ)
-        grad_w2c[b * chunks + first] = gw
-        grad_K[b * chunks + first] = gk
-
-    return project, project_backward, camera_backward
+    return project, project_backward

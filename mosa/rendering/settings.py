@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from mosa.settings import Settings, Text
+from mosa.settings import Settings
 
 
 class RenderingSettings(Settings):
@@ -14,12 +14,6 @@ class RenderingSettings(Settings):
 
     where: ClassVar[str] = "rendering"
 
-    backend: Text = Field(
-        "warp",
-        description=(
-            "warp: CPU and CUDA; gsplat: rendering=gsplat, which needs the package on CUDA"
-        ),
-    )
     margin: int = Field(
         6, ge=0, le=256, description="px around the mattes' box that a training step renders"
     )

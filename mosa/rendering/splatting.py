@@ -1,9 +1,8 @@
 """Splatting on Warp, for CPU and CUDA: projection and compositing kernels behind one torch autograd function.
 
-Gradients to means, covariances, opacities, features and, where they ask for one, to the cameras' K and w2c, by
-hand-written adjoints. Kept for the backward pass: the projected Gaussians (records.py), the final transmittance and the
-place in its list where a pixel ended; on CUDA the tile lists too, one entry per (tile, Gaussian) pair that is visible.
-Nothing grows with Gaussians times pixels.
+Gradients to means, covariances, opacities and features, by hand-written adjoints. Kept for the backward pass: the projected
+Gaussians (records.py), the final transmittance and the place in its list where a pixel ended; on CUDA the tile lists too,
+one entry per (tile, Gaussian) pair that is visible. Nothing grows with Gaussians times pixels.
 """
 
 import contextlib
@@ -22,22 +21,8 @@ from mosa.rendering.raster_kernels import raster_kernels
 from mosa.rendering.tile_kernels import tile_kernels, tile_threads
 from mosa.rendering.tile_lists import tile_lists
 
-CAMERA_CHUNKS = 1024
-"""Threads per image that sum the gradient of its camera."""
-
-
-@dataclass(frozen=True)
-class Preset:
-    """near: nearest depth [m]; extent: standard deviations; square: INRIA's square extent, whole tiles; alpha_max:
-    cap of alpha."""
-
-    near: float
-    extent: float
-    square: bool
-    alpha_max: float
-
-
-PRESETS = {"gsplat": Preset(0.01, 3.33, False, 0.999), "inria": Preset(0.2, 3.0, True, 0.99)}
+NEAR, EXTENT, ALPHA_MAX = 0.01, 3.33, 0.999
+"""Nearest depth [m], extent of a Gaussian in standard deviations, cap of alpha: gsplat's."""
 
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
@@ -71,7 +56,6 @@ class Geometry:
     state_index: Tensor
     width: int
     height: int
-    preset: Preset
     scan: str
 
 
@@ -139,10 +123,7 @@ class Splat(torch.autograd.Function):
             )
             projected = (means, covariances, opacities, K, w2c, records, moments, ctx.geometry)
             gradients = project_backward(*projected)
-            cameras = (
-                camera_backward(*projected) if any(ctx.needs_input_grad[4:6]) else (None, None)
-            )
-        return *gradients, grad_features, *cameras, None
+        return *gradients, grad_features, None, None, None
 
 
 def project(
@@ -152,7 +133,7 @@ def project(
     images, count = len(g.state_index), means.shape[1]
     arrays = _Arrays(means.dtype)
     records, depths = means.new_empty(images, count, 8), means.new_empty(2 * images * count)
-    kernel, *_ = projection_kernels(arrays.scalar)
+    kernel, _ = projection_kernels(arrays.scalar)
     wp.launch(
         kernel,
         dim=(images, count),
@@ -275,7 +256,7 @@ def project_backward(
     grad_means, grad_covariances, grad_opacities = (
         torch.zeros_like(x) for x in (means, covariances, opacities)
     )
-    _, kernel, _ = projection_kernels(arrays.scalar)
+    _, kernel = projection_kernels(arrays.scalar)
     wp.launch(
         kernel,
         dim=count,
@@ -298,46 +279,11 @@ def project_backward(
     return grad_means, grad_covariances, grad_opacities
 
 
-def camera_backward(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    K: Tensor,
-    w2c: Tensor,
-    records: Tensor,
-    moments: Tensor,
-    g: Geometry,
-) -> tuple[Tensor, Tensor]:
-    """Gradients of K and w2c; arguments as of project_backward."""
-    arrays, images, count = _Arrays(means.dtype), len(records), means.shape[1]
-    chunks = min(count, CAMERA_CHUNKS)
-    partial_w2c, partial_K = (
-        means.new_empty(images, chunks, 3, 4),
-        means.new_empty(images, chunks, 3, 3),
-    )
-    *_, kernel = projection_kernels(arrays.scalar)
-    wp.launch(
-        kernel,
-        dim=(images, chunks),
-        inputs=[
-            arrays.vectors(means),
-            arrays.matrices(covariances),
-            *_projection(arrays, K, w2c, count, g),
-            chunks,
-            arrays.vectors(records),
-            arrays.vectors(moments),
-        ],
-        outputs=[arrays.matrices(partial_w2c), arrays.matrices(partial_K)],
-        device=wp.device_from_torch(means.device),
-    )
-    return partial_K.sum(1), torch.cat((partial_w2c.sum(1), means.new_zeros(images, 1, 4)), 1)
-
-
 def _splats(arrays: _Arrays, records: Tensor, features: Tensor, g: Geometry) -> list:
     """What all compositing kernels take after their lists."""
     count = records.shape[1]
     stride = count if features.shape[0] > 1 else 0
-    cap = arrays.scalar(g.preset.alpha_max)
+    cap = arrays.scalar(ALPHA_MAX)
     return [
         arrays.vectors(records),
         arrays.vectors(features),
@@ -351,10 +297,7 @@ def _splats(arrays: _Arrays, records: Tensor, features: Tensor, g: Geometry) -> 
 
 def _projection(arrays: _Arrays, K: Tensor, w2c: Tensor, count: int, g: Geometry) -> list:
     """What all projection kernels take after the Gaussians."""
-    preset = g.preset
-    settings = _vector(4, arrays.scalar)(
-        preset.near, CLAMP_MARGIN, preset.extent, float(preset.square)
-    )
+    settings = _vector(3, arrays.scalar)(NEAR, CLAMP_MARGIN, EXTENT)
     return [
         arrays.matrices(K),
         arrays.matrices(w2c),

@@ -1,4 +1,4 @@
-"""The screen of a program that goes on when nobody reads it any more."""
+"""Standard output that may lose its reader while the program goes on."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from typing import TextIO
 
 
-class Outlived:
-    """A stream of text whose reader may go before the program does (`| head -1`, a terminal that is closed, a log on a full disk):
-    what comes after that goes nowhere, and the work goes on."""
+class TolerantStream:
+    """A text stream whose reader may end before the program (`| head -1`, a closed terminal, a log on a full disk): later output is
+    discarded, and the program goes on."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -38,11 +38,11 @@ class Outlived:
 
 
 @contextmanager
-def outlived() -> Iterator[None]:
-    """Standard output and error may lose their readers meanwhile; where there are none (`>&-`) there are some that go nowhere."""
+def tolerant_output() -> Iterator[None]:
+    """Within it standard output and error may lose their readers; missing streams (`>&-`) are replaced by /dev/null."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (
-        Outlived(open(os.devnull, "w") if stream is None else stream) for stream in before
+        TolerantStream(open(os.devnull, "w") if stream is None else stream) for stream in before
     )
     try:
         yield

@@ -16,7 +16,6 @@ from mosa.config.build import plain, world_of
 from mosa.data.sequences import load_sequences
 from mosa.evaluation.evaluate import Sequence
 from mosa.modules.body.body import Body, World
-from mosa.rendering.rasterizer import use_backend
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa
 from mosa.types import Scene
@@ -26,7 +25,6 @@ def assemble(cfg: DictConfig, device: torch.device | str = "cpu", *, held_out: b
     """The run that `cfg`, a configuration of conf/train.yaml, describes. held_out: with the sequences nothing is learned from.
 
     Errors, here or where a part is asked for: ConfigError naming the key, DataError naming the file."""
-    use_backend(cfg.rendering.backend)
     return Run(cfg, device, held_out)
 
 

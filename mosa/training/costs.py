@@ -279,7 +279,7 @@ def before_data(cfg: Mapping[str, Any], most: int) -> str:
         return "data: pictures of a folder; what the rest takes is said when they have been read"
     from mosa.data.synthetic import sequences
     from mosa.data.synthetic.bodies.objects import object_named
-    from mosa.data.synthetic.films import take_file
+    from mosa.data.synthetic.films import film_file
 
     film, names = object_named(keys["name"]).footage, sequences(keys["name"])
     if keys.get("sequence", "train") != "train":
@@ -292,7 +292,7 @@ def before_data(cfg: Mapping[str, Any], most: int) -> str:
             Size(particles_of(cfg, most), film.cameras, film.frames, pixels, len(names), taught),
         )
     made = [
-        take_file(keys["name"], s, keys["material"], keys["seed"], keys.get("cache")).is_file()
+        film_file(keys["name"], s, keys["material"], keys["seed"], keys.get("cache")).is_file()
         for s in names
     ]
     pixels = film.cameras * film.frames * film.size**2

@@ -34,7 +34,7 @@ from mosa.errors import ConfigError, MosaError
 from mosa.settings import shown
 from mosa.system.console import fail, say_version
 from mosa.system.refused import explained, let_go
-from mosa.system.screen import outlived
+from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.training.sweep_table import FAILED, text_of, write_table
 
@@ -225,7 +225,7 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
     say_version()
     settle_threads()
     sys.argv[1:] = map(quoted, sys.argv[1:])
-    with outlived():
+    with tolerant_output():
         check_arguments(sys.argv[1:], Path(conf))
         check_folders(sys.argv[1:])
         check_files(sys.argv[1:], Path(conf))
@@ -366,7 +366,7 @@ def held_back() -> Iterator[None]:
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
     result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
-    with outlived():  # also in a launcher's worker, and for the message
+    with tolerant_output():  # also in a launcher's worker, and for the message
         return attempted(job, cfg)
 
 

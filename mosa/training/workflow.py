@@ -20,7 +20,7 @@ from mosa.config.composition import with_defaults
 from mosa.config.extensions import load_extensions
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
-from mosa.evaluation.likeness import warn_of_others
+from mosa.evaluation.same_body import warn_of_other_bodies
 from mosa.modules.body.body import Body, Start
 from mosa.modules.fitting.parameters import warn_of_ends
 from mosa.physics import exact_sums
@@ -28,8 +28,6 @@ from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.driven import driven_from_config
 from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
-from mosa.rendering.rasterizer import use_backend
-from mosa.rendering.settings import RenderingSettings
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import assemble, scenes
@@ -151,7 +149,7 @@ def train(cfg: DictConfig) -> float | None:
         body = module.body
         check_starts(world, body, starts)
         warn_of_little(world, body, starts, [scene, *others])
-        warn_of_others(body, starts, [scene, *others])
+        warn_of_other_bodies(body, starts, [scene, *others])
         if not filmed and not all(stage.newton for stage in module.stages):
             raise ConfigError(
                 "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
@@ -216,10 +214,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     exact_sums.use(cfg.deterministic)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
-    # as the run rendered; a machine without it renders the same pictures by warp
-    use_backend(
-        RenderingSettings.part(twin.record.settings.get("rendering") or {}).backend, required=False
-    )
     if cfg.plan is not None:
         ranked = plan(twin, count=cfg.plan)
         log.info("\n%s", plan_text(ranked))
@@ -263,7 +257,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
             touched = replace(twin.world.ground, height=scene.ground.height)  # as the run found it
             world = replace(world, ground=touched)
-        warn_of_others(body, found, [scene, *held_out])
+        warn_of_other_bodies(body, found, [scene, *held_out])
     else:
         found = {k: Start.read(s.plain(), body.rest) for k, s in twin.record.starts.items()}
         if len(found) != 1 + len(held_out):

@@ -67,6 +67,13 @@ class Scale:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def stiffness_scale(factor: np.ndarray) -> Scale:
+    """Of stiffness factors (N,), about 1: what differs by less than 1 % shall not look like a contrast."""
+    span = max(float(np.abs(factor - 1).max()), 0.01)
+    label = r"stiffness factor $1 + a\,\tanh\,\eta$ [-]"
+    return Scale(label, "coolwarm", 1 - span, 1 + span)
+
+
 @dataclass(frozen=True)
 class ShownSplats:
     """M splats that a body's particles carry, over T frames: centers (T, M, 3) [m], covariances (T, M, 3, 3) [m^2], colors
@@ -171,14 +178,7 @@ class Clip:
     @cached_property
     def scales(self) -> dict[str, Scale]:
         """Of each quantity, one for all frames and models: a colour means one value while the sequence plays, in both bodies."""
-        span = max(
-            float(np.abs(self.factor - 1).max()), 0.01
-        )  # what differs by less than 1 % shall not look like a contrast
-        found = {
-            "heterogeneity": Scale(
-                r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span
-            )
-        }
+        found = {"heterogeneity": stiffness_scale(self.factor)}
         if self.reference is not None:
             frames = range(len(self.bodies[self.reference].centers))
             high = max(

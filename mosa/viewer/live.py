@@ -1,4 +1,4 @@
-"""A twin to play with: dropped, paused, stepped, pushed by a ball that a hand moves, coloured by what is known of it.
+"""A twin to play with: dropped, paused, stepped, pushed by a ball that a hand moves, coloured by stretch or stiffness.
 
 Nothing here knows of a browser; `mosa.viewer.live_viewer` shows it. Not for several threads at once, but for `target`.
 """
@@ -15,26 +15,22 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import MosaError, SimulationDiverged
-from mosa.evaluation.uncertainty import total_spread
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion
 from mosa.rendering.appearance.carried_splats import Seen, seen
-from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import TwinState
 from mosa.twin.start import start_in
 from mosa.twin.twin import Twin
-from mosa.viewer.clips import GRAY, Scale
+from mosa.viewer.clips import Scale, stiffness_scale
 from mosa.viewer.pages import horizontal
 
-COLORS = ("appearance", "stretch", "heterogeneity", "uncertainty")
+COLORS = ("appearance", "stretch", "heterogeneity")
 FASTEST = 4.0
 """Of the ball, in sizes of the body per second: a mouse jumps, a solid that jumps passes through what it should push."""
 COURANT = 0.45
 """Cells per substep that the ball moves at most, below the half that a step allows."""
-DRAWS = 4
-"""Laws that the uncertainty is the spread of: each is a simulation beside the learned one's."""
 STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
-"""Where a scale of colours may end [% or mm]: the next one above what was seen since the drop."""
+"""Where the scale of stretches may end [%]: the next one above what was seen since the drop."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +48,12 @@ class Release:
 class Live:
     """One body of a twin among the twin's colliders and a ball, `hand`, that goes to `target` (3,) [m] as fast as a step allows.
 
-    drop_as: the next drop; running: whether whoever shows it shall step on; uncertain: whether the next drop carries the spread of
-    drawn laws along; message: what went wrong last, "" where nothing did. No method raises what a simulation or a start can: the
-    motion stops, the message says why, and the last state reached stays.
+    drop_as: the next drop; running: whether whoever shows it shall step on; message: what went wrong last, "" where nothing did. No
+    method raises what a simulation or a start can: the motion stops, the message says why, and the last state reached stays.
     """
 
-    def __init__(self, twin: Twin, *, draws: int = DRAWS) -> None:
-        self.twin, self.draws = twin, draws
+    def __init__(self, twin: Twin) -> None:
+        self.twin = twin
         body, world = twin.body, twin.world
         self.up = world.up.double().numpy()
         self.up = self.up / np.linalg.norm(self.up)
@@ -86,12 +81,10 @@ class Live:
         low = float(((self.arms @ Q.T + middle) @ self.up).min()) - self.ground
         self.drop_as = Release(height=min(max(low, 0.0), self.highest))
         self.middle = middle
-        self.running, self.uncertain, self.message = False, False, ""
+        self.running, self.message = False, ""
         self.state: TwinState | None = None
-        self.others: TwinWorlds | None = None
-        self.spread: np.ndarray | None = None
         self.force = np.zeros(3)
-        self._last, self._highs = self.drop_as, {}
+        self._last, self._high = self.drop_as, 0.0
         self.target = self.home()
         self.begin(self.drop_as)
 
@@ -119,13 +112,7 @@ class Live:
     def begin(self, drop: Release) -> bool:
         """Let the body go from `drop`, at rest in time until `running`; whether it could be. The ball begins at its target, or at
         home where the body is."""
-        self.message, self.running, self.others, self.spread, self.force = (
-            "",
-            False,
-            None,
-            None,
-            np.zeros(3),
-        )
+        self.message, self.running, self.force = "", False, np.zeros(3)
         twin, given = self.twin, self.start(drop)
         try:
             start, _ = start_in(twin.body, twin.world, twin.training_start, **given)
@@ -141,24 +128,8 @@ class Live:
             state = twin.reset(**given, **options)
         except (MosaError, RuntimeError) as error:
             return self.fail(error)
-        self.state, self._last, self._highs = state, drop, {}
-        if self.uncertain:
-            self.begin_others(given, options)
+        self.state, self._last, self._high = state, drop, 0.0
         return True
-
-    def begin_others(self, start: dict, options: dict) -> None:
-        """The same drop under laws drawn from the posterior."""
-        if self.twin.posterior is None:
-            self.message = "This run kept no posterior: its uncertainty is not known (a fit by Gauss-Newton keeps one)."
-            return
-        try:
-            laws = self.twin.posterior.draws(self.draws, torch.Generator().manual_seed(0))
-            others = self.twin.worlds(self.draws, laws=laws)
-            others.reset(start, **options)
-        except (MosaError, RuntimeError) as error:
-            self.message = f"No uncertainty in this drop: {error}"
-            return
-        self.others, self.spread = others, np.zeros(len(self.arms))
 
     def ball(self, at: np.ndarray) -> Collider:
         return Collider(Sphere(self.radius), mode="separate", friction=0.3, name=self.hand,
@@ -170,8 +141,8 @@ class Live:
         return self.running
 
     def soften(self, E: float) -> None:
-        """Young's modulus [Pa] of the drops to come; how sure the learned one was says nothing about it."""
-        self.twin.material.E, self.uncertain = E, False
+        """Young's modulus [Pa] of the drops to come."""
+        self.twin.material.E = E
 
     def reset(self) -> bool:
         """Back to the beginning of the last drop, the ball at home, paused."""
@@ -188,23 +159,8 @@ class Live:
             state, reactions = self.twin.step(action)
         except (MosaError, RuntimeError) as error:
             return self.fail(error)
-        self.state, self.force = (
-            state,
-            reactions[:, self.column, :3].mean(0).detach().double().cpu().numpy(),
-        )
-        if self.others is not None:
-            try:
-                x = self.others.step(action).state.positions
-                self.spread = (
-                    total_spread(x[:, None], self.twin.posterior.model_error)[0]
-                    .detach()
-                    .double()
-                    .cpu()
-                    .numpy()
-                )
-            except (MosaError, RuntimeError) as error:
-                self.others = self.spread = None
-                self.message = f"No uncertainty from here on: {error}"
+        felt = reactions[:, self.column, :3].mean(0)
+        self.state, self.force = state, felt.detach().double().cpu().numpy()
         return True
 
     def pull(self) -> np.ndarray:
@@ -289,38 +245,17 @@ class Live:
         F = self.F_tot.double()
         return torch.linalg.eigvalsh(F.mT @ F)[:, -1].clamp(min=0).sqrt().cpu().numpy() - 1
 
-    def known(self, by: str) -> np.ndarray | None:
-        """(N,) what is coloured by, in the unit of its scale; None for the appearance, and where it is not known."""
-        if by == "stretch":
-            return 100 * self.stretch()
-        if by == "heterogeneity":
-            return self.factor
-        return 1e3 * self.spread if by == "uncertainty" and self.spread is not None else None
-
-    def scale(self, by: str, values: np.ndarray) -> Scale:
-        """Of `values`: of the stretch and the uncertainty it only grows until the next drop."""
-        if by == "heterogeneity":
-            span = max(
-                float(np.abs(values - 1).max()), 0.01
-            )  # what differs by less than 1 % shall not look like a contrast
-            return Scale(
-                r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span
-            )
-        high = float(np.quantile(values, 0.99))
-        high = next((step for step in STEPS if step >= high), STEPS[-1])
-        self._highs[by] = high = max(high, self._highs.get(by, 0.0))
-        label, colors = {"stretch": ("largest principal stretch - 1 [%]", "viridis"),
-                         "uncertainty": ("predicted standard deviation [mm]", "magma")}[by]  # fmt: skip
-        return Scale(label, colors, 0, high, "max")
-
     def paint(self, by: str) -> tuple[np.ndarray, Scale | None]:
-        """((N, 3) colours in [0, 1], their scale): gray, without a scale, where what is asked for is not known."""
+        """((N, 3) colours in [0, 1], their scale); that of the stretch only grows until the next drop."""
         if by == "appearance":
             return self.twin.body.colors.clamp(0, 1).cpu().numpy(), None
-        values = self.known(by)
-        if values is None:
-            return np.full((len(self.arms), 3), GRAY), None
-        scale = self.scale(by, values)
+        if by == "heterogeneity":
+            scale = stiffness_scale(self.factor)
+            return scale.paint(self.factor), scale
+        values = 100 * self.stretch()
+        high = float(np.quantile(values, 0.99))
+        self._high = max(self._high, next((s for s in STEPS if s >= high), STEPS[-1]))
+        scale = Scale("largest principal stretch - 1 [%]", "viridis", 0, self._high, "max")
         return scale.paint(values), scale
 
     @torch.no_grad()

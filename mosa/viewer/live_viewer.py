@@ -49,8 +49,6 @@ class LiveViewer:
                 "speed": gui.add_slider("speed [m/s]", 0.0, round(fastest, 1), 0.05, 0.0),
                 "heading": gui.add_slider("heading [degrees]", -180, 180, 1, 0, hint="of tilt, spin and speed; 0: to the right"),
             }  # fmt: skip
-            self.uncertain = gui.add_checkbox("uncertainty", False, disabled=live.twin.posterior is None,
-                                              hint=f"{live.draws} drawn laws are simulated along: slower")  # fmt: skip
             E = live.twin.material.E
             self.stiffness, middle = None, round(float(np.log10(E)), 2) if E > 0 else 0.0
             if E > 0:
@@ -128,11 +126,9 @@ class LiveViewer:
     def drop(self) -> None:
         """Let the body go as the sliders say."""
         with self.busy:
-            self.live.uncertain = bool(self.uncertain.value)
             if self.stiffness is not None and offered(self.stiffness) != self.set_stiffness:
                 self.set_stiffness = float(offered(self.stiffness))
                 self.live.soften(10**self.set_stiffness)
-                self.uncertain.value, self.uncertain.disabled = False, True
             self.live.change(
                 **{name: float(offered(slider)) for name, slider in self.sliders.items()}
             )
@@ -223,8 +219,6 @@ class LiveViewer:
         hidden = len(live.twin.world.planes) + sum(node is None for node in self.solids)
         if hidden:
             said += f"  \nNot drawn: {hidden} walls, half spaces or meshes"
-        if offered(self.color) == "uncertainty" and live.spread is None:
-            said += "  \nGray: not known; tick uncertainty and drop the body."
         self.caption.content = said
         self.message.content = f"**{live.message}**" if live.message else ""
 

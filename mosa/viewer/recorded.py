@@ -9,6 +9,7 @@ known; beside it the calibrated prior's and the learned body's. Needs viser: the
 from __future__ import annotations
 
 import logging
+import re
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,6 @@ from mosa.viewer.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.viewer.live import Live
 from mosa.viewer.live_viewer import LiveViewer
 from mosa.viewer.pages import add_ground, aim, beside_panel, offered, open_server, view_of
-from mosa.viewer.usage import USAGE
 
 GEOMETRY = ("splats", "particles")
 
@@ -233,41 +233,24 @@ class Viewer:
 def options(arguments: Sequence[str]) -> dict[str, str | None]:
     """run= (or the path alone), live=, checkpoint=, host=, port=, device= of the command line. Errors: ConfigError naming what is
     wrong."""
-    known = {
-        "run": None,
-        "checkpoint": None,
-        "live": "false",
-        "host": "127.0.0.1",
-        "port": "8080",
-        "device": "cpu",
-    }
+    known = {"run": None, "checkpoint": None, "live": "false", "host": "127.0.0.1", "port": "8080", "device": "cpu"}  # fmt: skip
     for argument in arguments:
         argument = "live=true" if argument == "--live" else argument
         key, mark, value = argument.partition("=")
         if key not in known and known["run"] is None and Path(argument).exists():
             key, mark, value = "run", "=", argument
-        if not mark and not argument.startswith("-") and key not in known and known["run"] is None:
-            raise ConfigError(
-                f"run: expected the folder of a run, found no file or folder {argument!r}; the options are written "
-                "key=value, and python -m mosa.viewer --help lists them"
-            )
         if not mark or key not in known:
             raise ConfigError(
-                "viewer: expected run=<folder>, --live, checkpoint=<file>, host=<address>, port=<number>, "
-                f"device=<name>, found {argument!r}"
+                "viewer: expected the folder of a run, --live, checkpoint=<file>, host=<address>, port=<number>, "
+                f"device=<name>, found {argument!r}; python -m mosa.viewer --help lists them"
             )
         known[key] = value
+    known["run"] = known["run"] or known["checkpoint"]
     if known["run"] is None:
-        if known["live"] != "true" or known["checkpoint"] is None:
-            raise ConfigError(
-                "run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>"
-            )
-        known["run"] = known["checkpoint"]
-    if (
-        not known["port"].isdecimal()
-        or not known["port"].isascii()
-        or not 0 < int(known["port"]) < 65536
-    ):
+        raise ConfigError(
+            "run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>"
+        )
+    if not re.fullmatch(r"[0-9]{1,5}", known["port"]) or not 0 < int(known["port"]) < 65536:
         raise ConfigError(f"port: expected a number from 1 to 65535, found {known['port']!r}")
     if known["live"] not in ("true", "false"):
         raise ConfigError(f"live: expected true or false, found {known['live']!r}")
@@ -302,9 +285,6 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
 
 
 def main(arguments: Sequence[str]) -> None:
-    if any(argument in ("--help", "-h") for argument in arguments):
-        print(USAGE)
-        return
     try:
         chosen = options(arguments)
         viewer = opened(chosen)
@@ -325,7 +305,3 @@ def main(arguments: Sequence[str]) -> None:
         viewer.ended.wait()
     except KeyboardInterrupt:
         viewer.stop()
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -66,18 +66,6 @@ def test_plates_and_masks_are_asked_for_by_name(tmp_path):
         open_clip(tmp_path / "phone1.mp4")
 
 
-def test_rembg_is_named_where_it_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rembg", None)
-    with pytest.raises(ConfigError, match=r"pip install 'mosa\[rembg\]'"):
-        matting_of(
-            "rembg",
-            Clip(tmp_path, np.arange(5) / 60, (8, 6), 0, 0.0),
-            plates=None,
-            plate_seconds=None,
-            masks=None,
-        )
-
-
 def test_mask_videos_are_read_with_their_frames(tmp_path):
     import imageio.v2 as iio
 

@@ -2,8 +2,8 @@
 
 import pytest
 from blocks_film import block_scene
+from written_scenes import export_pacnerf, export_transforms
 
-from mosa.data.formats.export import export_pacnerf, export_transforms
 from mosa.types import Scene
 
 

@@ -8,8 +8,8 @@ from itertools import permutations
 import pytest
 import torch
 from blocks_film import WORLD, assert_same_footage, clouds_of
+from written_scenes import export_pacnerf, export_particles, export_transforms
 
-from mosa.data.formats.export import export_pacnerf, export_particles, export_transforms
 from mosa.data.sequences import load_sequences, sequence_names, taught_names
 from mosa.errors import ConfigError, DataError
 

@@ -100,12 +100,12 @@ PARENT = """
 import os, signal
 from pathlib import Path
 from mosa.experiments.workers import Worker
-from mosa.system.screen import outlived
+from mosa.system.screen import tolerant_output
 
 def stop(*_):
     raise KeyboardInterrupt
 
-with outlived():
+with tolerant_output():
     signal.signal(signal.SIGTERM, stop)
     worker = Worker({})
     job = worker.begin("saving_job:main", [], Path("screen.log"))

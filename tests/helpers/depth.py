@@ -1,4 +1,4 @@
-"""Depth as one more channel: what is rendered then has gradients to the cameras along their lines of sight."""
+"""Depth as one more channel of a picture."""
 
 import torch
 from torch import Tensor
@@ -21,20 +21,15 @@ def rasterize_with_depth(
     cameras: Cameras,
     state_index: Tensor,
     background: Tensor | None = None,
-    preset: str = "gsplat",
-    *,
-    backend: str | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`rasterize` with depth in the same pass: image (B, H, W, C), alpha (B, H, W), depth sum_i w_i z_i (B, H, W) [m].
 
     Depth over alpha is the expected depth. Gradients and errors as of `rasterize`; depth has gradients to means,
-    covariances, opacities and cameras.
+    covariances and opacities.
     """
     depths = depth_channel(means, cameras, state_index)
     stacked = torch.cat((features.expand(len(cameras), -1, -1), depths), -1)
-    image, alpha = rasterize(
-        means, covariances, opacities, stacked, cameras, state_index, preset=preset, backend=backend
-    )
+    image, alpha = rasterize(means, covariances, opacities, stacked, cameras, state_index)
     over = 0 if background is None else (1 - alpha)[..., None] * background.to(image)
     return image[..., :-1] + over, alpha, image[..., -1]
 
@@ -45,16 +40,13 @@ def expected_depth(
     opacities: Tensor,
     cameras: Cameras,
     state_index: Tensor,
-    preset: str = "gsplat",
 ) -> tuple[Tensor, Tensor]:
     """Mean depth sum_i w_i z_i / alpha [m] per pixel, infinite where nothing is seen, and alpha; both (B, H, W).
 
-    Gradients to means, covariances, opacities and cameras where something is seen.
+    Gradients to means, covariances and opacities where something is seen.
     """
     depths = depth_channel(means, cameras, state_index)
-    image, alpha = rasterize(
-        means, covariances, opacities, depths, cameras, state_index, preset=preset
-    )
+    image, alpha = rasterize(means, covariances, opacities, depths, cameras, state_index)
     seen = alpha > 0
     return torch.where(
         seen, image[..., 0] / torch.where(seen, alpha, torch.ones_like(alpha)), torch.inf

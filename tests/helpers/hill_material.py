@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 
 import torch
+from orthotropic import axes_parameter
 from torch import Tensor
 
-from mosa.data.synthetic.materials.axes import axes_parameter
 from mosa.data.synthetic.materials.hill import COEFFICIENTS
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import lame

@@ -70,7 +70,7 @@ PLACES = [  # command, its words, where memory ends, what is raised there
     ("splats", other("splats", f"ply={folder}/none.ply"), "mosa.splats.objects:check_splats", ALLOC),
     ("capture", other("capture", f"videos={folder}", f"poses={folder}", f"output={folder}/o"), "mosa.capture.making:check_capture",
      WARP),
-    ("environments", other("environments", "task=pushing"), "mosa.environments.command:check_environments", TORCH),
+    ("environments", other("environments", "task=placement"), "mosa.environments.command:check_environments", TORCH),
     ("view", [f"run={folder}"], "mosa.viewer.recorded:opened", HANDLE),
     ("experiment", ["table_time"], "mosa.cli.experiment:run", MODULE),
 ]  # fmt: skip

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from written_scenes import export_particles, export_transforms
 
-from mosa.data.formats.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
 from mosa.evaluation.evaluate import run_sequences
 from mosa.modules.fitting.search.ground_choice import named, taken_of

@@ -370,15 +370,6 @@ def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
     return seen
 
 
-def test_eval_renders_as_the_run_did(run, tmp_path, monkeypatch):
-    used = []
-    monkeypatch.setattr(
-        pipeline, "use_backend", lambda name, required: used.append((name, required))
-    )
-    evaluated(run, tmp_path, monkeypatch)
-    assert used == [("warp", False)]
-
-
 HELD_OUT = {"test/test_60", "test/test_40"}
 
 

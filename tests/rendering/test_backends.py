@@ -1,4 +1,4 @@
-"""The switch between warp and gsplat: what is refused and why, how calls are passed on, and parity on a GPU."""
+"""Parity of both orders of work, and with gsplat on a GPU (benchmarks/gsplat_adapter.py)."""
 
 import sys
 from dataclasses import replace
@@ -6,78 +6,11 @@ from types import ModuleType
 
 import pytest
 import torch
-from drawn_splats import NAMES, draw, render
+from drawn_splats import NAMES, draw
 from raster_reference import visible_covariance
 
-from mosa.errors import ConfigError
-from mosa.rendering import gsplat_backend, rasterizer
-from mosa.rendering.rasterizer import rasterize, use_backend
-
-
-@pytest.fixture
-def back_to_warp():
-    yield
-    use_backend("warp")
-
-
-needs_no_gsplat = pytest.mark.skipif(
-    gsplat_backend.why_unavailable() is None, reason="gsplat runs on this machine"
-)
-
-
-@needs_no_gsplat
-def test_gsplat_is_refused_with_the_reason_where_it_cannot_run():
-    with pytest.raises(
-        ConfigError,
-        match=r"gsplat cannot be used here: .*(not installed|no CUDA device|nvcc|not import).*rendering=warp",
-    ):
-        use_backend("gsplat")
-    with pytest.raises(
-        ConfigError, match=r"gsplat backend cannot be used for this call: .*use backend='warp'"
-    ):
-        render(draw(5), rasterize, backend="gsplat")
-
-
-def test_gsplat_that_is_not_required_leaves_the_work_to_warp(monkeypatch, back_to_warp):
-    for reason, expected in (("not installed", "warp"), (None, "gsplat")):
-        monkeypatch.setattr(gsplat_backend, "why_unavailable", lambda reason=reason: reason)
-        use_backend("gsplat", required=False)
-        assert rasterizer._backend == expected
-    with pytest.raises(ConfigError, match="found 'opengl'"):
-        use_backend("opengl", required=False)
-
-
-def test_unknown_backends_are_named():
-    with pytest.raises(
-        ConfigError, match=r"rendering.backend: expected one of warp, gsplat, found 'opengl'"
-    ):
-        use_backend("opengl")
-    with pytest.raises(ConfigError, match="unknown backend 'opengl'"):
-        render(draw(5), rasterize, backend="opengl")
-
-
-def test_what_gsplat_has_no_kernels_for_is_said_or_stays_with_warp(monkeypatch, back_to_warp):
-    """Asked for in a call: an error that says what is in the way. Chosen for the process: warp does what gsplat cannot."""
-    monkeypatch.setattr(gsplat_backend, "why_unavailable", lambda: None)
-    scene = draw(5)
-    with pytest.raises(ConfigError, match="tensors are on cpu, it needs CUDA"):
-        render(scene, rasterize, backend="gsplat")
-    wanted, _ = render(scene, rasterize)
-    use_backend("gsplat")
-    assert torch.equal(render(scene, rasterize)[0], wanted)
-    on_cuda = type("OnCuda", (), {"is_cuda": True, "device": "cuda", "dtype": torch.float32})()
-    cameras = scene.cameras
-    assert gsplat_backend.obstacle(on_cuda, cameras, "gsplat", None) is None
-    assert "no preset inria" in gsplat_backend.obstacle(on_cuda, cameras, "inria", None)
-    assert "kernels of warp" in gsplat_backend.obstacle(on_cuda, cameras, "gsplat", "tile")
-    learned = replace(cameras, K=cameras.K.clone().requires_grad_())
-    assert "no gradient to the intrinsics" in gsplat_backend.obstacle(
-        on_cuda, learned, "gsplat", None
-    )
-    skewed = replace(cameras, K=cameras.K + torch.tensor([[0.0, 0.1, 0.0], [0.0] * 3, [0.0] * 3]))
-    assert "skew" in gsplat_backend.obstacle(on_cuda, skewed, "gsplat", None)
-    on_cuda.dtype = torch.float64
-    assert "computes in float32" in gsplat_backend.obstacle(on_cuda, cameras, "gsplat", None)
+from benchmarks import gsplat_adapter
+from mosa.rendering.rasterizer import rasterize
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -136,7 +69,7 @@ def test_states_and_images_keep_their_order_on_the_way_through_gsplat(
         scene.opacities = torch.stack((scene.opacities, scene.opacities.flip(0)))
     values = [getattr(scene, name) for name in NAMES]
     for ours, wanted in zip(
-        gsplat_backend.splat(*values, scene.cameras, scene.state_index),
+        gsplat_adapter.splat(*values, scene.cameras, scene.state_index),
         rasterize(*values, scene.cameras, scene.state_index),
     ):
         torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-13)
@@ -182,24 +115,20 @@ def parity_scene():
 
 GRADIENT_TOLERANCES = {  # gsplat's own tests of 1.5: rtol, and atol here in units of the largest entry
     "means": (5e-3, 5e-3), "covariances": (1e-2, 1e-2), "opacities": (8e-3, 6e-3), "features": (1e-3, 1e-3),
-    "w2c": (2e-3, 2e-3),
 }  # fmt: skip
 
 
 def outcome(scene, clear, way):
     """Image, alpha and the gradients of all inputs, by name, of an objective that looks at the clear pixels only."""
     leaves = {name: getattr(scene, name).detach().clone().requires_grad_() for name in NAMES}
-    w2c = scene.cameras.w2c.detach().clone().requires_grad_()
-    image, alpha = way(
-        *leaves.values(), replace(scene.cameras, w2c=w2c), scene.state_index, scene.background
-    )
+    image, alpha = way(*leaves.values(), scene.cameras, scene.state_index, scene.background)
     g = torch.Generator().manual_seed(8)
     weights = [torch.randn(x.shape, generator=g).to(x) for x in (image, alpha)]
     total = (image * weights[0] * clear[..., None]).sum() + (alpha * weights[1] * clear).sum()
     return (
         image.detach(),
         alpha.detach(),
-        dict(zip((*NAMES, "w2c"), torch.autograd.grad(total, [*leaves.values(), w2c]))),
+        dict(zip(NAMES, torch.autograd.grad(total, list(leaves.values())))),
     )
 
 
@@ -236,7 +165,7 @@ def test_both_orders_of_work_agree_in_float32():
 
 @pytest.mark.gpu
 def test_parity_with_gsplat():
-    reason = gsplat_backend.why_unavailable()
+    reason = gsplat_adapter.why_unavailable()
     if reason:
         pytest.skip(reason)
     scene, clear = parity_scene()
@@ -245,6 +174,6 @@ def test_parity_with_gsplat():
     compare(
         scene,
         clear.to("cuda"),
-        lambda *x: rasterize(*x, backend="warp"),
-        lambda *x: rasterize(*x, backend="gsplat"),
+        rasterize,
+        gsplat_adapter.splat,
     )

@@ -19,7 +19,6 @@ def shoot(
     *,
     channels=None,
     background=None,
-    preset="gsplat",
     scan="gaussian",
 ):
     """Image and alpha of discs parallel to the image, of `sigmas` [px, before the low-pass] at `pixels`."""
@@ -44,7 +43,6 @@ def shoot(
         camera,
         torch.tensor([0]),
         background,
-        preset,
         scan=scan,
     )
     return image[0], alpha[0]
@@ -62,16 +60,15 @@ def test_pixel_centres_and_low_pass(scan):
     )
 
 
-@pytest.mark.parametrize("preset, cap", [("gsplat", 0.999), ("inria", 0.99)])
-def test_alpha_cap(preset, cap):
-    _, alpha = shoot([(24.5, 24.5)], [3.0], [1.0], preset=preset)
-    assert float(alpha[24, 24]) == pytest.approx(cap, rel=1e-12)
+def test_alpha_cap():
+    _, alpha = shoot([(24.5, 24.5)], [3.0], [1.0])
+    assert float(alpha[24, 24]) == pytest.approx(0.999, rel=1e-12)
 
 
-@pytest.mark.parametrize("preset, near", [("gsplat", 0.01), ("inria", 0.2)])
-def test_near_plane(preset, near):
+def test_near_plane():
+    near = 0.01
     for depth, seen in ((0.99 * near, False), (1.01 * near, True)):
-        _, alpha = shoot([(24.5, 24.5)], [3.0], [0.5], [depth], preset=preset)
+        _, alpha = shoot([(24.5, 24.5)], [3.0], [0.5], [depth])
         assert bool(alpha.max() > 0) is seen
 
 
@@ -122,16 +119,3 @@ def test_any_number_of_channels(channels):
     )
     assert image.shape == (SIZE, SIZE, channels)
     torch.testing.assert_close(image, alpha[..., None] * (1.0 + torch.arange(channels)))
-
-
-@pytest.mark.parametrize("scan", ["gaussian", "tile"])
-def test_inria_extent_is_three_sigma_in_whole_tiles(scan):
-    """Variance 10.75 px^2 makes a radius of 10 px where alpha reaches 1/255 at 10.9 px. Around 23.2 that touches
-    the tiles
-    from 0 to 31: pixel 12, 10.7 px away, is seen although beyond the radius, pixel 32, 9.3 px away, is not."""
-    alpha = shoot([(23.2, 24.5)], [math.sqrt(10.45)], [0.98], preset="inria", scan=scan)[1][24]
-    assert float(alpha[12]) == pytest.approx(0.98 * math.exp(-0.5 * 10.7**2 / 10.75), rel=1e-9)
-    assert float(alpha[32]) == 0
-    assert float(
-        shoot([(23.2, 24.5)], [math.sqrt(10.45)], [0.98], scan=scan)[1][24, 32]
-    ) == pytest.approx(0.98 * math.exp(-0.5 * 9.3**2 / 10.75), rel=1e-9)

@@ -186,10 +186,8 @@ def test_a_number_that_is_none_is_named(name):
         render(scene, rasterize)
 
 
-def test_unknown_preset_and_scan():
+def test_unknown_scan():
     scene = draw(5)
-    with pytest.raises(ConfigError, match="unknown preset 'gplat'"):
-        render(scene, rasterize, preset="gplat")
     with pytest.raises(ConfigError, match="unknown scan"):
         render(scene, rasterize, scan="rows")
 

@@ -14,7 +14,7 @@ from mosa.physics import exact_sums
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.records import record_functions
-from mosa.rendering.splatting import PRESETS, Geometry, depth_lists, project
+from mosa.rendering.splatting import Geometry, depth_lists, project
 from mosa.rendering.tile_kernels import BLOCK_HEIGHT, BLOCK_WIDTH, reach_function
 from mosa.system.warp_start import start_warp
 
@@ -123,7 +123,7 @@ def test_lists_hold_what_touches_a_tile_by_depth(dtype):
     scene.cameras = ring(3, 37, 50)
     K, w2c = scene.cameras.K.to(dtype), scene.cameras.w2c.to(dtype)
     start_warp()
-    g = Geometry(scene.state_index.to(torch.int32), 37, 50, PRESETS["gsplat"], "tile")
+    g = Geometry(scene.state_index.to(torch.int32), 37, 50, "tile")
     records, depths = project(
         scene.means.to(dtype), scene.covariances.to(dtype), scene.opacities.to(dtype), K, w2c, g
     )

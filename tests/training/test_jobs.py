@@ -392,8 +392,8 @@ def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
 OUTLIVED = """
     import logging, sys
     from mosa.system.console import begin_log
-    from mosa.system.screen import outlived
-    with outlived():
+    from mosa.system.screen import tolerant_output
+    with tolerant_output():
         logging.basicConfig(stream=sys.stdout, level=logging.INFO)
         begin_log()
         for k in range(2000):

@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from mosa.config.build import build_world
-from mosa.errors import ConfigError
 from mosa.modules.body.body import Body, SimulationSettings, Start
 from mosa.modules.body.material import Material
 from mosa.twin.twin import Twin
-from mosa.viewer.live import COURANT, FASTEST, GRAY, Live
+from mosa.viewer.live import COURANT, FASTEST, Live
 
 SPACING, DX, DT = 0.02, 0.04, 0.01
 START = 0.05
@@ -41,17 +40,6 @@ def twin(**settings) -> Twin:
         torch.zeros(3),
     )
     return Twin(body.eval(), build_world(world), DT, None, start)
-
-
-class Drawn:
-    """A posterior of one number, log E, whose draws differ by half."""
-
-    model_error = 1e-3
-
-    def draws(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        from mosa.modules.fitting.parameters import read_numbers
-
-        return read_numbers(twin().body)[None] + 0.5 * torch.linspace(-1, 1, count)[:, None]
 
 
 def test_it_begins_where_the_training_did_and_drops_as_it_is_told():
@@ -159,7 +147,7 @@ def test_errors_that_are_no_mistake_of_a_user_go_through(monkeypatch):
         live.step()
 
 
-def test_colours_are_by_stretch_stiffness_and_what_is_known():
+def test_colours_are_by_stretch_and_stiffness():
     live = Live(twin())
     colors, scale = live.paint("appearance")
     assert (colors == 0.25).all() and scale is None
@@ -177,34 +165,6 @@ def test_colours_are_by_stretch_stiffness_and_what_is_known():
     )
     assert live.paint("stretch")[1].high == 50  # it does not flicker
     assert live.paint("heterogeneity")[1].low == 0.99  # nothing was learned: no contrast
-    colors, scale = live.paint("uncertainty")
-    assert (colors == GRAY).all() and scale is None
-
-
-def test_the_uncertainty_is_the_spread_of_drawn_laws_and_grows_from_the_model_s_error():
-    played = twin()
-    live = Live(played)
-    live.uncertain = True
-    assert live.drop() and live.spread is None and "kept no posterior" in live.message
-    played.posterior = Drawn()
-    live = Live(played, draws=3)
-    live.uncertain = True
-    live.change(height=0.0)
-    assert live.drop() and live.message == "" and (live.spread == 0).all()
-    live.step()
-    first = live.spread.copy()
-    for _ in range(14):
-        assert live.step()
-    assert (
-        first.shape == (125,)
-        and first.min() >= 1e-3 - 1e-9
-        and live.spread.max() > 1.2 * first.max()
-    )
-    colors, scale = live.paint("uncertainty")
-    assert scale.label == "predicted standard deviation [mm]" and colors.shape == (125, 3)
-    live.others.step = lambda action: (_ for _ in ()).throw(ConfigError("a law of them burst"))
-    assert live.step() and live.others is None and live.spread is None
-    assert live.message == "No uncertainty from here on: a law of them burst"
 
 
 def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
@@ -222,9 +182,7 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         assert shown.server.scene.get_handle_by_name("/ground") is not None
         assert shown.splats.visible and not shown.points.visible
         assert np.allclose(shown.splats.centers * shown.unit, live.positions.numpy(), atol=1e-6)
-        assert shown.uncertain.disabled and shown.sliders["height"].value == pytest.approx(
-            START, abs=1e-6
-        )
+        assert shown.sliders["height"].value == pytest.approx(START, abs=1e-6)
         shown.step()
         assert (
             live.time == pytest.approx(DT)
@@ -309,23 +267,19 @@ def test_it_is_played_with_on_a_gpu_as_on_a_cpu():
     for device in ("cpu", "cuda"):
         made = twin()
         made.body.to(device)
-        made.posterior = Drawn()
-        live = Live(made, draws=2)
-        live.uncertain = True
+        live = Live(made)
         live.change(height=0.02)
         assert live.drop(), live.message
         live.target = live.hand_position + np.array([0.3, 0.0, 0.0])
         for _ in range(20):
             assert live.step(), live.message
         ends[device] = live.positions.cpu().numpy(), live.hand_position
-        for by in ("appearance", "stretch", "heterogeneity", "uncertainty"):
+        for by in ("appearance", "stretch", "heterogeneity"):
             colors, _ = live.paint(by)
             assert np.isfinite(colors).all() and all(
                 np.isfinite(part).all() for part in live.splats(by, colors)
             )
-        assert (
-            live.poses() == [] and "Force on the ball" in live.caption() and live.spread is not None
-        )
+        assert live.poses() == [] and "Force on the ball" in live.caption()
         assert live.reset() and not live.running
         live.state = None
         assert live.positions.shape == (125, 3)

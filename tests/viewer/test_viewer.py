@@ -419,9 +419,9 @@ def test_the_legend_goes_through_the_scale_s_colours():
 
 
 def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
-    for arguments, message in (([], "run: expected the folder"), (["folder"], "no file or folder 'folder'"),
-                               (["run=x", "folder"], "expected run=<folder>.*found 'folder'"),
-                               (["--lives"], "expected run=<folder>.*found '--lives'"), (["run=x", "a=2"], "found 'a=2'"),
+    for arguments, message in (([], "run: expected the folder"), (["folder"], "expected the folder of a run, .*found 'folder'"),
+                               (["run=x", "folder"], "expected the folder of a run, .*found 'folder'"),
+                               (["--lives"], "expected the folder of a run, .*found '--lives'"), (["run=x", "a=2"], "found 'a=2'"),
                                (["run=x", "port=no"], "port: expected a number .*, found 'no'")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
             viewer.options(arguments)

@@ -25,12 +25,12 @@ OPEN, SUSPECT = 0.2, 0.04
 """Share of a matte that the hull leaves open from which on data are refused, and warned of. With a right calibration it is at most
 0.001 (built-in films of 64 to 400 px, PAC-NeRF's bird)."""
 ISLAND = 4
-"""Pixels of a matte, in pieces that no other camera sees, from which on they are said; single ones are noise of matting."""
+"""Pixels of a matte in wholly uncovered pieces, above which a warning is given; single pixels are noise of matting."""
 SUNK = 0.25
-"""Share of the hull below the ground in frame 0 from which on the ground is elsewhere."""
-APART = 0.35
-"""Radii between the ground and the lowest point of the hull where the object turns round, from which on it is said. Bodies of films
-that are right turn within 0.15."""
+"""Share of the hull below the ground in frame 0, above which scene.ground.height is taken for wrong."""
+MAX_GROUND_GAP = 0.35
+"""Distance between the ground and the lowest point of the hull at the turning point, in radii, above which a warning is given.
+In correct films it is below 0.15."""
 
 
 STRAY, LOST = 0.3, 0.6
@@ -75,15 +75,15 @@ def hull_points(mattes: Tensor, cameras: Cameras, box: Tensor) -> tuple[Tensor, 
     return hull.points()[hull.values > 0.5], pitch
 
 
-def left_open(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> Tensor:
-    """Share (V,) of each matte (V, H, W) that is further than a voxel from where points (M, 3) are seen."""
-    return open_and_apart(points, pitch, mattes, cameras)[0]
+def uncovered_share(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> Tensor:
+    """Share (V,) of each matte (V, H, W) that is farther than a voxel from the projections of points (M, 3)."""
+    return uncovered_and_islands(points, pitch, mattes, cameras)[0]
 
 
-def open_and_apart(
+def uncovered_and_islands(
     points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras
 ) -> tuple[Tensor, list[int]]:
-    """What `left_open` says, and how many pixels of each matte are in pieces of which all is open."""
+    """`uncovered_share`, and the pixels of each matte that are in wholly uncovered pieces."""
     shares, islands = [], []
     for matte, K, w2c in zip(mattes, cameras.K, cameras.w2c):
         seen = points @ w2c[:3, :3].T + w2c[:3, 3]
@@ -139,8 +139,8 @@ def check_outlines(scene: Scene, label: str) -> None:
             raise DataError(f"{label}, frame {frame}: {error}") from error
         if not len(points):
             continue  # thinner than a voxel
-        shares, islands = open_and_apart(points, pitch, mattes, cameras)
-        worst = max(worst, most_open(shares, cameras.names, frame, label))
+        shares, islands = uncovered_and_islands(points, pitch, mattes, cameras)
+        worst = max(worst, worst_uncovered(shares, cameras.names, frame, label))
         if (
             frame == 0 and max(islands) >= ISLAND
         ):  # later it may splash, and drops are thinner than a voxel
@@ -167,8 +167,10 @@ def check_outlines(scene: Scene, label: str) -> None:
         warnings.warn(worst[1], stacklevel=3)
 
 
-def most_open(shares: Tensor, names: tuple[str, ...], frame: int, label: str) -> tuple[float, str]:
-    """The largest share of a matte that is open, and what is said of it."""
+def worst_uncovered(
+    shares: Tensor, names: tuple[str, ...], frame: int, label: str
+) -> tuple[float, str]:
+    """Largest uncovered share of a matte, and a message that names cameras and causes."""
     order = shares.argsort(descending=True)[:4].tolist()
     listed = ", ".join(
         f"{names[v]} ({float(shares[v]):.0%})"
@@ -184,7 +186,7 @@ def most_open(shares: Tensor, names: tuple[str, ...], frame: int, label: str) ->
 
 def check_landing(height: float, radius: float, frame: int, label: str) -> None:
     """A warning where the object turns round far from the ground."""
-    if abs(height) > APART * radius:
+    if abs(height) > MAX_GROUND_GAP * radius:
         where = "above" if height > 0 else "below"
         warnings.warn(f"{label}: the object turns round in frame {frame} with its lowest point {abs(height):.3g} m {where} the "
                       "ground: expected it there; check scene.ground.height and scene.up (what else it lands on "

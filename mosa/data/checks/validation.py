@@ -35,10 +35,10 @@ CORNER = 0.1
 """Share of an image's size from its corner within which a principal point was measured from the image's centre."""
 FARTHEST = 100.0
 """[m] of a camera from the origin: float32 rounds positions to 0.008 mm there, a thousandth of a pixel."""
-APART = 3.0
-"""Of the cameras' distances from their middle: farther off the whole capture is away from the origin, and not in another unit."""
-SQUARE, NEARLY = 2.0, 1.05
-"""Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
+MAX_ORIGIN_RATIO = 3.0
+"""Distance from the origin, over the cameras' spread, above which the capture is off the origin rather than in another unit."""
+MAX_FOCAL_RATIO, USUAL_FOCAL_RATIO = 2.0, 1.05
+"""Ratios of a camera's two focal lengths that are an error, and above which a warning is given: sensors have square pixels."""
 
 
 def validate(scene: Scene) -> Scene:
@@ -142,8 +142,8 @@ def check_cameras(scene: Scene, label: str) -> None:
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
             raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
         if (
-            far := float(places[v].norm())
-        ) > FARTHEST and far > APART * spread:  # else the unit is wrong, which is said below
+            (far := float(places[v].norm())) > FARTHEST and far > MAX_ORIGIN_RATIO * spread
+        ):  # else the unit is wrong, which is said below
             raise DataError(
                 f"{label}: camera {name}: expected within {FARTHEST:g} m of the origin, where float32 has digits for "
                 f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids"
@@ -195,9 +195,9 @@ def check_pixels(K: torch.Tensor, label: str) -> None:
         f"{label}: expected focal lengths of square pixels, found fl_x = {across:.5g} and fl_y = {down:.5g} px: were the "
         "images stretched, or one of them taken for another size?"
     )
-    if ratio >= SQUARE:
+    if ratio >= MAX_FOCAL_RATIO:
         raise DataError(said)
-    if ratio > NEARLY:
+    if ratio > USUAL_FOCAL_RATIO:
         warnings.warn(said, stacklevel=4)
 
 

@@ -196,7 +196,7 @@ def even_times(times: list[float], frames: list[int], where: str, remedy: str) -
         )
 
 
-def told_rate(times: list[float], fps: float, where: str) -> None:
+def warn_of_other_rate(times: list[float], fps: float, where: str) -> None:
     """A warning where scene.fps takes the place of times in the file that say another rate."""
     steps = np.diff(np.asarray(times, dtype=np.float64))
     middle = float(np.median(steps)) if len(steps) else 0.0

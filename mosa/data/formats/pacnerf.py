@@ -19,7 +19,7 @@ from mosa.data.formats.footage import (
     number,
     read_json,
     same_camera,
-    told_rate,
+    warn_of_other_rate,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -71,7 +71,7 @@ def read_pacnerf(
         remedy = "correct them, restrict scene.frames, or set scene.fps"
         even_times([times[f][0] for f in numbers], numbers, str(listing), remedy)
     else:
-        told_rate([times[f][0] for f in numbers], fps, str(listing))
+        warn_of_other_rate([times[f][0] for f in numbers], fps, str(listing))
     if prefix == "r":
         log.info(
             "%s: raw images without mattes; matted from the background plates r_<camera>_-1.png",

@@ -15,7 +15,7 @@ from mosa.data.formats.footage import (
     matrix,
     number,
     read_json,
-    told_rate,
+    warn_of_other_rate,
     world_to_camera,
 )
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -59,7 +59,7 @@ def read_spring_gaus(
             chosen, numbers, listing, "correct them, restrict scene.frames, or set scene.fps"
         )
     else:
-        told_rate(chosen, fps, listing)
+        warn_of_other_rate(chosen, fps, listing)
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / camera / f"{frame:03}.png",
         lambda _, file, pixels: split_alpha(file, pixels), "camera.json", scale=scale, fill=fill)  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from mosa.data.formats.footage import (
     read_json,
     same_camera,
     scaled,
-    told_rate,
+    warn_of_other_rate,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -85,7 +85,7 @@ def read_transforms(
     times, table = synchronise(by_camera, fps)
     wanted = frame_range(list(range(len(times))), frames, str(file))
     if fps is not None and all(entry.get("time") is not None for entry in document["frames"]):
-        told_rate([times[f] for f in wanted], fps, str(file))
+        warn_of_other_rate([times[f] for f in wanted], fps, str(file))
         times = [i / fps for i in range(len(times))]
     remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
     even_times([times[f] for f in wanted], wanted, str(file), remedy)
@@ -119,55 +119,50 @@ def read_transforms(
     return footage_of(calibration, images, mattes, wanted, [times[f] for f in wanted], str(file))
 
 
-def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
-    """The entries of a document. Errors: DataError naming entry and key."""
-    if (
-        not isinstance(document, dict)
-        or not isinstance(document.get("frames"), list)
-        or not document["frames"]
-    ):
+def entries_of(file: Path, document) -> list[tuple[str, dict]]:
+    """(where it is written, entry) of each image of a document. Errors: DataError naming entry and key."""
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not frames:
         raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
-    shared = {k: number(v, f"{file}, {k}") for k, v in document.items() if k in intrinsic_keys()}
-    shots = []
-    counting = counting_place(
-        [
-            str(e.get("file_path"))
-            for e in document["frames"]
-            if isinstance(e, dict) and "time" not in e
-        ]
-    )
-    for i, entry in enumerate(document["frames"]):
-        where = f"{file}, frames[{i}]"
+    found = [(f"{file}, frames[{i}]", entry) for i, entry in enumerate(frames)]
+    for where, entry in found:
         for key in ("file_path", "transform_matrix"):
             if not isinstance(entry, dict) or key not in entry:
                 raise DataError(f"{where}: expected the key {key}")
-        if bent := [k for k in FOREIGN if entry.get(k, document.get(k))]:
-            raise DataError(
-                f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
-                "rational or thin prism model; undistort the images first"
-            )
-        intrinsics = shared | {
-            k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()
-        }
-        fisheye = is_fisheye(
-            entry.get("camera_model", document.get("camera_model")),
-            entry.get("is_fisheye", document.get("is_fisheye")),
-            where,
+    return found
+
+
+def shot_of(where: str, entry: dict, document: dict) -> Shot:
+    """What an entry says of its camera; image and mask as they are named, time None where it has none. Errors: DataError."""
+    both = {**document, **entry}
+    if bent := [k for k in FOREIGN if both.get(k)]:
+        raise DataError(
+            f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
+            "rational or thin prism model; undistort the images first"
         )
+    intrinsics = {
+        k: number(both[k], f"{where}, {k}") for k in intrinsic_keys() if both.get(k) is not None
+    }
+    fisheye = is_fisheye(both.get("camera_model"), both.get("is_fisheye"), where)
+    pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
+    time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
+    camera = str(entry["camera"]) if entry.get("camera") is not None else None
+    mask = Path(str(entry["mask_path"])) if entry.get("mask_path") else None
+    image = Path(str(entry["file_path"]))
+    return Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye)
+
+
+def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
+    """The entries of a document, with files that there are and a time. Errors: DataError naming entry and key."""
+    entries = entries_of(file, document)
+    counting = counting_place([str(e["file_path"]) for _, e in entries if "time" not in e])
+    shots = []
+    for where, entry in entries:
+        shot = shot_of(where, entry, document)
         image = locate(file.parent, str(entry["file_path"]), where)
-        mask = (
-            locate(file.parent, str(entry["mask_path"]), where) if entry.get("mask_path") else None
-        )
-        pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
-        time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
-        if time is None:
-            time = counted_time(image, fps, where, counting)
-        camera = str(entry["camera"]) if entry.get("camera") is not None else None
-        shots.append(
-            Shot(
-                where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye
-            )
-        )
+        mask = None if shot.mask is None else locate(file.parent, str(entry["mask_path"]), where)
+        time = counted_time(image, fps, where, counting) if shot.time is None else shot.time
+        shots.append(replace(shot, image=image, mask=mask, time=time))
     return shots
 
 

@@ -24,7 +24,6 @@ from mosa.rendering.appearance.spherical_harmonics import (
     degree_of,
     mean_colors,
 )
-from mosa.rendering.covariance import scales_and_rotations
 from mosa.system.ply import check_ply
 from mosa.system.whole_files import written_whole
 from mosa.types import Splats
@@ -181,23 +180,6 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
     said = " ".join(document.comments).lower().partition("vertical axis:")[2].split()[:1]
     splats = Splats(means, scales, rotations / length, opacities, colors)
     return splats, coefficients, offset, "".join(said)
-
-
-def export_splats(
-    splats: Splats, positions: Tensor, covariances: Tensor, folder: str | Path
-) -> Path:
-    """Write moving Gaussians as <frame>.ply, frame numbers of three digits.
-
-    positions: (T, N, 3) [m]; covariances: (T, N, 3, 3) [m^2], A_t = F_tot A_0 F_tot^T; opacities and colours of `splats`.
-    """
-    folder = Path(folder)
-    for t in range(len(positions)):
-        scales, rotations = scales_and_rotations(covariances[t])
-        save_ply(
-            folder / f"{t:03d}.ply",
-            Splats(positions[t], scales, rotations, splats.opacities, splats.colors),
-        )
-    return folder
 
 
 def _finite(column: np.ndarray, name: str, path: Path, verb: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Moving splats as files: 3DGS PLY, `.splat`, `.spz` or a USD stage, for the viewers and editors that read them.
+"""Moving splats as files: 3DGS PLY or a USD stage, for the viewers, editors and converters that read them.
 
 Each frame is written in the world's axes and in its own light: covariances are taken apart into scales and rotations, harmonics are
 turned with the body, and a factor of the colours becomes part of the harmonics, which no format keeps apart.
@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from mosa.data.io.gaussian_ply import save_ply
-from mosa.errors import ConfigError, DataError
+from mosa.errors import ConfigError
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import Y0, degree_of, mean_colors, rotated
 from mosa.rendering.covariance import scales_and_rotations
@@ -24,19 +23,10 @@ from mosa.settings import Expected, check, such
 from mosa.system.whole_files import written_whole
 from mosa.types import Appearance, Splats
 
-FORMATS = ("ply", "splat", "spz", "usd")
+FORMATS = ("ply", "usd")
 Formats = Annotated[
     Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: all(name in FORMATS for name in v))
 ]  # fmt: skip
-SPLAT = np.dtype(
-    [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
-)
-"""32 bytes of a Gaussian of a `.splat` file, as antimatter15's viewer has them: m, standard deviations in m, 8-bit RGBA, quaternion
-wxyz as 128 + 128 q."""
-
-
-SPZ_BITS = 16
-"""Of a position behind the point: 0.015 mm, within 128 m."""
 
 
 def splats_at(shown: Seen, frame: int) -> Appearance:
@@ -53,79 +43,6 @@ def splats_at(shown: Seen, frame: int) -> Appearance:
     scales, rotations = scales_and_rotations(shown.covariances[frame])
     splats = Splats(shown.means[frame], scales, rotations, shown.opacities, mean_colors(harmonics))
     return Appearance(splats, harmonics).to("cpu")
-
-
-def save_splat(path: str | Path, splats: Splats) -> Path:
-    """Write a `.splat` file: no header, the largest and most opaque first, colours without their dependence on the direction.
-    Errors: DataError for a number that is not finite."""
-    path = Path(path)
-    numbers = torch.cat(
-        [splats.means, splats.scales, splats.rotations, splats.opacities[:, None], splats.colors], 1
-    )
-    if not bool(torch.isfinite(numbers).all()):
-        raise DataError(f"{path}: expected finite numbers to write, found NaN or infinity")
-    order = (-splats.scales.prod(1) * splats.opacities).argsort().numpy()
-    rows = np.empty(len(order), SPLAT)
-    rows["position"], rows["scale"] = splats.means.numpy()[order], splats.scales.numpy()[order]
-    rgba = torch.cat([splats.colors, splats.opacities[:, None]], 1).numpy()[order]
-    rows["color"] = np.clip(255 * rgba + 0.5, 0, 255).astype(np.uint8)
-    unit = torch.nn.functional.normalize(splats.rotations, dim=-1).numpy()[order]
-    rows["rotation"] = np.clip(128 + 128 * unit + 0.5, 0, 255).astype(np.uint8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as partial:
-        rows.tofile(partial)
-    return path
-
-
-def load_splat(path: str | Path) -> Splats:
-    """Gaussians of a `.splat` file, float32. Errors: DataError naming the file: not whole, or not of such numbers."""
-    path = Path(path)
-    if not path.is_file() or path.stat().st_size == 0 or path.stat().st_size % SPLAT.itemsize:
-        raise DataError(
-            f"{path}: expected a .splat file of {SPLAT.itemsize} bytes a Gaussian, found "
-            f"{f'{path.stat().st_size} bytes' if path.is_file() else 'no file'}"
-        )
-    rows = np.fromfile(path, SPLAT)
-    finite = (
-        np.isfinite(rows["position"]).all()
-        and np.isfinite(rows["scale"]).all()
-        and (rows["scale"] > 0).all()
-    )
-    rotation = (rows["rotation"].astype(np.float32) - 128) / 128
-    length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    if not finite or not (length > 0.5).all():
-        raise DataError(
-            f"{path}: expected finite positions, standard deviations above 0, unit quaternions; another format?"
-        )
-    color = torch.from_numpy(rows["color"].astype(np.float32) / 255)
-    return Splats(
-        torch.from_numpy(rows["position"].copy()),
-        torch.from_numpy(rows["scale"].copy()),
-        torch.from_numpy(rotation / length),
-        color[:, 3],
-        color[:, :3],
-    )
-
-
-def save_spz(path: str | Path, appearance: Appearance) -> Path:
-    """Write a `.spz` file (Niantic's compressed Gaussians) with the package gsply. Errors: ConfigError without it."""
-    try:
-        from gsply import GSData
-        from gsply.spz import write_spz
-    except ImportError as error:
-        raise ConfigError(
-            "formats: spz needs the package gsply: pip install 'mosa[spz]', or gsply by itself"
-        ) from error
-    splats, harmonics = appearance.splats, appearance.harmonics
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    logits = torch.logit(splats.opacities.clamp(1e-6, 1 - 1e-6))
-    higher = harmonics[:, 1:].contiguous().numpy() if harmonics.shape[1] > 1 else None
-    data = GSData.from_arrays(splats.means.numpy(), splats.scales.clamp(min=1e-9).log().numpy(), splats.rotations.numpy(),
-                              logits.numpy(), harmonics[:, 0].contiguous().numpy(), higher)  # fmt: skip
-    with written_whole(path) as partial:
-        write_spz(partial, data, fractional_bits=SPZ_BITS)
-    return path
 
 
 def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up: Tensor) -> Path:
@@ -197,29 +114,18 @@ def save_frames(
     rate: float = 30.0,
     up: Tensor | None = None,
 ) -> Path:
-    """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `splat/000.splat`, `spz/000.spz`, and `splats.usdc` for all.
+    """Write every frame of moving Gaussians: `<folder>/ply/000.ply` and so on, and `splats.usdc` for all.
 
     rate [1/s], up (3,): of the USD stage. Errors: ConfigError for another format, or where a package is missing; DataError.
     """
     check("formats", formats, Formats)
-    folder, frames = Path(folder), []
-    for kind in ("ply", "splat", "spz"):
-        drop_later_frames(folder / kind, f".{kind}", len(shown.means))
-    for t in range(len(shown.means)):
-        frame = splats_at(shown, t)
-        if "ply" in formats:
+    folder = Path(folder)
+    drop_later_frames(folder / "ply", ".ply", len(shown.means))
+    frames = [splats_at(shown, t) for t in range(len(shown.means))] if formats else []
+    if "ply" in formats:
+        for t, frame in enumerate(frames):
             save_ply(folder / "ply" / f"{t:03d}.ply", frame.splats, frame.harmonics)
-        if "splat" in formats:
-            save_splat(folder / "splat" / f"{t:03d}.splat", frame.splats)
-        if "spz" in formats:
-            save_spz(folder / "spz" / f"{t:03d}.spz", frame)
-        if "usd" in formats:
-            frames.append(frame)
-    if frames:
-        save_usd(
-            folder / "splats.usdc",
-            frames,
-            rate=rate,
-            up=torch.tensor([0.0, 1, 0]) if up is None else up,
-        )
+    if "usd" in formats:
+        up = torch.tensor([0.0, 1, 0]) if up is None else up
+        save_usd(folder / "splats.usdc", frames, rate=rate, up=up)
     return folder

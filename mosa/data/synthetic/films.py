@@ -74,7 +74,7 @@ def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
     )  # fmt: skip
 
 
-def take_file(
+def film_file(
     name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None
 ) -> Path:
     """Where a take lies once it has been made."""
@@ -102,13 +102,13 @@ def make(
 
     Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
     """
-    file = take_file(name, sequence, material, seed, cache)
-    kept = read_take(file)
+    file = film_file(name, sequence, material, seed, cache)
+    kept = read_film(file)
     if kept is not None:
         return kept
     take = film_drop(name, sequence, material, seed, progress)
     try:
-        write_take(file, take)
+        write_film(file, take)
     except OSError as error:
         raise ConfigError(
             f"scene.cache: cannot write {file} ({error.strerror}); set XDG_CACHE_HOME to another folder"
@@ -178,7 +178,7 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
     )  # fmt: skip
 
 
-def read_take(file: Path) -> Film | None:
+def read_film(file: Path) -> Film | None:
     """A cached take, or None where there is none or a damaged one, which is then made again."""
     if not file.is_file():
         return None
@@ -199,7 +199,7 @@ def read_take(file: Path) -> Film | None:
         return None
 
 
-def write_take(file: Path, take: Film) -> None:
+def write_film(file: Path, take: Film) -> None:
     """Write atomically: a process that is stopped leaves no half file, two that write at once leave one whole."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(file) as partial, open(partial, "wb") as stream:

@@ -9,7 +9,7 @@ import warp as wp
 import warp.geometry
 from scipy.spatial import cKDTree
 
-from mosa.data.synthetic.bodies.shapes import Shape
+from mosa.data.synthetic.bodies.parts import Shape
 from mosa.system.warp_start import start_warp
 
 start_warp()

@@ -39,7 +39,7 @@ class Pressed:
     modulus: float
 
 
-def turned_to(direction: Tensor) -> Tensor:
+def rotation_to(direction: Tensor) -> Tensor:
     """(3, 3) float64 rotation Q with Q direction = z; direction: (3,) unit."""
     a, z = direction.double(), torch.tensor([0.0, 0.0, 1.0]).double()
     axis, cosine = torch.linalg.cross(a, z), float(a @ z)
@@ -68,7 +68,7 @@ def press(
     side = torch.arange(-2 * cells, 2 * cells).double() * dx / 2 + dx / 4
     x = torch.cartesian_prod(side, side, axis)
     x = x[x[:, :2].norm(dim=1) < RADIUS]
-    n, Q = len(x), turned_to(direction / direction.norm())
+    n, Q = len(x), rotation_to(direction / direction.norm())
     duration = SWINGS * 2 * HEIGHT / math.sqrt(modulus / density)
     rate = STROKE / duration
     # a start that is pressed already all over, or the plates would send a wave through it

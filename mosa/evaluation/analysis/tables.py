@@ -33,7 +33,7 @@ def results_table(
 ) -> str:
     """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence, of these metrics and
     those that were registered."""
-    sequences = [s for s in _sequences(figures)]
+    sequences = _sequences(figures)
     rows = []
     units = UNITS | {name: own[1:] for name, own in MOTION_METRICS.items()}
     units |= {f"{name}_crop": own[1:] for name, own in IMAGE_METRICS.items()}
@@ -174,6 +174,15 @@ def form_text(errors: Mapping[str, float]) -> str:
     return said
 
 
+def _part(figures: Mapping[str, float], prefix: str, suffix: str = "_m") -> dict[str, float]:
+    """The figures with a prefix and a suffix, by what is between the two."""
+    return {
+        key.removeprefix(prefix).removesuffix(suffix): value
+        for key, value in figures.items()
+        if key.startswith(prefix) and key.endswith(suffix)
+    }
+
+
 def _words(name: str) -> str:
     """A contact by `named` in words; both modes with friction leave the ground freely, so the mode is said as well."""
     mode, friction = contact(name)
@@ -208,28 +217,15 @@ def _backbones(compared: Mapping[str, float], gained: Mapping[str, float]) -> st
 def determined_text(figures: Mapping[str, float], law: str) -> str:
     """What the data determine and what they do not, in sentences; empty where a run kept no posterior. law: of the prior, which
     says what its parameters are measured in."""
-    compared, gained = (
-        {
-            k.removeprefix(f"id_prior/{kind}/").removesuffix("_m"): v
-            for k, v in figures.items()
-            if k.startswith(f"id_prior/{kind}/")
-        }
-        for kind in ("compared", "gain")
-    )
     lines = []
-    if compared:
+    if compared := _part(figures, "id_prior/compared/"):
+        gained = _part(figures, "id_prior/gain/", "")
         lines = [f"Backbone: {law}. {_backbones(compared, gained)}", ""]
-    touched, gains = ({k.removeprefix("id_prior/ground/").removesuffix(end): v for k, v in figures.items()
-                       if k.startswith("id_prior/ground/") and k.endswith(end)} for end in ("_m", "_gain"))  # fmt: skip
-    if touched:
-        for part in filter(None, (ground_text(touched, gains), ground_table(touched, gains))):
+    if distances := _part(figures, "id_prior/ground/"):
+        gains = _part(figures, "id_prior/ground/", "_gain")
+        for part in filter(None, (ground_text(distances, gains), ground_table(distances, gains))):
             lines += [part, ""]
-    held_back = {
-        k.removeprefix("held_back/").removesuffix("_m"): v
-        for k, v in figures.items()
-        if k.startswith("held_back/")
-    }
-    if held_back:
+    if held_back := _part(figures, "held_back/"):
         lines += [form_text(held_back), ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
@@ -278,13 +274,11 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             )
     if "posterior/test/sd_m" in figures:
         sure = figures.get("posterior/test/coverage")
+        covered = (
+            "" if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations"
+        )
         lines.append(
-            f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms)"
-            + (
-                "."
-                if sure is None
-                else f"; {sure:.0%} of the errors lie within two standard deviations."
-            )
+            f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms){covered}."
         )
     return "\n".join(lines)
 
@@ -302,12 +296,7 @@ def geometry_lines(figures: Mapping[str, float]) -> str:
         lines.append(
             f"Geometry: the visual hull, {get('carved_share'):.1%} of it left out; no refinement by colours."
         )
-    true = {
-        name.rsplit("/", 1)[1]: value
-        for name, value in figures.items()
-        if name.startswith("floor/geometry/")
-    }
-    if true:
+    if true := _part(figures, "floor/geometry/", ""):
         lines.append(
             f"Against the true shape: {true['outside_share']:.2%} of the particles outside, {true['missing_share']:.2%} of the "
             f"body missing, volume {true['volume_error']:+.2%}, centre of mass {true['center_error_m'] * 1e3:.2f} mm off."

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from mosa.experiments.collecting import Cell
@@ -52,12 +50,6 @@ AXES: Mapping[str, str] = {
     "scene": "object",
 }
 """What a stranger is told of an axis, where its name does not say it."""
-
-MARKED: Mapping[tuple[str, str], Mapping[str, tuple[float, float]]] = {
-    ("alpha", "alpha_normal"): {"default": (0.1, 0.1), "the paper's": (0.15, 0.15)}
-}
-"""{(rows, columns): {what it is: (value of the row, of the column)}} of the cells of a map that have a frame. The default is
-that of conf/adapter/mosa.yaml."""
 
 BETTER = {"most": ", more is better", "least": ", less is better", None: ""}
 MARKS = {"x": "diverged", "+": "failed"}
@@ -145,14 +137,14 @@ def save(canvas: Canvas, stem: Path) -> Path:
     return stem.with_suffix(".png")
 
 
+def cells_of(tables: Tables) -> list[Cell | None]:
+    """All cells of some tables."""
+    return [cell for rows in tables.values() for cells in rows.values() for cell in cells.values()]
+
+
 def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     """The experiment's picture, None where no job is complete."""
-    if not any(
-        cell is not None and cell.count
-        for rows in tables.values()
-        for cells in rows.values()
-        for cell in cells.values()
-    ):
+    if not any(cell is not None and cell.count for cell in cells_of(tables)):
         return None
     names = list(next(iter(tables.values())))
     if experiment.plot == "bars":  # a row that nothing was run of would take a place
@@ -171,10 +163,8 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     many = experiment.plot == "bars" and len(shown) * max(map(len, shown.values())) > MANY
     across = 1 if many or count == 1 else 2
     down = -(-count // across)
-    canvas = Canvas(
-        figsize=(WIDTH, 0.6 + (2.3 if many else 3.4 if down == 1 else 2.8) * down),
-        layout="constrained",
-    )
+    height = 2.3 if many else 3.4 if down == 1 else 2.8
+    canvas = Canvas(figsize=(WIDTH, 0.6 + height * down), layout="constrained")
     places = canvas.subplots(down, across, squeeze=False).ravel()
     for place in places[count:]:
         place.remove()
@@ -183,17 +173,9 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
         place.set_title(figure.label + BETTER[figure.best], fontsize=10)
         how(place, experiment, tables[figure.label], figure, styles)
     if experiment.plot != "map":
-        legend(
-            canvas,
-            names,
-            chain.from_iterable(tables[figure.label].values() for figure in experiment.figures),
-        )
-    elif any(
-        cell is None
-        for rows in tables.values()
-        for cells in rows.values()
-        for cell in cells.values()
-    ):
+        rows = [row for figure in experiment.figures for row in tables[figure.label].values()]
+        legend(canvas, names, rows)
+    elif None in cells_of(tables):
         canvas.supxlabel("white: not run", fontsize=9)
     return canvas
 
@@ -201,28 +183,20 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
 def legend(
     canvas: Canvas,
     names: Sequence[str],
-    cells_of_rows: Iterable[Mapping[str, Cell | None]] = (),
+    rows: Sequence[Mapping[str, Cell | None]] = (),
     without: str = "not run",
 ) -> None:
-    """One above all parts, in the order of `names`, with the words for the marks and gaps of these cells. without: what is said of
-    those of `names` that no part shows."""
+    """One above all parts, in the order of `names`, with the words for the marks and gaps of the cells of rows. without: what is
+    said of those of `names` that no part shows."""
     known = {
         text: handle
         for place in canvas.axes
         for handle, text in zip(*place.get_legend_handles_labels())
     }
-    ordered = [name for name in names if name in known] + [
-        text for text in known if text not in names
-    ]
-    handles = [known[name] for name in ordered]
-    rows = list(cells_of_rows)
-    marks = {
-        mark_of(cell)
-        for row in rows
-        for cell in row.values()
-        if cell is not None and not np.isfinite(cell.mean)
-    }
-    handles += [
+    ordered = [name for name in names if name in known] + [t for t in known if t not in names]
+    found = [cell for row in rows for cell in row.values() if cell is not None]
+    marks = {mark_of(cell) for cell in found if not np.isfinite(cell.mean)}
+    handles = [known[name] for name in ordered] + [
         Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
         for mark in sorted(marks, reverse=True)
     ]
@@ -237,14 +211,8 @@ def legend(
         canvas.supxlabel("; ".join(words), fontsize=9)
     if len(handles) > 1:
         labels = [*ordered, *(handle.get_label() for handle in handles[len(ordered) :])]
-        canvas.legend(
-            handles,
-            labels,
-            loc="outside upper center",
-            ncols=min(len(handles), 5),
-            fontsize=9,
-            frameon=False,
-        )
+        look: dict[str, Any] = {"loc": "outside upper center", "fontsize": 9, "frameon": False}
+        canvas.legend(handles, labels, ncols=min(len(handles), 5), **look)
 
 
 def mark_of(cell: Cell) -> str:
@@ -258,37 +226,33 @@ def marked(place, at: float, cell: Cell, color: str) -> None:
                color=color, linestyle="", zorder=4, clip_on=False)  # fmt: skip
 
 
-def bars(
-    place,
-    experiment: Experiment,
-    rows: Mapping[str, Mapping[str, Cell | None]],
-    figure: Figure,
-    styles: Mapping[str, Mapping],
-) -> None:
+Rows = Mapping[str, Mapping[str, Cell | None]]
+Styles = Mapping[str, Mapping]
+
+
+def measured(
+    place, cells: Sequence[tuple[float, Cell | None]], color: str
+) -> list[tuple[float, Cell]]:
+    """Those of cells at x that have a finite mean; of the others that were run a mark is drawn."""
+    for x, cell in cells:
+        if cell is not None and not np.isfinite(cell.mean):
+            marked(place, x, cell, color)
+    return [(x, cell) for x, cell in cells if cell is not None and np.isfinite(cell.mean)]
+
+
+def bars(place, experiment: Experiment, rows: Rows, figure: Figure, styles: Styles) -> None:
     """A group of bars for each column, a bar for each row; one of MARKS where it has no finite mean."""
     columns = list(next(iter(rows.values())))
     width, least, values = 0.84 / len(rows), np.inf, []
     for i, (row, cells) in enumerate(rows.items()):
-        color, at = (
-            styles[row]["color"],
-            [j - 0.42 + width * (i + 0.5) for j in range(len(columns))],
-        )
-        for x, column in zip(at, columns):
-            if cells.get(column) is not None and not np.isfinite(cells[column].mean):
-                marked(place, x, cells[column], color)
-        found = [
-            (x, cells[c])
-            for x, c in zip(at, columns)
-            if cells.get(c) is not None and np.isfinite(cells[c].mean)
-        ]
-        if not found:
-            place.bar([], [], label=row, color=color)
-            continue
+        color = styles[row]["color"]
+        at = [(j - 0.42 + width * (i + 0.5), cells.get(c)) for j, c in enumerate(columns)]
+        found = measured(place, at, color)
         means, spread = [c.mean for _, c in found], [c.sd or 0.0 for _, c in found]
-        place.bar([x for x, _ in found], means, width, yerr=spread if any(spread) else None, label=row, color=color,
-                  error_kw={"linewidth": 0.8})  # fmt: skip
+        look = {"label": row, "color": color, "error_kw": {"linewidth": 0.8}}
+        place.bar([x for x, _ in found], means, width, yerr=spread if any(spread) else None, **look)
         values += means
-        least = min(least, min(m - s for m, s in zip(means, spread)))
+        least = min([least, *(m - s for m, s in zip(means, spread))])
     limit(place, figure, least, values)
     place.set_xlim(-0.6, len(columns) - 0.4)
     place.set_xticks(range(len(columns)), columns, fontsize=9)
@@ -296,13 +260,7 @@ def bars(
         place.set_xlabel(AXES[experiment.columns], fontsize=9)
 
 
-def lines(
-    place,
-    experiment: Experiment,
-    rows: Mapping[str, Mapping[str, Cell | None]],
-    figure: Figure,
-    styles: Mapping[str, Mapping],
-) -> None:
+def lines(place, experiment: Experiment, rows: Rows, figure: Figure, styles: Styles) -> None:
     """A line for each column over the rows, at their values where these are numbers; a bar of one standard deviation where there
     are several seeds."""
     options = experiment.axes[experiment.rows]
@@ -310,101 +268,52 @@ def lines(
     at = [option.value if numeric else i for i, option in enumerate(options)]
     least, values = np.inf, []
     for column, style in styles.items():
-        cells = [
-            (x, rows[o.name][column])
-            for x, o in zip(at, options)
-            if rows[o.name].get(column) is not None
-        ]
-        for x, cell in cells:
-            if not np.isfinite(cell.mean):
-                marked(place, x, cell, style["color"])
-        found = [(x, cell) for x, cell in cells if np.isfinite(cell.mean)]
+        cells = [(x, rows[option.name].get(column)) for x, option in zip(at, options)]
+        found = measured(place, cells, style["color"])
         if not found:
             continue
-        place.plot(
-            [x for x, _ in found], [c.mean for _, c in found], marker=".", label=column, **style
-        )
-        if spread := [(x, c) for x, c in found if c.sd is not None]:
-            place.errorbar([x for x, _ in spread], [c.mean for _, c in spread], yerr=[c.sd for _, c in spread], fmt="none",
-                           ecolor=style["color"], elinewidth=1.0, capsize=2)  # fmt: skip
-        values += [c.mean for _, c in found]
-        least = min(least, min(c.mean - (c.sd or 0.0) for _, c in found))
+        means = [cell.mean for _, cell in found]
+        place.plot([x for x, _ in found], means, marker=".", label=column, **style)
+        if spread := [(x, c.mean, c.sd) for x, c in found if c.sd is not None]:
+            look = {"fmt": "none", "ecolor": style["color"], "elinewidth": 1.0, "capsize": 2}
+            x, mean, sd = zip(*spread)
+            place.errorbar(x, mean, yerr=sd, **look)
+        values += means
+        least = min([least, *(c.mean - (c.sd or 0.0) for _, c in found)])
     limit(place, figure, least, values)
     place.set_xlabel(AXES.get(experiment.rows, experiment.rows), fontsize=9)
     if not numeric:
         place.set_xticks(at, [option.name for option in options], fontsize=9)
 
 
-def heat_map(
-    place,
-    experiment: Experiment,
-    rows: Mapping[str, Mapping[str, Cell | None]],
-    figure: Figure,
-    styles: Mapping[str, Mapping],
-) -> None:
+def heat_map(place, experiment: Experiment, rows: Rows, figure: Figure, styles: Styles) -> None:
     """Rows downwards, columns to the right, each cell with its number, the better the lighter; what was not run stays white, what
-    diverged or failed says so. The cells of MARKED have a frame and their name."""
-    options = experiment.axes[experiment.columns]
-    cells = [[of.get(option.name) for option in options] for of in rows.values()]
+    diverged or failed says so."""
+    names = [option.name for option in experiment.axes[experiment.columns]]
+    cells = [[of.get(name) for name in names] for of in rows.values()]
+    finite = [[c is not None and np.isfinite(c.mean) for c in row] for row in cells]
     values = np.array(
-        [
-            [np.nan if cell is None or not np.isfinite(cell.mean) else cell.mean for cell in row]
-            for row in cells
-        ]
+        [[c.mean if f else np.nan for c, f in zip(*pair)] for pair in zip(cells, finite)]
     )
-    image = place.imshow(
-        values, aspect="auto", cmap="viridis_r" if figure.best == "least" else "viridis"
+    less = figure.best == "least"
+    image = place.imshow(values, aspect="auto", cmap="viridis_r" if less else "viridis")
+    middle = (
+        np.nanmean([np.nanmin(values), np.nanmax(values)]) if np.isfinite(values).any() else 0.0
     )
-    if np.isfinite(values).any():
-        middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
-        for (i, j), value in np.ndenumerate(values):
-            if np.isfinite(value):
-                color = "white" if (value < middle) != (figure.best == "least") else "black"
-                place.text(
-                    j,
-                    i,
-                    f"{value:.{figure.decimals}f}",
-                    ha="center",
-                    va="center",
-                    fontsize=9,
-                    color=color,
-                )
-            elif cells[i][j] is not None:
-                place.text(
-                    j,
-                    i,
-                    MARKS[mark_of(cells[i][j])],
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="0.3",
-                )
-    down, right = (
-        experiment.axes[experiment.rows],
-        {option.value: j for j, option in enumerate(options)},
-    )
-    for what, (of_row, of_column) in MARKED.get((experiment.rows, experiment.columns), {}).items():
-        for i, option in enumerate(down):
-            if option.value == of_row and of_column in right:
-                j = right[of_column]
-                place.add_patch(
-                    Rectangle(
-                        (j - 0.48, i - 0.47),
-                        0.96,
-                        0.94,
-                        fill=False,
-                        edgecolor="#d4111f",
-                        linewidth=2.2,
-                    )
-                )
-                place.annotate(what, (j, i + 0.34), ha="center", va="center", fontsize=7.5, color="black",
-                               bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
-    place.set_xticks(range(len(options)), [option.name for option in options], fontsize=9)
+    for (i, j), value in np.ndenumerate(values):
+        if cells[i][j] is None:
+            continue
+        said, size, color = MARKS[mark_of(cells[i][j])], 8, "0.3"
+        if np.isfinite(value):
+            said, size = f"{value:.{figure.decimals}f}", 9
+            color = "white" if (value < middle) != less else "black"
+        place.text(j, i, said, ha="center", va="center", fontsize=size, color=color)
+    place.set_xticks(range(len(names)), names, fontsize=9)
     place.set_yticks(range(len(rows)), list(rows), fontsize=9)
     place.set_xlabel(AXES.get(experiment.columns, experiment.columns), fontsize=9)
     place.set_ylabel(AXES.get(experiment.rows, experiment.rows), fontsize=9)
     bar = place.figure.colorbar(image, ax=place)
-    if figure.best == "least":
+    if less:
         bar.ax.invert_yaxis()  # so that the better end is above in every part
     if figure.best is not None:
         bar.set_label("better \N{RIGHTWARDS ARROW}", fontsize=9)

@@ -1,4 +1,4 @@
-"""Results of an experiment on disk: Markdown, CSV and LaTeX, with the paper's printed figures beside ours, and its picture."""
+"""Results of an experiment on disk: Markdown and CSV, with the paper's printed figures beside ours, and its picture."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import mosa
 from mosa.evaluation.analysis.tables import markdown
-from mosa.experiments.collecting import Cell, Record, best_of, records_of, said_below, table
+from mosa.experiments.collecting import Cell, Record, best_of, footnotes, records_of, table
 from mosa.experiments.commits import commit
-from mosa.experiments.report.drawing import draw, save
+from mosa.experiments.report.drawing import BETTER, draw, save
 from mosa.experiments.report.page import write_json
 from mosa.experiments.report.printed import printed_table
 from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
@@ -29,7 +29,6 @@ def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, com
     tables = {figure.label: table(experiment, records, figure) for figure in experiment.figures}
     name = experiment.name + ("_quick" if experiment.quick else "")
     write_csv(folder / f"{name}.csv", experiment, records)
-    write_whole(folder / f"{name}.tex", latex(experiment, tables))
     pictures = []
     if experiment.plot is not None and (figure := draw(experiment, tables)) is not None:
         pictures.append(save(figure, folder / name))
@@ -63,9 +62,9 @@ def markdown_page(
             for row in rows
         ]
         parts.append(
-            f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body)
+            f"{figure.label}{BETTER[figure.best]} (`{figure.figure}`)\n\n" + markdown(header, body)
         )
-    parts += [said] if (said := said_below(tables)) else []
+    parts += [said] if (said := footnotes(tables)) else []
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
@@ -81,22 +80,13 @@ def markdown_page(
     return "\n\n".join(parts) + "\n"
 
 
-def arrow(figure: Figure) -> str:
-    return {"most": ", more is better", "least": ", less is better", None: ""}[figure.best]
-
-
 def cell_text(
-    rows: Mapping[str, Mapping[str, Cell | None]],
-    row: str,
-    column: str,
-    figure: Figure,
-    bold: str,
-    plus: str = "±",
+    rows: Mapping[str, Mapping[str, Cell | None]], row: str, column: str, figure: Figure, bold: str
 ) -> str:
     found = rows[row].get(column)
     if found is None:
         return ""
-    text = found.text(figure.decimals, plus)
+    text = found.text(figure.decimals)
     return bold.format(text) if best_of(rows, column, figure.best) == row else text
 
 
@@ -152,27 +142,3 @@ def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> 
                         record.job.folder.name,
                     ]
                 )
-
-
-def latex(
-    experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
-) -> str:
-    """A tabular for each figure; needs booktabs."""
-    bold, parts = "{}" if experiment.plot == "map" else r"\textbf{{{}}}", []
-    for figure in experiment.figures:
-        rows = tables[figure.label]
-        columns = list(next(iter(rows.values())))
-        lines = [rf"% {experiment.title}: {figure.label} ({figure.figure})", rf"\begin{{tabular}}{{l{'c' * len(columns)}}}",
-                 r"\toprule",
-                 " & ".join([escaped(figure.label), *map(escaped, columns)]) + r" \\", r"\midrule"]  # fmt: skip
-        for row in rows:
-            cells = (cell_text(rows, row, column, figure, bold, r"$\pm$") for column in columns)
-            lines.append(" & ".join([escaped(row), *cells]) + r" \\")
-        parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
-    return "\n\n".join(parts) + "\n"
-
-
-def escaped(text: str) -> str:
-    for sign in ("\\", "&", "%", "_", "#", "$"):
-        text = text.replace(sign, r"\textbackslash{}" if sign == "\\" else f"\\{sign}")
-    return text

@@ -72,18 +72,6 @@ def camera_centers(cameras: Cameras) -> Tensor:
     return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
 
 
-def view_colors(
-    coefficients: Tensor, means: Tensor, cameras: Cameras, state_index: Tensor
-) -> Tensor:
-    """Features (B, N, 3) for `rasterize`: the colour of every Gaussian as each camera sees it.
-
-    coefficients: (N, K, 3), K = 1, 4, 9 or 16; means: (S, N, 3) [m]; state_index: (B,). Gradients to coefficients,
-    means and the cameras' w2c. The directions are those of the world: a body that turns takes its coefficients along
-    only if they are turned with it. Errors: ConfigError for another K.
-    """
-    return colors_in(coefficients, means[state_index] - camera_centers(cameras).to(means)[:, None])
-
-
 def rotated(coefficients: Tensor, rotation: Tensor) -> Tensor:
     """Coefficients (..., K, 3) of the colours of `coefficients` (..., K, 3) turned with their body by R, rotations (..., 3, 3):
     seen along d they have the colour that the given ones have along R^T d. Leading axes broadcast.

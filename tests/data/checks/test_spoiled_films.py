@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from written_scenes import export_transforms
 
 from mosa.data.checks.free_fall import check_still, track_of
 from mosa.data.checks.tangents import check_pictures
 from mosa.data.checks.validation import validate
-from mosa.data.formats.export import export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
 from mosa.rendering.cameras import look_at

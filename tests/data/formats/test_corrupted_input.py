@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from blocks_film import WORLD
+from written_scenes import export_particles
 
 from mosa.data.checks.validation import validate
-from mosa.data.formats.export import export_particles
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 
@@ -177,7 +177,7 @@ def test_corrupted_transforms(transforms_folder, name):
 
 
 def test_masks_of_another_size(blocks, tmp_path):
-    from mosa.data.formats.export import export_transforms
+    from written_scenes import export_transforms
 
     folder = export_transforms(blocks, tmp_path / "capture", masks=True)
     iio.imwrite(folder / "images" / "0_000_mask.png", np.zeros((8, 8), np.uint8))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from blocks_film import WORLD, assert_same_footage, clouds_of
+from written_scenes import export_particles, export_transforms
 
-from mosa.data.formats.export import export_particles, export_transforms
 from mosa.data.scene import held_out_sequences, load_scene
 
 

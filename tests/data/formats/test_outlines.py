@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from written_scenes import export_pacnerf, export_particles, export_transforms
 
-from mosa.data.formats.export import export_pacnerf, export_particles, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from blocks_film import WORLD, assert_same_footage, clouds_of
 from omegaconf import OmegaConf
+from written_scenes import export_particles, export_spring_gaus
 
 from mosa import compose
-from mosa.data.formats.export import export_particles, export_spring_gaus
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
 

@@ -7,8 +7,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from written_scenes import opengl_pose
 
-from mosa.data.formats.export import opengl_pose
 from mosa.data.images.lens import lens_of
 from mosa.data.images.reading import composite
 from mosa.data.scene import load_scene

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from blocks_film import WORLD, block_scene
+from written_scenes import export_pacnerf, export_transforms
 
 from mosa.data.checks.cameras import lines_of_sight
 from mosa.data.checks.validation import validate
-from mosa.data.formats.export import export_pacnerf, export_transforms
 from mosa.data.hull import visual_hull
 from mosa.data.scene import load_scene
 from mosa.errors import DataError

@@ -1,15 +1,13 @@
 """Moving splats as files: every frame, read back by readers that are not this program's, looks as the program sees it."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from mosa.data.io.splat_formats import load_splat, save_frames, splats_at
-from mosa.errors import ConfigError, DataError
+from mosa.data.io.splat_formats import save_frames, splats_at
+from mosa.errors import ConfigError
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import basis, colors_in
 
@@ -66,43 +64,8 @@ def test_plyfile_reads_what_is_seen(tmp_path):
         )
 
 
-def test_splat_files_have_32_bytes_a_gaussian(tmp_path):
-    shown = drawn(1)
-    save_frames(shown, tmp_path, ("splat",))
-    frame = splats_at(shown, 1).splats
-    raw = (tmp_path / "splat" / "001.splat").read_bytes()
-    assert len(raw) == 32 * M
-    order = (-frame.scales.prod(1) * frame.opacities).argsort()
-    position = np.frombuffer(raw, "<f4").reshape(M, 8)[
-        :, :3
-    ]  # a reader of one's own: position, scale, rgba, rotation
-    assert np.array_equal(position, frame.means[order].numpy())
-    rgba = np.frombuffer(raw, np.uint8).reshape(M, 32)[:, 24:28] / 255
-    assert np.allclose(rgba[:, :3], frame.colors[order].numpy(), atol=0.5 / 255 + 1e-6)
-    assert np.allclose(rgba[:, 3], frame.opacities[order].numpy(), atol=0.5 / 255 + 1e-6)
-    found = load_splat(tmp_path / "splat" / "001.splat")
-    torch.testing.assert_close(found.scales, frame.scales[order])
-    aligned = (found.rotations * frame.rotations[order]).sum(1).abs()
-    assert float(aligned.min()) > math.cos(0.02)
-
-
-def test_damaged_splat_files_are_named(tmp_path):
-    (tmp_path / "a.splat").write_bytes(b"x" * 33)
-    with pytest.raises(
-        DataError, match=r"a\.splat: expected a \.splat file of 32 bytes a Gaussian, found 33 bytes"
-    ):
-        load_splat(tmp_path / "a.splat")
-    (tmp_path / "a.splat").write_bytes(b"\xff" * 64)
-    with pytest.raises(DataError, match="expected finite positions"):
-        load_splat(tmp_path / "a.splat")
-    with pytest.raises(DataError, match="found no file"):
-        load_splat(tmp_path / "b.splat")
-
-
 def test_another_format_is_refused(tmp_path):
-    with pytest.raises(
-        ConfigError, match="formats: expected a list of some of ply, splat, spz, usd, found"
-    ):
+    with pytest.raises(ConfigError, match="formats: expected a list of some of ply, usd, found"):
         save_frames(drawn(0), tmp_path, ("ply", "obj"))
     assert not (tmp_path / "ply").exists()
 
@@ -130,25 +93,9 @@ def test_a_usd_stage_has_the_gaussians_of_every_frame(tmp_path):
         assert np.allclose(found, frame.harmonics.numpy(), atol=1e-6)
 
 
-def test_spz_files_are_read_back(tmp_path):
-    pytest.importorskip("gsply")
-    from gsply.spz import read_spz
-
-    shown = drawn(1)
-    save_frames(shown, tmp_path, ("spz",))
-    frame, found = splats_at(shown, 2), read_spz(tmp_path / "spz" / "002.spz")
-    assert np.allclose(found.means, frame.splats.means.numpy(), atol=2e-5)
-    assert np.allclose(np.exp(found.scales), frame.splats.scales.numpy(), rtol=0.05)
-    assert np.allclose(found.sh0, frame.harmonics[:, 0].numpy(), atol=0.03)
-
-
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     import sys
 
-    for name, message in (
-        ("gsply", "spz needs the package gsply"),
-        ("pxr", "usd needs the package usd-core"),
-    ):
-        monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(ConfigError, match=message):
-            save_frames(drawn(0), tmp_path, ("spz" if name == "gsply" else "usd",))
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(ConfigError, match="usd needs the package usd-core"):
+        save_frames(drawn(0), tmp_path, ("usd",))

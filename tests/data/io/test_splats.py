@@ -8,9 +8,8 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from mosa.data.io.gaussian_ply import export_splats, load_ply, save_ply
+from mosa.data.io.gaussian_ply import load_ply, save_ply
 from mosa.errors import ConfigError, DataError
-from mosa.rendering.covariance import covariance_from, quaternion_to_matrix
 from mosa.types import Splats
 
 COUNT = 7
@@ -87,25 +86,6 @@ def test_extremes_that_have_no_logarithm_stay_finite(tmp_path):
     found, _ = load_ply(save_ply(tmp_path / "splats.ply", splats))
     torch.testing.assert_close(found.opacities, splats.opacities, atol=2e-6, rtol=0)
     assert float(found.scales.max()) < 1e-8
-
-
-def test_frames_carry_the_deformed_covariances(tmp_path):
-    splats = drawn()
-    F = torch.eye(3) + 0.3 * torch.randn(2, COUNT, 3, 3, generator=torch.Generator().manual_seed(2))
-    rest = covariance_from(splats.scales, splats.rotations)
-    covariances, positions = F @ rest @ F.transpose(-1, -2), torch.randn(2, COUNT, 3)
-    folder = export_splats(splats, positions, covariances, tmp_path / "frames")
-    assert sorted(f.name for f in folder.iterdir()) == ["000.ply", "001.ply"]
-    for t in range(2):
-        found, _ = load_ply(folder / f"{t:03d}.ply")
-        torch.testing.assert_close(found.means, positions[t])
-        axes = quaternion_to_matrix(found.rotations)
-        torch.testing.assert_close(
-            axes @ torch.diag_embed(found.scales**2) @ axes.transpose(1, 2),
-            covariances[t],
-            rtol=1e-4,
-            atol=1e-7,
-        )
 
 
 def rewrite(change):

@@ -346,9 +346,9 @@ def test_version_2_meets_the_ground_in_its_own_way_and_version_1_as_before():
 
 def test_what_is_kept_of_version_1_is_found_as_before(tmp_path):
     """The key of a film is made of its object's repr, in which version 2 has no part."""
-    name = takes.take_file("rabbit", "train", "anisotropic", 0, tmp_path).name
+    name = takes.film_file("rabbit", "train", "anisotropic", 0, tmp_path).name
     assert name == "rabbit-train-anisotropic-0-9e62727fa106.npz"
-    assert takes.take_file("rabbit_v2", "train", "anisotropic", 0, tmp_path).name != name
+    assert takes.film_file("rabbit_v2", "train", "anisotropic", 0, tmp_path).name != name
 
 
 def test_the_scene_of_version_2_states_a_height_that_is_a_little_wrong(

@@ -5,7 +5,7 @@ import torch
 
 from mosa.data.synthetic.bodies.objects import CYLINDER
 from mosa.evaluation.analysis.anisotropy import directional_modulus, directions_in_plane
-from mosa.evaluation.analysis.compression import press, turned_to
+from mosa.evaluation.analysis.compression import press, rotation_to
 from mosa.evaluation.analysis.stiffness import directional_moduli
 from mosa.modules.adapters.hyperelastic import NUMBERS, HyperelasticAdapter
 from mosa.modules.body.material import Material, material_states
@@ -15,7 +15,7 @@ E, NU = 2e5, 0.3
 
 def test_a_direction_is_turned_to_the_axis():
     for n in ([0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.6, -0.8, 0.0], [0.48, 0.6, -0.64]):
-        Q = turned_to(torch.tensor(n))
+        Q = rotation_to(torch.tensor(n))
         torch.testing.assert_close(
             Q @ torch.tensor(n).double(), torch.tensor([0.0, 0.0, 1.0]).double(), rtol=0, atol=1e-6
         )

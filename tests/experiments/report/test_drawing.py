@@ -7,14 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import yaml
-from made_up import CONF, PAPER, experiment, made_up
+from made_up import PAPER, experiment, made_up
 from matplotlib.colors import to_rgba
 
 from mosa.experiments import analyses
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, records_of, table
-from mosa.experiments.report.drawing import FURTHER, MARKED, STYLES, draw, style_of
+from mosa.experiments.report.drawing import FURTHER, STYLES, draw, style_of
 from mosa.experiments.report.writing import write_results
 from mosa.experiments.specification import (
     Figure,
@@ -154,13 +153,8 @@ def test_every_axis_without_its_zero_says_so_and_errors_over_a_decade_are_logari
     assert ssim.get_ylim()[1] <= 100 and ssim.get_ylabel().startswith("axis cut at 9")
 
 
-def test_a_map_is_lighter_where_it_is_better_and_frames_the_default_of_the_configuration():
+def test_a_map_is_lighter_where_it_is_better():
     made = load_experiment(PAPER, "figure_alpha")
-    defaults = yaml.safe_load((CONF / "adapter" / "mosa.yaml").read_text())["adapter"]
-    assert defaults["alpha_normal"] is None and MARKED["alpha", "alpha_normal"]["default"] == (
-        defaults["alpha"],
-        defaults["alpha"],
-    )
     names = [option.name for option in made.axes["alpha"]]
     cells = {
         row: {column: Cell(i + j, None, 1) for j, column in enumerate(names)}
@@ -170,9 +164,8 @@ def test_a_map_is_lighter_where_it_is_better_and_frames_the_default_of_the_confi
     canvas = draw(made, {figure.label: cells for figure in made.figures})
     psnr, rms = canvas.axes[:2]
     for place in (psnr, rms):
-        assert [tuple(patch.get_xy()) for patch in place.patches] == [(0.52, 0.53), (1.52, 1.53)]
         words = [text.get_text() for text in place.texts]
-        assert {"default", "the paper's", "diverged"} <= set(words) and len(words) == 2 + 24
+        assert "diverged" in words and len(words) == 24
     shades = [
         place.images[0].cmap(place.images[0].norm(np.array([0.0, 7.0]))).sum(1)
         for place in (psnr, rms)

@@ -9,14 +9,14 @@ import pytest
 import squashed_body
 import torch
 
-from mosa.errors import DataError
-from mosa.evaluation.analysis.cue_error import (
+from benchmarks.cue_error import (
     cue_errors,
     motionless,
     rotation_error,
     strain_direction_error,
     true_motion,
 )
+from mosa.errors import DataError
 from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues, polar
 from mosa.reconstruction.pipeline import reconstruct, spacing_for
 from mosa.reconstruction.settings import build_settings

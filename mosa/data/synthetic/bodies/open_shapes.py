@@ -11,6 +11,7 @@ from mosa.data.synthetic.bodies.parts import (
     ellipsoid,
     join,
     sphere,
+    spot,
     step,
     waves,
 )
@@ -63,30 +64,19 @@ def gorilla_distance(points: np.ndarray) -> np.ndarray:
 
 def gorilla_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Brown fur with grey and russet patches, a pale back, a bare face and fists, dark eyes."""
-    color = coat(
-        points,
-        rng,
-        (0.40, 0.32, 0.27),
-        (0.58, 0.54, 0.50),
-        (0.55, 0.30, 0.18),
-        patch=0.085,
-        grain=0.027,
-    )
+    colors = (0.40, 0.32, 0.27), (0.58, 0.54, 0.50), (0.55, 0.30, 0.18)
+    color = coat(points, rng, colors, patch=0.085, grain=0.027)
     edge = waves(points, rng, 0.035) * 0.004
     color = blend(
         color,
         (0.74, 0.72, 0.68),
         step(-sphere(points, (-0.050, 0.190, 0.010), 0.052) + edge, 0.0, 0.010),
     )
-    color = blend(
-        color, (0.62, 0.48, 0.40), step(-sphere(points, (0.146, 0.204, 0.010), 0.036), 0.0, 0.005)
-    )
+    color = spot(color, points, (0.146, 0.204, 0.010), 0.036, (0.62, 0.48, 0.40), 0.005)
     for joints in ARMS:
-        color = blend(
-            color, (0.64, 0.50, 0.42), step(-sphere(points, joints[2], 0.031), 0.0, 0.006)
-        )
+        color = spot(color, points, joints[2], 0.031, (0.64, 0.50, 0.42), 0.006)
     for center, radius in (((0.137, 0.230, 0.030), 0.010), ((0.139, 0.229, -0.014), 0.008)):
-        color = blend(color, (0.05, 0.04, 0.04), step(-sphere(points, center, radius), 0.0, 0.003))
+        color = spot(color, points, center, radius, (0.05, 0.04, 0.04), 0.003)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -107,9 +97,8 @@ def calf_distance(points: np.ndarray) -> np.ndarray:
         capsule(points, (-0.082, 0.152, 0.0), (0.062, 0.154, 0.0), 0.048, 0.050),
         ellipsoid(points, (-0.012, 0.142, 0.0), (0.075, 0.052, 0.054)), 0.020,
     )  # fmt: skip
-    body = join(
-        body, capsule(points, (0.074, 0.168, 0.0), (0.108, 0.224, 0.004), 0.036, 0.031), 0.018
-    )
+    part = capsule(points, (0.074, 0.168, 0.0), (0.108, 0.224, 0.004), 0.036, 0.031)
+    body = join(body, part, 0.018)
     muzzle = capsule(points, (0.122, 0.226, 0.004), (0.148, 0.206, 0.008), 0.028, 0.024)
     head = join(sphere(points, (0.112, 0.232, 0.004), 0.035), muzzle, 0.012)
     for tip in ((0.098, 0.250, 0.052), (0.096, 0.242, -0.046)):
@@ -119,28 +108,18 @@ def calf_distance(points: np.ndarray) -> np.ndarray:
     body = join(body, head, 0.014)
     for joints in FEET:
         body = join(body, limb(points, joints, (0.030, 0.025, 0.0235)), 0.014)
-    return join(
-        body, capsule(points, (-0.116, 0.176, 0.0), (-0.142, 0.118, 0.012), 0.021, 0.019), 0.010
-    )
+    part = capsule(points, (-0.116, 0.176, 0.0), (-0.142, 0.118, 0.012), 0.021, 0.019)
+    return join(body, part, 0.010)
 
 
 def calf_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """White hide with brown and dark patches, a pink muzzle, dark hooves, eyes of two sizes."""
-    color = coat(
-        points,
-        rng,
-        (0.90, 0.87, 0.82),
-        (0.52, 0.32, 0.20),
-        (0.26, 0.20, 0.18),
-        patch=0.09,
-        grain=0.026,
-    )
-    color = blend(
-        color, (0.90, 0.62, 0.60), step(-sphere(points, (0.166, 0.198, 0.008), 0.030), 0.0, 0.005)
-    )
+    colors = (0.90, 0.87, 0.82), (0.52, 0.32, 0.20), (0.26, 0.20, 0.18)
+    color = coat(points, rng, colors, patch=0.09, grain=0.026)
+    color = spot(color, points, (0.166, 0.198, 0.008), 0.030, (0.90, 0.62, 0.60), 0.005)
     color = blend(color, (0.24, 0.20, 0.19), step(0.018 - points[:, 1], 0.0, 0.006))
     for center, radius in (((0.136, 0.252, 0.030), 0.010), ((0.137, 0.250, -0.022), 0.008)):
-        color = blend(color, (0.05, 0.04, 0.05), step(-sphere(points, center, radius), 0.0, 0.003))
+        color = spot(color, points, center, radius, (0.05, 0.04, 0.05), 0.003)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -161,15 +140,8 @@ def ring_distance(points: np.ndarray) -> np.ndarray:
 
 def ring_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Painted rubber: teal with ochre and dark red patches, and one white stretch."""
-    color = coat(
-        points,
-        rng,
-        (0.30, 0.62, 0.60),
-        (0.86, 0.66, 0.28),
-        (0.56, 0.18, 0.20),
-        patch=0.08,
-        grain=0.025,
-    )
+    colors = (0.30, 0.62, 0.60), (0.86, 0.66, 0.28), (0.56, 0.18, 0.20)
+    color = coat(points, rng, colors, patch=0.08, grain=0.025)
     white = RING_CENTER + np.array([0.07, -0.04, -0.03])
     return np.clip(
         blend(color, (0.94, 0.93, 0.88), step(-sphere(points, white, 0.036), 0.0, 0.006)), 0.02, 1.0

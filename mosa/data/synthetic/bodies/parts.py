@@ -72,6 +72,11 @@ def blend(color: np.ndarray, other, amount: np.ndarray) -> np.ndarray:
     return color + amount[:, None] * (np.asarray(other) - color)
 
 
+def spot(color: np.ndarray, points: np.ndarray, center, radius: float, other, edge: float):
+    """Colour (M, 3) with `other` within `radius` of a centre [m], soft over `edge` [m]."""
+    return blend(color, other, step(-sphere(points, center, radius), 0.0, edge))
+
+
 def waves(
     points: np.ndarray, rng: np.random.Generator, wavelength: float, count: int = 24
 ) -> np.ndarray:
@@ -84,12 +89,19 @@ def waves(
 
 
 def coat(
-    points: np.ndarray, rng: np.random.Generator, base, first, second, *, patch: float, grain: float
+    points: np.ndarray, rng: np.random.Generator, colors, *, patch: float, grain: float
 ) -> np.ndarray:
-    """Patches of two colours on a base, with a finer mottle over all: a texture in which every turn and stretch shows."""
+    """Patches of the second and third of three colours on the first, with a finer mottle over all: a texture in which every turn
+    and stretch shows. patch, grain: wavelengths [m]."""
+    base, first, second = colors
     color = np.broadcast_to(np.asarray(base, dtype=float), points.shape).copy()
     color = blend(color, first, step(waves(points, rng, patch), 0.45, 0.35))
     color = blend(color, second, step(waves(points, rng, 0.8 * patch), 0.85, 0.35))
     shade = 0.10 * waves(points, rng, grain) + 0.07 * waves(points, rng, 1.6 * grain)
     tint = np.stack([waves(points, rng, 1.3 * grain) for _ in range(3)], -1)
     return color * (1 + np.clip(shade, -0.3, 0.3))[:, None] + 0.03 * tint
+
+
+def shape(distance: Field, color, low, high) -> Shape:
+    """low, high: corners of the box that holds it [m]."""
+    return Shape(distance, color, np.array([low, high]))

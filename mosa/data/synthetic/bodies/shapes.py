@@ -14,14 +14,15 @@ from mosa.data.synthetic.bodies.open_shapes import (
     ring_distance,
 )
 from mosa.data.synthetic.bodies.parts import (
-    Shape,
     blend,
     capsule,
     coat,
     ellipsoid,
     join,
     mirrored,
+    shape,
     sphere,
+    spot,
     step,
     waves,
 )
@@ -66,15 +67,8 @@ def rabbit_distance(points: np.ndarray) -> np.ndarray:
 def rabbit_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A spotted coat; white muzzle, chest, feet and tail; pink nose and inner ears; one dark ear."""
     both = mirrored(points)
-    color = coat(
-        points,
-        rng,
-        (0.90, 0.78, 0.60),
-        (0.76, 0.42, 0.20),
-        (0.33, 0.20, 0.14),
-        patch=0.10,
-        grain=0.028,
-    )
+    colors = (0.90, 0.78, 0.60), (0.76, 0.42, 0.20), (0.33, 0.20, 0.14)
+    color = coat(points, rng, colors, patch=0.10, grain=0.028)
     white, pink = (0.97, 0.94, 0.90), (0.93, 0.56, 0.56)
     edge = waves(points, rng, 0.03) * 0.002
     for part in (
@@ -93,13 +87,9 @@ def rabbit_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
             pink,
             step(-ear(points, np.add(start, front), np.add(end, front), margin=-0.008), 0.0, 0.006),
         )
-    color = blend(color, pink, step(-sphere(points, (0.105, 0.141, 0.0), 0.0110), 0.0, 0.004))
-    color = blend(
-        color, (0.07, 0.05, 0.05), step(-sphere(both, (0.080, 0.162, 0.040), 0.0125), 0.0, 0.004)
-    )
-    color = blend(
-        color, (1.0, 1.0, 1.0), step(-sphere(both, (0.0875, 0.1685, 0.0405), 0.0045), 0.0, 0.002)
-    )
+    color = spot(color, points, (0.105, 0.141, 0.0), 0.0110, pink, 0.004)
+    color = spot(color, both, (0.080, 0.162, 0.040), 0.0125, (0.07, 0.05, 0.05), 0.004)
+    color = spot(color, both, (0.0875, 0.1685, 0.0405), 0.0045, (1.0, 1.0, 1.0), 0.002)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -130,23 +120,14 @@ def peanut_distance(points: np.ndarray) -> np.ndarray:
 
 def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A painted shell: ochre with patches of green and dark red, a pale band round the waist on one side."""
-    color = coat(
-        points,
-        rng,
-        (0.86, 0.66, 0.36),
-        (0.28, 0.52, 0.42),
-        (0.58, 0.20, 0.16),
-        patch=0.11,
-        grain=0.028,
-    )
+    colors = (0.86, 0.66, 0.36), (0.28, 0.52, 0.42), (0.58, 0.20, 0.16)
+    color = coat(points, rng, colors, patch=0.11, grain=0.028)
     points = upright(points)
     band = step(0.016 - np.abs(points[:, 1] - 0.135 - 0.2 * points[:, 0]), 0.0, 0.008) * step(
         points[:, 2], -0.02, 0.04
     )
     color = blend(color, (0.95, 0.90, 0.80), band)
-    color = blend(
-        color, (0.20, 0.28, 0.55), step(-sphere(points, (0.05, 0.215, 0.02), 0.022), 0.0, 0.006)
-    )
+    color = spot(color, points, (0.05, 0.215, 0.02), 0.022, (0.20, 0.28, 0.55), 0.006)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -169,22 +150,11 @@ def mandarin_distance(points: np.ndarray) -> np.ndarray:
 
 def mandarin_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Orange peel with green and dark patches, a green stalk, a pale label on one side."""
-    color = coat(
-        points,
-        rng,
-        (0.95, 0.56, 0.12),
-        (0.98, 0.78, 0.26),
-        (0.66, 0.26, 0.10),
-        patch=0.09,
-        grain=0.026,
-    )
+    colors = (0.95, 0.56, 0.12), (0.98, 0.78, 0.26), (0.66, 0.26, 0.10)
+    color = coat(points, rng, colors, patch=0.09, grain=0.026)
     color = blend(color, (0.26, 0.46, 0.18), step(points[:, 1], 0.158, 0.012))
-    color = blend(
-        color, (0.95, 0.95, 0.90), step(-sphere(points, (0.080, 0.105, 0.055), 0.028), 0.0, 0.004)
-    )
-    color = blend(
-        color, (0.16, 0.30, 0.60), step(-sphere(points, (0.084, 0.105, 0.060), 0.016), 0.0, 0.004)
-    )
+    color = spot(color, points, (0.080, 0.105, 0.055), 0.028, (0.95, 0.95, 0.90), 0.004)
+    color = spot(color, points, (0.084, 0.105, 0.060), 0.016, (0.16, 0.30, 0.60), 0.004)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -196,35 +166,22 @@ def chick_distance(points: np.ndarray) -> np.ndarray:
     both = mirrored(points)
     body = ellipsoid(points, (-0.010, 0.075, 0.0), (0.095, 0.075, 0.080))
     body = join(body, sphere(points, (0.035, 0.160, 0.0), 0.060), 0.030)
-    body = join(
-        body, capsule(points, (0.080, 0.156, 0.0), (0.105, 0.150, 0.0), 0.024, 0.020), 0.012
-    )
+    part = capsule(points, (0.080, 0.156, 0.0), (0.105, 0.150, 0.0), 0.024, 0.020)
+    body = join(body, part, 0.012)
     body = join(body, ellipsoid(both, (-0.020, 0.085, 0.078), (0.055, 0.036, 0.024)), 0.016)
-    return join(
-        body, capsule(points, (-0.085, 0.095, 0.0), (-0.118, 0.122, 0.0), 0.028, 0.021), 0.016
-    )
+    part = capsule(points, (-0.085, 0.095, 0.0), (-0.118, 0.122, 0.0), 0.028, 0.021)
+    return join(body, part, 0.016)
 
 
 def chick_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Yellow down with brown and pale patches, an orange beak, dark eyes of two sizes."""
     both = mirrored(points)
-    color = coat(
-        points,
-        rng,
-        (0.96, 0.84, 0.36),
-        (0.72, 0.50, 0.20),
-        (0.98, 0.95, 0.80),
-        patch=0.09,
-        grain=0.026,
-    )
+    colors = (0.96, 0.84, 0.36), (0.72, 0.50, 0.20), (0.98, 0.95, 0.80)
+    color = coat(points, rng, colors, patch=0.09, grain=0.026)
     beak = capsule(points, (0.090, 0.154, 0.0), (0.112, 0.149, 0.0), 0.026, 0.024)
     color = blend(color, (0.93, 0.48, 0.14), step(-beak, 0.0, 0.006))
-    color = blend(
-        color, (0.07, 0.05, 0.05), step(-sphere(both, (0.074, 0.184, 0.038), 0.013), 0.0, 0.003)
-    )
-    color = blend(
-        color, (0.24, 0.38, 0.62), step(-sphere(points, (-0.010, 0.080, 0.100), 0.022), 0.0, 0.005)
-    )
+    color = spot(color, both, (0.074, 0.184, 0.038), 0.013, (0.07, 0.05, 0.05), 0.003)
+    color = spot(color, points, (-0.010, 0.080, 0.100), 0.022, (0.24, 0.38, 0.62), 0.005)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -236,9 +193,8 @@ def chick2_distance(points: np.ndarray) -> np.ndarray:
     body = ellipsoid(points, (0.0, 0.098, 0.0), (0.078, 0.066, 0.068))
     neck = capsule(points, (0.035, 0.125, 0.0), (0.062, 0.176, 0.006), 0.042, 0.032)
     body = join(join(body, neck, 0.022), sphere(points, (0.066, 0.195, 0.008), 0.045), 0.014)
-    body = join(
-        body, capsule(points, (0.100, 0.190, 0.012), (0.124, 0.182, 0.014), 0.022, 0.019), 0.010
-    )
+    part = capsule(points, (0.100, 0.190, 0.012), (0.124, 0.182, 0.014), 0.022, 0.019)
+    body = join(body, part, 0.010)
     for tip, side in (((-0.030, 0.075, 0.118), 0.056), ((-0.020, 0.128, -0.116), -0.056)):
         body = join(body, capsule(points, (0.012, 0.112, side), tip, 0.029, 0.022), 0.014)
     for ankle, toe in (
@@ -247,22 +203,14 @@ def chick2_distance(points: np.ndarray) -> np.ndarray:
     ):
         leg = capsule(points, (ankle[0], 0.060, ankle[2]), ankle, 0.026, 0.024)
         body = join(body, join(leg, capsule(points, ankle, toe, 0.024, 0.022), 0.010), 0.014)
-    return join(
-        body, capsule(points, (-0.060, 0.105, 0.0), (-0.108, 0.158, 0.006), 0.030, 0.021), 0.016
-    )
+    part = capsule(points, (-0.060, 0.105, 0.0), (-0.108, 0.158, 0.006), 0.030, 0.021)
+    return join(body, part, 0.016)
 
 
 def chick2_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Pale down with brown and russet patches, red beak and feet, one dark wing tip, eyes of two sizes."""
-    color = coat(
-        points,
-        rng,
-        (0.93, 0.86, 0.66),
-        (0.62, 0.40, 0.22),
-        (0.80, 0.52, 0.24),
-        patch=0.085,
-        grain=0.026,
-    )
+    colors = (0.93, 0.86, 0.66), (0.62, 0.40, 0.22), (0.80, 0.52, 0.24)
+    color = coat(points, rng, colors, patch=0.085, grain=0.026)
     red = (0.86, 0.30, 0.16)
     color = blend(
         color,
@@ -270,11 +218,9 @@ def chick2_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         step(-capsule(points, (0.108, 0.188, 0.013), (0.128, 0.181, 0.014), 0.024), 0.0, 0.005),
     )
     color = blend(color, red, step(0.030 - points[:, 1], 0.0, 0.006))
-    color = blend(
-        color, (0.22, 0.17, 0.15), step(-sphere(points, (-0.024, 0.130, -0.122), 0.030), 0.0, 0.006)
-    )
+    color = spot(color, points, (-0.024, 0.130, -0.122), 0.030, (0.22, 0.17, 0.15), 0.006)
     for center, radius in (((0.092, 0.216, 0.040), 0.012), ((0.094, 0.214, -0.026), 0.010)):
-        color = blend(color, (0.06, 0.05, 0.06), step(-sphere(points, center, radius), 0.0, 0.003))
+        color = spot(color, points, center, radius, (0.06, 0.05, 0.06), 0.003)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -315,9 +261,7 @@ def rainbowball_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
         )[:, None]
     )
     color = blend(color, (0.96, 0.96, 0.94), step(arm @ axis, 0.084, 0.006))
-    color = blend(
-        color, (0.14, 0.14, 0.20), step(-sphere(points, (-0.06, 0.05, 0.07), 0.030), 0.0, 0.005)
-    )
+    color = spot(color, points, (-0.06, 0.05, 0.07), 0.030, (0.14, 0.14, 0.20), 0.005)
     return np.clip(color, 0.02, 1.0)
 
 
@@ -343,18 +287,9 @@ def cylinder_distance(points: np.ndarray) -> np.ndarray:
 
 def cylinder_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Grey rubber with blue and ochre patches, a red spot on one side, a white one near the top of another."""
-    color = coat(
-        points,
-        rng,
-        (0.62, 0.64, 0.66),
-        (0.20, 0.36, 0.66),
-        (0.86, 0.66, 0.28),
-        patch=0.085,
-        grain=0.026,
-    )
-    color = blend(
-        color, (0.80, 0.20, 0.18), step(-sphere(points, (0.090, 0.080, 0.020), 0.034), 0.0, 0.006)
-    )
+    colors = (0.62, 0.64, 0.66), (0.20, 0.36, 0.66), (0.86, 0.66, 0.28)
+    color = coat(points, rng, colors, patch=0.085, grain=0.026)
+    color = spot(color, points, (0.090, 0.080, 0.020), 0.034, (0.80, 0.20, 0.18), 0.006)
     return np.clip(
         blend(
             color,
@@ -367,33 +302,17 @@ def cylinder_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 SHAPES = {
-    "cylinder": Shape(
-        cylinder_distance, cylinder_color, np.array([[-0.13, -0.02, -0.12], [0.13, 0.27, 0.12]])
+    "cylinder": shape(cylinder_distance, cylinder_color, (-0.13, -0.02, -0.12), (0.13, 0.27, 0.12)),
+    "rabbit": shape(rabbit_distance, rabbit_color, (-0.15, -0.01, -0.10), (0.13, 0.27, 0.10)),
+    "peanut": shape(peanut_distance, peanut_color, (-0.15, -0.03, -0.09), (0.15, 0.16, 0.09)),
+    "mandarin": shape(mandarin_distance, mandarin_color, (-0.13, -0.02, -0.12), (0.13, 0.21, 0.12)),
+    "chick1": shape(chick_distance, chick_color, (-0.16, -0.02, -0.12), (0.15, 0.24, 0.12)),
+    "chick2": shape(chick2_distance, chick2_color, (-0.14, -0.01, -0.15), (0.15, 0.25, 0.15)),
+    "rainbowball": shape(
+        rainbowball_distance, rainbowball_color, (-0.11, -0.01, -0.11), (0.11, 0.21, 0.11)
     ),
-    "rabbit": Shape(
-        rabbit_distance, rabbit_color, np.array([[-0.15, -0.01, -0.10], [0.13, 0.27, 0.10]])
-    ),
-    "peanut": Shape(
-        peanut_distance, peanut_color, np.array([[-0.15, -0.03, -0.09], [0.15, 0.16, 0.09]])
-    ),
-    "mandarin": Shape(
-        mandarin_distance, mandarin_color, np.array([[-0.13, -0.02, -0.12], [0.13, 0.21, 0.12]])
-    ),
-    "chick1": Shape(
-        chick_distance, chick_color, np.array([[-0.16, -0.02, -0.12], [0.15, 0.24, 0.12]])
-    ),
-    "chick2": Shape(
-        chick2_distance, chick2_color, np.array([[-0.14, -0.01, -0.15], [0.15, 0.25, 0.15]])
-    ),
-    "rainbowball": Shape(
-        rainbowball_distance,
-        rainbowball_color,
-        np.array([[-0.11, -0.01, -0.11], [0.11, 0.21, 0.11]]),
-    ),
-    "gorilla": Shape(
-        gorilla_distance, gorilla_color, np.array([[-0.15, -0.01, -0.16], [0.19, 0.28, 0.16]])
-    ),
-    "calf": Shape(calf_distance, calf_color, np.array([[-0.17, -0.01, -0.11], [0.19, 0.28, 0.11]])),
+    "gorilla": shape(gorilla_distance, gorilla_color, (-0.15, -0.01, -0.16), (0.19, 0.28, 0.16)),
+    "calf": shape(calf_distance, calf_color, (-0.17, -0.01, -0.11), (0.19, 0.28, 0.11)),
     **STANDIN_SHAPES,
-    "ring": Shape(ring_distance, ring_color, np.array([[-0.13, -0.01, -0.13], [0.13, 0.22, 0.13]])),
+    "ring": shape(ring_distance, ring_color, (-0.13, -0.01, -0.13), (0.13, 0.22, 0.13)),
 }

@@ -10,20 +10,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from mosa.data.synthetic.bodies.parts import Shape, capsule, coat, ellipsoid, join, mirrored, sphere
+from mosa.data.synthetic.bodies.parts import capsule, coat, ellipsoid, join, mirrored, shape, sphere
 
 LEAN = np.array([0.35, 0.86, 0.37]) / np.linalg.norm([0.35, 0.86, 0.37])
 
 
-def painted(
-    base, first, second, size: float = 1.0
-) -> Callable[[np.ndarray, np.random.Generator], np.ndarray]:
+def painted(colors, size: float) -> Callable[[np.ndarray, np.random.Generator], np.ndarray]:
     """A coat of three colours; size: of its patches, 1 for a body of half a metre."""
 
     def color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return np.clip(
-            coat(points, rng, base, first, second, patch=0.17 * size, grain=0.052 * size), 0.02, 1.0
-        )
+        found = coat(points, rng, colors, patch=0.17 * size, grain=0.052 * size)
+        return np.clip(found, 0.02, 1.0)
 
     return color
 
@@ -45,13 +42,11 @@ def bird_distance(points: np.ndarray) -> np.ndarray:
     both = mirrored(points)
     body = ellipsoid(points, (0.0, 0.150, 0.0), (0.215, 0.150, 0.150))
     body = join(body, sphere(points, (0.130, 0.300, 0.0), 0.098), 0.060)
-    body = join(
-        body, capsule(points, (0.205, 0.290, 0.0), (0.270, 0.268, 0.0), 0.048, 0.042), 0.024
-    )
+    part = capsule(points, (0.205, 0.290, 0.0), (0.270, 0.268, 0.0), 0.048, 0.042)
+    body = join(body, part, 0.024)
     body = join(body, ellipsoid(both, (-0.050, 0.170, 0.140), (0.130, 0.075, 0.055)), 0.035)
-    return join(
-        body, capsule(points, (-0.180, 0.200, 0.0), (-0.290, 0.285, 0.0), 0.060, 0.048), 0.035
-    )
+    part = capsule(points, (-0.180, 0.200, 0.0), (-0.290, 0.285, 0.0), 0.060, 0.048)
+    return join(body, part, 0.035)
 
 
 def cat_distance(points: np.ndarray) -> np.ndarray:
@@ -63,15 +58,12 @@ def cat_distance(points: np.ndarray) -> np.ndarray:
         0.060,
     )
     body = join(body, sphere(points, (0.065, 0.350, 0.0), 0.095), 0.040)
-    body = join(
-        body, capsule(both, (0.055, 0.400, 0.055), (0.050, 0.455, 0.075), 0.048, 0.042), 0.020
-    )
-    body = join(
-        body, capsule(both, (0.090, 0.210, 0.060), (0.115, 0.048, 0.065), 0.052, 0.048), 0.030
-    )
-    return join(
-        body, capsule(points, (-0.150, 0.060, 0.030), (-0.170, 0.055, 0.190), 0.052, 0.045), 0.035
-    )
+    part = capsule(both, (0.055, 0.400, 0.055), (0.050, 0.455, 0.075), 0.048, 0.042)
+    body = join(body, part, 0.020)
+    part = capsule(both, (0.090, 0.210, 0.060), (0.115, 0.048, 0.065), 0.052, 0.048)
+    body = join(body, part, 0.030)
+    part = capsule(points, (-0.150, 0.060, 0.030), (-0.170, 0.055, 0.190), 0.052, 0.045)
+    return join(body, part, 0.035)
 
 
 def playdoh_distance(points: np.ndarray) -> np.ndarray:
@@ -112,9 +104,8 @@ def cream_distance(points: np.ndarray) -> np.ndarray:
         0.040,
     )
     body = join(body, torus(points, (0.010, 0.165, 0.0), up, 0.065, 0.062), 0.030)
-    return join(
-        body, capsule(points, (0.0, 0.200, 0.0), (0.020, 0.320, 0.010), 0.075, 0.045), 0.040
-    )
+    part = capsule(points, (0.0, 0.200, 0.0), (0.020, 0.320, 0.010), 0.075, 0.045)
+    return join(body, part, 0.040)
 
 
 def toothpaste_distance(points: np.ndarray) -> np.ndarray:
@@ -136,82 +127,43 @@ def trophy_distance(points: np.ndarray) -> np.ndarray:
     return join(join(foot, stem, 0.040), bowl, 0.050)
 
 
-def shape(distance, low, high, *colors, size: float = 1.0) -> Shape:
-    return Shape(distance, painted(*colors, size=size), np.array([low, high]))
-
+LOOKS = {
+    "torus": ((0.30, 0.55, 0.85), (0.90, 0.78, 0.30), (0.15, 0.2, 0.4)),
+    "bird": ((0.55, 0.75, 0.40), (0.90, 0.85, 0.50), (0.30, 0.25, 0.2)),
+    "cat": ((0.85, 0.60, 0.35), (0.55, 0.30, 0.16), (0.95, 0.92, 0.86)),
+    "playdoh": ((0.90, 0.35, 0.40), (0.98, 0.75, 0.30), (0.4, 0.2, 0.5)),
+    "droplet": ((0.35, 0.65, 0.90), (0.15, 0.35, 0.70), (0.9, 0.95, 1.0)),
+    "letter": ((0.85, 0.30, 0.25), (0.30, 0.30, 0.70), (0.95, 0.85, 0.4)),
+    "cream": ((0.97, 0.93, 0.85), (0.80, 0.55, 0.45), (0.55, 0.4, 0.35)),
+    "toothpaste": ((0.55, 0.85, 0.85), (0.95, 0.95, 0.95), (0.2, 0.4, 0.7)),
+    "trophy": ((0.85, 0.70, 0.35), (0.60, 0.42, 0.20), (0.98, 0.9, 0.7)),
+}
+"""Colours of the coats."""
+BOUNDS = {
+    "torus": ((-0.26, -0.02, -0.26), (0.26, 0.33, 0.26)),
+    "bird": ((-0.36, -0.02, -0.22), (0.33, 0.42, 0.22)),
+    "cat": ((-0.25, -0.02, -0.26), (0.20, 0.52, 0.26)),
+    "playdoh": ((-0.20, -0.02, -0.18), (0.25, 0.34, 0.20)),
+    "droplet": ((-0.17, -0.02, -0.17), (0.17, 0.40, 0.17)),
+    "letter": ((-0.18, -0.02, -0.08), (0.20, 0.46, 0.08)),
+    "cream": ((-0.20, -0.02, -0.20), (0.20, 0.38, 0.20)),
+    "toothpaste": ((-0.03, -0.004, -0.02), (0.03, 0.054, 0.02)),
+    "trophy": ((-0.18, -0.02, -0.18), (0.18, 0.44, 0.18)),
+}
+"""Corners of the boxes that hold them [m]."""
+DISTANCES = {
+    "torus": torus_distance,
+    "bird": bird_distance,
+    "cat": cat_distance,
+    "playdoh": playdoh_distance,
+    "droplet": droplet_distance,
+    "letter": letter_distance,
+    "cream": cream_distance,
+    "toothpaste": toothpaste_distance,
+    "trophy": trophy_distance,
+}
 
 STANDIN_SHAPES = {
-    "torus": shape(
-        torus_distance,
-        (-0.26, -0.02, -0.26),
-        (0.26, 0.33, 0.26),
-        (0.30, 0.55, 0.85),
-        (0.90, 0.78, 0.30),
-        (0.15, 0.2, 0.4),
-    ),
-    "bird": shape(
-        bird_distance,
-        (-0.36, -0.02, -0.22),
-        (0.33, 0.42, 0.22),
-        (0.55, 0.75, 0.40),
-        (0.90, 0.85, 0.50),
-        (0.30, 0.25, 0.2),
-    ),
-    "cat": shape(
-        cat_distance,
-        (-0.25, -0.02, -0.26),
-        (0.20, 0.52, 0.26),
-        (0.85, 0.60, 0.35),
-        (0.55, 0.30, 0.16),
-        (0.95, 0.92, 0.86),
-    ),
-    "playdoh": shape(
-        playdoh_distance,
-        (-0.20, -0.02, -0.18),
-        (0.25, 0.34, 0.20),
-        (0.90, 0.35, 0.40),
-        (0.98, 0.75, 0.30),
-        (0.4, 0.2, 0.5),
-    ),
-    "droplet": shape(
-        droplet_distance,
-        (-0.17, -0.02, -0.17),
-        (0.17, 0.40, 0.17),
-        (0.35, 0.65, 0.90),
-        (0.15, 0.35, 0.70),
-        (0.9, 0.95, 1.0),
-    ),
-    "letter": shape(
-        letter_distance,
-        (-0.18, -0.02, -0.08),
-        (0.20, 0.46, 0.08),
-        (0.85, 0.30, 0.25),
-        (0.30, 0.30, 0.70),
-        (0.95, 0.85, 0.4),
-    ),
-    "cream": shape(
-        cream_distance,
-        (-0.20, -0.02, -0.20),
-        (0.20, 0.38, 0.20),
-        (0.97, 0.93, 0.85),
-        (0.80, 0.55, 0.45),
-        (0.55, 0.4, 0.35),
-    ),
-    "toothpaste": shape(
-        toothpaste_distance,
-        (-0.03, -0.004, -0.02),
-        (0.03, 0.054, 0.02),
-        (0.55, 0.85, 0.85),
-        (0.95, 0.95, 0.95),
-        (0.2, 0.4, 0.7),
-        size=0.1,
-    ),
-    "trophy": shape(
-        trophy_distance,
-        (-0.18, -0.02, -0.18),
-        (0.18, 0.44, 0.18),
-        (0.85, 0.70, 0.35),
-        (0.60, 0.42, 0.20),
-        (0.98, 0.9, 0.7),
-    ),
+    name: shape(distance, painted(LOOKS[name], 0.1 if name == "toothpaste" else 1.0), *BOUNDS[name])
+    for name, distance in DISTANCES.items()
 }

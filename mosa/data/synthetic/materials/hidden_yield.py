@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mosa.data.synthetic.materials.axes import axes_parameter
 from mosa.data.synthetic.materials.hidden import Hidden
 from mosa.data.synthetic.materials.hill import COEFFICIENTS, HILL
 
@@ -45,7 +43,9 @@ class HiddenYield(Hidden):
             name: torch.full_like(factor, c)
             for name, c in zip(COEFFICIENTS, self.coefficients, strict=True)
         }
-        axes = axes_parameter(torch.as_tensor(Rotation.from_rotvec(self.turn).as_matrix())).to(rest)
+        turn = torch.tensor(self.turn, dtype=torch.float64)
+        angle = turn.norm()
+        axes = (turn * (angle / 2).tan() / angle).to(rest)  # as `axes_rotation` takes it
         return {**values, "axes": axes.expand(len(rest), 3)}
 
     def summary(self) -> dict[str, float]:

@@ -3,10 +3,16 @@
 import pytest
 import torch
 from anisotropic_states import check_gradients, drawn_rotations, drawn_states, stress
-from orthotropic import MODULI, ORTHOTROPIC, OrthotropicMaterial, orthotropic_energy
+from orthotropic import (
+    MODULI,
+    ORTHOTROPIC,
+    OrthotropicMaterial,
+    axes_matrix,
+    axes_parameter,
+    orthotropic_energy,
+)
 from substep_reference import polar
 
-from mosa.data.synthetic.materials.axes import axes_matrix, axes_parameter
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
 

@@ -1,5 +1,5 @@
-"""Whether the body that was found is the one that another film shows: what it looks like where that film's first frame has it,
-beside the pictures. A start is found for any body in any light; what is wrong with it shows here alone.
+"""Check that a held-out film shows the reconstructed body: renders the body at the film's estimated start and compares it with the
+first frame. A start is estimated for any body in any light, so that only this comparison detects a wrong body or exposure.
 """
 
 from __future__ import annotations
@@ -15,35 +15,36 @@ from mosa.modules.body.body import Body, Start
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.types import Scene
 
-FILLED = 0.93
-"""Share of the outlines that is filled, over that in the training film, below which it is said. The right body where its start was
-found is above 0.98; other bodies reach 0.69 to 0.84 (a chick or a ball for a rabbit, three of them)."""
-USUAL = 0.9
-"""Share of the outlines that a coarse body fills in its own film."""
-BRIGHTER = 0.15
-"""Mean colour, of 0 to 1 per channel, by which the object may differ from the body: in one light and exposure the parts that turn
-to the light and away from it leave 0.005 (12 cameras, or four of them) to 0.1 (two)."""
+MIN_OUTLINE_RATIO = 0.93
+"""Overlap of rendered and true mattes, over that in the training film, below which a warning is given. The right body at the right
+start is above 0.98; other bodies reach 0.69 to 0.84 (a chick or a ball for a rabbit, three of them)."""
+TRAINING_OUTLINE = 0.9
+"""Overlap of a coarse body with its own film, where no training film was compared."""
+MAX_COLOR_OFFSET = 0.15
+"""Largest difference of mean colour, of 0 to 1 per channel, without a warning. In one light and exposure the difference is 0.005
+(12 cameras, or four of them) to 0.1 (two), as the object turns in the light."""
+MAX_VIEWS = 4
+"""Cameras compared, evenly spread over a film's: large pictures of many splats take seconds each."""
 
 
-VIEWS = 4
-"""Looked at, evenly out of a film's cameras: large pictures of many splats take seconds each."""
-
-
-class Likeness(NamedTuple):
-    """outline: share that rendered and true mattes have in common of what either has; color: (3,) mean colour of the pictures less
-    that of the body, where both are."""
+class BodyMatch(NamedTuple):
+    """outline: intersection over union of rendered and true mattes; color: (3,) mean colour of the pictures minus that of the body,
+    over their intersection."""
 
     outline: float
     color: Tensor
 
 
 @torch.no_grad()
-def likeness(body: Body, start: Start, scene: Scene) -> Likeness:
-    """Of the body at the start of a film to its first frame, in some of the cameras that learning may read."""
+def body_match(body: Body, start: Start, scene: Scene) -> BodyMatch:
+    """Compare the body at the start of a film with the film's first frame, in at most `MAX_VIEWS` training cameras."""
     every, rotation = scene.training_cameras, start.rotation.to(body.rest)
     cameras = [
         every[i]
-        for i in torch.linspace(0, len(every) - 1, min(VIEWS, len(every))).round().long().tolist()
+        for i in torch.linspace(0, len(every) - 1, min(MAX_VIEWS, len(every)))
+        .round()
+        .long()
+        .tolist()
     ]
     x = (body.rest - body.center) @ rotation.T + start.center.to(body.rest)
     shown = seen(body, x[None], rotation.expand(1, len(x), 3, 3))
@@ -59,30 +60,30 @@ def likeness(body: Body, start: Start, scene: Scene) -> Likeness:
     inside = ((alpha > 0.9) & (mattes > 0.9)).to(alpha)[..., None]
     rendered = black + (1 - alpha)[..., None] * scene.background.to(alpha)
     off = ((images - rendered) * inside).sum((0, 1, 2)) / inside.sum().clamp(min=1)
-    return Likeness(float(common.mean()), off.cpu())
+    return BodyMatch(float(common.mean()), off.cpu())
 
 
-def warn_of_others(body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]) -> None:
-    """A warning for each other film whose first frame does not show this body, or not in this light. found: starts by prefix, that
-    of the training film as `train`; scenes: theirs, in this order."""
-    own = Likeness(USUAL, torch.zeros(3))
+def warn_of_other_bodies(body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]) -> None:
+    """Warn of each other film whose first frame shows another body or another light. found: starts by prefix, that of the training
+    film as `train`; scenes: their scenes, in the same order."""
+    own = BodyMatch(TRAINING_OUTLINE, torch.zeros(3))
     for (prefix, start), scene in zip(found.items(), scenes):
         if scene.markers is not None:
             continue
-        like = likeness(body, start, scene)
+        match = body_match(body, start, scene)
         if prefix == "train":
-            own = like
+            own = match
             continue
-        if like.outline < FILLED * own.outline:
+        if match.outline < MIN_OUTLINE_RATIO * own.outline:
             warnings.warn(
-                f"{prefix}: in its first frame the body of the training film fills {like.outline:.0%} of the outlines, "
+                f"{prefix}: in its first frame the body of the training film fills {match.outline:.0%} of the outlines, "
                 f"where it looks most like it, and {own.outline:.0%} of its own: another body, a pose that was not "
                 "found, or a shape that the training film tells too little of (few cameras)? figures of this sequence "
                 "count on it",
                 stacklevel=2,
             )
-        off = like.color - own.color
-        if float(off.abs().max()) > BRIGHTER:
+        off = match.color - own.color
+        if float(off.abs().max()) > MAX_COLOR_OFFSET:
             said = ", ".join(
                 f"{name} {value:+.2f}"
                 for name, value in zip(("red", "green", "blue"), off.tolist())

@@ -1,4 +1,4 @@
-"""gsplat (Ye et al. 2024, https://github.com/nerfstudio-project/gsplat) as a backend: optional, CUDA only, float32.
+"""gsplat (Ye et al. 2024, https://github.com/nerfstudio-project/gsplat) behind the arguments of `rasterize`: CUDA only, float32.
 
 Imported inside the functions that need it. It compiles its kernels on first use, which takes minutes and nvcc.
 """
@@ -14,14 +14,14 @@ from torch import Tensor
 from mosa.types import Cameras
 
 NEAR, LOW_PASS = 0.01, 0.3
-"""Near plane [m] and low-pass [px^2] of the preset gsplat (`splatting.PRESETS`)."""
+"""Near plane [m] and low-pass [px^2] of `mosa.rendering`."""
 
 
 @functools.cache
 def why_unavailable() -> str | None:
     """Why gsplat cannot run on this machine; None where it can."""
     if importlib.util.find_spec("gsplat") is None:
-        return "the package gsplat is not installed (pip install 'mosa[gsplat]')"
+        return "the package gsplat is not installed (pip install gsplat)"
     if not torch.cuda.is_available():
         return "there is no CUDA device"
     try:
@@ -33,25 +33,6 @@ def why_unavailable() -> str | None:
     return "its kernels are not compiled and nvcc is not there to do it" if _C is None else None
 
 
-def obstacle(means: Tensor, cameras: Cameras, preset: str, scan: str | None) -> str | None:
-    """Why gsplat cannot serve a call; None where it can."""
-    if why_unavailable():
-        return why_unavailable()
-    if not means.is_cuda:
-        return f"the tensors are on {means.device}, it needs CUDA"
-    if means.dtype != torch.float32:
-        return f"the tensors are {means.dtype}, it computes in float32"
-    if preset != "gsplat":
-        return f"it has no preset {preset}"
-    if scan is not None:
-        return "scan chooses among the kernels of warp"
-    if cameras.K.requires_grad:
-        return "it has no gradient to the intrinsics K"
-    if bool((cameras.K[:, 0, 1] != 0).any()):
-        return "it has no skew K[0, 1]"
-    return None
-
-
 def splat(
     means: Tensor,
     covariances: Tensor,
@@ -59,8 +40,9 @@ def splat(
     features: Tensor,
     cameras: Cameras,
     state_index: Tensor,
+    background: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Image (B, H, W, C) and alpha (B, H, W) over zeros; arguments as `mosa.rendering.rasterizer.rasterize`.
+    """Image (B, H, W, C) and alpha (B, H, W); arguments as `mosa.rendering.rasterizer.rasterize`.
 
     One call of gsplat per state, with all cameras that see it. Not packed: an object in the middle of all images is
     visible nearly everywhere.
@@ -92,4 +74,7 @@ def splat(
         alphas.append(alpha[..., 0])
         members.append(chosen)
     back = torch.cat(members).argsort()
-    return torch.cat(images)[back], torch.cat(alphas)[back]
+    image, alpha = torch.cat(images)[back], torch.cat(alphas)[back]
+    if background is not None:
+        image = image + (1 - alpha)[..., None] * background.to(image)
+    return image, alpha

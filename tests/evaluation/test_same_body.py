@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mosa.data.scene import load_scene
-from mosa.evaluation.likeness import likeness, warn_of_others
+from mosa.evaluation.same_body import body_match, warn_of_other_bodies
 from mosa.modules.body.body import Start
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.training.preflight import warn_of_little
@@ -57,13 +57,13 @@ def film(scene, body, start, factor=1.0):
 def told(*given):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        warn_of_others(*given)
+        warn_of_other_bodies(*given)
     return [str(each.message) for each in found]
 
 
 def test_a_body_fills_its_own_outlines_in_its_own_colours(cameras):
     body = block()
-    found = likeness(body, at(40), film(cameras, body, at(40)))
+    found = body_match(body, at(40), film(cameras, body, at(40)))
     assert found.outline > 0.999
     assert float(found.color.abs().max()) < 1e-3
 
@@ -83,7 +83,7 @@ def test_another_body_light_or_pose_is_said(cameras, change, said):
     assert len(found) == (said is not None), found
     if said:
         with pytest.warns(UserWarning, match=said):
-            warn_of_others(
+            warn_of_other_bodies(
                 body, {"train": at(0), "test/h": at(change.get("start", 40))}, [own, other]
             )
 
