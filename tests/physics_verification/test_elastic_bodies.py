@@ -9,6 +9,7 @@ from bodies import LAWS, PRECISIONS, is_fluid
 from elastic_bodies import affine_motion, cantilever, column, free_fall, interior_force, wave
 from elements_on_incline import released_elements
 from incline import bounced, point_mass, released, slide, slip_angle
+from locking import over_theory
 from plates import squeezed
 
 from mosa.physics.constitutive.laws import law_named
@@ -80,6 +81,12 @@ def test_16_cantilever_against_timoshenko(law, dtype):
     deflection, ratio = cantilever(law, dtype, depth=4, length=24)
     assert float(deflection.max()) < 0.05 * 24 * 0.02  # small, as the theory asks
     assert ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_33_a_nearly_incompressible_cantilever_does_not_lock():
+    """nu = 0.499, two cells deep: 0.65 with each particle's own volume; by finite elements, whose clamp keeps the root from
+    narrowing as this one does, 0.954."""
+    assert over_theory(0.499, 2, 10, 1, True) == pytest.approx(0.954, abs=0.02)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)

@@ -66,6 +66,21 @@ class Law:
         return "mu" in self.offsets and (self.viscosity is None or self.damped)
 
     @property
+    def moduli_slots(self) -> tuple[int, int, int]:
+        """Places of mu, lam and kappa among the parameters, -1 for one there is not, all -1 for a
+        fluid: for the mean change of volume. Errors: ConfigError where volume has to be each
+        particle's own."""
+        if {"law", "friction_alpha"} & set(self.parameters):
+            raise ConfigError(
+                f"prior.options.mean_volume: expected one law whose yielding does not depend on volume, found {self.name!r} "
+                "(a mixture, or friction between grains): leave it out"
+            )
+        if not self.sheared:
+            return -1, -1, -1
+        mu, lam, kappa = (self.offsets.get(name, -1) for name in ("mu", "lam", "kappa"))
+        return mu, lam, kappa
+
+    @property
     def damped(self) -> bool:
         """Whether the law has a viscous branch (`damping`), whose stress is per rest volume."""
         return "damping" in self.parameters

@@ -37,6 +37,13 @@ class LawOptions(Settings):
     init_affine: Literal["spin", "zero"] = Field(
         "spin", description="spin takes a start's C_affine, zero replaces it by 0"
     )
+    mean_volume: bool = Field(
+        False,
+        description=(
+            "the stress takes the mean change of volume around a particle in place of its own: a "
+            "nearly incompressible body or liquid does not lock"
+        ),
+    )
     mass_cutoff: float | None = Field(
         None,
         description=(

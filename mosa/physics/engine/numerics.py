@@ -47,7 +47,8 @@ class Numerics:
     step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
     admissible domain, all in the simulator's axes (`axes`), box: the same corners in the world, norm_eps under the root of yield
     norms, colliders None where there are none, strain: measure of an operator that is a stiffness (`stress_kernel`), None for one
-    that acts on the stress; touching: whether a plane is met by particles.
+    that acts on the stress; touching: whether a plane is met by particles; moduli: the law's
+    `moduli_slots` where the stress takes the mean change of volume (`mean_volume`), None where it takes each particle's own.
 
     driven: how many of the colliders, the last ones, are sets of driven particles; points: how many
     points lead them (`contact.driven`)."""
@@ -70,6 +71,7 @@ class Numerics:
     colliders: PackedColliders | None = None
     strain: str | None = None
     touching: bool = False
+    moduli: tuple[int, int, int] | None = None
     driven: int = 0
     points: int = 0
 

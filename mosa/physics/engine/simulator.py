@@ -142,6 +142,7 @@ class Simulator:
             touching=touching, low=low, high=high, box=box, norm_eps=float(options.norm_eps), rebuild=options.rebuild,
             check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain, driven=len(sets),
+            moduli=self.law.moduli_slots if options.mean_volume else None,
             points=sum(c.motion.points.shape[1] for c in sets if isinstance(c.motion, Points)),
         )  # fmt: skip
         values[:, :3] = axes.vectors(values[:, :3])
@@ -439,6 +440,11 @@ class Simulator:
             ]
         if isinstance(adapter, Sequence):
             adapter = Several(adapter, count)
+        if adapter is not None and stride is not None and self.numerics.moduli is not None:
+            raise ConfigError(
+                "prior.options.mean_volume: expected an adapter whose operator does not depend on the state "
+                f"(adapter=operator), found {type(adapter).__name__}, which would read each particle's own volume"
+            )
         lanes = Lanes(solvers, self.buffers)
         return Prepared(
             self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers

@@ -24,6 +24,7 @@ from mosa.physics.contact.touch import springs, touch_kernels
 from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.exact_sums import COLUMNS, needed
+from mosa.physics.grid.mean_volume import mean_volume_kernels
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.grid.window import SMALL
 from mosa.physics.launching import SCALARS, aligned, copies, launch, zeros_in_one
@@ -86,6 +87,9 @@ class Workspace:
         self.tau, self.tau_wp = self._per_slot(
             substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33
         )
+        if numerics.moduli is not None:
+            self.mean = mean_volume_kernels(self.scalar, SLOTS, self.exact)
+            _, self.F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
         self.mass, self.mass_wp = self.array((n,), self.scalar)
         self.volume, self.volume_wp = self.array((n,), self.scalar)
         vec6, mat66 = wp.types.vector(6, self.scalar), wp.types.matrix((6, 6), self.scalar)
@@ -112,6 +116,8 @@ class Workspace:
             if self.plastic:
                 self.adj_F_tot, self.adj_F_tot_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
+            if numerics.moduli is not None:
+                _, self.adj_F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
             buffer, parts = zeros_in_one(
                 [shape for shape, _ in shapes.values()], numerics.dtype, numerics.device
             )
@@ -246,6 +252,8 @@ class Workspace:
         )
         if self.exact:
             self.sums, self.sums_wp = self.array((4 * count, COLUMNS), wp.int64, torch.int64)
+        if self.numerics.moduli is not None:
+            _, (self.volumes_wp, self.adj_volumes_wp) = self._per_slot(2, (count, 4), vec4)
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self.array((count, 4), vec4)
             _, self.adj_velocity_wp = self._per_slot(2, (count, 4), vec4)
@@ -425,10 +433,39 @@ class Workspace:
         solids."""
         return self.colliders.struck if self.struck else self._struck(state)[1]
 
+    def _averaged(self, state: int) -> wp.array:
+        """F of which the stress is taken."""
+        if self.numerics.moduli is None:
+            return self.F_wp[state]
+        if not self.exact:
+            self.over_nodes(self.kernels.clear, [self.volumes_wp])
+        x, F, volumes = self.x_wp[state], self.F_wp[state], self._added_to(self.volumes_wp)
+        at = [self.window_wp, self.size, 1.0 / self.numerics.dx]
+        self.run(self.mean.collect, self.particles, [x, F, self.volume_wp, *at, volumes])
+        self._settle(self.volumes_wp)
+        taken = [x, F, self.held_wp["parameters"], *self.numerics.moduli, *at, self.volumes_wp]
+        self.run(self.mean.average, self.particles, [*taken, self.F_bar_wp])
+        return self.F_bar_wp
+
+    def _adj_averaged(self, step: int, adj_x: wp.array, adj_F: wp.array) -> None:
+        """Adds what `adj_F_bar` says to the gradients of x, F and parameters, after `_averaged` of
+        the same step."""
+        if not self.exact:
+            self.over_nodes(self.kernels.clear, [self.adj_volumes_wp])
+        x, F = self.x_wp[step], self.F_wp[step]
+        at = [self.window_wp, self.size, 1.0 / self.numerics.dx]
+        self.run(self.mean.adj_average, self.particles, [
+            x, F, self.held_wp["parameters"], *self.numerics.moduli, *at, self.volumes_wp, self.adj_F_bar_wp, adj_x, adj_F,
+            self.adj_held_wp["parameters"], self._added_to(self.adj_volumes_wp),
+        ])  # fmt: skip
+        self._settle(self.adj_volumes_wp)
+        taken = [x, F, self.volume_wp, *at, self.volumes_wp, self.adj_volumes_wp]
+        self.run(self.mean.adj_collect, self.particles, [*taken, adj_x, adj_F])
+
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
         return [
-            self.F_wp[state],
+            self._averaged(state),
             self.C_affine_wp[state],
             held["parameters"],
             held["G"],
@@ -542,9 +579,15 @@ class Workspace:
                 self.run(self.touch.adj_meet, n, [
                     *self._touch_arguments(step, step), self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp,
                 ])  # fmt: skip
+            adj_F = self.adj_F_wp[a]
+            if numerics.moduli is not None:
+                adj_F = self.adj_F_bar_wp
+                adj_F.zero_()
             self.run(self.stress, n, self._stress_arguments(step, step), [
-                self.adj_F_wp[a], self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
+                adj_F, self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
             ])  # fmt: skip
+            if numerics.moduli is not None:
+                self._adj_averaged(step, self.adj_x_wp[a], self.adj_F_wp[a])
         if self.springs is not None:
             self.run(self.touch.loosen, n, [self.adj_springs_wp, self.slopes_wp, self.adj_slots_wp])
         if self.colliders is not None and first == 0:
