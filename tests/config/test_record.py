@@ -7,6 +7,8 @@ from strangers import cube, saved
 from mosa.config.build import build_body, world_of
 from mosa.config.record import BodyRecord, RunRecord
 from mosa.errors import ConfigError
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.parameters import blocks_of, tensors_of
 from mosa.types import Ground
 
 
@@ -27,6 +29,19 @@ def test_what_was_decided_stands_beside_the_settings():
     assert body.material.law == "stvk" and body.material.candidates == ()
     assert world.ground == Ground(0.0, "touch", 0.3) and len(world.planes) == 6
     assert build_body(RunRecord.read(given), cube()).material.candidates != ()
+
+
+@pytest.mark.parametrize(("ground", "walls", "learned"), [
+    (True, "null", True), (False, "null", False), (False, "{mode: separate}", True),
+])  # fmt: skip
+def test_a_contact_offset_is_learned_where_something_lies_still_below(ground, walls, learned):
+    """Solids and driven sets keep their place from the body, whatever the offset is."""
+    record = RunRecord.read(saved(f"world.walls={walls}")["mosa"]).body
+    body = build_body(record if ground else record.but(ground=None), cube())
+    blocks = blocks_of(body, adapter=False, heterogeneity=False, settings=IdentificationSettings())
+    assert ("contact" in [block.name for block in blocks]) == learned
+    assert len(tensors_of(body, adapter=False, heterogeneity=False)) == len(blocks)
+    assert learned or float(body.contact.lift(None).detach()) == 0.0
 
 
 def test_a_ground_that_is_sought_is_one_that_the_body_sticks_to():
