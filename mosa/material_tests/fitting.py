@@ -146,7 +146,7 @@ class Fitting:
             covariance = np.linalg.inv(
                 J.T @ J / noise**2 + prior + UNKNOWN**-2 * np.eye(len(prior))
             )
-            shares = 1 - np.diag(covariance) * np.diag(prior)
+            shares = 1 - np.diag(covariance @ prior)
             determined, effective = shares[self.own], float(shares.sum())
             noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))
             if self.own.any():

@@ -379,7 +379,7 @@ class GaussNewton:
             raise ValueError("posterior: expected an iteration before it is asked for")
         covariance = torch.linalg.inv(self.matrix - (1 - share) * self.data)
         covariance = 0.5 * (covariance + covariance.T)
-        determined = (1 - covariance.diagonal() * self.precision().diagonal()).clamp(0, 1)
+        determined = (1 - (covariance @ self.precision()).diagonal()).clamp(0, 1)
         if wrong is not None:
             moved = covariance @ (share * (self.columns.T @ wrong.to(self.columns)).double().cpu())
             covariance = covariance + torch.outer(moved, moved)

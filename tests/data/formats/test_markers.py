@@ -1,6 +1,7 @@
 """Tracked points: files, release, alignment, how they go with the body, and a law learned from
 them alone."""
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from mosa.data.io.markers import Recording, alignment, read_markers, released, s
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.stages import Stage
@@ -167,6 +169,23 @@ def test_a_law_from_points_alone(swinging):
         fit.iterate()
     assert float(body.material.physical()["E"]) == pytest.approx(E, rel=0.02)
     assert float(body.material.physical()["nu"]) == pytest.approx(NU, abs=1e-3)
+
+
+@torch.no_grad()
+def test_what_another_experiment_said_outweighs_a_film_that_says_less(swinging):
+    """E is known to 1e-4, as correlated with nu as it may be; nu, which is not learned, is left out."""
+    _, world, begin, cues = swinging
+    body = small_body(adapter=False, E=E, law="neo_hookean", counts=(8, 3, 3))
+    body.material.raw["nu"].requires_grad_(False)
+    ones = torch.ones(2).double()
+    said = Posterior(["E", "nu"], torch.tensor([math.log(1.1 * E), 0.0]).double(),
+                     1e-8 * (0.5 * torch.eye(2).double() + 0.5), ones)  # fmt: skip
+    fit = Identification(body, [Take(begin, None, cues, 1 / 60, 1)], world, Stage(name="prior", iterations=2, lr=0.1),
+                         Criterion(name="corrected"), IdentificationSettings(), seats=1, known=said)  # fmt: skip
+    for _ in range(2):
+        fit.iterate()
+    assert float(body.material.physical()["E"]) == pytest.approx(1.1 * E, rel=2e-3)
+    assert fit.newton.known.names == ["E"] and fit.posterior().covariance[0, 0] < 1.01e-8
 
 
 @torch.no_grad()
