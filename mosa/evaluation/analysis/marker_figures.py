@@ -102,12 +102,13 @@ def film(body: Body, scene, rollout: Rollout, measured: np.ndarray, predicted: n
     level = torch.eye(3).double() - up[:, None] * up
     flat = level @ torch.cov(x[0].T) @ level / torch.cov(x[0].T).trace()
     side = torch.linalg.eigh(flat + 2 * up[:, None] * up)[1][:, 0]  # the shortest level axis
+    side = side * torch.sign(side[side.abs().argmax()])
     across = torch.linalg.cross(up, side)
     shown = torch.cat([x.flatten(0, 1), torch.from_numpy(predicted).double().flatten(0, 1)])
     middle = 0.5 * (shown.amin(0) + shown.amax(0))
     wide, high = (float((shown - middle).mul(axis).sum(-1).abs().max()) for axis in (across, up))
     far = 20 * max(wide, high)  # nearly without perspective
-    focal = 0.45 * far * min(SIZE[0] / wide, SIZE[1] / high)
+    focal = 0.42 * far * min(SIZE[0] / wide, SIZE[1] / high)
     K = torch.tensor([[focal, 0, SIZE[0] / 2], [0, focal, SIZE[1] / 2], [0, 0, 1.0]])
     w2c = look_at((middle + far * side).float(), middle.float(), up.float())
     camera = Cameras(K[None], w2c[None], *SIZE, ("side",))
