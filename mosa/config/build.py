@@ -133,13 +133,16 @@ def build_body(record: BodyRecord, tensors: Mapping[str, Tensor]) -> Body:
         sections.heterogeneity, tensors["rest"].amin(0), tensors["rest"].amax(0)
     )
     adapter = fitting(build_adapter(sections.adapter.plain()), material.law)
+    settings = sections.simulation.on_grid(record.dx)
+    if record.ground is None and sections.world.walls is None:
+        settings = settings.but(contact_offset=False)  # solids keep their place from the body
     return Body(
         **tensors,
         density=record.density,
         material=material,
         heterogeneity=heterogeneity,
         adapter=adapter,
-        settings=sections.simulation.on_grid(record.dx),
+        settings=settings,
         law_options=options,
     )
 

@@ -5,20 +5,25 @@ What is promised, and what is not, is in docs/safety.md.
 
 from __future__ import annotations
 
+import json
 import math
 import pickletools
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mosa.config.record import VERSION, BodyRecord, RunRecord, SplatsRecord
+from mosa.config.record import VERSION, BodyRecord, PosteriorRecord, RunRecord, SplatsRecord
 from mosa.errors import ConfigError, DataError
+from mosa.evaluation.uncertainty import INFLATION
 from mosa.modules.adapters.registry import adapter_class
+from mosa.modules.body.material import Material
+from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.limits import machine_memory
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
@@ -207,6 +212,56 @@ def check_numbers(record: RunRecord, count: int, path: str | Path) -> None:
         raise DataError(
             f"ckpt_path: {path}: mosa.posterior.names: expected {count} names, found {len(record.posterior.names)}"
         )
+
+
+def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Posterior:
+    """What another experiment said of the numbers that are learned of a law: the checkpoint of a
+    fit, or the material.json of `mosa-material`. Other numbers of it are integrated out: the
+    contact's and the stiffness modes' belong to one body. A fit's standard deviations are those
+    that its results say. Errors: DataError naming the file, ConfigError naming `where`."""
+    if Path(path).suffix == ".json":
+        try:
+            found = json.loads(Path(path).read_text())
+            law, stiffness, own = found["law"], found["stiffness"] or {}, found["posterior"]
+            values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
+            named = [_as_operator(name) for name in own["names"]]
+            ones = torch.ones(len(named), dtype=torch.float64)
+            record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,
+                                           "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+            raise DataError(
+                f"{where}: {path}: expected a material.json of mosa-material with its posterior "
+                f"({type(error).__name__}: {error})"
+            ) from error
+        inflation = 1.0
+    else:
+        run = record_of(read_checkpoint(path), path)
+        law, stiffness, record = run.law or run.sections.prior.law, run.sections.adapter.plain(), run.posterior  # fmt: skip
+        inflation = INFLATION
+    if record is None:
+        raise DataError(f"{where}: {path}: expected the checkpoint of an ended fit, found none")
+    count = 0 if adapter is None else len(getattr(adapter, "numbers", ()))
+    learned = [*material.learned, *(f"operator[{k}]" for k in range(count))]
+    posterior = Posterior.read(record.plain()).only(learned)
+    if law.split("~")[0] != material.law.split("~")[0] or not posterior.names:
+        raise ConfigError(
+            f"{where}: expected numbers of {material.law} that are learned "
+            f"({', '.join(learned)}), found {', '.join(record.names)} of {law}: {path}"
+        )
+    strain = getattr(adapter, "strain", None)
+    if len(posterior.names) > sum(name in material.learned for name in posterior.names) and (
+        stiffness.get("strain", strain) != strain
+    ):
+        raise ConfigError(
+            f"{where}: expected a stiffness in the strain {strain}, found {stiffness['strain']}"
+        )
+    return replace(posterior, covariance=inflation**2 * posterior.covariance)
+
+
+def _as_operator(name: str) -> str:
+    """A number of the learned stiffness by the name that fits to films give it."""
+    number = name.removeprefix("stiffness_")
+    return name if number == name else f"operator[{int(number) - 1}]"
 
 
 def checked_splats(found: Any, path: str | Path) -> dict[str, Tensor] | None:

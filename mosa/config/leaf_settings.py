@@ -329,6 +329,13 @@ class MaterialSettings(LawSections):
     leave_out: bool = Field(
         True, description="fit once more without each test, and predict that test"
     )
+    known: Text | None = Field(
+        None,
+        description=(
+            "checkpoint of a fit, or material.json of other tests: what it says of the law's "
+            "numbers is their prior (docs/several_recordings.md)"
+        ),
+    )
     density: Positive = Field(1000, description="kg/m^3, of the cube in checkpoints/specimen.ckpt")
 
 

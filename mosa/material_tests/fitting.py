@@ -18,6 +18,7 @@ from mosa.material_tests.measurements import Measurements
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
+from mosa.modules.fitting.gauss_newton import Posterior
 
 ORTHOTROPIC = 7
 """The first numbers of `anisotropic_basis` keep the planes of x, y and z as mirrors; the others do not."""
@@ -79,18 +80,29 @@ class Law:
 
 
 class Fitting:
-    """`law` against `data`. seed: of the starts. Errors: SimulationDiverged where no start can be evaluated."""
+    """`law` against `data`. seed: of the starts; known: what another experiment said of some of the
+    numbers (the stiffness' by the names operator[k]), which is their prior. Errors: SimulationDiverged
+    where no start can be evaluated."""
 
     def __init__(
-        self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int
-    ) -> None:
+        self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int,
+        known: Posterior | None = None,
+    ) -> None:  # fmt: skip
         self.law, self.data, self.starts, self.seed = law, data, starts, seed
         self.begin = law.get()
         self.specimens = Specimens(data, incompressible)
         self.unit = float(np.sqrt(np.mean(data.value**2)))
-        known = ~np.isnan(data.sd)
-        self.sd = np.where(known, data.sd, self.unit)
+        self.sd = np.where(np.isnan(data.sd), self.unit, data.sd)
         self.own = np.arange(len(law.names)) >= len(law.names) - law.count
+        self.root, self.mean = np.zeros((0, len(law.names))), law.get()
+        if known is not None:
+            names = [*law.material.learned, *(f"operator[{k}]" for k in range(law.count))]
+            known = known.only(names)
+            at = [names.index(name) for name in known.names]
+            self.root = np.zeros((len(at), len(names)))
+            self.root[:, at] = np.linalg.cholesky(np.linalg.inv(known.covariance.numpy())).T
+            self.mean[at] = known.mean.numpy()
+            self.own[at] = False
 
     def predicted(self, theta: np.ndarray) -> np.ndarray:
         """(m,) [Pa]. Errors: SimulationDiverged."""
@@ -108,7 +120,8 @@ class Fitting:
                 misfit = np.clip(misfit, -HOPELESS, HOPELESS)
             except SimulationDiverged:
                 misfit = np.full(int(rows.sum()), HOPELESS)
-            return np.concatenate([misfit / noise, theta[self.own] / sigma])
+            prior = self.root @ (theta - self.mean)
+            return np.concatenate([misfit / noise, theta[self.own] / sigma, prior])
 
         def solve(theta: np.ndarray, evaluations: int):
             return least_squares(
@@ -129,10 +142,12 @@ class Fitting:
         for _ in range(LOOKS):
             before = noise, sigma
             J, misfit = best.jac[: rows.sum()] * noise, best.fun[: rows.sum()] * noise
-            precision = J.T @ J / noise**2 + np.diag(self.own / sigma**2 + UNKNOWN**-2)
-            covariance = np.linalg.inv(precision)
-            determined = 1 - np.diag(covariance)[self.own] / sigma**2
-            effective = float((~self.own).sum() + determined.sum())
+            prior = np.diag(self.own / sigma**2) + self.root.T @ self.root
+            covariance = np.linalg.inv(
+                J.T @ J / noise**2 + prior + UNKNOWN**-2 * np.eye(len(prior))
+            )
+            shares = 1 - np.diag(covariance @ prior)
+            determined, effective = shares[self.own], float(shares.sum())
             noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))
             if self.own.any():
                 own = best.x[self.own]

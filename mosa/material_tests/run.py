@@ -7,6 +7,7 @@ import logging
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_adapter, build_prior, plain
+from mosa.config.checkpoints import known_numbers
 from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import MaterialSettings
 from mosa.errors import ConfigError
@@ -56,12 +57,16 @@ def fit_tests(cfg: DictConfig) -> float:
     load_extensions(values.get("extensions"))
     MaterialSettings.read(values)
     data = read_tests(values["tests"], values["unit"])
+    law, known = build_law(values), None
+    if values["known"] is not None:
+        known = known_numbers(values["known"], law.material, law.adapter, "known")
     fitting = Fitting(
-        build_law(values),
+        law,
         data,
         values["incompressible"],
         starts=values["starts"],
         seed=values["seed"],
+        known=known,
     )
     if not fitting.law.names:
         raise ConfigError("prior.frozen: expected a parameter that is learned, found none")

@@ -31,7 +31,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_stages, plain, rehearse, world_of
-from mosa.config.checkpoints import check_plain, check_same_data, read_checkpoint
+from mosa.config.checkpoints import check_plain, check_same_data, known_numbers, read_checkpoint
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
@@ -372,6 +372,14 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """This candidate is the run's backbone from now on."""
         self.body.choose(law)
         self.record = self.record.but(law=law)
+
+    @property
+    def known(self) -> Posterior | None:
+        """What another experiment said of the law's numbers (`identification.known`)."""
+        if self.settings.known is None:
+            return None
+        where = "identification.known"
+        return known_numbers(self.settings.known, self.body.material, self.body.adapter, where)
 
     @property
     def ground_is_sought(self) -> bool:

@@ -119,7 +119,7 @@ def write_outputs(
         save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
     marked = [s for s in evaluated if s.scene.markers is not None]
     if marked:
-        write_markers(folder, body, marked, kept)
+        write_markers(folder, body, marked, kept, video=cfg.evaluation.video)
     elif cfg.evaluation.video:
         simulated = [s for s in evaluated if TITLES.keys() & kept[s.prefix].keys()]
         shown = [s for s in simulated if s.prefix.startswith("test")] or simulated[:1]

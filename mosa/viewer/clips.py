@@ -99,7 +99,8 @@ class Clip:
     calibrated law's without adapter and heterogeneity, where the run left it; one of observed, over the frames that were learned
     from, and truth, or neither; appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's
     stiffness differs from the law's; spread: (T, N) [m] predicted standard deviation of the learned positions, None where the run
-    left none; splat_opacities: (M,), splat_particles: (M,) nearest particles of the splats that all bodies carry, where the run has
+    left none; points: (2, T, M, 3) [m] of tracked points, measured and predicted, None where there are
+    none; splat_opacities: (M,), splat_particles: (M,) nearest particles of the splats that all bodies carry, where the run has
     them."""
 
     name: str
@@ -110,6 +111,7 @@ class Clip:
     factor: np.ndarray
     world: World
     spread: np.ndarray | None = None
+    points: np.ndarray | None = None
     splat_opacities: np.ndarray | None = None
     splat_particles: np.ndarray | None = None
 
@@ -245,7 +247,12 @@ class Clip:
     def caption(self, frame: int) -> str:
         """What a frame is, and what the scene leaves out."""
         said = f"**{self.name}**, frame {frame}, {self.times[frame] - self.times[0]:.3f} s  \n"
-        if self.reference is None:
+        if self.points is not None:
+            square = np.square(self.points[0, frame] - self.points[1, frame]).sum(-1)
+            far = [1e3 * float(each) ** 0.5 for each in square if np.isfinite(each)]
+            said += "Points, red measured, blue predicted, are apart by (mm): "
+            said += ", ".join(f"{each:.1f}" for each in far) or "not seen in this frame"
+        elif self.reference is None:
             said += "No observed and no true motion to compare with."
         elif self.deviation(frame) is None:
             said += "Not observed in this frame."
@@ -286,6 +293,7 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
         kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()
     } | {"learned": rollouts}
     spreads = arrays(folder / "uncertainty.npz") if (folder / "uncertainty.npz").is_file() else {}
+    tracked = arrays(folder / "markers.npz") if (folder / "markers.npz").is_file() else {}
     clips = []
     for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
         check_motion(rollouts, name, paths["learned"], ("x",))
@@ -320,7 +328,7 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
             bodies[kind] = ShownMotion(x, covariances(stored, name, body), carried_by(body, x))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
                           body.factor.numpy(), body.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
-                          **splat_keys(body)))  # fmt: skip
+                          points_of(tracked, name, shape[0], folder / "markers.npz"), **splat_keys(body)))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
     return clips
@@ -375,6 +383,23 @@ def spread_of(
             f"{path}: {name}/sd: expected {shape} finite standard deviations, found {found.dtype} {found.shape}"
         )
     return found
+
+
+def points_of(
+    stored: dict[str, np.ndarray], name: str, frames: int, path: Path
+) -> np.ndarray | None:
+    """(2, T, M, 3) [m] measured and predicted points, None where the file has none of this
+    sequence. Errors: DataError naming file and entry."""
+    kinds = [stored.get(f"{name}/{kind}") for kind in ("measured", "predicted")]
+    if all(found is None for found in kinds):
+        return None
+    shapes = [None if found is None else found.shape for found in kinds]
+    if shapes[0] != shapes[1] or len(shapes[0]) != 3 or shapes[0][::2] != (frames, 3):
+        raise DataError(
+            f"{path}: {name}/measured, {name}/predicted: expected points of shape "
+            f"({frames}, M, 3) both, found {shapes[0]} and {shapes[1]}"
+        )
+    return np.stack(kinds).astype(np.float32)
 
 
 def check_motion(

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from mosa.errors import ConfigError, DataError, MosaError
+from mosa.evaluation.analysis.marker_figures import MEASURED, PREDICTED
 from mosa.system.limits import named_device
 from mosa.system.refused import explained
 from mosa.twin.twin import Twin
@@ -126,6 +127,19 @@ class Viewer:
                 scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
             )
 
+        self.points = [
+            scene.add_point_cloud(
+                f"/points/{kind}",
+                np.zeros((1, 3), np.float32),
+                color,
+                point_size=0.02 * clip.size,
+                point_shape="circle",
+                precision="float32",
+                visible=False,
+            )
+            for kind, color in (("measured", MEASURED), ("predicted", PREDICTED))
+        ]
+
     def look(self, *cameras) -> None:
         """The current sequence's first view, for what viser calls cameras."""
         aim(*beside_panel(*first_view(self.clip), self.clip.up), *cameras)
@@ -177,6 +191,15 @@ class Viewer:
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
                     self.body(name, frame, place * clip.side, under=name == below)
+            place = list(clip.bodies).index("learned") if layout == "side by side" else 0
+            for k, node in enumerate(self.points):
+                node.visible = clip.points is not None and (
+                    layout == "side by side" or "learned" in (above, below)
+                )
+                if node.visible:
+                    places = clip.points[k, frame]
+                    places = places[np.isfinite(places).all(-1)] + place * clip.side
+                    node.points = places.astype(np.float32)
             self.caption.content = clip.caption(frame)
 
     def body(self, name: str, frame: int, shift: np.ndarray, under: bool) -> None:

@@ -2,11 +2,16 @@
 
 import pytest
 import torch
-from strangers import cube, saved
+from strangers import checkpoint, cube, saved
 
 from mosa.config.build import build_body, world_of
+from mosa.config.checkpoints import known_numbers
 from mosa.config.record import BodyRecord, RunRecord
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
+from mosa.evaluation.uncertainty import INFLATION
+from mosa.modules.body.material import Material
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.parameters import blocks_of, tensors_of
 from mosa.types import Ground
 
 
@@ -29,6 +34,19 @@ def test_what_was_decided_stands_beside_the_settings():
     assert build_body(RunRecord.read(given), cube()).material.candidates != ()
 
 
+@pytest.mark.parametrize(("ground", "walls", "learned"), [
+    (True, "null", True), (False, "null", False), (False, "{mode: separate}", True),
+])  # fmt: skip
+def test_a_contact_offset_is_learned_where_something_lies_still_below(ground, walls, learned):
+    """Solids and driven sets keep their place from the body, whatever the offset is."""
+    record = RunRecord.read(saved(f"world.walls={walls}")["mosa"]).body
+    body = build_body(record if ground else record.but(ground=None), cube())
+    blocks = blocks_of(body, adapter=False, heterogeneity=False, settings=IdentificationSettings())
+    assert ("contact" in [block.name for block in blocks]) == learned
+    assert len(tensors_of(body, adapter=False, heterogeneity=False)) == len(blocks)
+    assert learned or float(body.contact.lift(None).detach()) == 0.0
+
+
 def test_a_ground_that_is_sought_is_one_that_the_body_sticks_to():
     record = RunRecord.read(saved()["mosa"]).body.on(Ground(0.0, "auto"))
     assert record.ground_is_sought and world_of(record).ground == Ground(0.0, "sticky")
@@ -43,3 +61,20 @@ def test_a_ground_that_is_sought_is_one_that_the_body_sticks_to():
 def test_what_is_no_record_is_named(key, value, message):
     with pytest.raises(ConfigError, match=message):
         RunRecord.read(saved()["mosa"] | {key: value})
+
+
+def test_what_a_fit_said_is_read_from_its_checkpoint(tmp_path):
+    """Of the numbers that another law learns too, with the standard deviations that results say."""
+    names = ["E", "contact", "operator[0]"]
+    covariance = torch.tensor([[0.04, 0.01, 0.0], [0.01, 0.02, 0.0], [0.0, 0.0, 1.0]]).double()
+    said = {"names": names, "mean": torch.tensor([11.0, 0.3, 0.5]).double(), "covariance": covariance,
+            "determined": torch.ones(3).double(), "model_error": 1e-3}  # fmt: skip
+    path = checkpoint(
+        tmp_path / "a.ckpt", change=lambda found: found["mosa"].update(posterior=said)
+    )
+    law = saved()["mosa"]["settings"]["prior"]["law"]
+    found = known_numbers(str(path), Material(law, {"E": 1e5, "nu": 0.3}), None, "known")
+    assert found.names == ["E"] and float(found.mean) == 11.0
+    assert float(found.covariance) == pytest.approx(INFLATION**2 * 0.04)
+    with pytest.raises(DataError, match=r"known: .*: expected the checkpoint of an ended fit"):
+        known_numbers(str(checkpoint(tmp_path / "b.ckpt")), Material(law, {"E": 1e5, "nu": 0.3}), None, "known")  # fmt: skip

@@ -8,11 +8,12 @@ import pytest
 import torch
 from forked import call
 
-from mosa.errors import DataError
+from mosa.config.checkpoints import known_numbers
+from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.law_stress import in_double, kirchhoff, tangent
 from mosa.material_tests.fitting import Fitting, Law
 from mosa.material_tests.measurements import measurements, read_tests
-from mosa.material_tests.report import figures, rms
+from mosa.material_tests.report import figures, rms, written
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
@@ -122,6 +123,40 @@ def test_numbers_are_recovered_with_their_uncertainty():
     left = fitting.left_out()
     assert set(left) == {"uniaxial x", "biaxial xy", "shear xy"}
     assert rms(left["shear xy"] - fitting.data.value[~fitting.data.without(2)]) < 2 * 200
+
+
+def test_two_halves_of_the_tests_say_what_all_of_them_say(tmp_path):
+    """Through material.json, each half with its own noise; the numbers are correlated. A film's fit
+    takes the same file, by the names that it gives its numbers."""
+    truth = {"E": E, "nu": 0.49, "yeoh_2": 0.08, "yeoh_3": 0.01}
+    l = np.linspace(1.02, 2.2, 40)
+    states = [*rows("uniaxial x", l), *rows("shear xy", l - 1, 0.0)]
+    noise = 200 * np.random.default_rng(1).standard_normal(len(states))
+    for state, P in zip(states, predicted("yeoh", truth, states) + noise):
+        state["stress_1"], state["sd_1"] = P, 200.0
+
+    def fitted(some, known=None):
+        start = Material("yeoh", {"E": 1e5, "nu": 0.49, "yeoh_2": 0.5, "yeoh_3": 0.1}, ["nu"])
+        law = Law(start, None, "full")
+        fitting = Fitting(law, measurements(some, "Pa", "here"), True, starts=1, seed=0, known=known)  # fmt: skip
+        return fitting.law.set((fit := fitting.fit()).theta), fit
+
+    law, first = fitted(states[::2])
+    path = tmp_path / "material.json"
+    path.write_text(json.dumps(written(law, first)))
+    known = known_numbers(str(path), law.material, None, "known")
+    (_, second), (_, whole) = fitted(states[1::2], known), fitted(states)
+    sd = np.sqrt(np.diag(whole.covariance))
+    assert (np.sqrt(np.diag(first.covariance)) > 1.2 * sd).all()
+    assert (np.abs(second.theta - whole.theta) < 0.15 * sd).all()
+    assert np.abs(second.covariance / np.outer(sd, sd) - whole.covariance / np.outer(sd, sd)).max() < 0.15  # fmt: skip
+    only = known_numbers(str(path), Material("yeoh", truth, ["yeoh_2", "yeoh_3"]), None, "known")
+    assert only.names == ["E"] and float(only.covariance) == pytest.approx(first.covariance[0, 0])
+    with pytest.raises(ConfigError, match="expected numbers of neo_hookean that are learned"):
+        known_numbers(str(path), Material("neo_hookean", {"E": E, "nu": 0.4}), None, "known")
+    path.write_text("{}")
+    with pytest.raises(DataError, match=r"known: .*material\.json: expected a material\.json"):
+        known_numbers(str(path), law.material, None, "known")
 
 
 HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"

@@ -1,6 +1,7 @@
 """Sag, frequency and damping ratio of measured and predicted points of a run of scene=markers.
 
-python tests/physics_verification/beam_markers.py <run folder>    prints the table of docs/beam.md
+python tests/physics_verification/beam_markers.py <run folder> [recording ...]    prints the tables
+of docs/beam.md; of each recording, where its first three points come to rest
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
+
+from mosa.data.io.markers import AT_REST, read_markers
 
 
 def ringing(times: np.ndarray, moved: np.ndarray) -> tuple[float, float, float]:
@@ -42,3 +45,9 @@ if __name__ == "__main__":
         ]
         said = [f"{-1e3 * sag:.2f} {f:.3f} {100 * ratio:.2f}" for sag, f, ratio in rows]
         print(f"{name}: {' ; '.join(said)}")
+    for path in map(Path, sys.argv[2:]):
+        recording = read_markers(path)
+        moved = recording.positions[:, :3].mean(1)
+        begin, end = recording.times[0] + AT_REST, recording.times[-1] - 0.5
+        moved = moved[recording.times > end].mean(0) - moved[recording.times < begin].mean(0)
+        print(f"{path.name}: {1e3 * np.linalg.norm(moved):.2f} mm at rest")

@@ -181,6 +181,25 @@ def test_a_run_of_fewer_files_is_read(run):
     assert viewer.layouts(train) == ("side by side", "learned over prior", "prior", "learned")
 
 
+def test_tracked_points_are_read_and_said(run):
+    """5 mm apart; of a file of other frames its entry is named."""
+    (run / "observed.npz").unlink()
+    (run / "truth.npz").unlink()
+    predicted = np.zeros((T, 2, 3), np.float32)
+    measured = predicted + np.array([0.003, 0, 0.004])
+    measured[1, 1], measured[2] = np.nan, np.nan
+    np.savez(run / "markers.npz", **{"train/measured": measured, "train/predicted": predicted})
+    train, test = read_run(run)
+    assert train.points.shape == (2, T, 2, 3) and test.points is None
+    said = [train.caption(frame).splitlines()[1].split("(mm): ")[1].strip() for frame in range(3)]
+    assert said == ["5.0, 5.0", "5.0", "not seen in this frame"]
+    np.savez(run / "markers.npz", **{"train/measured": measured[1:], "train/predicted": predicted})
+    with pytest.raises(
+        DataError, match=r"markers\.npz: train/measured, .* expected points of shape"
+    ):
+        read_run(run)
+
+
 def test_splats_that_the_particles_carry_are_shown(run):
     """In each frame's place and light; by a quantity they have the colour of the particle nearest at rest."""
     body = Twin.load("").body
@@ -662,6 +681,27 @@ def test_the_server_shows_a_learned_body_alone(run):
             and not shown.layout.disabled
             and shown.nodes["observed"][0].visible
         )
+    finally:
+        shown.stop()
+
+
+def test_the_server_shows_tracked_points_on_the_learned_body(run):
+    pytest.importorskip("viser")
+    predicted = np.full((T, 2, 3), 0.1, np.float32)
+    measured = predicted + np.float32(0.01)
+    measured[1, 1] = np.nan
+    np.savez(run / "markers.npz", **{"train/measured": measured, "train/predicted": predicted})
+    shown = viewer.Viewer(read_run(run))
+    try:
+        red, blue = shown.points
+        shown.frame.value = 1
+        assert red.visible and blue.visible
+        side = 2 * shown.clip.side
+        assert np.allclose(red.points, measured[1, :1] + side) and np.allclose(blue.points, predicted[1] + side)  # fmt: skip
+        shown.layout.value = "prior"
+        assert not red.visible
+        shown.layout.value, shown.sequence.value = "learned", "test/test_60"
+        assert not blue.visible
     finally:
         shown.stop()
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from mosa.data.formats.scene_from_footage import check_density
-from mosa.data.io.markers import AT_REST, alignment, read_markers, released
+from mosa.data.io.markers import AT_REST, alignment, read_markers, released, swung
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Box, collider_of
 from mosa.physics.contact.driven import driven_from_config
@@ -22,6 +22,8 @@ from mosa.types import AUTO, Cameras, Ground, Markers, Scene
 
 log = logging.getLogger(__name__)
 
+FOUND = {AUTO: released, "swing": swung}
+"""How scene.start is found."""
 WIDE = 3.0
 """The world reaches so many sizes of the body beyond it."""
 
@@ -61,13 +63,13 @@ def load_markers(
     names = recording.names if tracked is None else tuple(tracked)
     seen = recording.of(names, "scene.tracked")
     times = recording.times
-    if start == AUTO:
-        begin = released(times, seen, str(path))
+    if start in FOUND:
+        begin = FOUND[start](times, seen, str(path))
     elif is_number(start) and times[0] <= float(start) < times[-1]:
         begin = float(start)
     else:
         raise ConfigError(
-            f"scene.start: expected auto, or seconds from {times[0]:g} to {times[-1]:g}, "
+            f"scene.start: expected auto, swing, or seconds from {times[0]:g} to {times[-1]:g}, "
             f"found {start!r}"
         )
     rate = 1 / float(np.median(np.diff(times))) if fps is None else float(fps)

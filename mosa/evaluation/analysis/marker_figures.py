@@ -1,32 +1,48 @@
-"""Tracked points beside where a fitted body says they are: markers.npz, markers.png."""
+"""Tracked points beside where a fitted body says they are: markers.npz, markers.png, and a film."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import matplotlib
 import numpy as np
+import torch
 
+from mosa.evaluation.analysis.comparison import drawn
+from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_strip, write_video
 from mosa.modules.body.body import Body
 from mosa.reconstruction.marker_body import cues_of_markers
+from mosa.rendering.cameras import look_at, project
 from mosa.system.npz import write_npz
-from mosa.types import Rollout
+from mosa.types import Cameras, Rollout
 
 SHOWN = 3
 """Points of a sequence that are drawn: those that move most."""
+SIZE = (320, 220)
+"""Width and height [px] of the film."""
+MEASURED, PREDICTED = (200, 30, 30), (20, 60, 200)
 
 
 def write_markers(
-    folder: Path, body: Body, sequences: Sequence, kept: Mapping[str, Mapping[str, Rollout]]
+    folder: Path,
+    body: Body,
+    sequences: Sequence,
+    kept: Mapping[str, Mapping[str, Rollout]],
+    *,
+    video: bool = False,
 ) -> None:
     """markers.npz with `<name>/measured`, `<name>/predicted` [T, M, 3] (m), `<name>/times` [T] (s),
     `<name>/names`; markers.png: displacements [mm] of the points that move most, along the axis in
-    which they do, measured (dots) and predicted (lines)."""
+    which they do, measured (dots) and predicted (lines). video: also video.mp4 of the last sequence
+    and strip.png of the first swing of all (`film`)."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     arrays: dict[str, np.ndarray] = {}
+    films: dict[str, np.ndarray] = {}
+    swings: dict[str, int] = {}
     figure, axes = pyplot.subplots(
         len(sequences), 1, figsize=(9, 2.6 * len(sequences)), squeeze=False, constrained_layout=True
     )
@@ -44,6 +60,10 @@ def write_markers(
             f"{s.prefix}/names": np.array(names),
         }
         moved = measured - s.scene.markers.rest.numpy()
+        if video:
+            films[s.prefix] = film(body, s.scene, kept[s.prefix]["adapted"], measured, predicted)
+            far = np.linalg.norm(predicted - predicted[0], axis=-1).mean(1)
+            swings[s.prefix] = min(2 * int(far.argmax()), len(times) - 1)
         spread = np.nanstd(moved, 0)
         along = int(spread.sum(0).argmax())
         for k, m in enumerate(np.argsort(-spread[:, along])[:SHOWN]):
@@ -58,3 +78,45 @@ def write_markers(
     figure.savefig(folder / "markers.png", dpi=110)
     pyplot.close(figure)
     write_npz(folder / "markers.npz", arrays)
+    if films:
+        moments = {s.prefix: [f"{t:.2f} s" for t in s.scene.times.tolist()] for s in sequences}
+        said = "red measured, blue predicted"
+        prefix = list(films)[-1]
+        footer = [f"{prefix}   {moment}" for moment in moments[prefix]]
+        write_video(
+            folder / "video.mp4", side_by_side({said: films[prefix]}, footer=footer), fps=20
+        )
+        most = max(swings.values()) + 1
+        write_strip(
+            folder / "strip.png",
+            {f"{name}: {said}": images[:most] for name, images in films.items()},
+            notes={f"{name}: {said}": moments[name][:most] for name in films},
+        )
+
+
+@torch.no_grad()
+def film(body: Body, scene, rollout: Rollout, measured: np.ndarray, predicted: np.ndarray):
+    """(T, H, W, 3) uint8: the predicted body from the side on which it is longest, with measured
+    (discs) and predicted (rings) points [T, M, 3] (m)."""
+    x, up = rollout.x.cpu().double(), (scene.up / scene.up.norm()).double()
+    level = torch.eye(3).double() - up[:, None] * up
+    flat = level @ torch.cov(x[0].T) @ level / torch.cov(x[0].T).trace()
+    side = torch.linalg.eigh(flat + 2 * up[:, None] * up)[1][:, 0]  # the shortest level axis
+    side = side * torch.sign(side[side.abs().argmax()])
+    across = torch.linalg.cross(up, side)
+    shown = torch.cat([x.flatten(0, 1), torch.from_numpy(predicted).double().flatten(0, 1)])
+    middle = 0.5 * (shown.amin(0) + shown.amax(0))
+    wide, high = (float((shown - middle).mul(axis).sum(-1).abs().max()) for axis in (across, up))
+    far = 20 * max(wide, high)  # nearly without perspective
+    focal = 0.42 * far * min(SIZE[0] / wide, SIZE[1] / high)
+    K = torch.tensor([[focal, 0, SIZE[0] / 2], [0, focal, SIZE[1] / 2], [0, 0, 1.0]])
+    w2c = look_at((middle + far * side).float(), middle.float(), up.float())
+    camera = Cameras(K[None], w2c[None], *SIZE, ("side",))
+    images = [to_uint8(image).copy() for image in drawn(body, rollout, camera, scene)]
+    kinds = ((measured, MEASURED, 3, -1), (predicted, PREDICTED, 6, 2))
+    for points, color, radius, thickness in kinds:
+        for image, places in zip(images, torch.from_numpy(points).float()):
+            for pixel in project(places, camera)[0][0][torch.isfinite(places).all(-1)].tolist():
+                at = [round(16 * value) for value in pixel]  # of 1/16 px
+                cv2.circle(image, at, 16 * radius, color, thickness, cv2.LINE_AA, 4)
+    return np.stack(images)

@@ -15,7 +15,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -107,6 +107,18 @@ class Posterior:
         rivals = {name: numbers.double() for name, numbers in written.get("rivals", {}).items()}
         return cls(list(written["names"]), *tensors, float(written["model_error"]), rivals)
 
+    def only(self, names: Sequence[str]) -> Posterior:
+        """Of those of its numbers that are among `names`, whatever the others are."""
+        kept = [i for i, name in enumerate(self.names) if name in names]
+        return replace(
+            self,
+            names=[self.names[i] for i in kept],
+            mean=self.mean[kept],
+            covariance=self.covariance[kept][:, kept],
+            determined=self.determined[kept],
+            rivals={},
+        )
+
     def among(self, names: Sequence[str]) -> Posterior:
         """The same numbers among `names`, of which the others are 0 and not learned."""
         place = [names.index(name) for name in self.names]
@@ -148,13 +160,14 @@ def _length(step: Tensor, matrix: Tensor) -> float:
 class GaussNewton:
     """One or more seats of the same model; the first one holds the result. steps: tried with one Jacobian at most; progress: called
     after every column; many: (K, R) residuals of K rows of numbers (K, D) at once, where the columns of a Jacobian shall not be
-    asked for one by one."""
+    asked for one by one; known: of some of the numbers, their prior in place of the blocks'."""
 
     blocks: list[Block]
     seats: list[Seat]
     steps: int = 6
     progress: Callable[[], None] | None = None
     many: Callable[[Tensor], Tensor] | None = None
+    known: Posterior | None = None
     matrix: Tensor | None = field(default=None, init=False)
     data: Tensor | None = field(default=None, init=False)
     columns: Tensor | None = field(default=None, init=False)
@@ -167,11 +180,23 @@ class GaussNewton:
 
     def mean(self) -> Tensor:
         """(D,) of the prior."""
-        return self._vector(lambda b: b.mean)
+        mean = self._vector(lambda b: b.mean)
+        if self.known is not None:
+            mean[self._places()] = self.known.mean.double()
+        return mean
 
     def precision(self) -> Tensor:
-        """(D,) of the prior."""
-        return 1 / self._vector(lambda b: b.sd * b.factor).square()
+        """(D, D) of the prior."""
+        precision = torch.diag(1 / self._vector(lambda b: b.sd * b.factor).square())
+        if self.known is not None:
+            at = self._places()
+            precision[at[:, None], at] = torch.linalg.inv(self.known.covariance.double())
+        return precision
+
+    def _places(self) -> Tensor:
+        """Of the known numbers."""
+        names = self.names()
+        return torch.tensor([names.index(name) for name in self.known.names])
 
     def clamped(self, numbers: Tensor) -> Tensor:
         """Within the blocks' bounds."""
@@ -182,9 +207,8 @@ class GaussNewton:
 
     def cost(self, numbers: Tensor, r: Tensor) -> float:
         """Minus the logarithm of the posterior, up to a constant."""
-        return 0.5 * float(r.square().sum()) + 0.5 * float(
-            (self.precision() * (numbers - self.mean()).square()).sum()
-        )
+        away = numbers - self.mean()
+        return 0.5 * float(r.square().sum()) + 0.5 * float(away @ self.precision() @ away)
 
     def jacobian(self, numbers: Tensor, r: Tensor) -> Tensor:
         """(R, D) of the type and on the device of r (R,): one residual vector per column, the columns shared among the seats."""
@@ -255,10 +279,10 @@ class GaussNewton:
             self._evidence(away, H, g)
         precision, begun = self.precision(), numbers
         before = after = self.cost(numbers, r)
-        first = M = H + torch.diag(precision)
+        first = M = H + precision
         length, trust = 0.0, 1.0
         for i in range(self.steps):
-            direction = torch.linalg.solve(M, -(g + precision * (numbers - self.mean())))
+            direction = torch.linalg.solve(M, -(g + precision @ (numbers - self.mean())))
             proposed = _length(direction, M)
             length = proposed if i == 0 else length
             moved = self.clamped(numbers + trust * direction)
@@ -286,7 +310,7 @@ class GaussNewton:
             else:
                 trust *= SHORTER
             H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
-            M = H + torch.diag(precision)
+            M = H + precision
         seat.write(numbers)
         self.matrix, self.data = M, H
         share = _length(numbers - begun, first) / length if length > 0 else 0.0
@@ -308,7 +332,7 @@ class GaussNewton:
         try:
             r = seat.residuals()
             for _ in range(steps):
-                gradient = (self.columns.T @ r).double().cpu() + precision * (numbers - mean)
+                gradient = (self.columns.T @ r).double().cpu() + precision @ (numbers - mean)
                 numbers = self.clamped(numbers - torch.linalg.solve(self.matrix, gradient))
                 seat.write(numbers)
                 r = seat.residuals()
@@ -333,8 +357,8 @@ class GaussNewton:
             b.factor = 1.0 if b.learned else b.factor
         for _ in range(EVIDENCE_PASSES):
             precision = self.precision()
-            covariance = torch.linalg.inv(H + torch.diag(precision))
-            theta = away - covariance @ (g + precision * away)
+            covariance = torch.linalg.inv(H + precision)
+            theta = away - covariance @ (g + precision @ away)
             variance = covariance.diagonal()
             for b, spread, moved in zip(self.blocks, variance.split(sizes), theta.split(sizes)):
                 determined = float((1 - spread / (b.sd * b.factor) ** 2).sum())
@@ -355,7 +379,7 @@ class GaussNewton:
             raise ValueError("posterior: expected an iteration before it is asked for")
         covariance = torch.linalg.inv(self.matrix - (1 - share) * self.data)
         covariance = 0.5 * (covariance + covariance.T)
-        determined = (1 - covariance.diagonal() * self.precision()).clamp(0, 1)
+        determined = (1 - (covariance @ self.precision()).diagonal()).clamp(0, 1)
         if wrong is not None:
             moved = covariance @ (share * (self.columns.T @ wrong.to(self.columns)).double().cpu())
             covariance = covariance + torch.outer(moved, moved)

@@ -70,7 +70,8 @@ class Identification:
     frame is trusted beyond, and its direction is free: a multiple of it, known to within
     `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
 
-    parts: those of `search.parts` that the law may have; progress: called after every column of
+    parts: those of `search.parts` that the law may have; known: what another experiment said of its
+    numbers, in place of the prior of those that are learned; progress: called after every column of
     a Jacobian; seats: rollouts side by side; None: as many as the machine has room for.
     """
 
@@ -78,6 +79,7 @@ class Identification:
         self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,
         kinds: tuple[bool, bool, bool] = (True, True, True), progress: Callable[[], None] | None = None,
         seats: int | None = None, parts: Sequence[str] = PARTS,
+        known: Posterior | None = None,
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
         self.calibrating, self.iterations = stage.calibrates, stage.iterations
@@ -129,6 +131,8 @@ class Identification:
             progress=progress,
             many=self._many if body.rest.is_cuda and not body.settings.adaptive else None,
         )
+        if known is not None and (shared := known.only(self.newton.names())).names:
+            self.newton.known = shared
         self.converged = False
         self.report: dict[str, float] = {}
         self._residuals: Tensor | None = (

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Interval
 from pydantic import ConfigDict, Field
 
-from mosa.settings import Positive, Settings, Weight
+from mosa.settings import Positive, Settings, Text, Weight
 
 
 class Criterion(Settings):
@@ -74,6 +74,13 @@ class IdentificationSettings(Settings):
     evidence: bool = Field(
         True,
         description="find the size of both from the data (MacKay)",
+    )
+    known: Text | None = Field(
+        None,
+        description=(
+            "checkpoint of another fit, or material.json of mosa-material: what it says "
+            "of the law's numbers is their prior (docs/several_recordings.md)"
+        ),
     )
     tolerance: Positive = Field(
         0.3,

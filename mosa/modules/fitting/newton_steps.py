@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import DataError, SimulationDiverged
+from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.fitting.search.backbone import choose_law
 from mosa.modules.fitting.search.ground import RIVAL_ITERATIONS, better_friction, choose_ground
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 
 class NewtonSteps:
     """The part of `LitMosa` that runs stages by Gauss-Newton, under a trainer or, by `identify`, without one."""
+
+    known: Posterior | None
 
     def newton_loss(self, stage: Stage, iteration: int) -> Tensor:
         """Minus the logarithm of the posterior at the numbers as they stand; the optimiser goes on from there."""
@@ -162,6 +165,7 @@ class NewtonSteps:
             self.criterion,
             self.settings,
             own.kinds,
+            known=self.known,
         )
         state = own.state()
         other.restore(state | {"iteration": max(state["iteration"], EVIDENCE_ITERATIONS)})
@@ -233,7 +237,15 @@ class NewtonSteps:
             self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch")
         )
         return Identification(
-            self.body, self.takes, world, stage, self.criterion, self.settings, kinds, parts=parts
+            self.body,
+            self.takes,
+            world,
+            stage,
+            self.criterion,
+            self.settings,
+            kinds,
+            parts=parts,
+            known=self.known,
         )
 
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """Tracked points: files, release, alignment, how they go with the body, and a law learned from
 them alone."""
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,11 @@ import pytest
 import torch
 from small_bodies import FREE, NU, E, small_body
 
-from mosa.data.io.markers import alignment, read_markers, released
+from mosa.data.io.markers import Recording, alignment, read_markers, released, swung
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.stages import Stage
@@ -59,7 +61,9 @@ def test_a_scene_of_a_csv_file(tmp_path):
     assert len(scene.cameras) == 0 and scene.markers.names == ("a", "b")
     expected = positions[0, :2, 1] - 0.5 * 9.8 * scene.times.numpy()[:, None] ** 2
     found = scene.markers.positions.numpy()
-    assert np.nanmax(np.abs(found[..., 1] - expected)) < 4e-4  # of lines between samples
+    assert (
+        np.nanmax(np.abs(found[..., 1] - expected)) < 4e-4
+    )  # where the release falls between samples
     torch.testing.assert_close(scene.markers.rest.double(), torch.tensor(positions[0, :2]), atol=1e-5, rtol=0)  # fmt: skip
     x, volume = filled(scene.markers.body, marker_spacing(scene, 500))
     assert 400 < len(x) < 600 and float(volume.sum()) == pytest.approx(8e-3, rel=1e-5)
@@ -70,6 +74,31 @@ def test_the_release_is_found_to_a_part_of_a_sample():
     assert released(times, positions, "here") == pytest.approx(0.3037, abs=2e-4)
     with pytest.raises(DataError, match="set scene"):
         released(times, positions[::-1], "here")
+
+
+def test_a_swing_begins_at_its_turning_point():
+    """Of a body that hands let go over 20 ms: the oscillation is that of a release in one moment, and
+    of 13 samples a period a resampled one keeps its amplitude."""
+    times = np.arange(0, 2.0, 0.01)
+    begin, omega, ratio = 0.3137, 2 * np.pi * 7.7, 0.05
+    t = np.clip(times - begin, 0, None)
+    swing = 6e-3 * (
+        np.exp(-ratio * omega * t) * (np.cos(omega * t) + ratio * np.sin(omega * t)) - 1
+    )
+    early = (times > begin - 0.012) & (times < begin + 0.012)
+    swing[early] = -1.2e-3 * ((times[early] - begin + 0.012) / 0.024) ** 2
+    places = np.array([[0.1, 0.02, 0.0], [0.1, 0.0, 0.02]])
+    positions = np.tile(places, (len(times), 1, 1))
+    positions[..., 1] += swing[:, None]
+    assert released(times, positions, "here") < begin - 4e-3
+    assert swung(times, positions, "here") == pytest.approx(begin, abs=2e-4)
+    later = begin + np.arange(5, 60) / 100
+    t = later - begin
+    expected = 6e-3 * (np.exp(-ratio * omega * t) * (np.cos(omega * t) + ratio * np.sin(omega * t)) - 1)  # fmt: skip
+    found = Recording(("a", "b"), times, positions).at(later)[:, 0, 1] - places[0, 1]
+    assert np.abs(found - expected).max() < 3e-5
+    with pytest.raises(DataError, match="two periods and more of an oscillation"):
+        swung(*let_go(), "here")
 
 
 def test_a_gap_stays_one(tmp_path):
@@ -140,6 +169,23 @@ def test_a_law_from_points_alone(swinging):
         fit.iterate()
     assert float(body.material.physical()["E"]) == pytest.approx(E, rel=0.02)
     assert float(body.material.physical()["nu"]) == pytest.approx(NU, abs=1e-3)
+
+
+@torch.no_grad()
+def test_what_another_experiment_said_outweighs_a_film_that_says_less(swinging):
+    """E is known to 1e-4, as correlated with nu as it may be; nu, which is not learned, is left out."""
+    _, world, begin, cues = swinging
+    body = small_body(adapter=False, E=E, law="neo_hookean", counts=(8, 3, 3))
+    body.material.raw["nu"].requires_grad_(False)
+    ones = torch.ones(2).double()
+    said = Posterior(["E", "nu"], torch.tensor([math.log(1.1 * E), 0.0]).double(),
+                     1e-8 * (0.5 * torch.eye(2).double() + 0.5), ones)  # fmt: skip
+    fit = Identification(body, [Take(begin, None, cues, 1 / 60, 1)], world, Stage(name="prior", iterations=2, lr=0.1),
+                         Criterion(name="corrected"), IdentificationSettings(), seats=1, known=said)  # fmt: skip
+    for _ in range(2):
+        fit.iterate()
+    assert float(body.material.physical()["E"]) == pytest.approx(1.1 * E, rel=2e-3)
+    assert fit.newton.known.names == ["E"] and fit.posterior().covariance[0, 0] < 1.01e-8
 
 
 @torch.no_grad()

@@ -374,6 +374,27 @@ def test_draws_have_the_moments_of_the_posterior():
     )  # without a generator
 
 
+def test_two_halves_of_the_data_say_what_the_whole_says():
+    """What one half says of the shared numbers, correlated as they are, is the prior of the other;
+    a number that only the first half has is integrated out."""
+    A, b = drawn(60, 4, seed=3), drawn(60, seed=4)
+    A[:30, 3], A[30:, 3] = 0.0, 0.5 * A[30:, 0]
+    whole, second = linear(two_blocks(), A, b), linear(two_blocks(), A[30:], b[30:])
+    first = linear(two_blocks()[:1], A[:30, :3], b[:30])
+    for newton in (whole, first):
+        newton.iterate(learn=False)
+    second.known = first.posterior()
+    second.seats[0].write(second.mean())
+    second.iterate(learn=False)
+    found, expected = second.posterior(), whole.posterior()
+    assert torch.allclose(found.mean, expected.mean, rtol=0, atol=1e-11)
+    assert torch.allclose(found.covariance, expected.covariance, rtol=0, atol=1e-11)
+    alone, three = linear(two_blocks()[:1], A[:30, :3], b[:30]), whole.posterior()
+    alone.known = three.only(["a[0]", "a[1]", "a[2]"])
+    at = torch.linalg.inv(three.covariance[:3, :3])
+    assert torch.allclose(alone.precision(), at, rtol=1e-9) and alone.known.names == first.names()
+
+
 def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
     """Of r = A x - b and another b the minimum is reached with the first one's columns; the seat stays where it stands."""
     A, b, other = drawn(50, 4, seed=3), drawn(50, seed=4), drawn(50, seed=5)
@@ -383,10 +404,10 @@ def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
     newton.seats[0].residuals = linear_residuals(newton, A, other)
     found, cost = newton.transferred(1)
     away = found - newton.mean()
-    gradient = A.T @ (A @ found - other) + newton.precision() * away
+    gradient = A.T @ (A @ found - other) + newton.precision() @ away
     assert gradient.abs().max() < 1e-6 * (A.T @ other).abs().max()
     assert cost == pytest.approx(
-        0.5 * float((A @ found - other).square().sum() + (newton.precision() * away.square()).sum())
+        0.5 * float((A @ found - other).square().sum() + away @ newton.precision() @ away)
     )
     assert torch.equal(newton.seats[0].read(), here) and not torch.allclose(found, here, atol=1e-3)
 

@@ -49,9 +49,9 @@ def held_back(
 
     squares: (D + 1, D + 1) matrix [J r]^T [J r] of each frame's whitened residuals, of what belongs
     to no frame, then of each frame's positions alone; owners: block of each of the D numbers;
-    numbers, mean, precision: (D,) where they stand, and their prior; stretches: frames that are
-    left out together; compared: of each frame, the index of its positions in `squares`, the length
-    [m] of their unit and the distance [m] between two grids."""
+    numbers: (D,) where they stand; mean (D,), precision (D, D): of their prior; stretches: frames
+    that are left out together; compared: of each frame, the index of its positions in `squares`,
+    the length [m] of their unit and the distance [m] between two grids."""
     whole = torch.stack(list(squares[: len(squares) - len(compared)])).sum(0)
     parts = [part for part in PARTS if part in owners]
     errors = {}
@@ -75,7 +75,7 @@ def _step(square: Tensor, free: Tensor, numbers: Tensor, mean: Tensor, precision
     """(D,) from `numbers` to the minimum of the linear problem, numbers not `free` at their mean."""
     H, g = square[:-1, :-1], square[:-1, -1]
     step = torch.where(free, torch.zeros_like(numbers), mean - numbers)
-    slope = g + H @ step + precision * (numbers - mean)
-    matrix = (H + torch.diag(precision))[free][:, free]
+    slope = g + H @ step + precision @ (numbers + step - mean)
+    matrix = (H + precision)[free][:, free]
     step[free] = -torch.linalg.solve(matrix, slope[free])
     return step

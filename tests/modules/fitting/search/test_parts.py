@@ -27,7 +27,7 @@ def errors_of(truth: torch.Tensor, noise: float = 0.01, grids: float = 0.0) -> d
     r = -J @ truth + noise * torch.randn(FRAMES, ROWS, generator=generator, dtype=torch.float64)
     table = torch.cat([J, r[..., None]], -1)
     squares = list(table.mT @ table)
-    zero, one = torch.zeros(4, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    zero, one = torch.zeros(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
     stretches = [[0, 1], [2, 3], [4, 5], [6, 7]]
     compared = {k: (FRAMES + k, 2e-3, grids) for k in range(FRAMES)}
     return held_back(squares + squares, OWNERS, zero, zero, one, stretches, compared)
@@ -64,7 +64,7 @@ def test_a_held_back_frame_is_not_learned_from():
     r = torch.tensor([0.0, 0.0, -2.0], dtype=torch.float64)[:, None, None]
     table = torch.cat([J, r], -1)
     squares = list(table.mT @ table)
-    zero, loose = torch.zeros(1, dtype=torch.float64), torch.full((1,), 1e-9).double()
+    zero, loose = torch.zeros(1, dtype=torch.float64), torch.full((1, 1), 1e-9).double()
     found = held_back(
         squares * 2, ["E"], zero, zero, loose, [[2]], {k: (3 + k, 1.0, 0.0) for k in range(3)}
     )
