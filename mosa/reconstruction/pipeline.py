@@ -27,6 +27,7 @@ from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_g
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.motion.observed import Windows, object_windows
+from mosa.reconstruction.pose.known import register_known
 from mosa.reconstruction.pose.registration import light_of
 from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
@@ -64,13 +65,15 @@ def object_geometry(
     cache_dir: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> Geometry:
-    """The body inside the visual hull, by settings.geometry; cached apart from the stages that depend on the particles' spacing.
+    """The body of `scene.body`, or the one inside the visual hull, by settings.geometry; cached apart from the stages that depend on the particles' spacing.
 
     Errors: DataError (empty mattes, empty hull).
     """
     cache = _geometry_cache(scene, settings, cache_dir)
 
     def stage() -> dict[str, Any]:
+        if scene.body is not None:
+            return known_geometry(scene, settings).stored()
         if settings.geometry.source == "gaussians":
             return geometry_of_gaussians(scene, settings, device).stored()
         found = find_geometry(
@@ -80,6 +83,14 @@ def object_geometry(
         return found.stored()
 
     return Geometry.read(cache.stage("geometry", stage))
+
+
+def known_geometry(scene: Scene, settings: ReconstructionSettings) -> Geometry:
+    """The body of `scene.body` where frame 0 shows it. Errors: DataError."""
+    found = register_known(scene)
+    body = found.body(settings.resolution)
+    empty = torch.empty(0)
+    return Geometry(body, body.occupied_volume(), empty, found.frames, registered=found.figures())
 
 
 def geometry_of_gaussians(
@@ -190,6 +201,8 @@ def _open_cache(
         "settings": settings,
         "box": scene.box.tolist(),
     }
+    if scene.body is not None:
+        key["body"] = [scene.body.fingerprint, scene.body.scale]
     return StageCache(Path(cache_dir) if cache_dir is not None else None, key | more)
 
 

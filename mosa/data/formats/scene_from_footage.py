@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
+from pydantic import Field
 
 from mosa.data.checks.validation import fingerprint
 from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
-from mosa.errors import ConfigError
-from mosa.settings import Positive, check
-from mosa.types import FALLING, REST, Ground, Scene, Truth
+from mosa.errors import ConfigError, DataError
+from mosa.settings import Positive, Settings, Text, check
+from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth
 
 DENSITIES = 0.1, 1e5
 """[kg/m^3]: aerogel has 1, osmium 22,590."""
@@ -25,8 +27,36 @@ LIGHT = 10.0
 """[kg/m^3] below which a density is asked about: foams of polystyrene have 15."""
 STEEP = 3.0
 """[degrees] of an incline that is said."""
+SHAPES = (".ply", ".obj", ".stl")
+"""Endings of files of a body's rest shape."""
 WIDEST = 1e5
 """[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
+
+
+class BodySettings(Settings):
+    """The rest shape of a body that is known from elsewhere (docs/data.md)."""
+
+    where = "scene.body"
+
+    shape: Text = Field(description="file .ply, .obj or .stl of a closed mesh, a cloud or Gaussians")
+    scale: Positive | None = Field(
+        None, description="m of the file's unit; null: the mattes tell it, of one camera the fall"
+    )
+
+
+def known_body(keys: Mapping[str, Any] | None) -> KnownBody | None:
+    """Errors: ConfigError naming the key, DataError where there is no such file."""
+    if keys is None:
+        return None
+    settings = BodySettings.read({k: v for k, v in keys.items() if v is not None} if isinstance(keys, Mapping) else keys)  # fmt: skip
+    path = Path(settings.shape)
+    if not path.is_file() or path.suffix.lower() not in SHAPES:
+        raise DataError(
+            f"scene.body.shape: expected a file {', '.join(SHAPES)} beside the images or below "
+            f"scene.root, found {path}"
+        )
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    return KnownBody(str(path), settings.scale, digest)
 
 
 def scene_from_footage(
@@ -45,6 +75,7 @@ def scene_from_footage(
     holdout_cameras=(),
     holdout_frames=(),
     particles: Path | None = None,
+    body: Mapping[str, Any] | None = None,
     known_parameters: dict[str, float] | None = None,
     truth: Truth | None = None,
     synthetic: bool = False,
@@ -53,7 +84,7 @@ def scene_from_footage(
 
     gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; start: falling | rest;
     last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
-    per frame; fps overrides times.
+    per frame; body: {shape: file, scale} of a known rest shape; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
     up = vector(up, "up")
@@ -104,14 +135,16 @@ def scene_from_footage(
             "with it",
             stacklevel=4,
         )
+    known = known_body(body)
+    fewest = 2 if known is None else 1
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
         gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
         background=footage.background, synthetic=synthetic, start=start, last_free_frame=last_free_frame,
-        holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
+        holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names, fewest),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
         particles=read_clouds(particles, footage.frames) if particles is not None else None,
-        known_parameters=dict(known_parameters or {}),
+        known_parameters=dict(known_parameters or {}), body=known,
     )  # fmt: skip
     return replace(scene, fingerprint=fingerprint(scene))
 
@@ -155,8 +188,8 @@ def vector(value, key: str) -> torch.Tensor:
     return result
 
 
-def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
-    """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where under two are left."""
+def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> tuple[int, ...]:
+    """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where fewer than `fewest` are left."""
     if names is not None and not isinstance(names, (list, tuple)):
         raise ConfigError(
             f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}"
@@ -168,11 +201,14 @@ def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
                 f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}"
             )
         indices.append(footage_names.index(str(name)))
-    if len(footage_names) < 2:
-        raise ConfigError(f"scene: expected at least two cameras, found {len(footage_names)}")
-    if len(footage_names) - len(set(indices)) < 2:
+    if len(footage_names) < fewest:
         raise ConfigError(
-            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from"
+            f"scene: expected at least two cameras, found {len(footage_names)}; of one, say the rest shape (scene.body.shape)"
+        )
+    if len(footage_names) - len(set(indices)) < fewest:
+        raise ConfigError(
+            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from, or one "
+            "of a body whose rest shape is given (scene.body.shape)"
         )
     return tuple(sorted(set(indices)))
 

@@ -7,7 +7,7 @@ that is."""
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F
@@ -52,13 +52,14 @@ class GeometrySettings(GeometrySection):
 class Geometry:
     """body: values 0 or 1; hull_volume [m^3]; deviation: standard deviation [m] of the surface where it is known at all, on the
     body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used;
-    static: Gaussians that the body was found by, if any."""
+    static: Gaussians that the body was found by, if any; registered: figures of a known body's place, if it is one."""
 
     body: Volume
     hull_volume: float
     deviation: Tensor
     free_frames: int
     static: Splats | None = None
+    registered: dict[str, float] = field(default_factory=dict)
 
     def figures(self, spacing: float) -> dict[str, float]:
         """`geometry/...`: volumes [m^3], share of the hull that was emptied, and, where images were used, share of the surface
@@ -74,14 +75,14 @@ class Geometry:
                 (2 * on_surface > 0.7 * spacing).double().mean()
             )
             figures["geometry/deviation_m"] = float(on_surface.median())
-        return figures
+        return figures | self.registered
 
     def stored(self) -> dict:
         """Tensors and numbers of it, for `read`."""
         return {
             "values": self.body.values.cpu(), "origin": self.body.origin.cpu(), "pitch": self.body.pitch,
             "hull_volume": self.hull_volume, "deviation": self.deviation.cpu(), "free_frames": self.free_frames,
-            "static": None if self.static is None else vars(self.static.to("cpu")),
+            "static": None if self.static is None else vars(self.static.to("cpu")), "registered": self.registered,
         }  # fmt: skip
 
     @classmethod
@@ -93,6 +94,7 @@ class Geometry:
             stored["deviation"],
             stored["free_frames"],
             Splats(**stored["static"]) if stored.get("static") else None,
+            stored.get("registered") or {},
         )
 
 

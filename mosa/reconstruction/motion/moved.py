@@ -26,6 +26,7 @@ from mosa.reconstruction.motion.response import (
     image_matrices,
     response_of,
 )
+from mosa.reconstruction.pose.registration import followed_centres
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import turned_basis
@@ -51,8 +52,11 @@ class MovingParts:
 
     @cached_property
     def centres(self) -> Tensor:
-        """(T, 3) [m] of the visual hulls of the training frames."""
+        """(T, 3) [m] of the visual hulls of the training frames; of a known body, whose few cameras
+        leave a hull open, where it looks most like them as a rigid one."""
         scene = self.scene
+        if scene.body is not None:
+            return followed_centres(scene, self.static, self.splats.means.mean(0))
         views, frames = scene.training_cameras, scene.training_frames
         cameras = scene.cameras.select(views)
         found = list(
