@@ -28,6 +28,7 @@ from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.motion.observed import Windows, object_windows
 from mosa.reconstruction.pose.known import register_known
+from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.pose.registration import light_of
 from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
@@ -90,7 +91,9 @@ def known_geometry(scene: Scene, settings: ReconstructionSettings) -> Geometry:
     found = register_known(scene)
     body = found.body(settings.resolution)
     empty = torch.empty(0)
-    return Geometry(body, body.occupied_volume(), empty, found.frames, registered=found.figures())
+    return Geometry(
+        body, body.occupied_volume(), empty, found.frames, None, found.figures(), vars(found.place)
+    )
 
 
 def geometry_of_gaussians(
@@ -355,7 +358,8 @@ def reconstruct(
     splats = Splats(**particles)
 
     static = Splats(**cache.stage("static", static_stage))
-    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
+    place = Similarities(**geometry.place) if geometry.place else None
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings, place)
 
     def motion_stage() -> dict[str, Tensor]:
         return first_motion(parts, windows, background, seed, bar, cache)
@@ -487,7 +491,9 @@ def follow(
             leave=False,
         )
 
-    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
+    known = reconstruction.moving.place if reconstruction.moving is not None else None
+    place = None if known is None else known.turned(*(p.cpu() for p in pose))
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings, place)
 
     def motion_stage() -> dict[str, Tensor]:
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)

@@ -52,7 +52,8 @@ class GeometrySettings(GeometrySection):
 class Geometry:
     """body: values 0 or 1; hull_volume [m^3]; deviation: standard deviation [m] of the surface where it is known at all, on the
     body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used;
-    static: Gaussians that the body was found by, if any; registered: figures of a known body's place, if it is one."""
+    static: Gaussians that the body was found by, if any; registered, place: figures of a body of known shape, and the
+    parts of its similarity (`Similarities`)."""
 
     body: Volume
     hull_volume: float
@@ -60,6 +61,7 @@ class Geometry:
     free_frames: int
     static: Splats | None = None
     registered: dict[str, float] = field(default_factory=dict)
+    place: dict[str, Tensor] = field(default_factory=dict)
 
     def figures(self, spacing: float) -> dict[str, float]:
         """`geometry/...`: volumes [m^3], share of the hull that was emptied, and, where images were used, share of the surface
@@ -83,6 +85,7 @@ class Geometry:
             "values": self.body.values.cpu(), "origin": self.body.origin.cpu(), "pitch": self.body.pitch,
             "hull_volume": self.hull_volume, "deviation": self.deviation.cpu(), "free_frames": self.free_frames,
             "static": None if self.static is None else vars(self.static.to("cpu")), "registered": self.registered,
+            "place": self.place,
         }  # fmt: skip
 
     @classmethod
@@ -95,6 +98,7 @@ class Geometry:
             stored["free_frames"],
             Splats(**stored["static"]) if stored.get("static") else None,
             stored.get("registered") or {},
+            stored.get("place") or {},
         )
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from plyfile import PlyData
-from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -75,7 +74,9 @@ def known_solid(path: str | Path) -> Solid:
     """The solid in a file. Errors: DataError naming the file."""
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"scene.body.shape: expected a file .ply, .obj or .stl, found none at {path}")
+        raise DataError(
+            f"scene.body.shape: expected a file .ply, .obj or .stl, found none at {path}"
+        )
     if path.suffix.lower() == ".ply":
         check_ply(path)
         elements = {e.name: e for e in PlyData.read(str(path)).elements}
@@ -120,7 +121,11 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
     if not 0 < unit < np.inf:
         raise DataError(f"scene.body.shape: {path}: expected an extent, found {unit:.3g}")
     kept = Splats(
-        (kept.means - middle) / unit, kept.scales / unit, kept.rotations, kept.opacities, kept.colors
+        (kept.means - middle) / unit,
+        kept.scales / unit,
+        kept.rotations,
+        kept.opacities,
+        kept.colors,
     )
     try:
         solid = solid_of(kept, resolution=VOXELS)

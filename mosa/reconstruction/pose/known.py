@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.data.hull import Volume, hull_bounds
+from mosa.data.hull import Volume
 from mosa.errors import DataError
 from mosa.reconstruction.geometry.known import Solid, known_solid
 from mosa.reconstruction.pose.outlines import (
@@ -116,26 +116,25 @@ def register_known(scene: Scene) -> Registered:
     best = flights[0]
     others = [f.off for f in flights[1:] if not same(solid, best.place, f.place)]
     rival = min(others, default=torch.inf) / max(best.off, NOISE)
+    frames = len(best.places.size)
     if best.deviation > SIZED and size is None:
         raise DataError(
             f"scene.body: expected cameras that tell the size of {scene.body.shape}, found "
-            f"{len(views)} and {best.frames} frames of free flight, from which it is known to "
+            f"{len(views)} and {frames} frames of free flight, from which it is known to "
             f"{best.deviation:.0%}: say scene.body.scale=<metres per unit of the file>, or learn "
             "from a second camera"
         )
-    overlap = dict(
-        zip(cameras.names, overlaps(solid, best.place, scene.mattes[views, 0], cameras))
-    )
+    overlap = dict(zip(cameras.names, overlaps(solid, best.place, scene.mattes[views, 0], cameras)))
     listed = ", ".join(f"{name} {share:.3f}" for name, share in overlap.items())
     result = Registered(
-        solid, best.place, overlap, best.off, best.deviation, min(rival, 99.0), best.frames
+        solid, best.place, overlap, best.off, best.deviation, min(rival, 99.0), frames
     )
     log.info(
         "%s: registered; intersection over union of camera %s; outlines %.2f px off; %.5g m per "
-        "unit of the file (+- %.1f %%), %d frames of free flight; the next best pose fits %.1f "
+        "unit of the file (+- %.2f %%), %d frames of free flight; the next best pose fits %.1f "
         "times as badly",
         scene.body.shape, listed, best.off, float(best.place.size[0]) / solid.unit,
-        100 * best.deviation, best.frames, result.rival,
+        100 * best.deviation, frames, result.rival,
     )  # fmt: skip
     said = (
         f"scene.body.shape: {scene.body.shape}: expected a shape whose silhouettes fill the mattes "
@@ -145,7 +144,9 @@ def register_known(scene: Scene) -> Registered:
     if worst < WRONG:
         raise DataError(f"{said}: another body, or one that is deformed there?")
     if worst < POOR:
-        warnings.warn(f"{said}: is it this body's, at rest, and are the mattes right?", stacklevel=2)
+        warnings.warn(
+            f"{said}: is it this body's, at rest, and are the mattes right?", stacklevel=2
+        )
     if result.rival < AMBIGUOUS:
         warnings.warn(
             f"scene.body.shape: {scene.body.shape}: another pose fits the mattes nearly as well, "
@@ -222,13 +223,16 @@ def searched(
 
 @dataclass(frozen=True)
 class Flight:
-    """A similarity of frame 0 that free flight went into; off [px], deviation and frames as of
-    `Registered`."""
+    """places: similarities of the frames of free flight, the first of frame 0; off [px], deviation
+    as of `Registered`."""
 
-    place: Similarities
+    places: Similarities
     off: float
     deviation: float
-    frames: int
+
+    @property
+    def place(self) -> Similarities:
+        return self.places.take(torch.tensor([0]))
 
 
 def flown(solid: Solid, scene: Scene, place: Similarities, size: float | None) -> Flight:
@@ -259,22 +263,49 @@ def flown(solid: Solid, scene: Scene, place: Similarities, size: float | None) -
         rays.append(own)
     while len(tracked) > 1:
         first, velocity = ballistic(tracked, times, gravity, cameras, single=single)
-        found = joint(
-            solid, first, velocity, rays, times[: len(rays)], gravity, sized=size is None
-        )
-        if (
-            last is not None
-            or not single
-            or len(rays) <= 3
-            or lowest(solid, found[1], scene) > 0
-        ):
-            place, off, deviation = found[0], found[2], found[3]
-            return Flight(place, off, deviation, len(rays))
+        found = joint(solid, first, velocity, rays, times[: len(rays)], gravity, sized=size is None)
+        end = found.places.take(torch.tensor([len(rays) - 1]))
+        if last is not None or not single or len(rays) <= 3 or lowest(solid, end, scene) > 0:
+            return found
         tracked, rays = tracked[:-1], rays[:-1]
     _, _, matrix, off = equations(solid, place, rays[0])
     noise = max(float(off), NOISE) ** 2 * CORRELATED / len(rays[0].origin)
-    deviation = 0.0 if size is not None else torch.inf if single else spread(solid, place, matrix[0], noise)  # fmt: skip
-    return Flight(place, float(off), deviation, 1)
+    deviation = torch.inf if single else 0.0
+    if size is None and not single:
+        deviation = spread(solid, place, matrix[0], noise)
+    return Flight(place, float(off), deviation)
+
+
+def known_centres(scene: Scene, place: Similarities) -> Tensor:
+    """Centres (T, 3) [m] of a body of known shape in the training frames: of free flight, and then
+    of the rigid one whose outlines are nearest. place: of frame 0.
+
+    A single camera does not see how far a body is that is squashed: it moves on as it flew."""
+    assert scene.body is not None
+    solid, views = known_solid(scene.body.shape), scene.training_cameras
+    cameras = scene.cameras.select(views)
+    free = flown(solid, scene, place, float(place.size[0])).places
+    tracked = [free.take(torch.tensor([t])) for t in range(len(free.size))]
+    flew = len(tracked)
+    for t in scene.training_frames[flew:]:
+        own = outline_rays(scene.mattes[views, t], cameras).some(300)
+        before = tracked[-1]
+        shift = before.center - tracked[-2].center if t > 1 else torch.zeros(1, 3)
+        start = Similarities(before.rotation, before.center + shift, before.size)
+        moved, _ = fitted(solid, start, own, 15, sized=False)
+        if len(views) == 1:
+            eye, here = camera_places(cameras)[0], tracked[flew - 1].center[0]
+            velocity = torch.zeros(3)
+            if flew > 1:
+                step = scene.times[flew - 1] - scene.times[flew - 2]
+                velocity = (here - tracked[flew - 2].center[0]) / step
+            sight = moved.center[0] - eye
+            ahead = sight - (sight @ scene.up) * scene.up
+            way = here - eye + velocity * (scene.times[t] - scene.times[flew - 1])
+            factor = (way @ ahead) / (sight @ ahead)
+            moved = Similarities(moved.rotation, eye + factor * sight[None], moved.size)
+        tracked.append(moved)
+    return torch.cat([each.center for each in tracked])
 
 
 def lowest(solid: Solid, at: Similarities, scene: Scene) -> float:
@@ -311,18 +342,15 @@ def ballistic(
     found = torch.linalg.lstsq(rows.flatten(0, 1), fall.flatten()).solution
     factor = float(found[0]) if 0.02 < float(found[0]) < 50 else 1.0
     eye = camera_places(cameras)
-    scaled = Similarities(
-        first.rotation, eye + factor * (first.center - eye), factor * first.size
-    )
+    scaled = Similarities(first.rotation, eye + factor * (first.center - eye), factor * first.size)
     return scaled, found[1:].float()
 
 
 def joint(
     solid: Solid, first: Similarities, velocity: Tensor, rays: list[Rays], times: Tensor,
     gravity: Tensor, *, sized: bool, iterations: int = 15,
-) -> tuple[Similarities, Similarities, float, float]:  # fmt: skip
-    """(frame 0, the last frame, misfit [px], relative deviation of the size) of a free flight that is
-    fitted to the outlines of all frames: its first pose, size, velocity and spin."""
+) -> Flight:  # fmt: skip
+    """A free flight fitted to the outlines of all frames: its first pose, size, velocity and spin."""
     reach = solid.reach
     motion = torch.zeros(13)
     motion[6:9] = velocity
@@ -360,5 +388,4 @@ def joint(
     noise = max(float(state[3]), NOISE) ** 2 * CORRELATED / rays_in_all
     order = [*range(6), 12, *range(6, 12)]
     deviation = spread(solid, at, state[2][order][:, order], noise) if sized else 0.0
-    ends = (at.take(torch.tensor([k])) for k in (0, len(times) - 1))
-    return *ends, float(state[3]), deviation
+    return Flight(at, float(state[3]), deviation)

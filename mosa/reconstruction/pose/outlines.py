@@ -17,7 +17,7 @@ from mosa.reconstruction.geometry.field import camera_rays, sample
 from mosa.reconstruction.geometry.known import Solid
 from mosa.reconstruction.geometry.refinement import edges
 from mosa.reconstruction.pose.registration import choose
-from mosa.reconstruction.pose.rigid import Poses, damped, rotation_exp
+from mosa.reconstruction.pose.rigid import damped, rotation_exp
 from mosa.types import Cameras
 
 SAMPLES = 28
@@ -49,9 +49,10 @@ class Similarities:
             self.size * (step[:, 6] / arm[:, 0]).exp(),
         )
 
-    def posed(self, poses: Poses) -> Similarities:
-        """The same size in other poses (K or 1 of them)."""
-        return Similarities(poses.rotation, poses.center, self.size.expand(len(poses.center)))
+    def turned(self, rotation: Tensor, center: Tensor, about: Tensor) -> Similarities:
+        """Turned by `rotation` (3, 3) about a point (3,), which comes to lie at `center` (3,) [m]."""
+        moved = (self.center - about) @ rotation.T + center
+        return Similarities(rotation @ self.rotation, moved, self.size)
 
 
 @dataclass(frozen=True)
@@ -139,9 +140,7 @@ def misses(solid: Solid, at: Similarities, rays: Rays) -> tuple[Tensor, Tensor]:
     return residual * told, J * told[..., None]
 
 
-def equations(
-    solid: Solid, at: Similarities, rays: Rays
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def equations(solid: Solid, at: Similarities, rays: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cost (K,) [px^2] per ray, gradient (K, 7) and Gauss-Newton matrix (K, 7, 7) of Huber's rule
     from twice the median on, at least one pixel; and the root mean square (K,) [px]."""
     parts = []

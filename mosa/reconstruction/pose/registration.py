@@ -30,15 +30,10 @@ from mosa.reconstruction.pose.rigid import (
 )
 from mosa.rendering.appearance.lighting import LIGHT
 from mosa.rendering.covariance import quaternion_to_matrix
-from mosa.types import Cameras, Scene, Splats
-
+from mosa.types import Cameras, Splats
 
 SILHOUETTE = 2.29
 """Side of a square as large as a ball's silhouette, over the root mean square distance of its points from the middle."""
-
-
-TRACKED = 56
-"""Pixels across a body that is followed from frame to frame."""
 
 
 def spread_rotations(count: int) -> Tensor:
@@ -273,23 +268,6 @@ def register_pose(
     return Registered(
         Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm)), found
     )
-
-
-def followed_centres(scene: Scene, splats: Splats, center: Tensor) -> Tensor:
-    """Centres (T, 3) [m] of a body in the training frames, as of one that moved rigidly from where its splats lie in frame 0, about
-    `center` (3,): frame by frame from the pose before, from training cameras alone."""
-    views = scene.training_cameras
-    cameras, body = scene.cameras.select(views).to(center.device), RigidBody.of(splats, center)
-    pose = Poses(torch.eye(3).to(center)[None], center[None])
-    centres, background = [center], scene.background.to(center)
-    for t in scene.training_frames[1:]:
-        shift = centres[-1] - centres[-2] if t > 1 else torch.zeros_like(center)
-        images, mattes = (x[views, t : t + 1].to(center) for x in (scene.images, scene.mattes))
-        level = make_level(images, mattes, cameras, pose.center[0], TRACKED)
-        start = Poses(pose.rotation, pose.center + shift)
-        pose, _ = refine(body, level, start, background, iterations=10)
-        centres.append(pose.center[0])
-    return torch.stack(centres)
 
 
 def distinct(poses: Poses, cost: Tensor, count: int, *, degrees: float = 5.0) -> Tensor:
