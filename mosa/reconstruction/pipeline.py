@@ -66,7 +66,8 @@ def object_geometry(
     cache_dir: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> Geometry:
-    """The body of `scene.body`, or the one inside the visual hull, by settings.geometry; cached apart from the stages that depend on the particles' spacing.
+    """The body of `scene.body`, or the one inside the visual hull, by settings.geometry; cached apart from the stages that depend
+    on the particles' spacing.
 
     Errors: DataError (empty mattes, empty hull).
     """

@@ -278,8 +278,8 @@ def check_colors(scene: Scene, label: str) -> None:
 
 
 def check_borders(scene: Scene, label: str) -> None:
-    """The first frame, which says where the object is, shows all of it to two learning cameras at least, to one where the rest shape
-    is known."""
+    """The first frame, which says where the object is, shows all of it to two learning cameras at least, to one of a body of known
+    shape."""
     covered = scene.mattes > 0.5
     cut = torch.cat(
         [covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2

@@ -34,7 +34,7 @@ WIDEST = 1e5
 
 
 class BodySettings(Settings):
-    """The rest shape of a body that is known from elsewhere (docs/data.md)."""
+    """The rest shape of a body that is known from elsewhere (docs/few_cameras.md)."""
 
     where = "scene.body"
 
@@ -47,10 +47,12 @@ class BodySettings(Settings):
 
 
 def known_body(keys: Mapping[str, Any] | None) -> KnownBody | None:
-    """Errors: ConfigError naming the key, DataError where there is no such file."""
-    if keys is None:
+    """None where no shape is named. Errors: ConfigError naming the key, DataError where there is no such file."""
+    settings = BodySettings.read({} if keys is None else keys)
+    if settings.shape is None:
+        if settings.scale is not None:
+            raise ConfigError("scene.body.scale: expected scene.body.shape beside it, found none")
         return None
-    settings = BodySettings.read({k: v for k, v in keys.items() if v is not None} if isinstance(keys, Mapping) else keys)  # fmt: skip
     path = Path(settings.shape)
     if not path.is_file() or path.suffix.lower() not in SHAPES:
         raise DataError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from mosa.reconstruction.geometry.field import at, gradient
 from mosa.reconstruction.geometry.refinement import signed_distance
 from mosa.reconstruction.geometry.shell import solid_of
 from mosa.system.ply import check_ply
-from mosa.types import Splats
+from mosa.types import KnownBody, Splats
 
 NODES = 64
 """Nodes along the longest side of a mesh, between which its distance is linear."""
@@ -29,9 +29,9 @@ VOXELS = 112
 """Along the longest side of a cloud or of Gaussians."""
 OPAQUE = 0.1
 """Opacity of Gaussians that count."""
-FILLED = 3.0
-"""Spacings below the surface at which half of the points of a cloud lie that fills a body, and is
-no scan of its surface."""
+DEEP, FILLED = 1.5, 0.3
+"""Spacings below the surface, and the share of a cloud's points that lie deeper, from which on it
+fills a body and is no scan of its surface."""
 THIN = 1e-2
 """Standard deviation of a scanned point, in spacings."""
 
@@ -70,9 +70,10 @@ class Solid:
         return gradient(self.distance.values, self.distance.pitch)
 
 
-def known_solid(path: str | Path) -> Solid:
-    """The solid in a file. Errors: DataError naming the file."""
-    path = Path(path)
+@lru_cache(maxsize=1)
+def known_solid(body: KnownBody) -> Solid:
+    """The solid in its file. Errors: DataError naming the file."""
+    path = Path(body.shape)
     if not path.is_file():
         raise DataError(
             f"scene.body.shape: expected a file .ply, .obj or .stl, found none at {path}"
@@ -146,10 +147,9 @@ def solid_of_points(points: Tensor, path: Path) -> Solid:
     sizes = torch.full((n, 3), max(THIN * gap, 1e-12))
     cloud = Splats(points, sizes, turns, torch.full((n,), 0.95), grey)
     found = solid_of_gaussians(cloud, path)
-    gap = gap / found.unit
+    gap, grid = gap / found.unit, found.distance
     depth = -found.at((points - found.centre) / found.unit)
-    if float((depth > FILLED * gap).float().mean()) < 0.5:
-        return found
-    grid = found.distance
-    grown = Volume(grid.values - 0.5 * gap, grid.origin, grid.pitch)
-    return centred(grown, found.unit, found.centre)
+    fills = float((depth > DEEP * gap).float().mean()) > FILLED
+    surface = float(depth[depth < gap].median()) - (0.5 * gap if fills else 0.0)
+    moved = Volume(grid.values + surface, grid.origin, grid.pitch)
+    return centred(moved, found.unit, found.centre)

@@ -18,6 +18,7 @@ from mosa.data.hull import Volume
 from mosa.errors import DataError
 from mosa.reconstruction.geometry.known import Solid, known_solid
 from mosa.reconstruction.pose.outlines import (
+    STILL,
     Rays,
     Similarities,
     equations,
@@ -43,7 +44,7 @@ MOST_FRAMES = 6
 OTHERWISE = 1.5
 """Of the first frame's misfit [px], and `LOOSE` px more, beyond which a frame shows no rigid body."""
 LOOSE = 0.1
-POOR, WRONG = 0.93, 0.7
+POOR, WRONG = 0.93, 0.8
 """Intersections over unions of a silhouette and its matte below which the shape is said to be
 another than the body's, and refused."""
 SAME = 0.95
@@ -54,6 +55,8 @@ SIZED = 0.05
 """Relative standard deviation of a size that is known well enough."""
 CORRELATED = 3.0
 """Pixels of an outline that err together: the information of all is divided by it."""
+SOFT = 1e-7
+"""Damping of the first step: along a single camera's line of sight the misfit has a long valley."""
 NOISE = 0.1
 """[px] of an outline, at least."""
 
@@ -102,7 +105,7 @@ def register_known(scene: Scene) -> Registered:
 
     Errors: DataError where the shape does not fit the mattes, or nothing tells its size."""
     assert scene.body is not None
-    solid = known_solid(scene.body.shape)
+    solid = known_solid(scene.body)
     views = scene.training_cameras
     cameras = scene.cameras.select(views)
     size = None if scene.body.scale is None else scene.body.scale * solid.unit
@@ -224,11 +227,13 @@ def searched(
 @dataclass(frozen=True)
 class Flight:
     """places: similarities of the frames of free flight, the first of frame 0; off [px], deviation
-    as of `Registered`."""
+    as of `Registered`; velocity [m/s] and spin [rad/s] (3,) at frame 0."""
 
     places: Similarities
     off: float
     deviation: float
+    velocity: Tensor
+    spin: Tensor
 
     @property
     def place(self) -> Similarities:
@@ -273,7 +278,26 @@ def flown(solid: Solid, scene: Scene, place: Similarities, size: float | None) -
     deviation = torch.inf if single else 0.0
     if size is None and not single:
         deviation = spread(solid, place, matrix[0], noise)
-    return Flight(place, float(off), deviation)
+    return Flight(place, float(off), deviation, torch.zeros(3), torch.zeros(3))
+
+
+def known_start(
+    scene: Scene, place: Similarities, rest: Similarities, rest_center: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rotation (3, 3) from the rest shape, centre (3,) [m], velocity and spin (3,) that the outlines of
+    free flight show. place: of frame 0, nearly; rest: of the rest shape, whose centre of mass is
+    `rest_center` (3,). Errors: DataError where there is no second frame of free flight."""
+    assert scene.body is not None
+    found = flown(known_solid(scene.body), scene, place, float(place.size[0]))
+    if len(found.places.size) < 2:
+        raise DataError(
+            f"{scene.name}/{scene.sequence}: expected two frames of free flight at least in which "
+            "the outlines are those of scene.body.shape, found one (scene.frames, "
+            "scene.last_free_frame); of a film that starts at rest say scene.start=rest"
+        )
+    rotation = found.place.rotation[0] @ rest.rotation[0].T
+    center = found.place.center[0] + rotation @ (rest_center - rest.center[0])
+    return rotation, center, found.velocity, found.spin
 
 
 def known_centres(scene: Scene, place: Similarities) -> Tensor:
@@ -282,7 +306,7 @@ def known_centres(scene: Scene, place: Similarities) -> Tensor:
 
     A single camera does not see how far a body is that is squashed: it moves on as it flew."""
     assert scene.body is not None
-    solid, views = known_solid(scene.body.shape), scene.training_cameras
+    solid, views = known_solid(scene.body), scene.training_cameras
     cameras = scene.cameras.select(views)
     free = flown(solid, scene, place, float(place.size[0])).places
     tracked = [free.take(torch.tensor([t])) for t in range(len(free.size))]
@@ -348,13 +372,13 @@ def ballistic(
 
 def joint(
     solid: Solid, first: Similarities, velocity: Tensor, rays: list[Rays], times: Tensor,
-    gravity: Tensor, *, sized: bool, iterations: int = 15,
+    gravity: Tensor, *, sized: bool, iterations: int = 25,
 ) -> Flight:  # fmt: skip
     """A free flight fitted to the outlines of all frames: its first pose, size, velocity and spin."""
     reach = solid.reach
     motion = torch.zeros(13)
     motion[6:9] = velocity
-    best, state, damping = motion, None, torch.full((1,), 1e-3)
+    best, state, damping = motion, None, torch.full((1,), SOFT)
     trial = motion
 
     def placed(motion: Tensor) -> Similarities:
@@ -383,9 +407,12 @@ def joint(
         step = torch.zeros(13)
         step[free] = damped(state[1][None, free], state[2][None, free, free], damping)[0]
         trial = best + step
+        still = STILL * float(first.size[0]) * reach
+        if float(step.norm()) < still and float(damping) < 10 * SOFT:
+            break
     at = placed(best)
     rays_in_all = sum(len(each.origin) for each in rays)
     noise = max(float(state[3]), NOISE) ** 2 * CORRELATED / rays_in_all
     order = [*range(6), 12, *range(6, 12)]
     deviation = spread(solid, at, state[2][order][:, order], noise) if sized else 0.0
-    return Flight(at, float(state[3]), deviation)
+    return Flight(at, float(state[3]), deviation, best[6:9], best[9:12])

@@ -24,6 +24,8 @@ SAMPLES = 28
 """Of a ray across the solid's ball, before the nearest is refined."""
 FULL = 0.02
 """Of a pixel: a matte that is nearer to 0 or 1 says on which side the surface is, not how far."""
+STILL = 3e-5
+"""Of a body's radius: a shorter step is the last one."""
 AT_ONCE = 4_000_000
 """Points whose distance is looked up together."""
 
@@ -122,7 +124,8 @@ def pieces(count: int, rays: Rays) -> list[Tensor]:
 def misses(solid: Solid, at: Similarities, rays: Rays) -> tuple[Tensor, Tensor]:
     """Residuals (K, M) [px] and their derivatives (K, M, 7) [px/m] in the steps of `moved`."""
     distance, points = passing(solid, at, rays)
-    width = rays.pixel * (rays.origin[None] - at.center[:, None]).norm(dim=-1)
+    sight = at.center[:, None] - rays.origin[None]
+    width = rays.pixel * sight.norm(dim=-1)
     residual = distance / width - (0.5 - rays.matte)
     empty, full = rays.matte < FULL, rays.matte > 1 - FULL
     told = ~((empty & (residual > 0)) | (full & (residual < 0)))
@@ -130,13 +133,18 @@ def misses(solid: Solid, at: Similarities, rays: Rays) -> tuple[Tensor, Tensor]:
     normal = sample(solid.slopes, (points - grid.origin) / grid.pitch)
     beyond = distance / at.size[:, None] > 0.1  # where the grid may have ended: towards its middle
     normal = torch.where(beyond[..., None], points, normal)
+    # where a ray is nearest the distance does not change along it: what differences over cells leave
+    # of that would tell a single camera how far the solid is
+    along = rays.direction[None] @ at.rotation
+    normal = normal - (normal * along).sum(-1, keepdim=True) * along
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     turned = normal @ at.rotation.transpose(1, 2)
     arm = points @ at.rotation.transpose(1, 2)
     reach = solid.reach
     around = -torch.linalg.cross(arm, turned) / reach
     grows = (distance / at.size[:, None] - (points * normal).sum(-1)) / reach
-    J = torch.cat([-turned, around, grows[..., None]], -1) / width[..., None]
+    widens = (distance / sight.square().sum(-1))[..., None] * sight
+    J = torch.cat([-turned - widens, around, grows[..., None]], -1) / width[..., None]
     return residual * told, J * told[..., None]
 
 
@@ -186,6 +194,8 @@ def fitted(
         most = 0.4 * best.size * solid.reach
         step = step * (most / step.norm(dim=-1).clamp(min=1e-12)).clamp(max=1)[:, None]
         trial = best.moved(step, solid.reach)
+        if float((step.norm(dim=-1) / most).max()) < STILL:
+            break
     return best, state[0]
 
 
