@@ -29,9 +29,10 @@ VOXELS = 112
 """Along the longest side of a cloud or of Gaussians."""
 OPAQUE = 0.1
 """Opacity of Gaussians that count."""
-DEEP, FILLED = 1.5, 0.3
+DEEP, FILLED = 0.75, 0.3
 """Spacings below the surface, and the share of a cloud's points that lie deeper, from which on it
-fills a body and is no scan of its surface."""
+fills a body and is no scan of its surface. A dense, noisy scan that passes for one is made larger by
+half of its small spacing."""
 THIN = 1e-2
 """Standard deviation of a scanned point, in spacings."""
 

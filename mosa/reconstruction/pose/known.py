@@ -49,8 +49,8 @@ POOR, WRONG = 0.93, 0.8
 another than the body's, and refused."""
 SAME = 0.95
 """Share of a body inside of itself in another pose from which on both poses are one."""
-AMBIGUOUS = 1.3
-"""Of the best misfit: another pose that fits as well."""
+AMBIGUOUS, FAR = 1.3, 3.0
+"""Of the best misfit: another pose that fits as well, and one that is not looked at again."""
 SIZED = 0.05
 """Relative standard deviation of a size that is known well enough."""
 CORRELATED = 3.0
@@ -66,7 +66,7 @@ class Registered:
     """place: the one similarity; solid: what it takes to the world; overlap: intersection over
     union of every training camera's matte; off [px]: root mean square misfit of the outlines;
     deviation: relative standard deviation of the size; rival: misfit of the next best pose over
-    the best one's; frames: of free flight that were used."""
+    the best one's, at most `FAR`; frames: of free flight that were used."""
 
     solid: Solid
     place: Similarities
@@ -130,14 +130,14 @@ def register_known(scene: Scene) -> Registered:
     overlap = dict(zip(cameras.names, overlaps(solid, best.place, scene.mattes[views, 0], cameras)))
     listed = ", ".join(f"{name} {share:.3f}" for name, share in overlap.items())
     result = Registered(
-        solid, best.place, overlap, best.off, best.deviation, min(rival, 99.0), frames
+        solid, best.place, overlap, best.off, best.deviation, min(rival, FAR), frames
     )
     log.info(
         "%s: registered; intersection over union of camera %s; outlines %.2f px off; %.5g m per "
         "unit of the file (+- %.2f %%), %d frames of free flight; the next best pose fits %.1f "
-        "times as badly",
+        "times as badly%s",
         scene.body.shape, listed, best.off, float(best.place.size[0]) / solid.unit,
-        100 * best.deviation, frames, result.rival,
+        100 * best.deviation, frames, result.rival, " or more" * (result.rival == FAR),
     )  # fmt: skip
     said = (
         f"scene.body.shape: {scene.body.shape}: expected a shape whose silhouettes fill the mattes "
@@ -217,8 +217,10 @@ def searched(
     chosen: list[int] = []
     for k in cost.argsort().tolist():
         one = found.take(torch.tensor([k]))
-        if len(chosen) < 4 and not any(
-            same(solid, found.take(torch.tensor([j])), one) for j in chosen
+        if (
+            cost[k] <= FAR**2 * cost.min()
+            and len(chosen) < 4
+            and not any(same(solid, found.take(torch.tensor([j])), one) for j in chosen)
         ):
             chosen.append(k)
     return found.take(torch.tensor(chosen)), cost[chosen]
