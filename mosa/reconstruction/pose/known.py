@@ -275,12 +275,13 @@ def flown(solid: Solid, scene: Scene, place: Similarities, size: float | None) -
         if last is not None or not single or len(rays) <= 3 or lowest(solid, end, scene) > 0:
             return found
         tracked, rays = tracked[:-1], rays[:-1]
-    _, _, matrix, off = equations(solid, place, rays[0])
-    noise = max(float(off), NOISE) ** 2 * CORRELATED / len(rays[0].origin)
+    _, _, matrix, left_over = equations(solid, place, rays[0])
+    misfit = float(left_over)
+    noise = max(misfit, NOISE) ** 2 * CORRELATED / len(rays[0].origin)
     deviation = torch.inf if single else 0.0
     if size is None and not single:
         deviation = spread(solid, place, matrix[0], noise)
-    return Flight(place, float(off), deviation, torch.zeros(3), torch.zeros(3))
+    return Flight(place, misfit, deviation, torch.zeros(3), torch.zeros(3))
 
 
 def known_start(
@@ -380,8 +381,8 @@ def joint(
     reach = solid.reach
     motion = torch.zeros(13)
     motion[6:9] = velocity
-    best, state, damping = motion, None, torch.full((1,), SOFT)
-    trial = motion
+    best, trial, damping = motion, motion, torch.full((1,), SOFT)
+    state: tuple[Tensor, ...] | None = None
 
     def placed(motion: Tensor) -> Similarities:
         sizes = first.size * (motion[12] / (first.size * reach)).exp()
@@ -412,6 +413,7 @@ def joint(
         still = STILL * float(first.size[0]) * reach
         if float(step.norm()) < still and float(damping) < 10 * SOFT:
             break
+    assert state is not None
     at = placed(best)
     rays_in_all = sum(len(each.origin) for each in rays)
     noise = max(float(state[3]), NOISE) ** 2 * CORRELATED / rays_in_all

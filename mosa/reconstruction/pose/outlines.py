@@ -178,17 +178,17 @@ def fitted(
     whether the size is fitted too."""
     free = slice(0, 7 if sized else 6)
     damping = torch.full_like(at.size, 1e-2)
-    best, trial, state = at, at, None
-    for _ in range(iterations + 1):
-        found = equations(solid, trial, rays)[:3]
-        if state is None:
-            state = found
-        else:
+    best, state = at, equations(solid, at, rays)[:3]
+    trial = best
+    for k in range(iterations + 1):
+        if k:
+            found = equations(solid, trial, rays)[:3]
             better = found[0] < state[0]
             damping = torch.where(better, damping / 3, damping * 6)
             pairs = zip(vars(trial).values(), vars(best).values())
             best = Similarities(*(choose(better, new, old) for new, old in pairs))
-            state = tuple(choose(better, new, old) for new, old in zip(found, state))
+            cost, vector, matrix = (choose(better, new, old) for new, old in zip(found, state))
+            state = cost, vector, matrix
         step = torch.zeros_like(state[1])
         step[:, free] = damped(state[1][:, free], state[2][:, free, free], damping)
         most = 0.4 * best.size * solid.reach
