@@ -38,8 +38,8 @@ class BodySettings(Settings):
 
     where = "scene.body"
 
-    shape: Text = Field(
-        description="file .ply, .obj or .stl of a closed mesh, a cloud or Gaussians"
+    shape: Text | None = Field(
+        None, description="file .ply, .obj or .stl of a closed mesh, a cloud or Gaussians"
     )
     scale: Positive | None = Field(
         None, description="m of the file's unit; null: the mattes tell it, of one camera the fall"
