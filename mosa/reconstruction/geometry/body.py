@@ -67,6 +67,8 @@ class Geometry:
         """`geometry/...`: volumes [m^3], share of the hull that was emptied, and, where images were used, share of the surface
         that they do not tell to 0.7 particle spacings (two standard deviations): there the body is a guess between outlines."""
         volume = self.body.occupied_volume()
+        if self.registered:
+            return {"geometry/volume_m3": volume, **self.registered}
         figures = {
             "geometry/hull_volume_m3": self.hull_volume, "geometry/volume_m3": volume,
             "geometry/carved_share": 1 - volume / self.hull_volume, "geometry/free_frames": float(self.free_frames),
@@ -77,7 +79,7 @@ class Geometry:
                 (2 * on_surface > 0.7 * spacing).double().mean()
             )
             figures["geometry/deviation_m"] = float(on_surface.median())
-        return figures | self.registered
+        return figures
 
     def stored(self) -> dict:
         """Tensors and numbers of it, for `read`."""
