@@ -111,6 +111,17 @@ class Markers:
 
 
 @dataclass(frozen=True)
+class KnownBody:
+    """Rest shape of a body from elsewhere. shape: file of a mesh, a cloud or 3D Gaussians, in its
+    own axes and unit; scale: [m] of that unit, None where the mattes shall tell it; fingerprint: of
+    the file."""
+
+    shape: str
+    scale: float | None = None
+    fingerprint: str = ""
+
+
+@dataclass(frozen=True)
 class Scene:
     """One sequence of multi-view images of one object; the same for every data format.
 
@@ -120,6 +131,7 @@ class Scene:
     `holdout_cameras`, `holdout_frames`: indices that no stage of learning may read.
     start: `FALLING`, or `REST`: at frame 0 nothing moves, and the body may be in contact already.
     `markers`: tracked points in place of images, of which there are then none (V = 0).
+    `body`: the rest shape, where it is known from elsewhere.
     """
 
     __repr__ = in_brief
@@ -146,6 +158,7 @@ class Scene:
     fingerprint: str = ""
     start: str = FALLING
     markers: Markers | None = None
+    body: KnownBody | None = None
 
     @property
     def frames(self) -> int:

@@ -90,6 +90,11 @@ def load_scene(
     if keys.get("particles") is not None:
         found = beside(place, keys["particles"])
         arguments["particles"] = under(root, keys["particles"]) if found is None else found
+    body = arguments.get("body")
+    if format != "markers" and isinstance(body, Mapping) and isinstance(body.get("shape"), str):
+        near = (place if place.is_dir() else place.parent) / body["shape"]
+        shape = near if near.is_file() else under(root, body["shape"])
+        arguments["body"] = {**body, "shape": str(shape)}
     found = call(loader, {"path": place, **arguments})
     if not isinstance(found, Scene):
         raise DataError(

@@ -27,6 +27,8 @@ from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_g
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.motion.observed import Windows, object_windows
+from mosa.reconstruction.pose.known import register_known
+from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.pose.registration import light_of
 from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
@@ -64,13 +66,16 @@ def object_geometry(
     cache_dir: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> Geometry:
-    """The body inside the visual hull, by settings.geometry; cached apart from the stages that depend on the particles' spacing.
+    """The body of `scene.body`, or the one inside the visual hull, by settings.geometry; cached apart from the stages that depend
+    on the particles' spacing.
 
     Errors: DataError (empty mattes, empty hull).
     """
     cache = _geometry_cache(scene, settings, cache_dir)
 
     def stage() -> dict[str, Any]:
+        if scene.body is not None:
+            return known_geometry(scene, settings).stored()
         if settings.geometry.source == "gaussians":
             return geometry_of_gaussians(scene, settings, device).stored()
         found = find_geometry(
@@ -80,6 +85,16 @@ def object_geometry(
         return found.stored()
 
     return Geometry.read(cache.stage("geometry", stage))
+
+
+def known_geometry(scene: Scene, settings: ReconstructionSettings) -> Geometry:
+    """The body of `scene.body` where frame 0 shows it. Errors: DataError."""
+    found = register_known(scene)
+    body = found.body(settings.resolution)
+    empty = torch.empty(0)
+    return Geometry(
+        body, body.occupied_volume(), empty, found.frames, None, found.figures(), vars(found.place)
+    )
 
 
 def geometry_of_gaussians(
@@ -190,6 +205,8 @@ def _open_cache(
         "settings": settings,
         "box": scene.box.tolist(),
     }
+    if scene.body is not None:
+        key["body"] = [scene.body.fingerprint, scene.body.scale]
     return StageCache(Path(cache_dir) if cache_dir is not None else None, key | more)
 
 
@@ -342,7 +359,8 @@ def reconstruct(
     splats = Splats(**particles)
 
     static = Splats(**cache.stage("static", static_stage))
-    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
+    place = Similarities(**geometry.place) if geometry.place else None
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings, place)
 
     def motion_stage() -> dict[str, Tensor]:
         return first_motion(parts, windows, background, seed, bar, cache)
@@ -474,7 +492,9 @@ def follow(
             leave=False,
         )
 
-    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
+    known = reconstruction.moving.place if reconstruction.moving is not None else None
+    place = None if known is None else known.turned(*(p.cpu() for p in pose))
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings, place)
 
     def motion_stage() -> dict[str, Tensor]:
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)

@@ -259,9 +259,11 @@ class SceneDataModule(L.LightningDataModule):
         Prefixes: train, then train/<name> for the sequences that are learned from, test/<name> for the rest, in their order."""
         shape, (training, others) = self.shape, self.scenes
         seen = appearance_of(shape)
-        found = {"train": sequence_start(shape, seen, training, register=False)}
+        place = None if self.reconstruction.moving is None else self.reconstruction.moving.place
+        found = {"train": sequence_start(shape, seen, training, register=False, place=place)}
         for scene in tqdm(others, "poses of the other sequences", leave=False):
-            found[self.prefix(scene)] = sequence_start(shape, seen, scene, register=True)
+            start = sequence_start(shape, seen, scene, register=True, place=place)
+            found[self.prefix(scene)] = start
         return found
 
     @property

@@ -309,15 +309,17 @@ def check_colors(scene: Scene, label: str) -> None:
 
 
 def check_borders(scene: Scene, label: str) -> None:
-    """The first frame, which says where the object is, shows all of it to two learning cameras at least."""
+    """The first frame, which says where the object is, shows all of it to two learning cameras at least, to one of a body of known
+    shape."""
     covered = scene.mattes > 0.5
     cut = torch.cat(
         [covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2
     ).any(2)
     names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v, 0])]
-    if len(scene.training_cameras) - len(names) < 2:
+    fewest = 2 if scene.body is None else 1
+    if len(scene.training_cameras) - len(names) < fewest:
         raise DataError(
-            f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected two "
+            f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected {fewest} "
             "that see all of it; film from farther away, or start with another frame (scene.frames)"
         )
     if names:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
+from pydantic import Field
 
 from mosa.data.checks.validation import check_types, fingerprint
 from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
-from mosa.errors import ConfigError
-from mosa.settings import Positive, check
-from mosa.types import FALLING, REST, Ground, Scene, Truth
+from mosa.errors import ConfigError, DataError
+from mosa.settings import Positive, Settings, Text, check
+from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth
 
 DENSITIES = 0.1, 1e5
 """[kg/m^3]: aerogel has 1, osmium 22,590."""
@@ -25,6 +27,8 @@ LIGHT = 10.0
 """[kg/m^3] below which a density is asked about: foams of polystyrene have 15."""
 STEEP = 3.0
 """[degrees] of an incline that is said."""
+SHAPES = (".ply", ".obj", ".stl")
+"""Endings of files of a body's rest shape."""
 WIDEST = 1e5
 """[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
 
@@ -39,6 +43,36 @@ def check_density(key: str, density: float) -> None:
             "with it",
             stacklevel=5,
         )
+
+
+class BodySettings(Settings):
+    """The rest shape of a body that is known from elsewhere (docs/few_cameras.md)."""
+
+    where = "scene.body"
+
+    shape: Text | None = Field(
+        None, description="file .ply, .obj or .stl of a closed mesh, a cloud or Gaussians"
+    )
+    scale: Positive | None = Field(
+        None, description="m of the file's unit; null: the mattes tell it, of one camera the fall"
+    )
+
+
+def known_body(keys: Mapping[str, Any] | None) -> KnownBody | None:
+    """None where no shape is named. Errors: ConfigError naming the key, DataError where there is no such file."""
+    settings = BodySettings.read({} if keys is None else keys)
+    if settings.shape is None:
+        if settings.scale is not None:
+            raise ConfigError("scene.body.scale: expected scene.body.shape beside it, found none")
+        return None
+    path = Path(settings.shape)
+    if not path.is_file() or path.suffix.lower() not in SHAPES:
+        raise DataError(
+            f"scene.body.shape: expected a file {', '.join(SHAPES)} beside the images or below "
+            f"scene.root, found {path}"
+        )
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    return KnownBody(str(path), settings.scale, digest)
 
 
 def scene_from_footage(
@@ -57,6 +91,7 @@ def scene_from_footage(
     holdout_cameras=(),
     holdout_frames=(),
     particles: Path | None = None,
+    body: Mapping[str, Any] | None = None,
     known_parameters: dict[str, float] | None = None,
     truth: Truth | None = None,
     synthetic: bool = False,
@@ -65,7 +100,7 @@ def scene_from_footage(
 
     gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; start: falling | rest;
     last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
-    per frame; fps overrides times.
+    per frame; body: {shape: file, scale} of a known rest shape; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
     check_types(footage, f"scene {name} ({sequence})")
@@ -111,14 +146,16 @@ def scene_from_footage(
             )
         last_free_frame = footage.frames.index(last_free_frame)
     check_ground(ground, up / up.norm(), pull, box)
+    known = known_body(body)
+    fewest = 2 if known is None else 1
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
         gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
         background=footage.background, synthetic=synthetic, start=start, last_free_frame=last_free_frame,
-        holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
+        holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names, fewest),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
         particles=read_clouds(particles, footage.frames) if particles is not None else None,
-        known_parameters=dict(known_parameters or {}),
+        known_parameters=dict(known_parameters or {}), body=known,
     )  # fmt: skip
     return replace(scene, fingerprint=fingerprint(scene))
 
@@ -162,8 +199,8 @@ def vector(value, key: str) -> torch.Tensor:
     return result
 
 
-def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
-    """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where under two are left."""
+def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> tuple[int, ...]:
+    """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where fewer than `fewest` are left."""
     if names is not None and not isinstance(names, (list, tuple)):
         raise ConfigError(
             f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}"
@@ -175,11 +212,14 @@ def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
                 f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}"
             )
         indices.append(footage_names.index(str(name)))
-    if len(footage_names) < 2:
-        raise ConfigError(f"scene: expected at least two cameras, found {len(footage_names)}")
-    if len(footage_names) - len(set(indices)) < 2:
+    if len(footage_names) < fewest:
         raise ConfigError(
-            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from"
+            f"scene: expected at least two cameras, found {len(footage_names)}; of one, say the rest shape (scene.body.shape)"
+        )
+    if len(footage_names) - len(set(indices)) < fewest:
+        raise ConfigError(
+            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from, or one "
+            "of a body whose rest shape is given (scene.body.shape)"
         )
     return tuple(sorted(set(indices)))
 

@@ -286,7 +286,13 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
 def geometry_lines(figures: Mapping[str, float]) -> str:
     """Sentences on the body that was filled: how surely its surface is known, and against the true shape where that is known."""
     lines, get = [], lambda name: figures.get(f"geometry/{name}")
-    if get("uncertain_share") is not None:
+    if get("registered_iou") is not None:
+        lines.append(
+            f"Geometry: the given rest shape, registered at {get('registered_scale'):.5g} m per unit of its file, with a standard "
+            f"deviation of {get('registered_scale_deviation'):.2%}; its silhouettes and the mattes have an intersection over union "
+            f"of at least {get('registered_iou'):.3f}; the next best pose fits {get('registered_rival'):.1f} times as badly."
+        )
+    elif get("uncertain_share") is not None:
         lines.append(
             f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not "
             "told by the images to 0.7 particle spacings and is guessed between outlines; "

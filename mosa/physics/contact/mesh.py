@@ -150,10 +150,8 @@ def _welded(points: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return unique, inverse.reshape(-1)[index]
 
 
-def field_of_mesh(
-    path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0
-) -> SignedDistanceField:
-    """Signed distances to the mesh of an OBJ, PLY or STL file (faces with more corners are cut into fans), times `scale` to metres.
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (P, 3) and triangles (T, 3) of an OBJ, PLY or STL file; faces with more corners are cut into fans.
 
     Errors: ConfigError naming the file.
     """
@@ -176,6 +174,17 @@ def field_of_mesh(
         raise ConfigError(
             f"mesh: {path} cannot be read ({type(error).__name__}: {error})"
         ) from error
+    return vertices, triangles
+
+
+def field_of_mesh(
+    path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0
+) -> SignedDistanceField:
+    """Signed distances to the mesh of a file (`read_mesh`), times `scale` to metres.
+
+    Errors: ConfigError naming the file.
+    """
+    vertices, triangles = read_mesh(path)
     try:
         return field_of_triangles(scale * vertices, triangles, spacing, margin)
     except ConfigError as error:

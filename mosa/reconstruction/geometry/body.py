@@ -7,7 +7,7 @@ that is."""
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F
@@ -52,18 +52,23 @@ class GeometrySettings(GeometrySection):
 class Geometry:
     """body: values 0 or 1; hull_volume [m^3]; deviation: standard deviation [m] of the surface where it is known at all, on the
     body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used;
-    static: Gaussians that the body was found by, if any."""
+    static: Gaussians that the body was found by, if any; registered, place: figures of a body of known shape, and the
+    parts of its similarity (`Similarities`)."""
 
     body: Volume
     hull_volume: float
     deviation: Tensor
     free_frames: int
     static: Splats | None = None
+    registered: dict[str, float] = field(default_factory=dict)
+    place: dict[str, Tensor] = field(default_factory=dict)
 
     def figures(self, spacing: float) -> dict[str, float]:
         """`geometry/...`: volumes [m^3], share of the hull that was emptied, and, where images were used, share of the surface
         that they do not tell to 0.7 particle spacings (two standard deviations): there the body is a guess between outlines."""
         volume = self.body.occupied_volume()
+        if self.registered:
+            return {"geometry/volume_m3": volume, **self.registered}
         figures = {
             "geometry/hull_volume_m3": self.hull_volume, "geometry/volume_m3": volume,
             "geometry/carved_share": 1 - volume / self.hull_volume, "geometry/free_frames": float(self.free_frames),
@@ -81,7 +86,8 @@ class Geometry:
         return {
             "values": self.body.values.cpu(), "origin": self.body.origin.cpu(), "pitch": self.body.pitch,
             "hull_volume": self.hull_volume, "deviation": self.deviation.cpu(), "free_frames": self.free_frames,
-            "static": None if self.static is None else vars(self.static.to("cpu")),
+            "static": None if self.static is None else vars(self.static.to("cpu")), "registered": self.registered,
+            "place": self.place,
         }  # fmt: skip
 
     @classmethod
@@ -93,6 +99,8 @@ class Geometry:
             stored["deviation"],
             stored["free_frames"],
             Splats(**stored["static"]) if stored.get("static") else None,
+            stored.get("registered") or {},
+            stored.get("place") or {},
         )
 
 

@@ -100,12 +100,15 @@ class _Group:
     start: Tensor
 
 
+def edges(mattes: Tensor) -> Tensor:
+    """Pixels (B, H, W) bool of mattes beside their outlines."""
+    around, box = mattes[:, None], mattes.new_ones(3, 3)
+    return ((dilation(around, box) > 0.02) & (erosion(around, box) < 0.98))[:, 0]
+
+
 def _group(views: Windows) -> _Group:
-    around, box = views.mattes[:, None], views.mattes.new_ones(3, 3)
-    edge = (dilation(around, box) > 0.02) & (erosion(around, box) < 0.98)
-    return _Group(
-        views, *camera_rays(views.cameras), edge[:, 0], torch.full_like(views.mattes, float("nan"))
-    )
+    start = torch.full_like(views.mattes, float("nan"))
+    return _Group(views, *camera_rays(views.cameras), edges(views.mattes), start)
 
 
 def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:

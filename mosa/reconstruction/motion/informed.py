@@ -38,9 +38,16 @@ AS_IT_IS = 0.8
 what was seen of a liquid's late frames may be a tenth of a metre off."""
 
 
-def laid_onto(predicted: Tensor, seen: Tensor) -> Tensor:
-    """Positions (T, N, 3) [m], moved rigidly, frame by frame, to where they are nearest to `seen` (Kabsch's rotation)."""
+def laid_onto(predicted: Tensor, seen: Tensor, eye: Tensor | None = None) -> Tensor:
+    """Positions (T, N, 3) [m], moved rigidly, frame by frame, to where they are nearest to `seen` (Kabsch's rotation).
+
+    eye: (3,) [m] of the only camera, which does not tell how far the body is: it stays as far as predicted."""
     centre, target = predicted.mean(1, keepdim=True), seen.mean(1, keepdim=True)
+    if eye is not None:
+        sight = target - eye
+        target = eye + sight * (centre - eye).norm(dim=-1, keepdim=True) / sight.norm(
+            dim=-1, keepdim=True
+        )
     rotation, _ = polar((seen - target).mT @ (predicted - centre))
     return (predicted - centre) @ rotation.mT + target
 
@@ -92,7 +99,9 @@ def informed_motion(
         ]
         return torch.stack([torch.zeros_like(found[0]), *found])
 
-    laid = laid_onto(predicted, seen)
+    w2c = windows.cameras.w2c
+    single = len(windows.view.unique()) == 1
+    laid = laid_onto(predicted, seen, -w2c[0, :3, :3].T @ w2c[0, :3, 3] if single else None)
     better = losses(predicted) < AS_IT_IS * losses(laid)
     begun = torch.where(better[:, None, None], predicted, laid)
     project(motion, scaffold, begun)

@@ -26,6 +26,8 @@ from mosa.reconstruction.motion.response import (
     image_matrices,
     response_of,
 )
+from mosa.reconstruction.pose.known import known_centres
+from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import turned_basis
@@ -41,18 +43,28 @@ log = logging.getLogger(__name__)
 class MovingParts:
     """What a motion of particles is fitted with. Found when it is first asked for, and kept: the second look takes the first one's.
 
-    splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both fits.
+    splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both fits; place: of a body of
+    known shape in frame 0.
     """
 
     def __init__(
-        self, scene: Scene, splats: Splats, static: Splats, settings: ReconstructionSettings
+        self,
+        scene: Scene,
+        splats: Splats,
+        static: Splats,
+        settings: ReconstructionSettings,
+        place: Similarities | None = None,
     ) -> None:
         self.scene, self.splats, self.static, self.settings = scene, splats, static, settings
+        self.place = place
 
     @cached_property
     def centres(self) -> Tensor:
-        """(T, 3) [m] of the visual hulls of the training frames."""
+        """(T, 3) [m] of the visual hulls of the training frames; those of a body of known shape, which few cameras may film, from
+        its outlines."""
         scene = self.scene
+        if self.place is not None:
+            return known_centres(scene, self.place).to(self.splats.means)
         views, frames = scene.training_cameras, scene.training_frames
         cameras = scene.cameras.select(views)
         found = list(

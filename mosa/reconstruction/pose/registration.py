@@ -32,6 +32,9 @@ from mosa.rendering.appearance.lighting import LIGHT
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Cameras, Splats
 
+SILHOUETTE = 2.29
+"""Side of a square as large as a ball's silhouette, over the root mean square distance of its points from the middle."""
+
 
 def spread_rotations(count: int) -> Tensor:
     """`count` rotations spread evenly over SO(3), (count, 3, 3): super-Fibonacci spirals (Alexa, CVPR 2022)."""
@@ -44,11 +47,12 @@ def spread_rotations(count: int) -> Tensor:
     ).float()
 
 
-def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
+def matte_centres(mattes: Tensor, cameras: Cameras, size: float | None = None) -> Tensor:
     """Points (T, 3) [m] nearest to the rays through the mattes' centres of area; mattes: (V, T, H, W).
 
-    Views where the matte is empty or runs over the image's border are left out where two others remain. Raises
-    DataError where fewer than two views see the object.
+    Views where the matte is empty or runs over the image's border are left out where two others remain. size: side [m] of a square
+    as large as the silhouettes of a known body, by which a single camera tells how far it is. Raises DataError where fewer than
+    two views see the object, or one of a body of unknown size.
     """
     y = torch.arange(cameras.height, dtype=mattes.dtype, device=mattes.device) + 0.5
     x = torch.arange(cameras.width, dtype=mattes.dtype, device=mattes.device) + 0.5
@@ -67,7 +71,7 @@ def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
     whole = seen & (border.amax(0) < 0.5)
     use = torch.where(whole.sum(0) >= 2, whole, seen).to(mattes)
     for t, number in enumerate(use.sum(0).tolist()):
-        if number < 2:
+        if number < (2 if size is None or len(cameras) > 1 else 1):
             raise DataError(
                 f"frame {t}: {int(number)} of {len(cameras)} views have a matte of the object, at least 2 are needed"
             )
@@ -80,6 +84,8 @@ def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
     )
     directions = directions / directions.norm(dim=-1, keepdim=True)
     origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:].to(mattes))[..., 0]
+    if len(cameras) == 1 and size is not None:
+        return origins[0] + directions[0] * (size * K[0, 0, 0] / area[0].sqrt())[:, None]
     P = use[..., None, None] * (
         torch.eye(3).to(mattes) - directions[..., None] * directions[..., None, :]
     )
@@ -134,7 +140,7 @@ def coarse_poses(
     R = spread_rotations(rotations).to(center)
     poses = Poses(R, center.expand(rotations, 3))
     seen = body.render(poses, level.cameras, background)
-    centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras)
+    centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras, SILHOUETTE * body.radius)
     poses = Poses(R, center + center - centres)
     cost = (
         huber(body.render(poses, level.cameras, background) - level.target)[0].flatten(1).mean(-1)
@@ -239,7 +245,7 @@ def register_pose(
     background = background.to(body.arm)
     images, mattes = images[:, None].to(body.arm), mattes[:, None].to(body.arm)
     cameras = cameras.to(body.arm.device)
-    center = matte_centres(mattes, cameras)[0]
+    center = matte_centres(mattes, cameras, SILHOUETTE * body.radius)[0]
     some = (
         torch.linspace(0, len(cameras) - 1, min(coarse_views, len(cameras))).round().long().tolist()
     )
@@ -329,7 +335,7 @@ def initial_velocity(
     times = (times - times[0]).to(body.arm)
     images, mattes, cameras = images.to(body.arm), mattes.to(body.arm), cameras.to(body.arm.device)
     start = Poses(pose[0].to(body.arm)[None], pose[1].to(body.arm)[None])
-    centres = matte_centres(mattes, cameras)
+    centres = matte_centres(mattes, cameras, SILHOUETTE * body.radius)
     fallen = centres - centres[0] - 0.5 * gravity * times[:, None] ** 2
     motion = torch.zeros(12).to(body.arm)
     motion[6:9] = (times @ fallen) / times.square().sum()

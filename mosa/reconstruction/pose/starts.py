@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from mosa.errors import DataError
 from mosa.physics.world import Start
 from mosa.reconstruction.marker_body import start_at_rest
+from mosa.reconstruction.pose.known import known_start
+from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.pose.registration import initial_velocity, register_pose
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
@@ -86,10 +88,16 @@ def appearance_of(body: RestShape) -> Appearance:
 
 
 def sequence_start(
-    body: RestShape, appearance: Appearance, scene: Scene, *, register: bool
+    body: RestShape,
+    appearance: Appearance,
+    scene: Scene,
+    *,
+    register: bool,
+    place: Similarities | None = None,
 ) -> Start:
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
-    rest shape's own. A film that starts at rest has no velocity. appearance: at rest, of `appearance_of`.
+    rest shape's own. A film that starts at rest has no velocity. appearance: at rest, of `appearance_of`; place: of a body of known
+    shape in frame 0 of the training sequence, whose outlines then give what their rendering hardly tells from a single camera.
 
     The free frames are found on the way: a rough velocity from the first two frames predicts the contact, the frames before it
     give the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is
@@ -116,6 +124,13 @@ def sequence_start(
     )
     if scene.start == REST:
         return start
+    if place is not None and scene.body is not None:
+        rest_center = body.center.cpu()
+        near = place.turned(rotation.cpu(), center.cpu(), rest_center)
+        turn, middle, velocity, spin = known_start(scene, near, place, rest_center)
+        if register:
+            rotation, center = turn, middle
+        return Start(*(x.to(body.rest) for x in (rotation, center, velocity, spin)))
     count, most, exact = 2, MOST_FRAMES, False
     while True:
         velocity, spin = initial_velocity(
