@@ -34,7 +34,7 @@ def write_markers(
     video: bool = False,
 ) -> None:
     """markers.npz with `<name>/measured`, `<name>/predicted` [T, M, 3] (m), `<name>/times` [T] (s),
-    `<name>/names`; markers.png: displacements [mm] of the points that move most, along the axis in
+    points in the order of `scene.tracked`; markers.png: displacements [mm] of the points that move most, along the axis in
     which they do, measured (dots) and predicted (lines). video: also video.mp4 of the last sequence
     and strip.png of the first swing of all (`film`)."""
     matplotlib.use("Agg")
@@ -57,7 +57,6 @@ def write_markers(
             f"{s.prefix}/measured": measured,
             f"{s.prefix}/predicted": predicted,
             f"{s.prefix}/times": times,
-            f"{s.prefix}/names": np.array(names),
         }
         moved = measured - s.scene.markers.rest.numpy()
         if video:
