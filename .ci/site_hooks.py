@@ -19,7 +19,7 @@ def on_config(config):
 
 
 def on_page_markdown(markdown, page, **kwargs):
-    if page.file.src_uri.startswith(("lab/", "identification", "experiments")):
+    if page.file.src_uri.startswith("lab/"):
         page.meta["search"] = {"exclude": True}
     # a file outside of docs/ is no page of the site: its name stands there as text
     return re.sub(

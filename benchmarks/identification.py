@@ -8,7 +8,7 @@
 fit reads in one file of a few MB, with the truth for the figures; of several drops with scene.also_train. `fit` calibrates the
 prior and runs the joint stage on it: a few seconds each on a GPU, minutes on a CPU. Figures are held-out errors after first
 contact, in mm, at 2000 particles; of all drops where none is held out.
-docs/identification.md has tables that were made so.
+docs/lab/2026-11-identification.md has tables that were made so.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ FORMS = 0.7
 ELSEWHERE = 3.0
 """By so much more than on the drops that it was learned from a law is wrong on another one, beside what draws and forms say. Both
 were chosen on the held-out drops of these four bodies under two backbones; those of other bodies, and films by other programs, hold
-what docs/identification.md#what-is-sure says."""
+what docs/lab/2026-11-identification.md#what-is-sure says."""
 LEAST_DRAWS = 4
 """Of those that could be simulated: fewer say nothing about a spread."""
 QUANTILES = 400

@@ -41,7 +41,8 @@ themselves out: a large one saturates the field, and what is saturated says noth
 fell to a twentieth in the ninth iteration, where the fit was done, and began again from a cost 20 times as large."""
 SOFTLY = (0.05, 0.1, 0.25, 0.5)
 """Shares of the data that the first iterations on several drops count. Counted in full from the start, a few drops are explained by
-sizes that later ones do not bear out, and the fit is half done when its iterations are over: see docs/identification.md."""
+sizes that later ones do not bear out, and the fit is half done when its iterations are over: see
+docs/lab/2026-11-identification.md."""
 FLAT = 0.5
 """Of minus the logarithm of the posterior: an iteration of the joint stage that lowers it by less, with the sizes settled, is the
 last. Numbers that still move then lie on a floor that the data do not tell apart."""

@@ -22,7 +22,8 @@ from mosa.types import Ground
 FINER = 0.25
 """Steps of the joint stage's differences over those of a calibration, which begins further from its end. What one-sided differences
 get wrong falls with their step, and on two drops it had stopped the fit: the rabbit's ended at a cost of 675, with these steps at
-585, and its held-out error fell from 0.56 to 0.51 of the prior's (docs/identification.md)."""
+585, and its held-out error fell from 0.56 to 0.51 of the prior's
+(docs/lab/2026-11-identification.md)."""
 
 END = 0.005
 """Of a parameter's range: nearer to its end, a fit ended there."""

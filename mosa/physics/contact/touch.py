@@ -2,7 +2,7 @@
 
 A grid stops a body half a cell above the nodes that hold it. What lies between is squeezed before the body touches, and slides:
 of the velocity along the ground with which a tilted body bounces a fifth is missing, on fine grids too
-(docs/identification.md#how-the-ground-is-touched). Here a particle, a ball of half a spacing, is pushed out by a spring, and
+(docs/uncertainty.md#how-the-ground-is-touched). Here a particle, a ball of half a spacing, is pushed out by a spring, and
 Coulomb friction acts on what slides:
 
     j = dt k (r - phi),   v <- v + j n,   v_t <- v_t - min(GRIP, friction j / |v_t|) v_t

@@ -2,7 +2,7 @@
 
 Free rollouts tell a body that slides, as friction shows in where it goes afterwards. Whether one that hardly slides sticks, or
 leaves the ground freely, an isotropic law cannot tell, nor with what friction it slides: its own mistakes are as large. The learned
-law can, when the fit has ended (docs/identification.md#how-the-ground-is-touched). Nor is it known whether a body
+law can, when the fit has ended (docs/uncertainty.md#how-the-ground-is-touched). Nor is it known whether a body
 meets it at its surface (`touch`), as one of finite elements, or at a grid's nodes (`separate`): both are tried.
 """
 
