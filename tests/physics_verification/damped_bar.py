@@ -1,6 +1,6 @@
 """Decay of a free vibrating rod with a viscous branch, against the closed form (check 32).
 
-python tests/physics_verification/damped_bar.py    prints the table of docs/driven.md
+python tests/physics_verification/damped_bar.py    prints the table of docs/results/contact.md
 """
 
 from __future__ import annotations

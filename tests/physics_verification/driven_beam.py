@@ -1,6 +1,6 @@
 """A cantilever whose end is held as driven particles, against Timoshenko's beam (check 31).
 
-python tests/physics_verification/driven_beam.py 10 20 40 80    prints the table of docs/driven.md
+python tests/physics_verification/driven_beam.py 10 20 40 80    prints the table of docs/results/contact.md
 """
 
 from __future__ import annotations

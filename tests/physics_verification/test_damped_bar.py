@@ -1,4 +1,4 @@
-"""Check 32: the decay of a damped rod (`damped_bar`); docs/driven.md has all grids and viscosities."""
+"""Check 32: the decay of a damped rod (`damped_bar`); docs/results/contact.md has all grids and viscosities."""
 
 import pytest
 from damped_bar import GRIDS, RATIOS, SPEED, K, decay

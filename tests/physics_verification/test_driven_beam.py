@@ -1,4 +1,4 @@
-"""Check 31: a held beam (`driven_beam`), coarse; docs/driven.md has its convergence."""
+"""Check 31: a held beam (`driven_beam`), coarse; docs/results/contact.md has its convergence."""
 
 import pytest
 import torch
