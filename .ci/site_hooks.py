@@ -1,8 +1,11 @@
-"""What the site needs beside Markdown: equations as MathML, files of the repository by their names, notebooks out of the search."""
+"""What the site needs beside Markdown: equations as MathML, files of the repository by their names, notebooks out of the search,
+CONTRIBUTING.md as a page."""
 
 import re
+from pathlib import Path
 
 from latex2mathml.converter import convert
+from mkdocs.structure.files import File
 
 
 def formula(source, language, css_class, options, md, **kwargs):
@@ -16,6 +19,12 @@ def on_config(config):
     fence = {"name": "math", "class": "math", "format": formula}
     config.mdx_configs.setdefault("pymdownx.superfences", {})["custom_fences"] = [fence]
     return config
+
+
+def on_files(files, config):
+    text = (Path(config.docs_dir).parent / "CONTRIBUTING.md").read_text()
+    files.append(File.generated(config, "contributing.md", content=text))
+    return files
 
 
 def on_page_markdown(markdown, page, **kwargs):
