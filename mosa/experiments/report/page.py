@@ -24,10 +24,12 @@ NOT_RUN, OURS = "not run", "ours"
 INTRODUCTION = """# Results
 
 This page lists every table and figure of the paper that this program reproduces, and says which
-claims hold. Each section links to the page with its tables, the paper's printed figures, commit,
-seeds and machine. The paper's data were not released: the bodies here are simulated, so their
-true motion is known. `mosa-experiment --page` makes this page from `docs/results/` ([how to run
-the experiments](reproduce.md)).
+claims hold. Each section links to a page with its tables, the difference between its data and the
+paper's, the paper's printed figures, commit, seeds and machine. The table below names the
+commit of the figures and, in brackets, how many later commits changed the program. The paper's
+data were not released: the bodies here are simulated, so their true motion is known.
+`mosa-experiment --page` makes this page from `docs/results/` ([how to reproduce the
+tables](reproduce.md)).
 
 - **ours** is the default of this program (`adapter=operator`, [fitted](uncertainty.md) by
   Gauss-Newton).
@@ -73,7 +75,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
     parts, lines = [], []
     for name in sorted(names, key=lambda name: not name.startswith("table_")):
         experiment = load_experiment(folder, name)
-        parts.append(f"## {experiment.title}\n\n{experiment.note.strip()}")
+        parts.append(f"## {experiment.title}")
         found = read_tables(results / f"{name}.json")
         tables, provenance = found if found is not None else ({}, [])
         known = {
@@ -84,13 +86,12 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             for label, rows in tables.items()
         }
         lines.append([experiment.title, *state_of(provenance), *claims_of(experiment, tables)])
-        parts += older(provenance)
         if not provenance:
             parts.append(f"Not run. Command: `mosa-experiment {name}`")
         if experiment.claims:
             parts.append(
                 "\n".join(
-                    f"- {claim.text}: **{verdict(experiment, claim, tables)}**"
+                    listed(claim.text, verdict(experiment, claim, tables))
                     for claim in experiment.claims
                 )
             )
@@ -150,15 +151,11 @@ def claims_of(experiment: Experiment, tables: Tables) -> tuple[str, str]:
     return of_paper, of_ours
 
 
-def older(lines: Sequence[str]) -> list[str]:
-    """What is said of figures that an earlier state of the program made, by the lines that say where they come from."""
-    found = commits_since(lines)
-    if found is None or found[1] == 0:
-        return []
-    made, count = found
-    changed = "1 commit has" if count == 1 else f"{count} commits have"
-    return [f"**Older commit:** the figures are those of {made}; {changed} changed the program (`mosa/`, `conf/`) since, "
-            "up to the date of this page."]  # fmt: skip
+def listed(claim: str, said: str) -> str:
+    """A claim as an item of a list, with its outcome, and one item below it for each comparison."""
+    outcome, _, figures = said.partition(", ")
+    compared = re.split(r"(?<=\)), (?=[\d.]+(?: ± [\d.]+)? against )", figures) if figures else []
+    return "\n    - ".join([f"- {claim}: **{outcome}**", *compared])
 
 
 def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
@@ -253,16 +250,12 @@ def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | N
     missing = [row for row in claim.against if row not in known]
     word = ("does not hold" if "behind" in said.values() else "within the spread" if "close" in said.values()
             else "holds" + bool(missing) * " against those that were run")  # fmt: skip
-    parts, last = [], None
+    parts = []
     for row, each in known.items():
         own = each.mine.text(figure.decimals)
         notes = [row] + ([f"better in {each.better} of {each.of}"] if each.of > 1 else [])
         notes += [f"without {', '.join(each.without)}"] if each.without else []
-        parts.append(
-            ("" if own == last else f"{own} against ")
-            + f"{each.other.text(figure.decimals)} ({'; '.join(notes)})"
-        )
-        last = own
+        parts.append(f"{own} against {each.other.text(figure.decimals)} ({'; '.join(notes)})")
     text = f"{word}, " + ", ".join(parts)
     one = any(each.mine.sd is None for each in known.values())
     return (

@@ -11,7 +11,7 @@ from mosa.cli.experiment import arguments, run
 from mosa.errors import ConfigError, DataError
 from mosa.experiments import commits
 from mosa.experiments.collecting import Cell
-from mosa.experiments.report.page import older, verdict
+from mosa.experiments.report.page import listed, state_of, verdict
 from mosa.experiments.report.writing import made_by, write_results
 from mosa.experiments.specification import (
     Claim,
@@ -190,7 +190,7 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     )
     least = "our default has the smallest error of all"
     assert (
-        f"{least}: **holds against those that were run, 10.0 against 20.0 (prior only; better in 2 of 2), "
+        f"{least}: **holds against those that were run**\n    - 10.0 against 20.0 (prior only; better in 2 of 2)\n"
         in text
     )
     assert "30.0 (NeuMA; better in 2 of 2); not run: " in text
@@ -202,28 +202,38 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
         run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")]))
 
 
-@pytest.mark.parametrize(("count", "said"), [("3", True), ("0", False), (None, False)])
-def test_the_page_says_of_figures_that_the_program_has_changed_since(monkeypatch, count, said):
-    """Of no change, or of a commit that this checkout does not know, it says nothing."""
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [("3", "0123456789ab, with changes (3)"), ("0", "0123456789ab, with changes (0)"), (None, "")],
+)
+def test_the_page_counts_the_changes_of_the_program_since_its_figures(monkeypatch, count, said):
+    """Of a commit that this checkout does not know, it says nothing."""
     asked = []
     monkeypatch.setattr(commits, "git", lambda *words: asked.append(words) or count)
-    found = older(
+    found = state_of(
         [
             "command: `mosa-experiment all`",
             "version 0.1.0, commit 0123456789ab, with changes",
-            "seeds: 0",
+            "2 of 2 jobs complete",
         ]
     )
     assert asked == [("rev-list", "--count", "0123456789ab..HEAD", "--", "mosa", "conf")]
-    assert (
-        found
-        == [
-            "**Older commit:** the figures are those of 0123456789ab; 3 commits have changed the program (`mosa/`, `conf/`) "
-            "since, up to the date of this page."
-        ]
-        * said
+    assert found == ("2 of 2", said)
+    assert state_of(["2 of 2 jobs complete", "version 0.1.0, commit unknown"]) == ("2 of 2", "")
+    assert len(asked) == 1
+
+
+def test_each_comparison_of_a_claim_is_an_item_of_its_own():
+    said = "holds, 9.1 ± 0.2 against 19.8 ± 0.0 (prior; better in 6 of 7), 9.1 ± 0.2 against 3.0 (box); not run: x"
+    assert listed("ours", said).splitlines() == [
+        "- ours: **holds**",
+        "    - 9.1 ± 0.2 against 19.8 ± 0.0 (prior; better in 6 of 7)",
+        "    - 9.1 ± 0.2 against 3.0 (box); not run: x",
+    ]
+    assert listed("moduli", "does not hold, 1 of 2 within 5 %; beyond it: a (9.0), b (7.0)") == (
+        "- moduli: **does not hold**\n    - 1 of 2 within 5 %; beyond it: a (9.0), b (7.0)"
     )
-    assert older(["version 0.1.0, commit unknown"]) == [] and len(asked) == 1
+    assert listed("speed", "not run") == "- speed: **not run**"
 
 
 def test_results_name_the_commits_that_their_runs_were_made_with(tmp_path):
