@@ -1,6 +1,6 @@
 """How well the true bulk modulus explains the droplet's true motion on coarser grids, with and without the mean volume.
 
-python benchmarks/droplet_kappa.py    prints the table of docs/verification.md, "Locking" (ten CPU-minutes)
+python benchmarks/droplet_kappa.py    prints the table of docs/results/locking.md (ten CPU-minutes)
 """
 
 import numpy as np

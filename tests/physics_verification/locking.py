@@ -1,7 +1,7 @@
 """The static sag of a nearly incompressible cantilever under its weight, with the simulator's own forces (check 33).
 
 PYTHONPATH=.:tests/helpers python tests/physics_verification/locking.py 3 4 6    prints the table of
-docs/verification.md
+docs/results/locking.md
 """
 
 from __future__ import annotations
