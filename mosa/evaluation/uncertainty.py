@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Ordered
 from typing import TypeVar
 
@@ -49,22 +49,25 @@ def predicted_spread(
     *,
     draws: int = DRAWS,
     seed: int = 0,
+    known: Mapping[str, Tensor] | None = None,
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """(figures, standard deviation (T, N) [m] of every particle's position by the sequence's prefix).
 
     The variance of a position, summed over its three components, is that of the draws (times `DRAWN`^2), that among the forms of
     the law (`Posterior.rivals`, times `FORMS`^2), and the square of what the model gets wrong on the training sequence itself
     (`Posterior.model_error`), which is `ELSEWHERE` times as much on a sequence that was not learned from. Draws and rivals that
-    cannot be simulated are left out and counted; sequences on which the law itself cannot are left out. Figures: posterior/draws,
+    cannot be simulated are left out and counted; sequences on which the law itself cannot are left out. known: positions
+    (T, N, 3) [m] that the law itself predicts, by the sequence's prefix, where they are at hand. Figures: posterior/draws,
     posterior/rivals, posterior/<prefix>/sd_m and, after first contact and where the true motion is known,
     posterior/<prefix>/coverage: the share of the particles' errors within two standard deviations.
     """
     generator = torch.Generator().manual_seed(seed)
 
-    base: dict[str, Tensor] = {}
+    base: dict[str, Tensor] = dict(known or {})
     for s in sequences:
         try:
-            base[s.prefix] = _positions(body, s, world)
+            if s.prefix not in base:
+                base[s.prefix] = _positions(body, s, world)
         except MosaError:  # `evaluate` has said so
             continue
     sequences = [s for s in sequences if s.prefix in base]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 from omegaconf import DictConfig
+from torch import Tensor
 
 from mosa import __version__
 from mosa.data.io.gaussian_ply import save_ply
@@ -56,8 +58,9 @@ def figures_of(
     scene = evaluated[0].scene
     figures, kept = evaluate(body, evaluated, world, settings)
     figures |= identification(body, scene) | law_figures(body)
+    known = {prefix: each["adapted"].x for prefix, each in kept.items() if "adapted" in each}
     figures |= hidden_figures(body, scene, figures) | posterior_figures(
-        body, posterior, evaluated, world, folder
+        body, posterior, evaluated, world, folder, known
     )
     if settings.floor:
         figures |= floor_figures(body, evaluated, world, settings) | true_geometry(body, scene)
@@ -65,13 +68,14 @@ def figures_of(
 
 
 def posterior_figures(
-    body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path
-) -> dict:
+    body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path,
+    known: Mapping[str, Tensor],
+) -> dict:  # fmt: skip
     """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no
-    posterior."""
+    posterior. known: positions that the law predicts, by the sequence's prefix."""
     if posterior is None:
         return {}
-    figures, spreads = predicted_spread(body, posterior, evaluated, world)
+    figures, spreads = predicted_spread(body, posterior, evaluated, world, known=known)
     if spreads:
         save_spread(folder / "uncertainty.npz", spreads)
     return figures | test_means(figures) | determined(body, posterior)

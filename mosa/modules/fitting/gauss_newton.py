@@ -220,7 +220,9 @@ class GaussNewton:
             finally:
                 self.seats[0].write(numbers)
         J = torch.empty(len(numbers), len(r), dtype=r.dtype, device=r.device)
-        left, lock, over = iter(range(len(numbers))), threading.Lock(), threading.Event()
+        # the grid's multiple, the last, needs no rollout while the prediction here is remembered
+        left, lock = iter(reversed(range(len(numbers)))), threading.Lock()
+        over = threading.Event()
 
         def work(seat: Seat) -> None:
             while True:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import copy
 import math
 import os
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -53,6 +55,8 @@ PARTICLES_TOGETHER = 400_000
 """Of all worlds in one launch: more no longer make a GPU's substep cheaper for each."""
 ROUNDED = 8
 """Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
+REMEMBERED = 8
+"""Predictions that are kept, as an iteration begins where a step of the last one ended: of its steps, and of where it began."""
 RIVAL_STEPS = 2
 """With the fitted law's Jacobian, from its numbers on: then their costs are within a tenth of the fitted law's mostly."""
 IMPLAUSIBLE = 3.0
@@ -113,6 +117,8 @@ class Identification:
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
         bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
         self.iteration, self.noise, self.substeps = 0, None, None
+        self._remembered: OrderedDict[tuple, list[residuals.Fields]] = OrderedDict()
+        self._lock = threading.Lock()
         self.grid: list[residuals.Fields] | None = (
             None  # differences between the two grids, of every pair
         )
@@ -248,10 +254,22 @@ class Identification:
         )
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
-        return [
-            self._differences(self.rollout(body, i, gain, self.substeps[i]), i)
-            for i, gain in self.pairs
-        ]
+        """Of every pair; those that were found last are remembered."""
+        numbers = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
+        place = torch.cat([t.detach().double().cpu().flatten() for t in numbers]).tolist()
+        key = (body.material.law, body.settings.dx, *self.substeps, *place)
+        with self._lock:
+            found = self._remembered.get(key)
+        if found is None:
+            found = [
+                self._differences(self.rollout(body, i, gain, self.substeps[i]), i)
+                for i, gain in self.pairs
+            ]
+            with self._lock:
+                self._remembered[key] = found
+                while len(self._remembered) > REMEMBERED:
+                    self._remembered.popitem(last=False)
+        return found
 
     def _differences(self, rollout: Rollout, index: int) -> residuals.Fields:
         """Of a rollout from what was seen of take `index`; forces are those of the first."""
@@ -364,10 +382,8 @@ class Identification:
 
     def _hold_substeps(self) -> None:
         """Substeps are a step function of the numbers: held fixed, differences are those of a smooth function."""
-        self.substeps = []
-        for i in range(len(self.takes)):
-            self.rollout(self.body, i)
-            self.substeps.append(-(-int(1.05 * self.body.last_substeps) // ROUNDED) * ROUNDED)
+        asked = [self.ready(self.body, i).simulator.substeps for i in range(len(self.takes))]
+        self.substeps = [-(-int(1.05 * count) // ROUNDED) * ROUNDED for count in asked]
 
     @torch.no_grad()
     def prepare(self) -> float:
