@@ -276,10 +276,6 @@ class ChainOfSegments(Stretch):
     foresees = True
 
     @property
-    def substeps(self) -> int:
-        return self.chain.substeps
-
-    @property
     def cut(self) -> bool:
         # shorter chains need less than the widest window, which is larger than any may be
         return self.substeps > WIDENED and len(self.chain.lengths) > 1
@@ -292,7 +288,7 @@ class ChainOfSegments(Stretch):
     ) -> tuple[Workspace, dict]:
         return self.chain.workspace(full), {"parameters": acting[0].detach()}
 
-    def advance(self, work: Workspace, acting: Sequence[Tensor]) -> None:
+    def advance(self, work: Workspace) -> None:
         self.chain.follow(work, self.learned)
         self.chain.capture(work.steps)
         self.chain.play(work.steps, "forward", work.with_adjoint)
@@ -326,7 +322,12 @@ def advance_chain(
     """(the state after the chain, reactions, statistics of each evaluation), differentiable in state, parameters, poses and the
     adapter's weights. Arguments: as `ChainOfSegments` and `advance_segment`. Errors: SimulationDiverged; LeftWindow."""
     stretch = ChainOfSegments(
-        lanes, first, steps or Steps(lanes.numerics.dt, lanes.numerics.dt), chain, learned
+        lanes,
+        first,
+        steps or Steps(lanes.numerics.dt, lanes.numerics.dt),
+        chain.substeps,
+        chain,
+        learned,
     )
     final, left = advance(stretch, state, (packed, *learned.weights, *poses))
     reactions = 2 if poses else 0

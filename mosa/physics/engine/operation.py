@@ -1,11 +1,10 @@
-"""A stretch of motion as one differentiable torch operation, whatever acts on the particles beside the law.
+"""A stretch of motion as one differentiable torch operation: a segment in which what an adapter answered is held, or a chain.
 
 Between the passes a stretch keeps what its backward pass reads, where there is room for it, and else only its inputs.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,14 +12,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from mosa.physics.adapters.interface import ANSWER
 from mosa.physics.contact.motion import Poses
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.numerics import State, Steps
-from mosa.physics.engine.solver import SegmentSolver, Windows
+from mosa.physics.engine.solver import WIDENED, LeftWindow, SegmentSolver, Windows
 from mosa.physics.engine.workspace import Workspace
+from mosa.physics.grid.transfer_kernels import WINDOW
 from mosa.physics.launching import copies
 
 STATES = len(State._fields)
+HELD = ("parameters", *ANSWER)
 
 
 class Kept:
@@ -37,11 +39,11 @@ class Kept:
 
 
 @dataclass
-class Stretch(ABC):
+class Stretch:
     """Some substeps that are advanced, and differentiated, as a whole.
 
-    Besides the state a stretch depends on other tensors: what acts, as a kind of stretch has it
-    (None for one there is not), then, where there are colliders, their poses at its substeps, as
+    Besides the state a stretch depends on other tensors: what acts, here what is held (`HELD`, None
+    for one there is not), then, where there are colliders, their poses at its substeps, as
     `contact.motion.Poses`, and the paths of points that lead driven particles. Besides the state it
     leaves the colliders' force [N] and torque about each collider's origin [N m], (S, W K, 3) each,
     then the `statistics` of its kind.
@@ -51,35 +53,53 @@ class Stretch(ABC):
     lanes: Lanes
     first: int
     steps: Steps
+    substeps: int
 
-    margin: ClassVar[int]
+    margin: ClassVar[int] = 2
     """Nodes of a window beyond what the speeds at the start ask for."""
-    substeps: ClassVar[int]
-    cut: ClassVar[bool]
-    """Whether the caller makes shorter ones of it where a particle leaves its window; else the window is widened."""
-    foresees: ClassVar[bool]
-    """Whether the window has room for what gravity adds to the speeds."""
 
-    @abstractmethod
+    @property
+    def cut(self) -> bool:
+        """Whether the caller makes shorter ones of it where a particle leaves its window; else the window is widened."""
+        return self.substeps > WIDENED
+
+    @property
+    def foresees(self) -> bool:
+        """Whether the window has room for what gravity adds to the speeds."""
+        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
+        return self.cut
+
     def buffers(
         self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool
     ) -> tuple[Workspace, dict]:
         """(the workspace, what is copied into it by name). full: with buffers for the adjoint."""
+        held = dict(zip(HELD, acting, strict=True))
+        operator = [held[name] for name in ("G", "h") if held[name] is not None]
+        # views of one row, as `expand` makes them, are read from there by all particles
+        shared = bool(operator) and all(part.stride(0) == 0 for part in operator)
+        return solver.workspace(
+            self.substeps, bool(operator), held["plastic_G"] is not None, full, shared
+        ), held
 
-    @abstractmethod
-    def advance(self, work: Workspace, acting: Sequence[Tensor | None]) -> None:
+    def advance(self, work: Workspace) -> None:
         """All substeps, in a workspace that is loaded."""
+        work.advance()
 
-    @abstractmethod
     def adjoint(
         self, work: Workspace, acting: Sequence[Tensor | None], again: bool, penalised: bool
     ) -> None:
         """Of all substeps, in a workspace that is loaded and seeded. again: the states are not there; penalised: `statistics_seeds`
         are not all zero."""
+        if again:
+            work.advance()
+        work.adjoint()
 
-    @abstractmethod
     def adjoint_of(self, work: Workspace, acting: Sequence[Tensor | None]) -> list[Tensor | None]:
         """Where `adjoint` leaves the gradients of what acts."""
+        return [
+            None if value is None else work.adj_held[name]
+            for name, value in zip(HELD, acting, strict=True)
+        ]
 
     def full(self, differentiated: bool, kept: bool) -> bool:
         """Whether the forward pass runs in the buffers of the backward pass, which it has to where its states are kept."""
@@ -137,20 +157,23 @@ class Stretch(ABC):
         """(the state after it, what else it leaves, what `backward` gets as `kept`). differentiated: whether that follows.
         Errors: SimulationDiverged naming substep and particle; LeftWindow where it is cut."""
         time, dt = self.substeps * self.steps.dt, self.steps.dt
+        # a body that is being accelerated may need the most that the time step bound allows, half a cell per substep
+        margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
 
         def run(solver: SegmentSolver, state: State, acting: tuple, poses: tuple):
             kept = differentiated and solver.has_room(self.substeps)
             full = self.full(differentiated, kept)
 
-            def launched(windows: Windows) -> Workspace:
+            for margin in margins:
+                windows = solver.windows(state, time, margin, self.foresees)
                 work = self._loaded(solver, state, acting, poses, windows, full)
-                self.advance(work, acting)
-                return work
-
-            margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
-            work, final, windows = solver.within(
-                launched, state, time, margins, self.foresees, self.first, dt
-            )
+                self.advance(work)
+                final = work.final()
+                if not solver.left_window(work.flags, final, self.first, dt):
+                    break
+            else:
+                fastest = int(work.flags[WINDOW])
+                raise LeftWindow if self.cut else solver.error(WINDOW, fastest, self.first, dt)
             left = [
                 *([] if work.colliders is None else work.colliders.reaction),
                 *self.statistics(work),
@@ -277,3 +300,34 @@ def advance(
     result = _Advance.apply(stretch, *state, *others)
     own = STATES if stretch.plastic else STATES - 1
     return State.whole(result[:own]), tuple(result[own:])
+
+
+def advance_segment(
+    lanes: Lanes,
+    state: State,
+    held: dict,
+    substeps: int,
+    first: int,
+    poses: tuple[Tensor, ...] = (),
+    steps: Steps | None = None,
+) -> tuple[State, tuple[Tensor, ...]]:
+    """(state after `substeps`, reactions), differentiable in state, everything in `held`, and poses.
+
+    poses: of K colliders at the segment's S substeps, () where there are none; reactions: as a `Stretch` leaves them. steps: times
+    of the substeps, the numerics' dt by default.
+    """
+    steps = steps or Steps(lanes.numerics.dt, lanes.numerics.dt)
+    done, most, reactions = 0, substeps, []
+    while done < substeps:
+        piece = lanes.piece(state, substeps - done, most, steps.dt)
+        others = (*(held[name] for name in HELD), *(part[done : done + piece] for part in poses))
+        try:
+            state, reaction = advance(Stretch(lanes, first + done, steps, piece), state, others)
+        except LeftWindow:
+            most = WIDENED
+            continue
+        reactions.append(reaction)
+        done, steps = done + piece, Steps(steps.dt, steps.dt)
+    return state, reactions[0] if len(reactions) == 1 else tuple(
+        torch.cat(parts) for parts in zip(*reactions, strict=True)
+    )

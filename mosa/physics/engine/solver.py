@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -92,30 +92,6 @@ class SegmentSolver:
             )  # fmt: skip
         return self.workspaces[key]
 
-    def within(
-        self, run: Callable[[Windows], Workspace], state: State, time: float, margins: Sequence[int], falls: bool, first: int,
-        dt: float,
-    ) -> tuple[Workspace, State, Windows]:  # fmt: skip
-        """(what `run` has run in, the state after it, the windows) in the first windows that no particle leaves.
-
-        The speeds at the start tell a window for `time` seconds; a body that is being accelerated may need the most that the time
-        step bound allows, half a cell per substep. margins: nodes beyond what the speeds ask for, of one window after the other;
-        with one alone the caller can cut what is run. falls: as `windows`; first, dt: of the substeps, for messages. Errors:
-        SimulationDiverged naming substep and particle; LeftWindow of what can be cut."""
-        if self._shared is not None:
-            work = run(self._shared.windows)
-            self._shared.flags.append(work.flags.clone())
-            self._shared.final = work.final()
-            return work, self._shared.final, self._shared.windows
-        for margin in margins:
-            windows = self.windows(state, time, margin, falls)
-            work = run(windows)
-            final = work.final()
-            flags = self.look(work.flags, final)
-            if not self.left_window(flags, first, dt):
-                return work, final, windows
-        raise LeftWindow if len(margins) == 1 else self.error(WINDOW, flags[WINDOW], first, dt)
-
     @contextmanager
     def one_look(self, state: State, time: float, margin: int) -> Iterator[None]:
         """The stretches inside begin at `state` and take `time` seconds in all; they have the same windows, and the host looks at
@@ -171,7 +147,10 @@ class SegmentSolver:
 
     def windows(self, state: State, time: float, margin: int, falls: bool) -> Windows:
         """The windows of the worlds, (W, 3) each, for `time` [s], with room for `margin` nodes more. falls: also for what gravity
-        adds to the speeds at the start. Errors: SimulationDiverged as `grid_window`."""
+        adds to the speeds at the start. Inside of `one_look` they are what its stretches share. Errors: SimulationDiverged as
+        `grid_window`."""
+        if self._shared is not None:
+            return self._shared.windows
         bounds = self.bounds(state)
         bounds = fallen(bounds, self._pull, time) if falls else bounds
         x, v = (self._apart(t) for t in state[:2])
@@ -209,15 +188,21 @@ class SegmentSolver:
         # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
         self._known = [t.detach() for t in state[:2]], bounds
 
-    def left_window(self, flags: list[int], first: int, dt: float) -> bool:
-        """Whether a particle left the grid's window; any other event raises."""
-        if min(flags) == NO_EVENT:
+    def left_window(self, flags: Tensor, final: State, first: int, dt: float) -> bool:
+        """Whether a particle left the grid's window in a stretch that left these flags and this state; any other event raises.
+        Inside of `one_look` that is asked afterwards. first, dt: of the substeps, for messages."""
+        if self._shared is not None:
+            self._shared.flags.append(flags.clone())
+            self._shared.final = final
+            return False
+        events = self.look(flags, final)
+        if min(events) == NO_EVENT:
             return False
         n = len(self.volume)
-        event = min(range(4), key=lambda i: (flags[i] // n, i != INVERTED, i == WINDOW, flags[i]))
+        event = min(range(4), key=lambda i: (events[i] // n, i != INVERTED, i == WINDOW, events[i]))
         if event == WINDOW:
             return True
-        raise self.error(event, flags[event], first, dt)
+        raise self.error(event, events[event], first, dt)
 
     def error(self, event: int, flag: int, first: int, dt: float) -> SimulationDiverged:
         """flag: number of the particle plus len(volume) for every substep after `first`."""

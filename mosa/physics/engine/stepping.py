@@ -26,8 +26,7 @@ from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.numerics import Numerics, State, Steps, flat
-from mosa.physics.engine.operation import wants_gradient
-from mosa.physics.engine.segment import HeldSegment, advance_segment
+from mosa.physics.engine.operation import Stretch, advance_segment, wants_gradient
 from mosa.physics.engine.solver import LeftWindow
 from mosa.physics.grid.transfer_kernels import OUTSIDE
 from mosa.physics.time.clock import Clock, Frame, Moment
@@ -177,7 +176,7 @@ class Prepared:
 
     @property
     def _margin(self) -> int:
-        return (HeldSegment if self.chains is None else ChainOfSegments).margin
+        return (Stretch if self.chains is None else ChainOfSegments).margin
 
     def _together(self, state: State, frame: Frame, frames: int) -> int:
         """How many of `frames` frames alike are launched before the host looks at them."""
