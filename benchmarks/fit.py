@@ -79,6 +79,7 @@ class Steps:
             began = self.clock()
             result = simulate(*args, **kwargs)
             self.rollout += self.clock() - began
+            self.substeps = result.substeps
             return result
 
         module.body.simulate = timed
@@ -140,7 +141,7 @@ def measure(
         figures[stage.name] = {part: [each[part] for each in made] for part in PARTS}
     body = module.body
     frames = len(module.takes[0].cues.positions)
-    about = f"{len(body.rest)} particles, {frames} frames, {body.last_substeps} substeps each, {len(views)} views"
+    about = f"{len(body.rest)} particles, {frames} frames, {steps.substeps} substeps each, {len(views)} views"
     if kernels:
         print_kernels(steps, len(module.stages) - 1, kernels)
     return figures, about

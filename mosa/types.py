@@ -360,6 +360,11 @@ class Rollout:
     reactions: Tensor | None = None
     counts: tuple[int, ...] = ()
 
+    @property
+    def substeps(self) -> int:
+        """Mean of `counts`, rounded up; 0 of the start alone."""
+        return -(-sum(self.counts) // max(1, len(self.counts)))
+
     def to(self, device: torch.device | str) -> Rollout:
         moved = {name: getattr(self, name).to(device) for name in ("x", "v", "F", "F_tot", "times")}
         final = ParticleState(*(getattr(self.final, f.name).to(device) for f in fields(self.final)))

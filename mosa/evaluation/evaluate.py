@@ -369,7 +369,8 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
                     name, figures[f"{prefix}/{name}"], scene.known_parameters[name]
                 )
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
-        figures[f"{prefix}/contact_offset_m"] = float(model.contact.height(scene.ground).detach())
+        height = model.contact.height(scene.ground, body.settings.dx)
+        figures[f"{prefix}/contact_offset_m"] = float(height.detach())
     return figures
 
 

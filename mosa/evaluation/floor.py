@@ -59,14 +59,14 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         frame_dt=frame_dt,
         gravity=world.gravity,
         up=world.up,
-        ground=body.contact.at_nodes(world.ground),
+        ground=body.contact.at_nodes(world.ground, settings.dx),
         planes=world.planes,
         colliders=world.solids,
         device=device,
         options=hidden.options,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
-    lift = body.contact.lift(world.ground).detach().float().cpu() * up
+    lift = body.contact.lift(world.ground, settings.dx).detach().float().cpu() * up
     F = Q.expand(n, 3, 3).contiguous()
     velocity = (
         (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()

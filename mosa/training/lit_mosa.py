@@ -600,7 +600,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """These scalars and the parameters, into the logs and `last`."""
         for name, value in self.body.material.physical().items():
             values[f"id/{name}"] = value.detach()
-        values["id/contact_offset"] = self.body.contact.height(self.world.ground).detach()
+        height = self.body.contact.height(self.world.ground, self.body.settings.dx)
+        values["id/contact_offset"] = height.detach()
         self.log_dict(
             {k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()},
             on_step=True,

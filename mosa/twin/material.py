@@ -206,9 +206,8 @@ class TwinMaterial:
         for variant in body.frozen.values():
             assert isinstance(variant, nn.ModuleDict)
             variant["material"] = copy.deepcopy(body.material).requires_grad_(False)
-        if new:  # the simulator in hand takes yield stresses as the law before did
+        if new:
             body.law_options = AS_USUAL
-            body.__dict__.pop("_simulator_key", None)
 
     def __repr__(self) -> str:
         values = ", ".join(said(self._body.material.law, k, v) for k, v in self.parameters.items())

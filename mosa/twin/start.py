@@ -147,7 +147,7 @@ def start_in(
             low = (
                 low
                 - 0.5 * body.volume.to(low) ** (1 / 3)
-                + body.contact.lift(world.ground).detach()
+                + body.contact.lift(world.ground, body.settings.dx).detach()
             )
         center = center + up * (ground + height - low.min() - center @ up)
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))

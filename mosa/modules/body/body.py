@@ -51,6 +51,8 @@ class Body(nn.Module):
     colors: Tensor
     opacities: Tensor
     covariances: Tensor
+    _made: tuple[World, tuple, Simulator] | None = None
+    """The last simulator, and for what it was made."""
 
     def __init__(
         self,
@@ -84,7 +86,7 @@ class Body(nn.Module):
         if adapter is not None:
             adapter.settle(self.rest, self.volume)
         # the calibrated backbones that every later figure is compared with; filled when their stage ends
-        self.contact = ContactOffset(settings.dx, settings.contact_offset)
+        self.contact = ContactOffset(settings.contact_offset)
         backbone = nn.ModuleDict({"material": material, "contact": self.contact})
         self.frozen = nn.ModuleDict(
             {"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)}
@@ -103,7 +105,7 @@ class Body(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the simulator, whose buffers are no part of a body: a copy makes its own."""
-        return {k: v for k, v in self.__dict__.items() if not k.startswith("_simulator")}
+        return self.__dict__ | {"_made": None}
 
     @property
     def center(self) -> Tensor:
@@ -235,7 +237,7 @@ class Body(nn.Module):
         ready = self.ready(
             start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps
         )
-        rollout = ready.simulate(
+        return ready.simulate(
             frames,
             world.solids,
             collect=collect,
@@ -244,9 +246,6 @@ class Body(nn.Module):
             gain=gain,
             unseen=unseen,
         )
-        taken = rollout.counts
-        self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
-        return rollout
 
     def ready(
         self, start: Start, world: World, frames: int, frame_dt: float, *, model: Model | None = None,
@@ -279,7 +278,7 @@ class Body(nn.Module):
                 float(material.max_viscosity(factor.detach())),
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
-        lift = model.contact.lift(world.ground) * up
+        lift = model.contact.lift(world.ground, self.settings.dx) * up
         simulator = None if adapter is None else adapter.simulator(self.density, world, frame_dt)
         if simulator is not None:  # no law on a grid: the adapter brings its dynamics
             lift, timing = torch.zeros_like(lift), None
@@ -318,24 +317,25 @@ class Body(nn.Module):
         """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).
 
         strain: of an adapter whose operator is a stiffness (`Simulator`)."""
-        key = (law, substeps, frame_dt, str(self.rest.device), strain, self.settings.dx)
-        if getattr(self, "_simulator_key", None) != key or self._simulator_world is not world:
-            dtype = torch.float64 if self.settings.precision == 64 else torch.float32
-            self._simulator = Simulator(
+        device, settings, options = self.rest.device, self.settings, self.law_options
+        key = (law, substeps, frame_dt, str(device), strain, settings, options)
+        if self._made is None or self._made[0] is not world or self._made[1] != key:
+            dtype = torch.float64 if settings.precision == 64 else torch.float32
+            simulator = Simulator(
                 law,
-                dx=self.settings.dx,
+                dx=settings.dx,
                 substeps=substeps,
                 frame_dt=frame_dt,
                 gravity=world.gravity,
                 up=world.up,
-                ground=self.contact.at_nodes(world.ground),
+                ground=self.contact.at_nodes(world.ground, settings.dx),
                 planes=world.planes,
                 colliders=world.solids,
                 box=world.box,
                 dtype=dtype,
-                device=self.rest.device,
+                device=device,
                 strain=strain,
-                options=self.law_options,
+                options=options,
             )
-            self._simulator_key, self._simulator_world = key, world
-        return self._simulator
+            self._made = world, key, simulator
+        return self._made[2]

@@ -20,6 +20,8 @@ class ContactOffset(nn.Module):
 
     A B-spline grid stops a body a fraction of dx before it touches a wall, by an amount that depends on dx and on the stencil's
     place; without this one number the stiffness absorbs it, differently on every grid.
+
+    dx [m] of its methods: spacing of the grid that it is asked for.
     """
 
     START, GRID = 0.3, 0.15
@@ -33,43 +35,42 @@ class ContactOffset(nn.Module):
 
     E then has a second valley beyond these bounds, and the number absorbs errors of the law."""
 
-    def __init__(self, dx: float, enabled: bool = True) -> None:
+    def __init__(self, enabled: bool = True) -> None:
         super().__init__()
-        self.dx, self.enabled = dx, enabled
+        self.enabled = enabled
         self.cells = nn.Parameter(
             torch.tensor(self.START if enabled else 0.0), requires_grad=enabled
         )
 
-    def forward(self) -> Tensor:
-        return self.dx * self.cells
-
-    def height(self, ground: Ground | None) -> Tensor:
+    def height(self, ground: Ground | None, dx: float) -> Tensor:
         """Height [m] above the ground at which the grid stops a body. Particles that meet the ground
         themselves need none: there the change from `START` is the error of the stated height."""
         touched = ground is not None and ground.mode == "touch" and self.enabled
-        return self.dx * (self.cells - self.START) if touched else self()
+        return dx * (self.cells - self.START if touched else self.cells)
 
-    def lift(self, ground: Ground | None) -> Tensor:
+    def lift(self, ground: Ground | None, dx: float) -> Tensor:
         """Height [m] by which a body is simulated above where it is, over the ground `at_nodes`."""
-        moved = self.at_nodes(ground)
+        moved = self.at_nodes(ground, dx)
         gap = 0.0 if moved is None or ground is None else moved.height - ground.height
-        return self.height(ground) + gap
+        return self.height(ground, dx) + gap
 
-    def at_nodes(self, ground: Ground | None) -> Ground | None:
+    def at_nodes(self, ground: Ground | None, dx: float) -> Ground | None:
         """The ground as it is simulated: at the highest layer of nodes below it, where nodes meet it.
 
         Otherwise what a body does would depend on where within a cell the ground lies."""
         if ground is None or ground.mode not in NODE_MODES or not self.enabled:
             return ground
-        return replace(ground, height=self.dx * math.floor(ground.height / self.dx + ROUNDED))
+        return replace(ground, height=dx * math.floor(ground.height / dx + ROUNDED))
 
-    def prior(self, ground: Ground | None, free: bool) -> tuple[float, tuple[float, float]]:
+    def prior(
+        self, ground: Ground | None, dx: float, free: bool
+    ) -> tuple[float, tuple[float, float]]:
         """(standard deviation about `START`, bounds) [cells].
 
         ground: where its accuracy is known, the bounds are two deviations; free: whether only free
         rollouts are compared."""
         if ground is not None and ground.accuracy is not None:
-            sd = math.hypot(self.GRID, ground.accuracy / self.dx)
+            sd = math.hypot(self.GRID, ground.accuracy / dx)
             low, high = self.LIMITS
             return sd, (max(low, self.START - 2 * sd), min(high, self.START + 2 * sd))
         return (self.NARROW, self.WITHIN) if free else (self.UNKNOWN, self.LIMITS)

@@ -318,7 +318,6 @@ class Identification:
         """What the numbers predict on a coarser grid; None where it cannot simulate them."""
         body = copy.deepcopy(self.body)
         body.settings = body.settings.but(dx=COARSER * body.settings.dx)
-        body.contact.dx *= COARSER
         try:
             return self._fields(body)
         except SimulationDiverged:
@@ -349,7 +348,8 @@ class Identification:
     def offsets(self) -> tuple[float | None, ...]:
         """Contact offsets [cells] of the search's grid; None: keep it, as its prior is narrow."""
         contact = self.body.contact
-        sd, (low, high) = contact.prior(self.world.ground, free=not any(self.gains))
+        dx, free = self.body.settings.dx, not any(self.gains)
+        sd, (low, high) = contact.prior(self.world.ground, dx, free)
         if not contact.enabled or sd <= contact.NARROW:
             return (None,)
         return tuple(cells for cells in OFFSET_STEPS if low <= cells <= high)

@@ -91,7 +91,7 @@ def blocks_of(
             )
         )
     if body.contact.enabled:
-        sd, bounds = body.contact.prior(ground, free)
+        sd, bounds = body.contact.prior(ground, body.settings.dx, free)
         mean = torch.tensor([ContactOffset.START])
         blocks.append(Block("contact", mean, torch.tensor([sd]), step, bounds=bounds))
     if adapter:

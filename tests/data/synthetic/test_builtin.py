@@ -299,7 +299,7 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     scene = held_out[0]
     world = World(scene.ground, scene.gravity, scene.up, scene.box)
     rest = training.truth.rest
-    contact = ContactOffset(2 * spacing)
+    contact = ContactOffset()
     torch.nn.init.constant_(contact.cells, OBJECTS["tiny"].meeting.lift)
     body = SimpleNamespace(
         rest=rest, volume=torch.full((len(rest),), spacing**3), contact=contact,

@@ -56,7 +56,7 @@ def test_the_twin_records_and_replays_its_counts():
     again = twin(**SOFT).simulate(frames=8, colliders=[PLATE])
     assert again.counts == rollout.counts and torch.equal(again.x, rollout.x)
     alone = one.simulate(frames=8)
-    assert one.body.last_substeps == math.ceil(sum(alone.counts) / 7)
+    assert alone.substeps == math.ceil(sum(alone.counts) / 7)
     start, world = one.training_start, one.world
     replayed = twin(SOFT["material"], adaptive=False).body.simulate(
         start, world, 8, 0.02, counts=alone.counts

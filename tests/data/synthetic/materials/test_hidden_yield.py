@@ -70,7 +70,7 @@ def test_it_is_a_scene_with_a_floor(tmp_path, monkeypatch):
         )
         world, truth = World(scene.ground, scene.gravity, scene.up, scene.box), scene.truth
         settings = SimpleNamespace(dx=2 * SMALL.spacing, courant=0.3)
-        contact = ContactOffset(settings.dx)
+        contact = ContactOffset()
         torch.nn.init.constant_(contact.cells, 0.4)
         volume = torch.full((len(truth.rest),), SMALL.spacing**3)
         body = SimpleNamespace(rest=truth.rest, volume=volume, settings=settings, contact=contact)

@@ -511,17 +511,17 @@ def test_a_ground_acts_alike_wherever_in_a_cell_it_lies(mode, friction, cells):
     low, high = low.detach(), high.detach()
     assert float((low - low[0]).abs().max()) > 0.1 * body.size
     assert float((high - low - raised * WORLD.up.to(low)).abs().max()) < 1e-9
-    assert float(body.contact.height(Ground(raised, mode)).detach()) == pytest.approx(
-        0.3 * body.settings.dx
-    )
+    assert float(
+        body.contact.height(Ground(raised, mode), body.settings.dx).detach()
+    ) == pytest.approx(0.3 * body.settings.dx)
 
 
 def test_a_ground_of_known_accuracy_bounds_the_contact():
     """Two deviations about what a grid does, of grid and accuracy together; narrow where rollouts are free."""
-    offset, ground = ContactOffset(0.02), Ground(0.0)
-    assert offset.prior(ground, free=False) == (offset.UNKNOWN, offset.LIMITS)
-    assert offset.prior(None, free=True) == (offset.NARROW, offset.WITHIN)
-    sd, bounds = offset.prior(replace(ground, accuracy=0.004), free=True)
+    offset, ground, dx = ContactOffset(), Ground(0.0), 0.02
+    assert offset.prior(ground, dx, free=False) == (offset.UNKNOWN, offset.LIMITS)
+    assert offset.prior(None, dx, free=True) == (offset.NARROW, offset.WITHIN)
+    sd, bounds = offset.prior(replace(ground, accuracy=0.004), dx, free=True)
     assert sd == pytest.approx(0.25) and bounds == pytest.approx((-0.2, 0.8))
 
 
@@ -538,18 +538,18 @@ def test_the_accuracy_of_a_ground_is_read_and_checked():
 
 def test_particles_that_meet_the_ground_themselves_need_no_lift():
     """The number then is what is not known of the ground's height, from nothing on."""
-    offset, sticks, meets = ContactOffset(0.1), Ground(0.0, "sticky"), Ground(0.0, "touch")
+    offset, sticks, meets = ContactOffset(), Ground(0.0, "sticky"), Ground(0.0, "touch")
     assert (
-        float(offset.lift(sticks).detach())
+        float(offset.lift(sticks, 0.1).detach())
         == pytest.approx(0.1 * offset.START)
-        == float(offset.lift(None).detach())
+        == float(offset.lift(None, 0.1).detach())
     )
-    assert float(offset.lift(meets).detach()) == 0.0
+    assert float(offset.lift(meets, 0.1).detach()) == 0.0
     torch.nn.init.constant_(offset.cells, offset.LIMITS[1])
-    assert float(offset.lift(meets).detach()) == pytest.approx(
+    assert float(offset.lift(meets, 0.1).detach()) == pytest.approx(
         0.1 * (offset.LIMITS[1] - offset.START)
     )
-    assert float(ContactOffset(0.1, enabled=False).lift(meets).detach()) == 0.0
+    assert float(ContactOffset(enabled=False).lift(meets, 0.1).detach()) == 0.0
 
 
 def test_adam_takes_a_body_that_sticks_and_says_so():
