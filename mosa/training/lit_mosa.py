@@ -46,10 +46,9 @@ from mosa.modules.body.body import Body, World
 from mosa.modules.body.material import material_states
 from mosa.modules.fitting import losses
 from mosa.modules.fitting.adam_steps import GradientSteps
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.newton_optimizer import GaussNewtonOptimizer
 from mosa.modules.fitting.newton_steps import NewtonSteps
 from mosa.modules.fitting.parameters import is_learned, tensors_of

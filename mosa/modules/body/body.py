@@ -230,7 +230,7 @@ class Body(nn.Module):
         model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
         adapter (penalties, mean |C|). counts: of substeps, to replay those of an adaptive rollout. observed, gain: (T, N, 3) [m]
         and a number; at every frame the velocities are corrected towards what was seen, but for what was `unseen` of the positions
-        in a frame (`criteria.corrected_rollout`). substeps: of
+        in a frame (`ready.corrected_rollout`). substeps: of
         every frame, where differences hold them fixed; None: as many as the time step bound asks for.
         Errors: SimulationDiverged, ConfigError (time step).
         """

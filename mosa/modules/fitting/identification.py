@@ -1,7 +1,7 @@
 """Identification of a body's few numbers by Gauss-Newton: what is compared, and what was found.
 
 The numbers are those of `learned_numbers`; what is compared are the motion cues (`residuals`), in the rollouts that the criterion
-asks for (`criteria`).
+asks for (`Ready.simulate`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules.body.body import Body, Ready, World
 from mosa.modules.body.material import RIVALS
 from mosa.modules.fitting import residuals
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of
 from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
 from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
@@ -212,11 +211,9 @@ class Identification:
     @torch.no_grad()
     def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
         take = self.takes[index]
-        cues = take.cues
-        return body.simulate(
-            take.start, self.world, len(cues.positions), take.frame_dt,
-            model=body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
-            observed=cues.positions if gain else None, gain=gain, unseen=self.unseen(take), substeps=substeps,
+        seen = take.cues.positions
+        return self.ready(body, index, substeps).simulate(
+            len(seen), self.world.solids, observed=seen if gain else None, gain=gain, unseen=self.unseen(take)
         )  # fmt: skip
 
     def response(self, take) -> Response | None:

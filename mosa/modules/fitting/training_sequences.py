@@ -38,7 +38,7 @@ class Take:
 
 
 CORRECTING = 0.5
-"""Share of its distance from what was seen that the second prediction closes in a frame (`criteria.corrected_rollout`)."""
+"""Share of its distance from what was seen that the second prediction closes in a frame (`ready.corrected_rollout`)."""
 
 
 def seen_again(take: Take, body: Body, world: World, response: bool = True) -> Take:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import SimulationDiverged
-from mosa.physics.adapters.chain import Chain, advance_chain, learned_of
+from mosa.physics.adapters.chain import Chain, Learned, advance_chain
 from mosa.physics.adapters.network_evaluation import at_hand
 from mosa.physics.engine.budget import free_memory, substep_bytes
 from mosa.physics.engine.lanes import Lanes
@@ -56,17 +56,8 @@ class Chains:
         )
         self.numerics = lanes.numerics
 
-    def look(self) -> tuple[Tensor, ...]:
-        """The adapter's weights that are learned, as they are from now on."""
-        self.learned = learned_of(self.adapter)
-        return self.learned.weights
-
-    def begin(self, state: State, substeps: int, stride: int, wanted: bool) -> None:
-        """Before a motion of `substeps` substeps from `state`, after `look`. wanted: whether a gradient is."""
-        self._plan = self.plan(state, substeps, stride, wanted)
-
     def plan(self, state: State, substeps: int, stride: int, wanted: bool) -> Plan:
-        """How to run a motion, by memory."""
+        """How to run a motion of `substeps` substeps from `state`, by memory. wanted: whether a gradient is."""
         device = self.numerics.device
         if device.type != "cuda":
             return Plan(SEGMENT)
@@ -88,16 +79,18 @@ class Chains:
         first: int,
         poses: tuple[Tensor, ...],
         steps: Steps | None,
+        plan: Plan,
+        learned: Learned,
     ) -> tuple[State, Tensor | None, list]:
-        """(as `Prepared.frame`, statistics of the evaluations). A chain that fails is cut."""
-        groups, done, forces, collected = grouped(lengths, self._plan.limit), 0, [], []
+        """(as `Prepared.frame`, statistics of the evaluations). A chain that fails is cut. learned: of the adapter as it is now."""
+        groups, done, forces, collected = grouped(lengths, plan.limit), 0, [], []
         while groups:
             count = sum(groups[0])
             along = tuple(part[done : done + count] for part in poses)
             try:
-                chain = self.chain(groups[0], state)
+                chain = self.chain(groups[0], state, plan.graphs, learned)
                 state, reaction, statistics = advance_chain(
-                    self.lanes, chain, self.learned, state, self.packed, first + done, along, steps
+                    self.lanes, chain, learned, state, self.packed, first + done, along, steps
                 )
             except (LeftWindow, SimulationDiverged):
                 shorter = grouped(groups[0], SEGMENT)
@@ -112,7 +105,9 @@ class Chains:
             del groups[0]
         return state, torch.cat(forces) if forces else None, collected
 
-    def chain(self, lengths: tuple[int, ...], state: State) -> Chain:
+    def chain(
+        self, lengths: tuple[int, ...], state: State, graphs: bool, learned: Learned
+    ) -> Chain:
         chains, n, worlds = self.lanes.buffers.chains, len(self.packed), self.lanes.worlds
         key = (
             self.adapter,
@@ -120,16 +115,16 @@ class Chains:
             worlds,
             lengths,
             self.collects,
-            self._plan.graphs,
-            self.learned.names,
+            graphs,
+            learned.names,
         )
         chain = chains.pop(key, None)
         if chain is None:
             while len(chains) >= MAX_CHAINS:
                 chains.pop(next(iter(chains)))
             chain = Chain(
-                self.numerics, self.adapter, self.ask, n, worlds, lengths, learned=self.learned, collects=self.collects,
-                graphs=self._plan.graphs, plastic_adapted=self._probe(state)[0],
+                self.numerics, self.adapter, self.ask, n, worlds, lengths, learned=learned, collects=self.collects,
+                graphs=graphs, plastic_adapted=self._probe(state)[0],
             )  # fmt: skip
         chains[key] = chain  # last: the first is the one that was not used for longest
         return chain

@@ -227,14 +227,15 @@ class Simulator:
         prepared, moment, varies = stepper.prepared, start, stepper.clock.varies
         current, frame = stepper.enter(start, not started)
         recorded = [flat(start.state)]
-        prepared.begin(current, all_known, (frames - 1) * self.substeps, varies, gives=True)
+        count = (frames - 1) * self.substeps
+        pace = prepared.begin(current, all_known, count, varies, gives=True)
         reactions, counts = [], []
         for number in range(1, frames):
             if number > 1:
                 current, frame = stepper.enter(moment, False)
             alike = 0 if varies or self.colliders else frames - 1 - number
             moment, forces, count = stepper.through(
-                moment, current, frame, poses(number - 1, frame), alike
+                moment, current, frame, poses(number - 1, frame), pace, alike
             )
             counts.append(count)
             if forces is not None:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.physics.adapters.chain import ChainOfSegments
+from mosa.physics.adapters.chain import ChainOfSegments, learned_of
 from mosa.physics.adapters.chain_schedule import SEGMENT, Chains
 from mosa.physics.adapters.interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.contact.colliders import Collider, reach
@@ -40,8 +40,22 @@ LONGEST_KEPT = 96
 
 
 @dataclass
+class Pace:
+    """How one motion is cut into stretches. alone: substeps of a segment, at most, where no adapter
+    cuts it; chained: plan of the chains and weights of their adapter, () where there are none;
+    most_ahead: substeps that are launched before the host looks, fewer once that failed; done:
+    states after the next frames, where these were launched already."""
+
+    alone: int
+    chained: tuple
+    most_ahead: int = AHEAD
+    done: list[State] = field(default_factory=list)
+
+
+@dataclass
 class Prepared:
-    """The bodies of one rollout: the parameters of their law, packed, what an adapter answered last, and what advances them.
+    """The bodies of one rollout: the parameters of their law, packed, and what advances them. held: these, and what an adapter
+    answered that is asked once.
 
     ask: (adapter, F, C_affine, packed, collect) -> its answer by name. gathers: whether a stretch of motion has as many substeps as
     it can, and is launched before the last one was looked at: segments are long, and an adapter that is a torch module is asked
@@ -56,7 +70,6 @@ class Prepared:
     collect: Callable[[Any], None] | None
     gathers: bool
     held: dict[str, Tensor | None] = None
-    most_alone: int = SEGMENT
 
     def __post_init__(self) -> None:
         self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
@@ -118,41 +131,45 @@ class Prepared:
         substeps: int,
         variable: bool,
         gives: bool = False,
-    ) -> None:
-        """Before a motion of `substeps` substeps: how long stretches may be that nothing cuts. gives: also memory, as above."""
+    ) -> Pace:
+        """Before a motion of `substeps` substeps: how it is cut. gives: also memory, as above."""
         self.settle(state)
-        weights = () if self.chains is None else self.chains.look()
+        learned = None if self.chains is None else learned_of(self.chains.adapter)
+        weights = () if learned is None else learned.weights
         wanted = wants_gradient((*state, *self.held.values(), *poses, *weights))
         if gives:
             self.give_memory(substeps, wanted)
-        self.most_alone, self._ahead, self._most_ahead = SEGMENT, [], AHEAD
-        if self.chains is not None:
-            self.chains.begin(state, substeps, self.stride, wanted)
-        elif self.gathers and not variable and not wanted:
-            self.most_alone = AHEAD
-        elif self.gathers and not variable and self.lanes.room:
-            self.most_alone = max(SEGMENT, min(LONGEST_KEPT, substeps // 8))
+        if learned is not None:
+            plan = self.chains.plan(state, substeps, self.stride, wanted)
+            return Pace(SEGMENT, (plan, learned))
+        if self.gathers and not variable and not wanted:
+            return Pace(AHEAD, ())
+        if self.gathers and not variable and self.lanes.room:
+            return Pace(max(SEGMENT, min(LONGEST_KEPT, substeps // 8)), ())
+        return Pace(SEGMENT, ())
 
-    def lengths(self, frame: Frame) -> list[int]:
+    def lengths(self, frame: Frame, alone: int) -> list[int]:
         """Of the segments of a frame; where counts vary, sizes that many of them share."""
         if self.adapter is not None:
             return segments(frame.count, self.stride)
         return (
-            segments(frame.count, None, self.most_alone)
+            segments(frame.count, None, alone)
             if frame.steps is None
             else segments(frame.count, SEGMENT)
         )
 
     def frame(
-        self, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0
+        self, state: State, frame: Frame, poses: tuple[Tensor, ...], pace: Pace, alike: int = 0
     ) -> tuple[State, Tensor | None]:
-        """(state after a frame, reactions (substeps, W K, 6) or None). poses: of W worlds with K colliders at its substeps, ()
-        where there are none; alike: frames that follow and are known to have as many substeps and no poses, of which some may be
-        done now. The state is then the one of the frame before."""
-        while not self._ahead:
-            count = self._together(state, frame, 1 + alike)
+        """(state after a frame, reactions (substeps, W K, 6) or None).
+
+        poses: of W worlds with K colliders at its substeps, () where there are none; pace: of the
+        motion, from `begin`; alike: frames that follow and are known to have as many substeps and
+        no poses, of which some may be done now. The state is then the one of the frame before."""
+        while not pace.done:
+            count = self._together(state, frame, min(1 + alike, pace.most_ahead // frame.count))
             if count == 1:
-                state, forces, collected = self._one(state, frame, poses)
+                state, forces, collected = self._one(state, frame, poses, pace)
                 self._collect(collected)
                 return state, forces
             done, collected = [state], []
@@ -162,17 +179,20 @@ class Prepared:
                 ):
                     for k in range(count):
                         after, _, more = self._one(
-                            done[-1], frame._replace(first=frame.first + k * frame.count), poses
+                            done[-1],
+                            frame._replace(first=frame.first + k * frame.count),
+                            poses,
+                            pace,
                         )
                         done.append(after)
                         collected += more
             except (LeftWindow, SimulationDiverged) as error:
                 # what can be had of these frames still is, and the one that fails says how
-                self._most_ahead = count // 2 * frame.count if isinstance(error, LeftWindow) else 0
+                pace.most_ahead = count // 2 * frame.count if isinstance(error, LeftWindow) else 0
                 continue
-            self._ahead = done[1:]
+            pace.done = done[1:]
             self._collect(collected)
-        return self._ahead.pop(0), None
+        return pace.done.pop(0), None
 
     @property
     def _margin(self) -> int:
@@ -180,7 +200,6 @@ class Prepared:
 
     def _together(self, state: State, frame: Frame, frames: int) -> int:
         """How many of `frames` frames alike are launched before the host looks at them."""
-        frames = min(frames, self._most_ahead // frame.count)
         if (
             frames < 2
             or not self.gathers
@@ -197,24 +216,24 @@ class Prepared:
             self.collect(each)
 
     def _one(
-        self, state: State, frame: Frame, poses: tuple[Tensor, ...]
+        self, state: State, frame: Frame, poses: tuple[Tensor, ...], pace: Pace
     ) -> tuple[State, Tensor | None, list]:
         """(as `frame`, of this frame alone, statistics of a chain's evaluations)."""
-        lengths, first, steps = self.lengths(frame), frame.first, frame.steps
+        lengths, first, steps = self.lengths(frame, pace.alone), frame.first, frame.steps
         if self.chains is not None:
-            return self.chains.frame(state, lengths, first, poses, steps)
-        forces, done = [], 0
+            return self.chains.frame(state, lengths, first, poses, steps, *pace.chained)
+        forces, done, held = [], 0, self.held
         flow = getattr(self.adapter, "flow", None)
         for length in lengths:
             if flow is not None:
                 state = state._replace(F=flow(state.F, length * frame.dt))
             if self.adapter is not None:
-                self.held.update(
-                    self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect)
+                held = held | self.ask(
+                    self.adapter, state.F, state.C_affine, self.packed, self.collect
                 )
             along = tuple(part[done : done + length] for part in poses)
             state, reaction = advance_segment(
-                self.lanes, state, self.held, length, first + done, along, steps
+                self.lanes, state, held, length, first + done, along, steps
             )
             forces += [torch.cat(reaction, -1)] if reaction else []
             steps = None if steps is None else Steps(steps.dt, steps.dt)
@@ -274,8 +293,8 @@ class Stepper:
         """
         state, frame = self.enter(moment, moment.substeps == 0, speed)
         along = self._poses(moment, frame, poses)
-        self.prepared.begin(state, along, frame.count, self.clock.varies)
-        after, forces, count = self.through(moment, state, frame, along)
+        pace = self.prepared.begin(state, along, frame.count, self.clock.varies)
+        after, forces, count = self.through(moment, state, frame, along, pace)
         (forces,) = self.apart([self.axes.world.vectors(forces)], 1)
         return Step(after._replace(state=ParticleState(*self.apart(after.state))), forces, count)
 
@@ -290,10 +309,16 @@ class Stepper:
         return self.prepared.first_advance(state, frame.dt) if begins else state, frame
 
     def through(
-        self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0
+        self,
+        moment: Moment,
+        state: State,
+        frame: Frame,
+        poses: tuple[Tensor, ...],
+        pace: Pace,
+        alike: int = 0,
     ) -> Step:
-        """The frame that `enter` found, of all particles one world's after the other's. poses, alike: as `Prepared.frame`."""
-        state, forces = self.prepared.frame(state, frame, poses, alike)
+        """The frame that `enter` found, of all particles one world's after the other's. Others: as of `Prepared.frame`."""
+        state, forces = self.prepared.frame(state, frame, poses, pace, alike)
         if self.axes.turn is not None:
             self._check_box(self.axes.world.points(state.x.detach()), frame)
         if forces is not None and frame.steps is not None:

@@ -14,10 +14,9 @@ from small_bodies import FREE, NU, E, small_body
 from mosa.data.io.markers import Recording, alignment, read_markers, released, swung
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.training_sequences import Take
 from mosa.physics.contact.driven import driven_from_config

@@ -10,9 +10,8 @@ from small_bodies import FREE, NU, E, cues_of, small_body, start, take_of
 
 from mosa.data.io.forces import ForceCurve, force_residuals, forces_from_config
 from mosa.errors import ConfigError, DataError
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.contact.driven import driven_from_config
 

@@ -8,9 +8,8 @@ from mosa.data.synthetic.materials.hidden_material import LAW
 from mosa.modules.body import material as material_module
 from mosa.modules.body.material import FORMS, LOG, Direction, Material, register_form
 from mosa.modules.body.ready import Ready
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.stages import Stage
 
 FRAMES = 10

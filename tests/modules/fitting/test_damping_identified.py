@@ -7,9 +7,8 @@ import torch
 from small_bodies import FREE, NU, E, cues_of, small_body, start, take_of
 
 from mosa.modules.body.material import Material
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.contact.driven import driven_from_config
 

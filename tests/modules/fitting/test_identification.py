@@ -13,10 +13,9 @@ from mosa.evaluation.analysis.anisotropy import dyads
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.modules.adapters.hyperelastic import anisotropic_basis
 from mosa.modules.fitting import identification as identification_module
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import Seat
 from mosa.modules.fitting.identification import COARSER, EVIDENCE_ITERATIONS, SOFTLY, Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.parameters import as_rival, read_numbers, write_numbers
 from mosa.modules.fitting.search.backbone import compass
 from mosa.modules.fitting.stages import Stage

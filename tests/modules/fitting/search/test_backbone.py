@@ -7,8 +7,7 @@ from small_bodies import NU, WORLD, E, small_body, start, take_of
 from mosa.config.record import BodyRecord
 from mosa.modules.body.material import AUTO, Material
 from mosa.modules.fitting import newton_steps
-from mosa.modules.fitting.criteria import Criterion
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.search.ground_choice import EXPLAINED
 from mosa.modules.fitting.stages import Stage
 from mosa.training.lit_mosa import LitMosa

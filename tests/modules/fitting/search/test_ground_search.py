@@ -21,9 +21,8 @@ from mosa.evaluation.analysis.tables import (
 from mosa.modules.body.body import World
 from mosa.modules.body.contact import ContactOffset
 from mosa.modules.fitting import newton_steps
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.newton_steps import NewtonSteps
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.modules.fitting.search import ground as ground_search

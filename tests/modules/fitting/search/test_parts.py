@@ -6,10 +6,9 @@ import pytest
 import torch
 from small_bodies import WORLD, E, small_body, start, take_of
 
-from mosa.modules.fitting.criteria import Criterion
 from mosa.modules.fitting.gauss_newton import KNOWN, Posterior
 from mosa.modules.fitting.identification import Identification
-from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.search.backbone import valleys
 from mosa.modules.fitting.search.parts import WORTH, chosen, held_back
 from mosa.modules.fitting.stages import Stage

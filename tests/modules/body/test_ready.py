@@ -6,7 +6,7 @@ from small_bodies import DX, FRAME_DT, FREE, WORLD, small_body, start
 
 from mosa.errors import ConfigError
 from mosa.modules.body.body import Ready
-from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification_settings import Criterion
 from mosa.modules.fitting.parameters import each_law, read_numbers
 
 
