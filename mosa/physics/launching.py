@@ -66,6 +66,14 @@ ON_CPU = Turns()
 NOTHING = nullcontext()
 
 
+def filled(kind, *values):
+    """An object of a Warp struct with these values of its fields, in their order."""
+    made = kind()
+    for name, value in zip(kind.vars, values, strict=True):
+        setattr(made, name, value)
+    return made
+
+
 def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None

@@ -10,6 +10,7 @@ from torch import Tensor
 from mosa.physics.contact.collider_kernels import collider_kernels
 from mosa.physics.contact.colliders import PackedColliders
 from mosa.physics.exact_sums import COLUMNS, sum_functions
+from mosa.physics.launching import filled
 
 
 class ColliderBuffers:
@@ -26,10 +27,10 @@ class ColliderBuffers:
         self.count = len(packed)
         self.kernels = collider_kernels(scalar, work.exact)
         self.scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
-        self._packed = [
-            wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
-            wp.from_torch(packed.fields, dtype=scalar),
-        ]  # fmt: skip
+        self._solids = filled(
+            self.kernels.Solids, self.count, wp.from_torch(packed.shapes, dtype=scalar),
+            wp.from_torch(packed.codes, dtype=wp.int32), wp.from_torch(packed.fields, dtype=scalar),
+        )  # fmt: skip
         columns = work.worlds * self.count
         vectors, matrices = (substeps, columns, 3), (substeps, columns, 3, 3)
         vec3, mat33 = self.kernels.vec3, self.kernels.mat33
@@ -39,14 +40,17 @@ class ColliderBuffers:
             made = [work.array(shape, kind) for shape, kind in kinds]
             return [tensor for tensor, _ in made], [array for _, array in made]
 
-        self.poses, self._poses = buffers(pose)
+        self.poses, poses = buffers(pose)
+        self.pose_arrays = filled(self.kernels.Poses, *poses)
         _, self._v_struck = work.array((work.particles, 3), vec3)
         self.reaction, self._reaction = buffers(pose[2:])
         self._reaction_sums = self.sums(self.reaction)
         if with_adjoint:
-            self.adj_poses, self._adj_poses = buffers(pose)
+            self.adj_poses, adj_poses = buffers(pose)
             self._adj_sums = self.sums(self.adj_poses)
-            self.adj_reaction, self._adj_reaction = buffers(pose[2:])
+            self._adj_added = self.added_to(adj_poses, self._adj_sums)
+            self.adj_pose_sums = filled(self.kernels.PoseSums, *self._adj_added)
+            self.adj_reaction, self.adj_reaction_arrays = buffers(pose[2:])
 
     def vectors(self, substeps: int, columns: int, count: int) -> tuple[list[Tensor], list]:
         """`count` times (substeps, columns, 3) zeros, and the same memory as Warp's arrays."""
@@ -67,21 +71,9 @@ class ColliderBuffers:
         return self._v_struck
 
     @property
-    def pose_arrays(self) -> list:
-        return self._poses
-
-    @property
     def reaction_arrays(self) -> list:
         """What particles add their forces and torques to."""
         return self.added_to(self._reaction, self._reaction_sums)
-
-    @property
-    def adj_reaction_arrays(self) -> list:
-        return self._adj_reaction
-
-    @property
-    def adj_pose_arrays(self) -> list:
-        return self.added_to(self._adj_poses, self._adj_sums)
 
     def load(self, poses: tuple[Tensor, ...]) -> None:
         """Copy the poses of a segment's substeps in."""
@@ -93,7 +85,7 @@ class ColliderBuffers:
             array.zero_()
 
     def reset_adjoint(self) -> None:
-        for array in self.adj_pose_arrays:
+        for array in self._adj_added:
             array.zero_()
 
     def settle(self) -> None:
@@ -119,7 +111,7 @@ class ColliderBuffers:
             self._work.run(settle, target.numel(), flat)
 
     def _arguments(self, met: list, step: int, time: float) -> list:
-        return [*met, time, self._work.size, self.count, step, *self._packed, *self._poses]
+        return [*met, time, self._work.size, step, self._solids, self.pose_arrays]
 
     def strike(self, step: int, met: list, time: float, again: bool) -> wp.array:
         """Velocities of particles after contact in substep `step`. met: x, v, volume, springs, mass; time [s]: for which the
@@ -133,6 +125,6 @@ class ColliderBuffers:
     def adjoint(self, step: int, met: list, time: float, adj_x, adj_v, adj_springs) -> None:
         """Turns the adjoint of velocities after contact into that before it; adds to the others."""
         self._work.run(self.kernels.adj_strike, self._work.particles, [
-            *self._arguments(met, step, time), *self._adj_reaction, adj_x, adj_v, adj_springs,
-            *self.adj_pose_arrays,
+            *self._arguments(met, step, time), *self.adj_reaction_arrays, adj_x, adj_v, adj_springs,
+            self.adj_pose_sums,
         ])  # fmt: skip

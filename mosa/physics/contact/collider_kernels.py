@@ -10,7 +10,7 @@ Colliders act in the order given, after the planes. The pose is the one at the s
 each with poses of its own: solid k of world w has column w count + k of poses and reactions.
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import warp as wp
@@ -34,6 +34,27 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     vectors = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=vec3)
     matrices = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=mat33)
     add_exactly = sum_functions(scalar).add_exactly
+
+    @partial(wp.struct, module=module)
+    class Solids:
+        count: int
+        shapes: wp.array2d(dtype=scalar)
+        codes: wp.array2d(dtype=int)
+        fields: wp.array(dtype=scalar)
+
+    @partial(wp.struct, module=module)
+    class Poses:
+        position: wp.array2d(dtype=vec3)
+        rotation: wp.array2d(dtype=mat33)
+        linear: wp.array2d(dtype=vec3)
+        angular: wp.array2d(dtype=vec3)
+
+    @partial(wp.struct, module=module)
+    class PoseSums:
+        position: vectors
+        rotation: matrices
+        linear: vectors
+        angular: vectors
 
     if exact:
 
@@ -60,32 +81,29 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.func
     def struck(
-        v: vec3, x: vec3, r: scalar, kick: scalar, k: int, c: int, substep: int, shapes: wp.array2d(dtype=scalar),
-        codes: wp.array2d(dtype=int), fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3),
-        rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3),
+        v: vec3, x: vec3, r: scalar, kick: scalar, k: int, c: int, substep: int,
+        solids: Solids, poses: Poses,
     ):  # fmt: skip
         """Velocity v of a particle after collider k in column c."""
-        R = x - position[substep, c]
-        Q = rotation[substep, c]
-        phi, g = signed_distance(wp.transpose(Q) * R, k, shapes, codes, fields)
+        R = x - poses.position[substep, c]
+        Q = poses.rotation[substep, c]
+        phi, g = signed_distance(wp.transpose(Q) * R, k, solids.shapes, solids.codes, solids.fields)
         out = v
         if phi < r:
-            V = linear[substep, c] + wp.cross(angular[substep, c], R)
+            V = poses.linear[substep, c] + wp.cross(poses.angular[substep, c], R)
             out = v + pushed(
                 v - V,
                 Q * wp.normalize(g),
-                kick * shapes[k, 8] * (r - phi),
-                shapes[k, 3],
-                shapes[k, 9],
+                kick * solids.shapes[k, 8] * (r - phi),
+                solids.shapes[k, 3],
+                solids.shapes[k, 9],
             )
         return out
 
     @wp.kernel(module=module, enable_backward=False)
     def strike(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), volume: wp.array(dtype=scalar), springs: wp.array(dtype=scalar),
-        mass: wp.array(dtype=scalar), dt: scalar, size: int, count: int, substep: int, shapes: wp.array2d(dtype=scalar),
-        codes: wp.array2d(dtype=int), fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3),
-        rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3),
+        mass: wp.array(dtype=scalar), dt: scalar, size: int, substep: int, solids: Solids, poses: Poses,
         v_struck: wp.array(dtype=vec3), force: vectors, torque: vectors,
     ):  # fmt: skip
         """Writes v_struck, adds to force and torque of the substep where they are given. size: particles of a world."""
@@ -93,40 +111,22 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         r = radius(volume[p])
         kick = dt * springs[p]
         u = v[p]
-        for k in range(count):
-            c = (p / size) * count + k
-            after = struck(
-                u,
-                x[p],
-                r,
-                kick,
-                k,
-                c,
-                substep,
-                shapes,
-                codes,
-                fields,
-                position,
-                rotation,
-                linear,
-                angular,
-            )
+        for k in range(solids.count):
+            c = (p / size) * solids.count + k
+            after = struck(u, x[p], r, kick, k, c, substep, solids, poses)
             f = (mass[p] / dt) * (u - after)
             if force and wp.dot(f, f) > scalar(0.0):
                 add_vector(force, substep, c, f)
-                add_vector(torque, substep, c, wp.cross(x[p] - position[substep, c], f))
+                add_vector(torque, substep, c, wp.cross(x[p] - poses.position[substep, c], f))
             u = after
         v_struck[p] = u
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_strike(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), volume: wp.array(dtype=scalar), springs: wp.array(dtype=scalar),
-        mass: wp.array(dtype=scalar), dt: scalar, size: int, count: int, substep: int, shapes: wp.array2d(dtype=scalar),
-        codes: wp.array2d(dtype=int), fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3),
-        rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3),
+        mass: wp.array(dtype=scalar), dt: scalar, size: int, substep: int, solids: Solids, poses: Poses,
         adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_x: wp.array(dtype=vec3),
-        adj_v: wp.array(dtype=vec3), adj_springs: wp.array(dtype=scalar), adj_position: vectors, adj_rotation: matrices,
-        adj_linear: vectors, adj_angular: vectors,
+        adj_v: wp.array(dtype=vec3), adj_springs: wp.array(dtype=scalar), adj_poses: PoseSums,
     ):  # fmt: skip
         """v: velocities as the first collider finds them. Turns adj_v into theirs, adds to the adjoints of x, of the springs, of
         the poses and of the solids' velocities."""
@@ -136,44 +136,29 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         a = adj_v[p]
         ax = adj_x[p]
         spring = scalar(0.0)
-        for reverse in range(count):
-            k = count - 1 - reverse
-            c = (p / size) * count + k
-            R = x[p] - position[substep, c]
-            Q = rotation[substep, c]
+        for reverse in range(solids.count):
+            k = solids.count - 1 - reverse
+            c = (p / size) * solids.count + k
+            R = x[p] - poses.position[substep, c]
+            Q = poses.rotation[substep, c]
             q = wp.transpose(Q) * R
-            phi, g = signed_distance(q, k, shapes, codes, fields)
+            phi, g = signed_distance(q, k, solids.shapes, solids.codes, solids.fields)
             if phi < r:
                 u = v[p]
                 for j in range(k):
-                    u = struck(
-                        u,
-                        x[p],
-                        r,
-                        kick,
-                        j,
-                        c - k + j,
-                        substep,
-                        shapes,
-                        codes,
-                        fields,
-                        position,
-                        rotation,
-                        linear,
-                        angular,
-                    )
-                omega = angular[substep, c]
+                    u = struck(u, x[p], r, kick, j, c - k + j, substep, solids, poses)
+                omega = poses.angular[substep, c]
                 local = wp.normalize(g)
                 n = Q * local
-                u = u - linear[substep, c] - wp.cross(omega, R)
-                stiffness = shapes[k, 8]
+                u = u - poses.linear[substep, c] - wp.cross(omega, R)
+                stiffness = solids.shapes[k, 8]
                 push = kick * stiffness * (r - phi)
                 # v' = v + D,  f = -(m/dt) D,  torque = R x f
                 at = adj_torque[substep, c]
-                f = -(mass[p] / dt) * pushed(u, n, push, shapes[k, 3], shapes[k, 9])
+                f = -(mass[p] / dt) * pushed(u, n, push, solids.shapes[k, 3], solids.shapes[k, 9])
                 aD = a - (mass[p] / dt) * (adj_force[substep, c] + wp.cross(at, R))
                 aR = wp.cross(f, at)
-                au, an, aj = adj_pushed(u, n, push, shapes[k, 3], shapes[k, 9], aD)
+                au, an, aj = adj_pushed(u, n, push, solids.shapes[k, 3], solids.shapes[k, 9], aD)
                 spring = spring + dt * stiffness * (r - phi) * aj
                 # u = v - V, V = linear + angular x R
                 a = a + au
@@ -181,18 +166,22 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
                 # n = Q local, local = g/|g|, g = grad phi(q), j = kick stiffness (r - phi(q))
                 al = wp.transpose(Q) * an
                 ag = (al - wp.dot(local, al) * local) / wp.length(g)
-                aq = curvature(q, k, shapes, codes, fields, ag) - (kick * stiffness * aj) * g
+                aq = (
+                    curvature(q, k, solids.shapes, solids.codes, solids.fields, ag)
+                    - (kick * stiffness * aj) * g
+                )
                 # q = Q^T R, R = x - position
                 aR = aR + Q * aq
                 ax = ax + aR
-                add_vector(adj_linear, substep, c, -au)
-                add_vector(adj_angular, substep, c, wp.cross(au, R))
-                add_matrix(adj_rotation, substep, c, wp.outer(an, local) + wp.outer(R, aq))
-                add_vector(adj_position, substep, c, -aR)
+                add_vector(adj_poses.linear, substep, c, -au)
+                add_vector(adj_poses.angular, substep, c, wp.cross(au, R))
+                add_matrix(adj_poses.rotation, substep, c, wp.outer(an, local) + wp.outer(R, aq))
+                add_vector(adj_poses.position, substep, c, -aR)
         adj_v[p] = a
         adj_x[p] = ax
         adj_springs[p] = adj_springs[p] + spring
 
     return SimpleNamespace(
+        Solids=Solids, Poses=Poses, PoseSums=PoseSums,
         strike=strike, adj_strike=adj_strike, add_vector=add_vector, add_matrix=add_matrix, vec3=vec3, mat33=mat33
     )  # fmt: skip

@@ -13,7 +13,7 @@ the set's holder feels the momentum that the particles lose,
 in which the added mass has neither weight nor inertia.
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import warp as wp
@@ -30,34 +30,52 @@ def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     """Kernels hold, feel, adj_feel, adj_hold for wp.float32 or wp.float64 fields. exact: as
     `collider_kernels`."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
-    mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     adding = collider_kernels(scalar, exact)
     add_vector, add_matrix = adding.add_vector, adding.add_matrix
     module = f"mosa.physics.{'exact_' if exact else ''}driven_{scalar.__name__}"
     vectors = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=vec3)
-    matrices = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=mat33)
+    Poses, PoseSums = adding.Poses, adding.PoseSums
     more = HEAVIER - 1.0
+
+    @partial(wp.struct, module=module)
+    class Sets:
+        """Of every particle its set, its place in the set's axes, its point; of a world the poses
+        and points."""
+
+        sets: wp.array(dtype=int)
+        local: wp.array(dtype=vec3)
+        points: wp.array(dtype=int)
+        columns: int
+        count: int
+
+    @partial(wp.struct, module=module)
+    class Paths:
+        places: wp.array2d(dtype=vec3)
+        rates: wp.array2d(dtype=vec3)
+
+    @partial(wp.struct, module=module)
+    class PathSums:
+        places: vectors
+        rates: vectors
 
     @wp.kernel(module=module, enable_backward=False)
     def hold(
-        x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), springs: wp.array(dtype=scalar), sets: wp.array(dtype=int),
-        local: wp.array(dtype=vec3), points: wp.array(dtype=int), dt: scalar, size: int, columns: int, count: int, substep: int,
-        position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3),
-        angular: wp.array2d(dtype=vec3), paths: wp.array2d(dtype=vec3), rates: wp.array2d(dtype=vec3), v_held: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), springs: wp.array(dtype=scalar), dt: scalar,
+        size: int, substep: int, driven: Sets, poses: Poses, paths: Paths, v_held: wp.array(dtype=vec3),
     ):  # fmt: skip
-        """Writes v_held. size, columns, count: particles, poses and points of a world."""
+        """Writes v_held. size: particles of a world."""
         p = wp.tid()
         u = v[p]
-        k = sets[p]
+        k = driven.sets[p]
         if k >= 0:
             world = p / size
-            c = world * columns + k
-            arm = rotation[substep, c] * local[p]
-            y = position[substep, c] + arm
-            u = linear[substep, c] + wp.cross(angular[substep, c], arm)
-            if points[p] >= 0:
-                y = y + paths[substep, world * count + points[p]]
-                u = u + rates[substep, world * count + points[p]]
+            c = world * driven.columns + k
+            arm = poses.rotation[substep, c] * driven.local[p]
+            y = poses.position[substep, c] + arm
+            u = poses.linear[substep, c] + wp.cross(poses.angular[substep, c], arm)
+            if driven.points[p] >= 0:
+                y = y + paths.places[substep, world * driven.count + driven.points[p]]
+                u = u + paths.rates[substep, world * driven.count + driven.points[p]]
             u = u + (dt * springs[p]) * (y - x[p])
         v_held[p] = u
 
@@ -68,67 +86,62 @@ def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def feel(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), v_held: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3),
-        mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), sets: wp.array(dtype=int), dt: scalar, size: int,
-        columns: int, substep: int, position: wp.array2d(dtype=vec3), force: vectors, torque: vectors,
+        mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), dt: scalar, size: int, substep: int,
+        driven: Sets, poses: Poses, force: vectors, torque: vectors,
     ):  # fmt: skip
         """Adds to force and torque of the substep. v, v_new: velocities before `hold` and after
         the grid; impulses: dt g of worlds."""
         p = wp.tid()
-        if sets[p] >= 0:
+        if driven.sets[p] >= 0:
             world = p / size
-            c = world * columns + sets[p]
+            c = world * driven.columns + driven.sets[p]
             f = felt(mass[p], dt, v[p], v_held[p], v_new[p], impulses[world])
             add_vector(force, substep, c, f)
-            add_vector(torque, substep, c, wp.cross(x[p] - position[substep, c], f))
+            add_vector(torque, substep, c, wp.cross(x[p] - poses.position[substep, c], f))
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_feel(
-        x: wp.array(dtype=vec3), mass: wp.array(dtype=scalar), sets: wp.array(dtype=int), dt: scalar, size: int,
-        columns: int, substep: int, position: wp.array2d(dtype=vec3), adj_force: wp.array2d(dtype=vec3),
-        adj_torque: wp.array2d(dtype=vec3),
+        x: wp.array(dtype=vec3), mass: wp.array(dtype=scalar), dt: scalar, size: int, substep: int,
+        driven: Sets, poses: Poses, adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3),
         adj_v_new: wp.array(dtype=vec3),
     ):  # fmt: skip
         """Adds to the adjoint of the velocities after the grid; those of all else `adj_hold` has."""
         p = wp.tid()
-        if sets[p] >= 0:
-            c = (p / size) * columns + sets[p]
+        if driven.sets[p] >= 0:
+            c = (p / size) * driven.columns + driven.sets[p]
             af = adj_force[substep, c] + wp.cross(
-                adj_torque[substep, c], x[p] - position[substep, c]
+                adj_torque[substep, c], x[p] - poses.position[substep, c]
             )
             adj_v_new[p] = adj_v_new[p] + (scalar(wp.static(more)) * mass[p] / dt) * af
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_hold(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3), springs: wp.array(dtype=scalar),
-        mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), sets: wp.array(dtype=int), local: wp.array(dtype=vec3),
-        points: wp.array(dtype=int), dt: scalar, size: int, columns: int, count: int, substep: int,
-        position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33), linear: wp.array2d(dtype=vec3),
-        angular: wp.array2d(dtype=vec3), paths: wp.array2d(dtype=vec3), rates: wp.array2d(dtype=vec3),
-        adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_x: wp.array(dtype=vec3),
-        adj_v: wp.array(dtype=vec3),
-        adj_springs: wp.array(dtype=scalar), adj_position: vectors, adj_rotation: matrices, adj_linear: vectors,
-        adj_angular: vectors, adj_paths: vectors, adj_rates: vectors,
+        mass: wp.array(dtype=scalar), impulses: wp.array(dtype=vec3), dt: scalar, size: int, substep: int,
+        driven: Sets, poses: Poses, paths: Paths, adj_force: wp.array2d(dtype=vec3),
+        adj_torque: wp.array2d(dtype=vec3), adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3),
+        adj_springs: wp.array(dtype=scalar), adj_poses: PoseSums, adj_paths: PathSums,
     ):  # fmt: skip
         """v: velocities as the sets find them. Turns adj_v into theirs, adds to the other adjoints."""
         p = wp.tid()
-        k = sets[p]
+        k = driven.sets[p]
         if k < 0:
             return
         world = p / size
-        c = world * columns + k
-        omega = angular[substep, c]
-        arm = rotation[substep, c] * local[p]
-        y = position[substep, c] + arm
-        held = linear[substep, c] + wp.cross(omega, arm)
-        n = world * count + points[p]
-        if points[p] >= 0:
-            y = y + paths[substep, n]
-            held = held + rates[substep, n]
+        c = world * driven.columns + k
+        omega = poses.angular[substep, c]
+        arm = poses.rotation[substep, c] * driven.local[p]
+        y = poses.position[substep, c] + arm
+        held = poses.linear[substep, c] + wp.cross(omega, arm)
+        n = world * driven.count + driven.points[p]
+        if driven.points[p] >= 0:
+            y = y + paths.places[substep, n]
+            held = held + paths.rates[substep, n]
         pull = dt * springs[p]
         gap = y - x[p]
         held = held + pull * gap
         # torque = R x f
-        R = x[p] - position[substep, c]
+        R = x[p] - poses.position[substep, c]
         at = adj_torque[substep, c]
         aR = wp.cross(felt(mass[p], dt, v[p], held, v_new[p], impulses[world]), at)
         af = (mass[p] / dt) * (adj_force[substep, c] + wp.cross(at, R))
@@ -139,12 +152,14 @@ def driven_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         adj_x[p] = adj_x[p] + aR - ay
         adj_springs[p] = adj_springs[p] + dt * wp.dot(gap, a)
         aarm = ay + wp.cross(a, omega)
-        add_vector(adj_position, substep, c, ay - aR)
-        add_matrix(adj_rotation, substep, c, wp.outer(aarm, local[p]))
-        add_vector(adj_linear, substep, c, a)
-        add_vector(adj_angular, substep, c, wp.cross(arm, a))
-        if points[p] >= 0:
-            add_vector(adj_paths, substep, n, ay)
-            add_vector(adj_rates, substep, n, a)
+        add_vector(adj_poses.position, substep, c, ay - aR)
+        add_matrix(adj_poses.rotation, substep, c, wp.outer(aarm, driven.local[p]))
+        add_vector(adj_poses.linear, substep, c, a)
+        add_vector(adj_poses.angular, substep, c, wp.cross(arm, a))
+        if driven.points[p] >= 0:
+            add_vector(adj_paths.places, substep, n, ay)
+            add_vector(adj_paths.rates, substep, n, a)
 
-    return SimpleNamespace(hold=hold, feel=feel, adj_feel=adj_feel, adj_hold=adj_hold)
+    return SimpleNamespace(
+        Sets=Sets, Paths=Paths, PathSums=PathSums, hold=hold, feel=feel, adj_feel=adj_feel, adj_hold=adj_hold
+    )  # fmt: skip

@@ -18,10 +18,12 @@ from mosa.physics.contact.colliders import (
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import exponential
 from mosa.physics.contact.reference import collide
+from mosa.physics.launching import filled
 
 DT, COUNT = 0.01, 1000
 KERNELS = collider_kernels(wp.float64)
 VEC3, MAT33, NUMBER = wp.vec3d, wp.mat33d, wp.float64
+POSE = VEC3, MAT33, VEC3, VEC3
 
 
 def uneven_field():
@@ -55,8 +57,12 @@ def drawn(colliders, seed=0):
     return [v, x, spring, centre, *others], (mass, volume)
 
 
-def launch(kernel, colliders, v, x, spring, poses, bodies, arrays):
-    """poses are those of substep 2 of 3; arrays: further (tensor, kind)."""
+def arrays_of(tensors, kinds):
+    return [wp.from_torch(t, dtype=kind) for t, kind in zip(tensors, kinds)]
+
+
+def launch(kernel, colliders, v, x, spring, poses, bodies, further):
+    """poses are those of substep 2 of 3; further: arguments."""
     packed = pack_colliders(colliders, torch.float64, torch.device("cpu"))
     held = [
         torch.stack([torch.full_like(p, 7.0), torch.full_like(p, 7.0), p]).contiguous()
@@ -66,10 +72,10 @@ def launch(kernel, colliders, v, x, spring, poses, bodies, arrays):
     inputs = [
         *(wp.from_torch(t.contiguous(), dtype=kind) for t, kind in ((x, VEC3), (v, VEC3), (volume, NUMBER), (spring, NUMBER),
                                                                     (mass, NUMBER))),
-        DT, COUNT, len(colliders), 2,
-        *(wp.from_torch(t, dtype=kind) for t, kind in zip(packed, (NUMBER, wp.int32, NUMBER))),
-        *(wp.from_torch(p, dtype=kind) for p, kind in zip(held, (VEC3, MAT33, VEC3, VEC3))),
-        *(wp.from_torch(t, dtype=kind) for t, kind in arrays),
+        DT, COUNT, 2,
+        filled(KERNELS.Solids, len(colliders), *arrays_of(packed, (NUMBER, wp.int32, NUMBER))),
+        filled(KERNELS.Poses, *arrays_of(held, POSE)),
+        *further,
     ]  # fmt: skip
     wp.launch(kernel, COUNT, inputs=inputs, device="cpu")
 
@@ -86,7 +92,7 @@ def forward(colliders, v, x, spring, poses, bodies):
         spring,
         poses,
         bodies,
-        [(t, VEC3) for t in (struck, force, torque)],
+        arrays_of((struck, force, torque), (VEC3,) * 3),
     )
     assert float(force[:2].abs().sum() + torque[:2].abs().sum()) == 0
     return struck, force[2], torque[2]
@@ -99,9 +105,9 @@ def backward(colliders, v, x, spring, poses, bodies, seeds):
         torch.stack([torch.full_like(s, 3.0)] * 2 + [s]).contiguous() for s in seeds[1:]
     )
     of_poses = [torch.zeros(3, *p.shape).double() for p in poses]
-    kinds = (VEC3, VEC3, VEC3, VEC3, NUMBER, VEC3, MAT33, VEC3, VEC3)
-    arrays = list(zip((adj_force, adj_torque, of_x, a, of_spring, *of_poses), kinds))
-    launch(KERNELS.adj_strike, colliders, v, x, spring, poses, bodies, arrays)
+    seeded = arrays_of((adj_force, adj_torque, of_x, a, of_spring), (*(VEC3,) * 4, NUMBER))
+    sums = filled(KERNELS.PoseSums, *arrays_of(of_poses, POSE))
+    launch(KERNELS.adj_strike, colliders, v, x, spring, poses, bodies, [*seeded, sums])
     return [a, of_x, of_spring, *(p[2] for p in of_poses)]
 
 
