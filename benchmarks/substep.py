@@ -85,12 +85,12 @@ def measure(
     )
     results = []
     for with_adjoint in (False, True):
-        work = solver.workspace(substeps, False, False, with_adjoint)
+        work = solver.workspace({}, substeps, False, False, with_adjoint)
         work.set_window(*window)
         work.load(state, held, volume, solver.mass, 0.0)
         if law is None:
-            launch = work._run
-            work._run = lambda kernel, *rest, launch=launch, skip=work.stress: (
+            launch = work.run
+            work.run = lambda kernel, *rest, launch=launch, skip=work.stress: (
                 None if kernel is skip else launch(kernel, *rest)
             )
             for tau in work.tau:

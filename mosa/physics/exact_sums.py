@@ -23,15 +23,11 @@ LARGEST = 2.0**44
 COLUMNS = 3
 """Of a sum: high part, low part, terms that are none."""
 
-_wanted = False
-
 
 def use(wanted: bool = True) -> None:
     """Have every computation of this process from now on give the same bits each time it is made, on the same GPU.
 
     Sums of Warp's kernels are exact, and torch takes its algorithms of fixed order. To be called before the first one."""
-    global _wanted
-    _wanted = wanted
     if wanted:
         os.environ.setdefault(
             "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
@@ -47,7 +43,7 @@ def use(wanted: bool = True) -> None:
 
 def needed(device: torch.device) -> bool:
     """Whether sums on a device have to be exact to be the same each time."""
-    return _wanted and device.type == "cuda"
+    return torch.are_deterministic_algorithms_enabled() and device.type == "cuda"
 
 
 @cache

@@ -284,7 +284,7 @@ class ChainOfSegments(Stretch):
         return differentiated  # a rollout with a backward pass has these buffers anyway
 
     def buffers(
-        self, solver: SegmentSolver, acting: Sequence[Tensor], full: bool
+        self, solver: SegmentSolver, pool: dict, acting: Sequence[Tensor], full: bool
     ) -> tuple[Workspace, dict]:
         return self.chain.workspace(full), {"parameters": acting[0].detach()}
 

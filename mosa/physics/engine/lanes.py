@@ -18,7 +18,7 @@ class Lanes:
     same launches, and one for each world on a CPU, where as many of them as there are cores advance at a time, each on a grid of
     its own.
 
-    buffers: of the simulator, from which a solver takes workspaces while it runs.
+    buffers: of the simulator, whose workspaces a solver uses while it runs.
     """
 
     def __init__(self, solvers: Sequence[SegmentSolver], buffers: Buffers) -> None:
@@ -64,16 +64,16 @@ class Lanes:
         ]
 
     def each(self, kind: tuple, function: Callable, *arguments: Sequence) -> list:
-        """function(solver, its arguments) of every solver, in their order."""
+        """function(solver, pool of workspaces, its arguments) of every solver, in their order."""
 
         def run(index: int):
             solver = self.solvers[index]
-            solver.workspaces = self.buffers.take()
+            pool = self.buffers.take()
             try:
                 with torch.no_grad():  # which a thread knows nothing of
-                    return function(solver, *(argument[index] for argument in arguments))
+                    return function(solver, pool, *(argument[index] for argument in arguments))
             finally:
-                self.buffers.give_back(solver.workspaces)
+                self.buffers.give_back(pool)
 
         count = len(self.solvers)
         if (

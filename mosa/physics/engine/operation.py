@@ -70,7 +70,7 @@ class Stretch:
         return self.cut
 
     def buffers(
-        self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool
+        self, solver: SegmentSolver, pool: dict, acting: Sequence[Tensor | None], full: bool
     ) -> tuple[Workspace, dict]:
         """(the workspace, what is copied into it by name). full: with buffers for the adjoint."""
         held = dict(zip(HELD, acting, strict=True))
@@ -78,7 +78,7 @@ class Stretch:
         # views of one row, as `expand` makes them, are read from there by all particles
         shared = bool(operator) and all(part.stride(0) == 0 for part in operator)
         return solver.workspace(
-            self.substeps, bool(operator), held["plastic_G"] is not None, full, shared
+            pool, self.substeps, bool(operator), held["plastic_G"] is not None, full, shared
         ), held
 
     def advance(self, work: Workspace) -> None:
@@ -133,10 +133,10 @@ class Stretch:
         return (name, type(self), *(t is None for t in others))
 
     def _loaded(
-        self, solver: SegmentSolver, state: State, acting: Sequence[Tensor | None], poses: Sequence[Tensor],
-        windows: Windows, full: bool,
+        self, solver: SegmentSolver, pool: dict, state: State, acting: Sequence[Tensor | None],
+        poses: Sequence[Tensor], windows: Windows, full: bool,
     ) -> Workspace:  # fmt: skip
-        work, held = self.buffers(solver, acting, full)
+        work, held = self.buffers(solver, pool, acting, full)
         work.set_window(*windows)
         work.load(
             state,
@@ -160,13 +160,13 @@ class Stretch:
         # a body that is being accelerated may need the most that the time step bound allows, half a cell per substep
         margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
 
-        def run(solver: SegmentSolver, state: State, acting: tuple, poses: tuple):
+        def run(solver: SegmentSolver, pool: dict, state: State, acting: tuple, poses: tuple):
             kept = differentiated and solver.has_room(self.substeps)
             full = self.full(differentiated, kept)
 
             for margin in margins:
                 windows = solver.windows(state, time, margin, self.foresees)
-                work = self._loaded(solver, state, acting, poses, windows, full)
+                work = self._loaded(solver, pool, state, acting, poses, windows, full)
                 self.advance(work)
                 final = work.final()
                 if not solver.left_window(work.flags, final, self.first, dt):
@@ -198,6 +198,7 @@ class Stretch:
 
         def run(
             solver: SegmentSolver,
+            pool: dict,
             kept: Kept,
             state: State,
             acting: tuple,
@@ -205,7 +206,7 @@ class Stretch:
             seeds: tuple,
             other_seeds: tuple,
         ):
-            work = self._loaded(solver, state, acting, poses, kept.windows, True)
+            work = self._loaded(solver, pool, state, acting, poses, kept.windows, True)
             tape = kept.take()
             solver.budget.used(tape)
             if tape:

@@ -42,9 +42,8 @@ class SegmentSolver:
     """Runs the segments of one rollout, of one world or of several in the same launches. volume:
     (N,) [m^3]; density: number or (N,) [kg/m^3]; cutoff: node mass [kg].
 
-    workspaces: by shape, those that it has while it runs (`Buffers.take`). budget: for the states
-    of all substeps, between the passes; segments that do not fit are run again in the backward
-    pass. gravities: of every world [m/s^2], among which the particles are shared in equal parts;
+    budget: for the states of all substeps, between the passes; segments that do not fit are run
+    again in the backward pass. gravities: of every world [m/s^2], among which the particles are shared in equal parts;
     None: one world with the numerics' own. first_world: number of the first one, for messages, None
     where there is but one. driven: particles of all worlds, None for none.
     """
@@ -56,7 +55,6 @@ class SegmentSolver:
     ) -> None:  # fmt: skip
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass, self.driven = density * volume, driven
-        self.workspaces: dict[tuple, Workspace] = {}
         self.budget = Budget()
         self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)
         self._pull = np.array(self.gravities)
@@ -70,12 +68,14 @@ class SegmentSolver:
 
     def workspace(
         self,
+        pool: dict[tuple, Workspace],
         substeps: int,
         adapted: bool,
         plastic_adapted: bool,
         with_adjoint: bool,
         shared: bool = False,
     ) -> Workspace:
+        """Of a pool that is this thread's alone (`Buffers.take`)."""
         key = (
             len(self.volume),
             substeps,
@@ -85,12 +85,12 @@ class SegmentSolver:
             self.worlds,
             shared,
         )
-        if key not in self.workspaces:
-            self.workspaces[key] = Workspace(
+        if key not in pool:
+            pool[key] = Workspace(
                 self.numerics, len(self.volume), substeps, adapted=adapted, plastic_adapted=plastic_adapted,
                 with_adjoint=with_adjoint, worlds=self.worlds, shared=shared,
             )  # fmt: skip
-        return self.workspaces[key]
+        return pool[key]
 
     @contextmanager
     def one_look(self, state: State, time: float, margin: int) -> Iterator[None]:
