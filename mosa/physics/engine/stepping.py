@@ -48,7 +48,7 @@ class Pace:
 
     alone: int
     chained: tuple
-    most_ahead: int = AHEAD
+    most_ahead: int = field(default_factory=lambda: AHEAD)
     done: list[State] = field(default_factory=list)
 
 
