@@ -29,7 +29,6 @@ from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
 from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.constitutive.laws import law_named
-from mosa.reconstruction.motion.response import Response
 from mosa.types import MarkerCues, Rollout
 
 COUNTED_AT_FIRST = 100 / 30
@@ -216,13 +215,8 @@ class Identification:
             len(seen), self.world.solids, observed=seen if gain else None, gain=gain, unseen=self.unseen(take)
         )  # fmt: skip
 
-    def response(self, take) -> Response | None:
-        """What the take's cues keep of the prediction that they were found about; None where that is not known."""
-        return take.response
-
     def unseen(self, take) -> Callable[[Tensor, int], Tensor] | None:
-        response = self.response(take)
-        return None if response is None else response.unseen
+        return None if take.response is None else take.response.unseen
 
     @torch.no_grad()
     def _many(self, rows: Tensor) -> Tensor:
@@ -272,7 +266,7 @@ class Identification:
         """Of a rollout from what was seen of take `index`; forces are those of the first."""
         take, curves = self.takes[index], self.world.forces if index == 0 else ()
         found = residuals.fields(
-            rollout, take.cues, take.start.rotation, self.chosen, self.response(take)
+            rollout, take.cues, take.start.rotation, self.chosen, take.response
         )
         if not curves:
             return found

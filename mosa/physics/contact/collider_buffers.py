@@ -17,7 +17,8 @@ class ColliderBuffers:
     """K colliders over `substeps` substeps of the workspace `work`, which holds them and is not held by them.
 
     poses, adj_poses: position (S, W K, 3), rotation (S, W K, 3, 3), linear, angular (S, W K, 3) of W worlds, one after another;
-    reaction: force [N] and torque [N m] about the collider's origin (S, W K, 3), as the body exerts them on the collider in
+    struck: velocities after `strike`; reaction_arrays: what particles add their forces and torques
+    to; reaction: force [N] and torque [N m] about the collider's origin (S, W K, 3), as the body exerts them on the collider in
     world axes.
     """
 
@@ -42,9 +43,10 @@ class ColliderBuffers:
 
         self.poses, poses = buffers(pose)
         self.pose_arrays = filled(self.kernels.Poses, *poses)
-        _, self._v_struck = work.array((work.particles, 3), vec3)
-        self.reaction, self._reaction = buffers(pose[2:])
+        _, self.struck = work.array((work.particles, 3), vec3)
+        self.reaction, reaction = buffers(pose[2:])
         self._reaction_sums = self.sums(self.reaction)
+        self.reaction_arrays = self.added_to(reaction, self._reaction_sums)
         if with_adjoint:
             self.adj_poses, adj_poses = buffers(pose)
             self._adj_sums = self.sums(self.adj_poses)
@@ -64,16 +66,6 @@ class ColliderBuffers:
             return None
         shapes = [(*t.shape[:2], prod(t.shape[2:]), COLUMNS) for t in tensors]
         return [self._work.array(shape, wp.int64, torch.int64) for shape in shapes]
-
-    @property
-    def struck(self) -> wp.array:
-        """Velocities after `strike`."""
-        return self._v_struck
-
-    @property
-    def reaction_arrays(self) -> list:
-        """What particles add their forces and torques to."""
-        return self.added_to(self._reaction, self._reaction_sums)
 
     def load(self, poses: tuple[Tensor, ...]) -> None:
         """Copy the poses of a segment's substeps in."""
@@ -118,9 +110,9 @@ class ColliderBuffers:
         substep's forces act; again: the reaction is known already."""
         reaction = [None, None] if again else self.reaction_arrays
         self._work.run(self.kernels.strike, self._work.particles, [
-            *self._arguments(met, step, time), self._v_struck, *reaction,
+            *self._arguments(met, step, time), self.struck, *reaction,
         ])  # fmt: skip
-        return self._v_struck
+        return self.struck
 
     def adjoint(self, step: int, met: list, time: float, adj_x, adj_v, adj_springs) -> None:
         """Turns the adjoint of velocities after contact into that before it; adds to the others."""
