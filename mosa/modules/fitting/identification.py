@@ -212,7 +212,8 @@ class Identification:
         take = self.takes[index]
         seen = take.cues.positions
         return self.ready(body, index, substeps).simulate(
-            len(seen), self.world.solids, observed=seen if gain else None, gain=gain, unseen=self.unseen(take)
+            len(seen), self.world.solids, observed=seen if gain else None, gain=gain,
+            unseen=self.unseen(take),
         )  # fmt: skip
 
     def unseen(self, take) -> Callable[[Tensor, int], Tensor] | None:

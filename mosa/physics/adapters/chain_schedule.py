@@ -57,7 +57,8 @@ class Chains:
         self.numerics = lanes.numerics
 
     def plan(self, state: State, substeps: int, stride: int, wanted: bool) -> Plan:
-        """How to run a motion of `substeps` substeps from `state`, by memory. wanted: whether a gradient is."""
+        """How to run a motion of `substeps` substeps from `state`, by memory. wanted: whether a
+        gradient is."""
         device = self.numerics.device
         if device.type != "cuda":
             return Plan(SEGMENT)
@@ -82,7 +83,8 @@ class Chains:
         plan: Plan,
         learned: Learned,
     ) -> tuple[State, Tensor | None, list]:
-        """(as `Prepared.frame`, statistics of the evaluations). A chain that fails is cut. learned: of the adapter as it is now."""
+        """(as `Prepared.frame`, statistics of the evaluations). A chain that fails is cut. learned:
+        of the adapter as it is now."""
         groups, done, forces, collected = grouped(lengths, plan.limit), 0, [], []
         while groups:
             count = sum(groups[0])

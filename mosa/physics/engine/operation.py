@@ -1,4 +1,5 @@
-"""A stretch of motion as one differentiable torch operation: a segment in which what an adapter answered is held, or a chain.
+"""A stretch of motion as one differentiable torch operation: a segment in which what an adapter
+answered is held, or a chain.
 
 Between the passes a stretch keeps what its backward pass reads, where there is room for it, and else only its inputs.
 """
@@ -60,13 +61,14 @@ class Stretch:
 
     @property
     def cut(self) -> bool:
-        """Whether the caller makes shorter ones of it where a particle leaves its window; else the window is widened."""
+        """Whether the caller makes shorter ones of it where a particle leaves its window; else the
+        window is widened."""
         return self.substeps > WIDENED
 
     @property
     def foresees(self) -> bool:
         """Whether the window has room for what gravity adds to the speeds."""
-        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
+        # a few substeps that gravity takes out of it are cheaper than nodes for it in every window
         return self.cut
 
     def buffers(
@@ -157,7 +159,8 @@ class Stretch:
         """(the state after it, what else it leaves, what `backward` gets as `kept`). differentiated: whether that follows.
         Errors: SimulationDiverged naming substep and particle; LeftWindow where it is cut."""
         time, dt = self.substeps * self.steps.dt, self.steps.dt
-        # a body that is being accelerated may need the most that the time step bound allows, half a cell per substep
+        # a body that is being accelerated may need the most that the time step bound allows: half
+        # a cell per substep
         margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
 
         def run(solver: SegmentSolver, pool: dict, state: State, acting: tuple, poses: tuple):

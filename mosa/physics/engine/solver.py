@@ -189,7 +189,8 @@ class SegmentSolver:
         self._known = [t.detach() for t in state[:2]], bounds
 
     def left_window(self, flags: Tensor, final: State, first: int, dt: float) -> bool:
-        """Whether a particle left the grid's window in a stretch that left these flags and this state; any other event raises.
+        """Whether a particle left the grid's window in a stretch that ended with these flags and this
+        state; any other event raises.
         Inside of `one_look` that is asked afterwards. first, dt: of the substeps, for messages."""
         if self._shared is not None:
             self._shared.flags.append(flags.clone())

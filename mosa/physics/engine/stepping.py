@@ -54,8 +54,8 @@ class Pace:
 
 @dataclass
 class Prepared:
-    """The bodies of one rollout: the parameters of their law, packed, and what advances them. held: these, and what an adapter
-    answered that is asked once.
+    """The bodies of one rollout: the parameters of their law, packed, and what advances them. held:
+    these, and the answer of an adapter that is asked once.
 
     ask: (adapter, F, C_affine, packed, collect) -> its answer by name. gathers: whether a stretch of motion has as many substeps as
     it can, and is launched before the last one was looked at: segments are long, and an adapter that is a torch module is asked
@@ -317,7 +317,8 @@ class Stepper:
         pace: Pace,
         alike: int = 0,
     ) -> Step:
-        """The frame that `enter` found, of all particles one world's after the other's. Others: as of `Prepared.frame`."""
+        """The frame that `enter` found, of all particles one world's after the other's. Other
+        arguments: as `Prepared.frame`."""
         state, forces = self.prepared.frame(state, frame, poses, pace, alike)
         if self.axes.turn is not None:
             self._check_box(self.axes.world.points(state.x.detach()), frame)
