@@ -374,7 +374,13 @@ class Identification:
 
     def _hold_substeps(self) -> None:
         """Substeps are a step function of the numbers: held fixed, differences are those of a smooth function."""
-        asked = [self.ready(self.body, i).simulator.substeps for i in range(len(self.takes))]
+        adaptive = self.body.settings.adaptive  # then only a rollout tells how many it takes
+        asked = [
+            self.rollout(self.body, i).substeps
+            if adaptive
+            else self.ready(self.body, i).simulator.substeps
+            for i in range(len(self.takes))
+        ]
         self.substeps = [-(-int(1.05 * count) // ROUNDED) * ROUNDED for count in asked]
 
     @torch.no_grad()
