@@ -39,8 +39,11 @@ class Ready:
     ) -> Rollout:  # fmt: skip
         """As `Body.simulate`, from here on; of a stack, the worlds at once."""
         simulator, stacked = self.simulator, self.state.x.ndim == 3
+        arguments, alone = self.arguments, not stacked and collect is None
+        if observed is not None and alone and arguments["stride"] is None:
+            arguments = self.answered().arguments  # once, not in every frame
         roll = partial(
-            simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders)
+            simulator.rollout, **arguments, collect=collect, motions=self.motions(colliders)
         )
         lift = self.lift[:, None] if stacked else self.lift
         if observed is None:
