@@ -44,12 +44,13 @@ from mosa.system import whole_files
 
 # ------------------------------------------------------------------------------------------------ files
 def options_once(name: str, quick: bool) -> set[tuple[str, ...]]:
-    """Overrides of the first job, and of one for every other option of every axis."""
+    """Overrides of as few jobs as have every option of every axis: the k-th has the k-th of each, from the first again where an
+    axis has fewer."""
     found = load_experiment(PAPER, name, quick)
-    first = {axis: options[0] for axis, options in found.axes.items()}
-    places = [first | {axis: option} for axis, options in found.axes.items() for option in options]
+    axes = list(found.axes.values())
+    places = [[options[k % len(options)] for options in axes] for k in range(max(map(len, axes)))]
     return {
-        (*found.common, *(each for option in place.values() for each in option.overrides))
+        (*found.common, *(each for option in place for each in option.overrides))
         for place in places
     }
 

@@ -5,37 +5,17 @@ from pathlib import Path
 from unittest.mock import patch
 
 import lightning as L
+from starts_once import start_once
 
 from mosa import compose
 from mosa.data.batches import SequenceBatch
-from mosa.modules.body.body import Start
-from mosa.reconstruction.pose.starts import sequence_start
-from mosa.reconstruction.rest_shape import RestShape
 from mosa.training import datamodule
 from mosa.training.assembly import Run, assemble
-from mosa.types import Appearance, Scene
 
 ROOT = Path(__file__).parents[2]
 ROUGHLY = ["reconstruction.resolution=40", "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30",
            "reconstruction.dynamic.iterations=20", "reconstruction.carried.iterations=10"]  # fmt: skip
 """Overrides of a reconstruction in a third of the time, for tests that ask nothing of its accuracy."""
-KNOWN: dict[tuple, Start] = {}
-"""By sequence, body and appearance: a start takes a second, and what is assembled here differs in what comes after it."""
-
-
-def start_once(shape: RestShape, seen: Appearance, scene: Scene, **named: bool) -> Start:
-    means, colors = (getattr(seen.splats, name).numpy().tobytes() for name in ("means", "colors"))
-    key = (
-        scene.sequence,
-        scene.fingerprint,
-        shape.rest.numpy().tobytes(),
-        means,
-        colors,
-        *named.items(),
-    )
-    if key not in KNOWN:
-        KNOWN[key] = sequence_start(shape, seen, scene, **named)
-    return KNOWN[key]
 
 
 def made(cache: Path, *overrides: str, taught: Collection[str] = ()) -> Run:

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from starts_once import start_once
 
 ROOT = Path(__file__).parents[2]
 IMPORTED = (
@@ -65,11 +66,12 @@ def call(script: str, *words: str, environment: Mapping[str, str] | None = None,
             json.dumps([script, words, environment, [str(screen) for screen in screens]]) + "\n"
         )
         process = int(server.stdout.readline())
-        if not select.select([server.stdout], [], [], timeout)[0]:
+        late = not select.select([server.stdout], [], [], timeout)[0]
+        if late:
             os.kill(process, signal.SIGKILL)
         code = int(server.stdout.readline())
         out, err = (screen.read_text() for screen in screens)
-    if code == -signal.SIGKILL:
+    if late:
         raise subprocess.TimeoutExpired([script, *words], timeout, out, err)
     return subprocess.CompletedProcess([script, *words], code, out, err)
 
@@ -78,6 +80,9 @@ def serve() -> None:
     """A line for each script: its number as a process, and, once it has ended, its exit code."""
     for name in IMPORTED:
         importlib.import_module(name)
+    from mosa.training import datamodule
+
+    datamodule.sequence_start = start_once
     gc.freeze()  # what is looked through by no fork
     while line := sys.stdin.readline():
         process = os.fork()

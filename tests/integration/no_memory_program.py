@@ -12,12 +12,7 @@ from unittest.mock import patch
 
 import torch
 
-from mosa.modules.body.body import Body
-from mosa.physics.world import Start
-from mosa.reconstruction.pose.starts import sequence_start
 from mosa.system import refused
-from mosa.training import datamodule
-from mosa.types import Appearance, Scene
 
 TORCH = torch.OutOfMemoryError(
     "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 139.80 GiB"
@@ -105,20 +100,7 @@ def raised(error: Exception):
     raise error
 
 
-KNOWN: dict[str, Start] = {}
-"""Of the scene's sequences: where a body starts costs seconds and is the same in all runs."""
-
-
-def start_once(body: Body, seen: Appearance, scene: Scene, **named: bool) -> Start:
-    if scene.sequence not in KNOWN:
-        KNOWN[scene.sequence] = sequence_start(body, seen, scene, **named)
-    return KNOWN[scene.sequence]
-
-
 if __name__ == "__main__":
-    with (
-        patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)),
-        patch.object(datamodule, "sequence_start", start_once),
-    ):
+    with patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)):
         for one in PLACES:
             tried(*one)

@@ -2,12 +2,10 @@
 
 import csv
 import json
-import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -277,29 +275,34 @@ def test_the_contact_offset_stays_where_a_grid_can_put_it(stepped):
     )
 
 
+KILLED = """
+import os, runpy, signal, sys, threading, time
+from pathlib import Path
+import torch
+
+def kill(checkpoint):
+    while not (
+        checkpoint.exists()
+        and torch.load(checkpoint, weights_only=True)["mosa"]["fit"]["steps_done"] >= 2
+    ):
+        time.sleep(0.1)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+sys.argv.pop(0)
+threading.Thread(target=kill, args=(Path(sys.argv.pop(0)),), daemon=True).start()
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""A run that ends without a word soon after its second step."""
+
+
 def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_path):
-    process = subprocess.Popen(
-        command("train.py", tmp_path / "killed", cache),
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
     checkpoint = tmp_path / "killed" / "checkpoints" / "last.ckpt"
-    try:
-        deadline = time.monotonic() + 300
-        while time.monotonic() < deadline:
-            time.sleep(0.1)
-            if (
-                checkpoint.exists()
-                and torch.load(checkpoint, weights_only=True)["mosa"]["fit"]["steps_done"] >= 2
-            ):
-                break
-        assert process.poll() is None, (
-            "the run ended before it could be killed: make the scene's fit longer"
-        )
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
+    (tmp_path / "killed.py").write_text(KILLED)
+    words = command("train.py", tmp_path / "killed", cache)[1:]
+    killed = forked.call(str(tmp_path / "killed.py"), str(checkpoint), *words)
+    assert killed.returncode == -signal.SIGKILL, (
+        "the run ended before it could be killed: make the scene's fit longer"
+    )
     begun = [
         call("train.py", tmp_path / "killed", cache, "resume=auto", *FEW_FIGURES) for _ in range(2)
     ]
