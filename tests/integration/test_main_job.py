@@ -404,7 +404,7 @@ def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(
     monkeypatch.setattr(evaluation, "rollouts", rollouts)
     monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", "evaluation.floor=false"])
+        cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", *FEW_FIGURES[1:]])
     named = "test/test_60" if where == "test" else "train"
     with pytest.warns(
         UserWarning,
