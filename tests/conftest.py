@@ -63,6 +63,11 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def pytest_sessionfinish():
+    """So that what is in cycles is freed: libraries count what is left at the end, and complain."""
+    gc.unfreeze()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def optimisation(request):
     """How Warp compiles for a CPU: as in the program, or without optimisation (`UNOPTIMISED`)."""
