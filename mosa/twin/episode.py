@@ -174,10 +174,10 @@ class Episode:
             if (
                 not isinstance(found, Tensor)
                 or found.shape != known.shape
-                or found.dtype != known.dtype
+                or (found.dtype, found.layout, found.device) != (known.dtype, known.layout, known.device)
             ):
                 what = (
-                    f"{found.dtype} {tuple(found.shape)}"
+                    f"{found.dtype} {tuple(found.shape)} ({found.layout}, {found.device})"
                     if isinstance(found, Tensor)
                     else repr(found)
                 )

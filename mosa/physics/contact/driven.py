@@ -62,7 +62,14 @@ class Driven:
                 raise ConfigError(f"{where}: expected a region, or points that move, found neither")
             region = self.motion.at(torch.zeros(1, dtype=torch.float64))[0].detach()
         if isinstance(region, Tensor) and region.ndim == 2:
-            return torch.cdist(region.double().cpu(), place).argmin(1).unique()
+            away, found = torch.cdist(region.double().cpu(), place).min(1)
+            size = float((place.amax(0) - place.amin(0)).max())
+            if float(away.max()) > FARTHEST * size:
+                raise ConfigError(
+                    f"{where}: expected points on the body, found one {float(away.max()):.3g} m from "
+                    f"its nearest particle; the body is {size:.3g} m long"
+                )
+            return found.unique()
         if isinstance(region, Tensor | Sequence):
             found = torch.as_tensor(region, dtype=torch.int64).cpu().unique()
             if len(found) and not 0 <= int(found[0]) <= int(found[-1]) < len(x):

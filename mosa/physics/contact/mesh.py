@@ -174,6 +174,11 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ConfigError(
             f"mesh: {path} cannot be read ({type(error).__name__}: {error})"
         ) from error
+    if not len(vertices) or not len(triangles):
+        raise ConfigError(
+            f"mesh: {path}: expected a mesh, found {len(vertices)} vertices and {len(triangles)} "
+            "triangles: an empty or damaged file?"
+        )
     return vertices, triangles
 
 
