@@ -25,6 +25,7 @@ from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.limits import machine_memory
+from mosa.system.whole_files import regular
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
@@ -221,14 +222,16 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
     that its results say. Errors: DataError naming the file, ConfigError naming `where`."""
     if Path(path).suffix == ".json":
         try:
-            found = json.loads(Path(path).read_text())
+            found = json.loads(regular(Path(path)).read_text())
             law, stiffness, own = found["law"], found["stiffness"] or {}, found["posterior"]
+            if not isinstance(law, str) or not isinstance(stiffness, dict):
+                raise TypeError("expected law: a name, stiffness: a section or null")
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             named = [_as_operator(name) for name in own["names"]]
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,
                                            "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ConfigError) as error:
             raise DataError(
                 f"{where}: {path}: expected a material.json of mosa-material with its posterior "
                 f"({type(error).__name__}: {error})"

@@ -16,6 +16,7 @@ from mosa.export.energies import ENERGIES, STIFFNESS, Energy, energy
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 from mosa.physics.constitutive.laws import law_named
+from mosa.system.whole_files import regular
 from mosa.twin.twin import Twin
 
 
@@ -41,7 +42,7 @@ def read_source(path: str | Path) -> Source:
 def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
     """What `mosa-material` wrote. Errors: DataError naming the file and what is wrong."""
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
+        found: dict[str, Any] = json.loads(regular(path).read_text())
         material = in_double(Material(found["law"], found["parameters"]))
         for name in material.directions:  # starts at its own value: the angles are 0
             getattr(material, f"frame_{name}").data = getattr(material, f"frame_{name}").double()

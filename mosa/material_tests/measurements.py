@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from mosa.errors import DataError
+from mosa.settings import LARGEST
 
 UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COLUMNS = ("test", "mode", "angle", "first", "second", "stress_1", "stress_2", "sd_1", "sd_2")
@@ -73,6 +74,8 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
             f"tests: {path}: expected the columns {', '.join(NEEDED)} and of "
             f"{', '.join(COLUMNS)} any others, found {wrong}"
         )
+    if len(set(header)) < len(header):
+        raise DataError(f"tests: {path}: expected each column once, found {', '.join(header)}")
     if not rows:
         raise DataError(f"tests: {path}: expected rows below the header, found none")
     return measurements(rows, unit, str(path))
@@ -84,6 +87,8 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
     states, stresses = [], []
     for i, row in enumerate(rows):
         line = f"tests: {where}: row {i + 1}"
+        if None in row:  # more cells than columns: as of decimal commas
+            raise DataError(f"{line}: expected a cell for each column, found more: {row[None]}")
         kind, _, axes = str(row["mode"]).strip().partition(" ")
         fits = KINDS.get(kind) == len(axes) == len(set(axes)) and set(axes) <= set(AXES)
         if not fits:
@@ -99,7 +104,7 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
                 number = float(text)
             except ValueError:
                 number = math.inf
-            if not math.isfinite(number):
+            if not abs(number) <= LARGEST:
                 raise DataError(f"{line}: {name}: expected a number, found {text!r}")
             return number
 
@@ -131,6 +136,20 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
     if 0 < np.isnan(sd).sum() < len(sd) or (sd <= 0).any():
         raise DataError(
             f"tests: {where}: sd_1, sd_2: expected a positive number beside every stress, or none at all"
+        )
+    size = float(np.abs(value).max())
+    if size == 0 or not (np.isnan(sd) | ((1e-9 * size <= sd) & (sd <= 1e9 * size))).all():
+        raise DataError(
+            f"tests: {where}: stress_1, stress_2, sd_1, sd_2: expected stresses other than 0, and deviations from "
+            f"1e-9 to 1e9 of the largest, found stresses up to {size:g}"
+        )
+    pulled = (kinds == "uniaxial")[row_of] & (np.abs(value) > 0.05 * size)
+    against = pulled & ((given[row_of, 0] - 1) * value < 0)
+    if 2 * against.sum() > pulled.sum():
+        raise DataError(
+            f"tests: {where}: expected stretches above 1 under tension and below 1 under compression, found "
+            f"{against.sum()} of {pulled.sum()} uniaxial states otherwise, as {given[row_of][against][0, 0]:g} under a stress of "
+            f"{value[against][0]:g}: strains in place of stretches, or the other sign of stresses?"
         )
     scale = UNITS[unit]
     return Measurements(

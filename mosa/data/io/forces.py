@@ -16,7 +16,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.keys import fits
 from mosa.physics.world import World
-from mosa.settings import Positive, Text
+from mosa.settings import LARGEST, Entries, Positive, Text, check
 from mosa.types import Rollout
 
 COLUMNS = ("time", "fx", "fy", "fz")
@@ -82,6 +82,7 @@ def forces_from_config(
     Columns of the file: time [s], fx, fy, fz [N].
     A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
     entry, DataError the file."""
+    check(field_name, items, Entries | None)
     curves = []
     for i, item in enumerate(items or ()):
         where = f"{field_name}[{i}]"
@@ -97,8 +98,8 @@ def forces_from_config(
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     """Errors: DataError naming the file, what was expected and found."""
     try:
-        found = np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8")
-    except (OSError, ValueError) as error:
+        found = np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8-sig")
+    except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path}: expected a csv of {', '.join(COLUMNS)}, found {error}") from error
     names = found.dtype.names or ()
     if "time" not in names or not set(names) & set(COLUMNS[1:]):
@@ -112,8 +113,11 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     forces = torch.from_numpy(np.stack(columns, 1))
     if len(times) < 2 or not bool((times.diff() > 0).all()):
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
-    if not bool(torch.isfinite(forces).any()):
-        raise DataError(f"{path}: expected forces [N], found no number")
+    there = forces[torch.isfinite(forces)]
+    if not len(there) or not 0 < float(there.abs().max()) <= LARGEST:
+        raise DataError(
+            f"{path}: expected forces [N], up to {LARGEST:g}, found no number other than 0, or a larger one"
+        )
     return ForceCurve(of, times, forces, sd)
 
 
@@ -142,6 +146,11 @@ def force_residuals(
         )
     for curve, column in zip(curves, columns_of(curves, world.solids)):
         mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
+        if not bool(torch.isfinite(mean).any()):
+            raise ConfigError(
+                f"world.forces: expected a curve of {curve.of!r} that covers an interval between frames, from 0 to "
+                f"{(len(rollout.x) - 1) * frame_dt:.3g} s, found {float(curve.times[0]):.6g} to {float(curve.times[-1]):.6g} s"
+            )
         felt = rollout.reactions.mean(1)[:, column, :3].double()
         parts.append(((felt - mean) / sd)[torch.isfinite(mean)])
     return torch.cat(parts)
