@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import pickletools
 import zipfile
 from collections import OrderedDict
@@ -25,7 +26,6 @@ from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.limits import machine_memory
-from mosa.system.whole_files import regular
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
@@ -220,18 +220,17 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
     fit, or the material.json of `mosa-material`. Other numbers of it are integrated out: the
     contact's and the stiffness modes' belong to one body. A fit's standard deviations are those
     that its results say. Errors: DataError naming the file, ConfigError naming `where`."""
-    if Path(path).suffix == ".json":
+    if os.path.isfile(path) and Path(path).suffix == ".json":
         try:
-            found = json.loads(regular(Path(path)).read_text())
-            law, stiffness, own = found["law"], found["stiffness"] or {}, found["posterior"]
-            if not isinstance(law, str) or not isinstance(stiffness, dict):
-                raise TypeError("expected law: a name, stiffness: a section or null")
+            found = json.loads(Path(path).read_text())
+            law, stiffness = str(found["law"]), dict(found["stiffness"] or {})
+            own = found["posterior"]
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             named = [_as_operator(name) for name in own["names"]]
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,
                                            "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ConfigError) as error:
+        except Exception as error:  # whatever the file holds
             raise DataError(
                 f"{where}: {path}: expected a material.json of mosa-material with its posterior "
                 f"({type(error).__name__}: {error})"

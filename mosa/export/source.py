@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ from mosa.export.energies import ENERGIES, STIFFNESS, Energy, energy
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 from mosa.physics.constitutive.laws import law_named
-from mosa.system.whole_files import regular
 from mosa.twin.twin import Twin
 
 
@@ -33,7 +33,7 @@ class Source:
 def read_source(path: str | Path) -> Source:
     """Of a checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without energy."""
     path = Path(path)
-    if path.suffix == ".json":
+    if path.suffix == ".json" and os.path.isfile(path):
         return source(*read_material(path))
     body = Twin.load(path).body
     return source(body.material, body.adapter)
@@ -42,7 +42,7 @@ def read_source(path: str | Path) -> Source:
 def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
     """What `mosa-material` wrote. Errors: DataError naming the file and what is wrong."""
     try:
-        found: dict[str, Any] = json.loads(regular(path).read_text())
+        found: dict[str, Any] = json.loads(path.read_text())
         material = in_double(Material(found["law"], found["parameters"]))
         for name in material.directions:  # starts at its own value: the angles are 0
             getattr(material, f"frame_{name}").data = getattr(material, f"frame_{name}").double()

@@ -150,9 +150,7 @@ class Fitting:
             )
             shares = 1 - np.diag(covariance @ prior)
             determined, effective = shares[self.own], float(shares.sum())
-            noise = max(
-                LEAST, float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))
-            )
+            noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0) + LEAST**2))
             if self.own.any():
                 own = best.x[self.own]
                 sigma = float(

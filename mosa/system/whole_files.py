@@ -49,13 +49,6 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def regular(path: Path) -> Path:
-    """Errors: OSError where it is no file: a device or a pipe would be read without end."""
-    if not path.is_file():
-        raise OSError(f"no file {path}")
-    return path
-
-
 def write_whole(path: str | Path, text: str) -> None:
     """A text, as `written_whole` writes; lines end as they are given."""
     with written_whole(path) as partial:

@@ -174,10 +174,10 @@ class Episode:
             if (
                 not isinstance(found, Tensor)
                 or found.shape != known.shape
-                or (found.dtype, found.layout, found.device) != (known.dtype, known.layout, known.device)
+                or found.dtype != known.dtype
             ):
                 what = (
-                    f"{found.dtype} {tuple(found.shape)} ({found.layout}, {found.device})"
+                    f"{found.dtype} {tuple(found.shape)}"
                     if isinstance(found, Tensor)
                     else repr(found)
                 )

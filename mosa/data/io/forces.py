@@ -14,15 +14,21 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider
-from mosa.physics.contact.keys import fits
 from mosa.physics.world import World
-from mosa.settings import LARGEST, Entries, Positive, Text, check
+from mosa.settings import LARGEST, Entries, Positive, Settings, Text, check
 from mosa.types import Rollout
 
 COLUMNS = ("time", "fx", "fy", "fz")
 MODEL_ERROR = 0.01
 """Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
-KEYS = {"of": Text, "file": Text, "sd": Positive}
+
+
+class Measured(Settings):
+    """An entry of world.forces."""
+
+    of: Text
+    file: Text
+    sd: Positive | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +89,8 @@ def forces_from_config(
     A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
     entry, DataError the file."""
     check(field_name, items, Entries | None)
-    curves = []
-    for i, item in enumerate(items or ()):
-        where = f"{field_name}[{i}]"
-        if unknown := [key for key in item if key not in KEYS]:
-            raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected {', '.join(KEYS)}")
-        if missing := [key for key in ("of", "file") if item.get(key) is None]:
-            raise ConfigError(f"{where}: expected of and file, found no {missing[0]}")
-        fits(item, KEYS, where)
-        curves.append(read_forces(Path(item["file"]), item["of"], item.get("sd")))
-    return tuple(curves)
+    read = [Measured.read(item, f"{field_name}[{i}]") for i, item in enumerate(items or ())]
+    return tuple(read_forces(Path(each.file), each.of, each.sd) for each in read)
 
 
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:

@@ -24,6 +24,9 @@ from mosa.physics.contact.reference import signed_distance
 from mosa.settings import Expected, Section, Text, Weight, Whole
 from mosa.system.npz import read_npz
 
+FARTHEST = 0.5
+"""Of the body's size: no particle is meant by a point that is farther from all of them."""
+
 
 def sample_paths(
     motions: Sequence, count: int, dt: float, start: float, first: int = 0
@@ -63,11 +66,9 @@ class Driven:
             region = self.motion.at(torch.zeros(1, dtype=torch.float64))[0].detach()
         if isinstance(region, Tensor) and region.ndim == 2:
             away, found = torch.cdist(region.double().cpu(), place).min(1)
-            size = float((place.amax(0) - place.amin(0)).max())
-            if float(away.max()) > FARTHEST * size:
+            if float(away.max()) > FARTHEST * float((place.amax(0) - place.amin(0)).max()):
                 raise ConfigError(
-                    f"{where}: expected points on the body, found one {float(away.max()):.3g} m from "
-                    f"its nearest particle; the body is {size:.3g} m long"
+                    f"{where}: points: expected places on the body, found one {away.max():.3g} m from it"
                 )
             return found.unique()
         if isinstance(region, Tensor | Sequence):

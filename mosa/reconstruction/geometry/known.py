@@ -33,10 +33,8 @@ DEEP, FILLED = 0.75, 0.3
 """Spacings below the surface, and the share of a cloud's points that lie deeper, from which on it
 fills a body and is no scan of its surface. A dense, noisy scan that passes for one is made larger by
 half of its small spacing."""
-FEWEST = 27
-"""Nodes inside of a solid."""
-FAR = 1e4
-"""Extents from the origin of a cloud or of Gaussians."""
+FEWEST, NEAR = 27, 1e-4
+"""Nodes inside of a solid; least extent of a cloud, of its way to the origin (single precision)."""
 THIN = 1e-2
 """Standard deviation of a scanned point, in spacings."""
 
@@ -108,13 +106,10 @@ def known_solid(body: KnownBody) -> Solid:
 
 def centred(distance: Volume, unit: float, middle: Tensor, path: Path) -> Solid:
     """About the centre of what is inside. middle: (3,) of the file, where the lattice has 0.
-
     Errors: DataError where next to nothing is inside."""
     if (inside := int((distance.values < 0).sum())) < FEWEST:
         raise DataError(
-            f"scene.body.shape: {path}: expected a solid, found {inside} of "
-            f"{distance.values.numel()} nodes {distance.pitch * unit:.3g} of its units apart inside: "
-            "too thin, open, or with points far away from it"
+            f"scene.body.shape: {path}: expected a solid, found {inside} nodes inside: too thin, open?"
         )
     centre = distance.points()[distance.values < 0].mean(0)
     moved = Volume(distance.values, distance.origin - centre, distance.pitch)
@@ -134,12 +129,9 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
         )
     middle = kept.means.median(0).values
     unit = float((kept.means.amax(0) - kept.means.amin(0)).max())
-    if not 0 < unit < np.inf:
-        raise DataError(f"scene.body.shape: {path}: expected an extent, found {unit:.3g}")
-    if float(middle.abs().max()) > FAR * unit:
+    if not NEAR * float(middle.abs().max()) < unit < np.inf:
         raise DataError(
-            f"scene.body.shape: {path}: expected a shape near its origin, which single precision "
-            f"resolves, found one of extent {unit:.3g} at {[round(v) for v in middle.tolist()]}"
+            f"scene.body.shape: {path}: expected an extent near its origin, found {unit:.3g}"
         )
     kept = Splats(
         (kept.means - middle) / unit,
