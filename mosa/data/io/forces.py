@@ -113,9 +113,7 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
     there = forces[torch.isfinite(forces)]
     if not len(there) or not 0 < float(there.abs().max()) <= LARGEST:
-        raise DataError(
-            f"{path}: expected forces [N], up to {LARGEST:g}, found no number other than 0, or a larger one"
-        )
+        raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")
     return ForceCurve(of, times, forces, sd)
 
 
@@ -146,8 +144,8 @@ def force_residuals(
         mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
         if not bool(torch.isfinite(mean).any()):
             raise ConfigError(
-                f"world.forces: expected a curve of {curve.of!r} that covers an interval between frames, from 0 to "
-                f"{(len(rollout.x) - 1) * frame_dt:.3g} s, found {float(curve.times[0]):.6g} to {float(curve.times[-1]):.6g} s"
+                f"world.forces: expected a curve of {curve.of!r} that covers an interval between "
+                f"frames, found {curve.times[0]:.6g} to {curve.times[-1]:.6g} s"
             )
         felt = rollout.reactions.mean(1)[:, column, :3].double()
         parts.append(((felt - mean) / sd)[torch.isfinite(mean)])

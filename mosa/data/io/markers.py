@@ -172,10 +172,7 @@ def released(times: np.ndarray, positions: np.ndarray, where: str) -> float:
     slope, height = np.polyfit(times[chosen], np.sqrt(moved[chosen]), 1)
     found = times[first] if slope <= 0 else -height / slope
     if found < times[0]:
-        raise DataError(
-            f"{where}: expected points at rest for {AT_REST} s and then let go, found them moving from "
-            "the first sample on; set scene.start [s]"
-        )
+        raise DataError(f"{where}: expected rest at first, found points moving; set scene.start")
     return float(min(found, times[first]))
 
 

@@ -67,9 +67,7 @@ class Driven:
         if isinstance(region, Tensor) and region.ndim == 2:
             away, found = torch.cdist(region.double().cpu(), place).min(1)
             if float(away.max()) > FARTHEST * float((place.amax(0) - place.amin(0)).max()):
-                raise ConfigError(
-                    f"{where}: points: expected places on the body, found one {away.max():.3g} m from it"
-                )
+                raise ConfigError(f"{where}: points: expected places on the body, found one beside")
             return found.unique()
         if isinstance(region, Tensor | Sequence):
             found = torch.as_tensor(region, dtype=torch.int64).cpu().unique()

@@ -107,10 +107,8 @@ def known_solid(body: KnownBody) -> Solid:
 def centred(distance: Volume, unit: float, middle: Tensor, path: Path) -> Solid:
     """About the centre of what is inside. middle: (3,) of the file, where the lattice has 0.
     Errors: DataError where next to nothing is inside."""
-    if (inside := int((distance.values < 0).sum())) < FEWEST:
-        raise DataError(
-            f"scene.body.shape: {path}: expected a solid, found {inside} nodes inside: too thin, open?"
-        )
+    if int((distance.values < 0).sum()) < FEWEST:
+        raise DataError(f"scene.body.shape: {path}: expected a solid, found nothing inside: open?")
     centre = distance.points()[distance.values < 0].mean(0)
     moved = Volume(distance.values, distance.origin - centre, distance.pitch)
     return Solid(moved, unit, (middle + unit * centre).float())
@@ -130,9 +128,7 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
     middle = kept.means.median(0).values
     unit = float((kept.means.amax(0) - kept.means.amin(0)).max())
     if not NEAR * float(middle.abs().max()) < unit < np.inf:
-        raise DataError(
-            f"scene.body.shape: {path}: expected an extent near its origin, found {unit:.3g}"
-        )
+        raise DataError(f"scene.body.shape: {path}: expected an extent near 0, found {unit:.3g}")
     kept = Splats(
         (kept.means - middle) / unit,
         kept.scales / unit,

@@ -143,7 +143,7 @@ def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
     with pytest.raises(DataError, match="expected times in seconds, found samples 10 s apart"):
         read_markers(write(tmp_path / "fall.csv", 1e3 * times, "abcd", positions))
     times = np.arange(300) / 100
-    with pytest.raises(DataError, match="moving from the first sample on"):
+    with pytest.raises(DataError, match="expected rest at first, found points moving"):
         released(times, positions[:1] + [0.0, 0.1, 0.0] * times[:, None, None], "here")
 
 
