@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import pickletools
 import zipfile
 from collections import OrderedDict
@@ -219,16 +220,17 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
     fit, or the material.json of `mosa-material`. Other numbers of it are integrated out: the
     contact's and the stiffness modes' belong to one body. A fit's standard deviations are those
     that its results say. Errors: DataError naming the file, ConfigError naming `where`."""
-    if Path(path).suffix == ".json":
+    if os.path.isfile(path) and Path(path).suffix == ".json":
         try:
             found = json.loads(Path(path).read_text())
-            law, stiffness, own = found["law"], found["stiffness"] or {}, found["posterior"]
+            law, stiffness = str(found["law"]), dict(found["stiffness"] or {})
+            own = found["posterior"]
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             named = [_as_operator(name) for name in own["names"]]
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,
                                            "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+        except Exception as error:  # whatever the file holds
             raise DataError(
                 f"{where}: {path}: expected a material.json of mosa-material with its posterior "
                 f"({type(error).__name__}: {error})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -93,7 +94,7 @@ def load_scene(
     body = arguments.get("body")
     if format != "markers" and isinstance(body, Mapping) and isinstance(body.get("shape"), str):
         near = (place if place.is_dir() else place.parent) / body["shape"]
-        shape = near if near.is_file() else under(root, body["shape"])
+        shape = near if os.path.isfile(near) else under(root, body["shape"])
         arguments["body"] = {**body, "shape": str(shape)}
     found = call(loader, {"path": place, **arguments})
     if not isinstance(found, Scene):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ class Source:
 def read_source(path: str | Path) -> Source:
     """Of a checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without energy."""
     path = Path(path)
-    if path.suffix == ".json":
+    if path.suffix == ".json" and os.path.isfile(path):
         return source(*read_material(path))
     body = Twin.load(path).body
     return source(body.material, body.adapter)

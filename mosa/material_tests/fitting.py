@@ -28,6 +28,8 @@ UNKNOWN = 100.0
 """Standard deviation of an unconstrained number that the tests do not determine."""
 HOPELESS = 1e3
 """Residual in units of the measured stresses' root mean square, where the law has no equilibrium."""
+LEAST = 1e-5
+"""Noise, in the unit of the residuals: of a test that a law meets exactly."""
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 """Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
 
@@ -148,7 +150,7 @@ class Fitting:
             )
             shares = 1 - np.diag(covariance @ prior)
             determined, effective = shares[self.own], float(shares.sum())
-            noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0)))
+            noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0) + LEAST**2))
             if self.own.any():
                 own = best.x[self.own]
                 sigma = float(

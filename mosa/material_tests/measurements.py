@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from mosa.errors import DataError
+from mosa.settings import LARGEST
 
 UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COLUMNS = ("test", "mode", "angle", "first", "second", "stress_1", "stress_2", "sd_1", "sd_2")
@@ -66,7 +67,7 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
             header, rows = tuple(reader.fieldnames or ()), list(reader)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"tests: {path}: expected a csv file of tests, found {error}") from error
-    missing = [name for name in NEEDED if name not in header]
+    missing = [name for name in NEEDED if header.count(name) != 1]
     if missing or (strange := [name for name in header if name not in COLUMNS]):
         wrong = f"no {missing[0]}" if missing else f"an unknown column {strange[0]!r}"
         raise DataError(
@@ -75,7 +76,10 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
         )
     if not rows:
         raise DataError(f"tests: {path}: expected rows below the header, found none")
-    return measurements(rows, unit, str(path))
+    found = measurements(rows, unit, str(path))
+    if not found.value.any():
+        raise DataError(f"tests: {path}: stress_1: expected stresses, found 0 in every row")
+    return found
 
 
 def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
@@ -84,6 +88,8 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
     states, stresses = [], []
     for i, row in enumerate(rows):
         line = f"tests: {where}: row {i + 1}"
+        if None in row:  # more cells than columns: as of decimal commas
+            raise DataError(f"{line}: expected a cell for each column, found more: {row[None]}")
         kind, _, axes = str(row["mode"]).strip().partition(" ")
         fits = KINDS.get(kind) == len(axes) == len(set(axes)) and set(axes) <= set(AXES)
         if not fits:
@@ -99,7 +105,7 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
                 number = float(text)
             except ValueError:
                 number = math.inf
-            if not math.isfinite(number):
+            if not abs(number) <= LARGEST:
                 raise DataError(f"{line}: {name}: expected a number, found {text!r}")
             return number
 
@@ -128,9 +134,16 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         stresses += [(i, k, v, sd) for k, v, sd in measured if not math.isnan(v)]
     test, kinds, axis, angles, given = (np.array(part) for part in zip(*states))
     row_of, component, value, sd = (np.array(part) for part in zip(*stresses))
-    if 0 < np.isnan(sd).sum() < len(sd) or (sd <= 0).any():
+    if 0 < np.isnan(sd).sum() < len(sd) or (sd <= 1 / LARGEST).any():
         raise DataError(
             f"tests: {where}: sd_1, sd_2: expected a positive number beside every stress, or none at all"
+        )
+    pulled = (kinds == "uniaxial")[row_of] & (np.abs(value) > 0.05 * np.abs(value).max())
+    against = pulled & ((given[row_of, 0] - 1) * value < 0)
+    if 2 * against.sum() > pulled.sum():
+        raise DataError(
+            f"tests: {where}: first: expected stretches above 1 under tension, below 1 under pressure, "
+            f"found {against.sum()} of {pulled.sum()} otherwise: strains, or the other sign of stresses?"
         )
     scale = UNITS[unit]
     return Measurements(

@@ -15,11 +15,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -33,7 +30,7 @@ from mosa.modules.body.body import Body, Start
 from mosa.physics.engine.inputs import numbers
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.geometry.filling import fill
-from mosa.reconstruction.geometry.shell import solid_of
+from mosa.reconstruction.geometry.shell import solid_of, together
 from mosa.reconstruction.pipeline import FEW, filling_spacing
 from mosa.reconstruction.resolution import PER_CELL, grid_spacing
 from mosa.rendering.appearance.carried_splats import CarriedSplats
@@ -48,8 +45,6 @@ log = logging.getLogger(__name__)
 
 ROOM = 4.0
 """Of the object's size, to each side of what it falls through."""
-GAP, PART = 0.1, 0.01
-"""Of the extent of nine tenths of the Gaussians, and of their number: smaller groups that lie farther away are strays."""
 PLAUSIBLE = (0.01, 2.0)
 """[m] of an object's longest side: without `size` others are asked for, with it a warning."""
 WIDE = 0.25
@@ -127,19 +122,6 @@ def read_object(
                 stacklevel=2,
             )
     return Appearance(splats, harmonics)
-
-
-def together(means: Tensor) -> Tensor:
-    """(N,) which Gaussians are the object: with those that are at most `GAP` of its extent away, at least `PART` of all."""
-    x = means.double().numpy()
-    extent, near = np.ptp(np.quantile(x, [0.05, 0.95], axis=0), axis=0), cKDTree(x).query(x, k=2)[0]
-    gap = max(GAP * float(extent.max()), 3 * float(np.median(near[:, 1])), 1e-30)
-    cells, at = np.unique(np.floor(x / gap), axis=0, return_inverse=True)
-    pairs = cKDTree(cells).query_pairs(1.0, p=np.inf, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells),) * 2)
-    piece = connected_components(links, directed=False)[1][at.reshape(-1)]
-    count = np.bincount(piece)[piece]
-    return torch.from_numpy(count > PART * len(means))
 
 
 def fill_object(

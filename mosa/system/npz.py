@@ -24,6 +24,8 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Numbers by name. Errors: DataError naming the file: damaged, of objects, or larger than it says."""
+    if not path.is_file():  # a device would be read without end
+        raise DataError(f"{path}: expected an npz file, found none")
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()

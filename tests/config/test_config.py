@@ -176,7 +176,7 @@ def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override
     (["world.colliders=[{type:cone}]"], r"world\.colliders\[0\]\.type"),
     (["world.driven=[{type:sphere}]"], r"world\.driven\[0\]: a sphere needs radius"),
     (["world.driven=[{indices:[0],mass:-1}]"], r"world\.driven\[0\]\.mass"),
-    (["world.forces=[{of:grip}]"], r"world\.forces\[0\]: expected of and file"),
+    (["world.forces=[{of:grip}]"], r"world\.forces\[0\]\.file: expected this key"),
     (["+prior.parameters.damping=-1"], r"prior\.parameters\.damping"),
 ])  # fmt: skip
 def test_a_part_that_cannot_be_built_is_named_before_anything_is_computed(overrides, message):

@@ -77,6 +77,14 @@ def test_free_faces_of_a_compressible_specimen_carry_nothing():
     assert small[0] == pytest.approx(1e-6 * E, rel=1e-4)
 
 
+def test_a_test_of_a_single_state_is_fitted():
+    law = Law(Material("neo_hookean", {"E": E, "nu": 0.4}), None, "full")
+    states = [dict(row, stress_1=1e3) for row in rows("uniaxial x", [1.1])]
+    data = measurements(states, "Pa", "here")
+    fit = Fitting(law, data, False, starts=1, seed=0).fit()
+    assert fit.predicted == pytest.approx([1e3], rel=1e-3) and np.isfinite(fit.covariance).all()
+
+
 def test_a_specimen_at_an_angle_is_a_material_that_is_turned():
     fibre = {"E": E, "nu": NU, "fibre_stiffness": 1e4, "fibre_exponent": 1.0, "dispersion": 0.1}
     states = rows("biaxial xy", LENGTHS[1:4], 1.1, angle=30.0)
@@ -154,9 +162,11 @@ def test_two_halves_of_the_tests_say_what_all_of_them_say(tmp_path):
     assert only.names == ["E"] and float(only.covariance) == pytest.approx(first.covariance[0, 0])
     with pytest.raises(ConfigError, match="expected numbers of neo_hookean that are learned"):
         known_numbers(str(path), Material("neo_hookean", {"E": E, "nu": 0.4}), None, "known")
-    path.write_text("{}")
-    with pytest.raises(DataError, match=r"known: .*material\.json: expected a material\.json"):
-        known_numbers(str(path), law.material, None, "known")
+    whole = json.loads(path.read_text())
+    for text in ("{}", "[" * 100_000, json.dumps(whole | {"stiffness": [1]})):
+        path.write_text(text)
+        with pytest.raises(DataError, match=r"known: .*material\.json: expected a material\.json"):
+            known_numbers(str(path), law.material, None, "known")
 
 
 HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
@@ -176,6 +186,12 @@ HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
         (HEADER + "a,biaxial xy,1.1,,1,,\n", "positive stretches"),
         (HEADER + "a,uniaxial x,1,,,,\n", "stress_1: expected a number, found none"),
         (HEADER + "a,shear xy,1,,1,2,\n", "stress_2: expected an empty cell"),
+        (HEADER + "a,uniaxial x,1.1,,1e300,,\n", "stress_1: expected a number, found '1e300'"),
+        (HEADER + "a,uniaxial x,1.1,,0,,\n", "expected stresses, found 0"),
+        (HEADER + "a,uniaxial x,1.1,,1,,1e-300\n", "sd_1, sd_2: expected a positive number"),
+        (HEADER + "a,uniaxial x,1,1,,1,,,5\n", "a cell for each column, found more"),
+        (HEADER.replace("second", "first") + "a,uniaxial x,1,,1,,\n", "expected the columns"),
+        (HEADER + "a,uniaxial x,0.1,,1,,\na,uniaxial x,0.2,,2,,\n", "found 2 of 2 .*strains"),
         (HEADER + "a,uniaxial x,1,,1,,0.1\nb,uniaxial x,1,,1,,\n", "beside every stress"),
     ],
 )

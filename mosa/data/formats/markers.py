@@ -6,24 +6,31 @@ import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import MinLen
 
-from mosa.data.formats.scene_from_footage import check_density
+from mosa.data.formats.scene_from_footage import check_density, directions
 from mosa.data.io.markers import AT_REST, alignment, read_markers, released, swung
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Box, collider_of
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.mesh import SignedDistanceField
-from mosa.settings import is_number
+from mosa.settings import Expected, Names, Positive, Three, Whole, check_values, is_number
 from mosa.types import AUTO, Cameras, Ground, Markers, Scene
 
 log = logging.getLogger(__name__)
 
+Places = Annotated[dict[str, Three], Expected("a section of places like {a: [0, 0, 0.1]} [m]")]
+KINDS: dict[str, Any] = {"points": Places | None, "tracked": Annotated[Names, MinLen(1)] | None, "fps": Positive | None,
+                         "duration": Positive | None, "holdout_frames": Whole}  # fmt: skip
 FOUND = {AUTO: released, "swing": swung}
 """How scene.start is found."""
+MOST_FRAMES = 100_000
+MISALIGNED = 0.1
+"""Of the points' extent: a distance (rms) of aligned points that is refused."""
 WIDE = 3.0
 """The world reaches so many sizes of the body beyond it."""
 
@@ -59,11 +66,14 @@ def load_markers(
     Errors: ConfigError naming the key, DataError naming the file.
     """
     check_density("scene.density", density)
+    given = {"points": points, "tracked": tracked, "duration": duration, "fps": fps}
+    check_values(given | {"holdout_frames": holdout_frames}, KINDS, "scene")
+    upright, pull = directions(up, gravity, ground)
     recording = read_markers(Path(path))
     names = recording.names if tracked is None else tuple(tracked)
     seen = recording.of(names, "scene.tracked")
     times = recording.times
-    if start in FOUND:
+    if isinstance(start, str) and start in FOUND:
         begin = FOUND[start](times, seen, str(path))
     elif is_number(start) and times[0] <= float(start) < times[-1]:
         begin = float(start)
@@ -74,13 +84,13 @@ def load_markers(
         )
     rate = 1 / float(np.median(np.diff(times))) if fps is None else float(fps)
     end = times[-1] if duration is None else min(times[-1], begin + float(duration))
-    frames = int(np.floor((end - begin) * rate + 1e-6)) + 1
-    held = int(holdout_frames) if is_number(holdout_frames) else -1
-    if not 0 <= held <= frames - 2:
+    span = float(np.floor((end - begin) * rate + 1e-6)) + 1
+    if not 2 + holdout_frames <= span <= MOST_FRAMES:
         raise ConfigError(
-            f"scene.holdout_frames: expected a number of last frames that leaves 2 of {frames} to "
-            f"learn from, found {holdout_frames!r} (scene.duration, scene.fps)"
+            f"scene.holdout_frames: expected to learn from 2 frames or more, and {MOST_FRAMES} at most "
+            f"in all, found {span:.6g} in all, {holdout_frames} held out (scene.duration, scene.fps)"
         )
+    frames = int(span)
     before = (times <= begin) & (times >= begin - AT_REST)
     known = {name: None for name in names} if points is None else dict(points)
     still = medians(recording.of(list(known), "scene.points")[before])
@@ -88,6 +98,11 @@ def load_markers(
     if points is not None:
         R, t, off = alignment(still, points, "scene.points")
         log.info("%s: aligned by %d points, %.2g mm off (rms)", Path(path).name, len(points), 1e3 * off)  # fmt: skip
+        if off > MISALIGNED * (size := float(np.ptp(list(points.values()), axis=0).max())):
+            raise ConfigError(
+                f"scene.points: expected places [m] of the recording's points, found them {off:.3g} m "
+                f"(rms) of {size:.3g} m off: another unit, a mirrored axis, exchanged names?"
+            )
     chosen = [recording.names.index(each) for each in names]
     moving = recording.at(begin + np.arange(frames) / rate)[:, chosen] @ R.T + t
     rest = medians(seen[before]) @ R.T + t
@@ -114,15 +129,15 @@ def load_markers(
         mattes=nothing,
         cameras=Cameras(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4), 1, 1, ()),
         times=torch.arange(frames) / rate,
-        gravity=torch.tensor(gravity, dtype=torch.float32),
-        up=torch.tensor(up, dtype=torch.float32),
+        gravity=pull,
+        up=upright,
         ground=ground,
         box=torch.stack([low - far, high + far]).float(),
         density=float(density),
         background=torch.ones(3),
         synthetic=False,
         last_free_frame=0,
-        holdout_frames=tuple(range(frames - held, frames)),
+        holdout_frames=tuple(range(frames - holdout_frames, frames)),
         fingerprint=hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16],
         markers=Markers(
             names,

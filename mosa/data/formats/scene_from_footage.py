@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -66,7 +67,7 @@ def known_body(keys: Mapping[str, Any] | None) -> KnownBody | None:
             raise ConfigError("scene.body.scale: expected scene.body.shape beside it, found none")
         return None
     path = Path(settings.shape)
-    if not path.is_file() or path.suffix.lower() not in SHAPES:
+    if not os.path.isfile(path) or path.suffix.lower() not in SHAPES:
         raise DataError(
             f"scene.body.shape: expected a file {', '.join(SHAPES)} beside the images or below "
             f"scene.root, found {path}"
@@ -104,14 +105,7 @@ def scene_from_footage(
     Errors: ConfigError naming the key, DataError for particle files.
     """
     check_types(footage, f"scene {name} ({sequence})")
-    up = vector(up, "up")
-    if not up.norm() > 0:
-        raise ConfigError("scene.up: expected a direction, found zero")
-    pull = vector(gravity, "gravity")
-    if ground is not None and bool(pull.norm() > 0) and not float(pull @ up) < 0:
-        raise ConfigError(
-            f"scene.gravity: expected a pull towards the ground, against scene.up = {up.tolist()}, found {pull.tolist()}; set both"
-        )
+    up, pull = directions(up, gravity, ground)
     try:
         low, high = box
     except (TypeError, ValueError) as error:
@@ -145,12 +139,12 @@ def scene_from_footage(
                 f"scene.last_free_frame: no frame {last_free_frame}; the scene has {footage.frames[0]} to {footage.frames[-1]}"
             )
         last_free_frame = footage.frames.index(last_free_frame)
-    check_ground(ground, up / up.norm(), pull, box)
+    check_ground(ground, up, pull, box)
     known = known_body(body)
     fewest = 2 if known is None else 1
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
-        gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
+        gravity=pull, up=up, ground=ground, box=box, density=float(density),
         background=footage.background, synthetic=synthetic, start=start, last_free_frame=last_free_frame,
         holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names, fewest),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
@@ -182,6 +176,18 @@ def check_ground(
         if angle > STEEP:
             warnings.warn(f"scene.gravity: pulls at {angle:.3g} degrees from scene.up, so that the ground is an incline: set "
                           "scene.up along -scene.gravity where it is not", stacklevel=5)  # fmt: skip
+
+
+def directions(up, gravity, ground: Ground | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """(scene.up of unit length, scene.gravity [m/s^2]), (3,) each. Errors: ConfigError naming the key."""
+    up, pull = vector(up, "up"), vector(gravity, "gravity")
+    if not 0 < float(up.norm()) < torch.inf:
+        raise ConfigError(f"scene.up: expected a direction, found {up.tolist()}")
+    if ground is not None and bool(pull.norm() > 0) and not float(pull @ up) < 0:
+        raise ConfigError(
+            f"scene.gravity: expected a pull towards the ground, against scene.up = {up.tolist()}, found {pull.tolist()}; set both"
+        )
+    return up / up.norm(), pull
 
 
 def vector(value, key: str) -> torch.Tensor:

@@ -14,15 +14,21 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider
-from mosa.physics.contact.keys import fits
 from mosa.physics.world import World
-from mosa.settings import Positive, Text
+from mosa.settings import LARGEST, Entries, Positive, Settings, Text, check
 from mosa.types import Rollout
 
 COLUMNS = ("time", "fx", "fy", "fz")
 MODEL_ERROR = 0.01
 """Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
-KEYS = {"of": Text, "file": Text, "sd": Positive}
+
+
+class Measured(Settings):
+    """An entry of world.forces."""
+
+    of: Text
+    file: Text
+    sd: Positive | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +88,16 @@ def forces_from_config(
     Columns of the file: time [s], fx, fy, fz [N].
     A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
     entry, DataError the file."""
-    curves = []
-    for i, item in enumerate(items or ()):
-        where = f"{field_name}[{i}]"
-        if unknown := [key for key in item if key not in KEYS]:
-            raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected {', '.join(KEYS)}")
-        if missing := [key for key in ("of", "file") if item.get(key) is None]:
-            raise ConfigError(f"{where}: expected of and file, found no {missing[0]}")
-        fits(item, KEYS, where)
-        curves.append(read_forces(Path(item["file"]), item["of"], item.get("sd")))
-    return tuple(curves)
+    check(field_name, items, Entries | None)
+    read = [Measured.read(item, f"{field_name}[{i}]") for i, item in enumerate(items or ())]
+    return tuple(read_forces(Path(each.file), each.of, each.sd) for each in read)
 
 
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     """Errors: DataError naming the file, what was expected and found."""
     try:
-        found = np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8")
-    except (OSError, ValueError) as error:
+        found = np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8-sig")
+    except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path}: expected a csv of {', '.join(COLUMNS)}, found {error}") from error
     names = found.dtype.names or ()
     if "time" not in names or not set(names) & set(COLUMNS[1:]):
@@ -112,8 +111,9 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     forces = torch.from_numpy(np.stack(columns, 1))
     if len(times) < 2 or not bool((times.diff() > 0).all()):
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
-    if not bool(torch.isfinite(forces).any()):
-        raise DataError(f"{path}: expected forces [N], found no number")
+    there = forces[torch.isfinite(forces)]
+    if not len(there) or not 0 < float(there.abs().max()) <= LARGEST:
+        raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")
     return ForceCurve(of, times, forces, sd)
 
 
@@ -142,6 +142,11 @@ def force_residuals(
         )
     for curve, column in zip(curves, columns_of(curves, world.solids)):
         mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
+        if not bool(torch.isfinite(mean).any()):
+            raise ConfigError(
+                f"world.forces: expected a curve of {curve.of!r} that covers an interval between "
+                f"frames, found {curve.times[0]:.6g} to {curve.times[-1]:.6g} s"
+            )
         felt = rollout.reactions.mean(1)[:, column, :3].double()
         parts.append(((felt - mean) / sd)[torch.isfinite(mean)])
     return torch.cat(parts)

@@ -80,6 +80,8 @@ def read_markers(path: Path) -> Recording:
     found = readers[path.suffix.lower()](path)
     if len(found.times) < 2 or not np.isfinite(found.positions).any():
         raise DataError(f"{path}: expected at least two frames of points, found fewer")
+    if (apart := float(np.median(np.diff(found.times)))) > AT_REST:
+        raise DataError(f"{path}: expected times in seconds, found samples {apart:g} s apart")
     if len(set(found.names)) < len(found.names):
         raise DataError(f"{path}: expected every point's name once, found {found.names}")
     return found
@@ -169,7 +171,9 @@ def released(times: np.ndarray, positions: np.ndarray, where: str) -> float:
     chosen = chosen[np.isfinite(moved[chosen])]
     slope, height = np.polyfit(times[chosen], np.sqrt(moved[chosen]), 1)
     found = times[first] if slope <= 0 else -height / slope
-    return float(np.clip(found, times[0], times[first]))
+    if found < times[0]:
+        raise DataError(f"{where}: expected rest at first, found points moving; set scene.start")
+    return float(min(found, times[first]))
 
 
 def swung(times: np.ndarray, positions: np.ndarray, where: str) -> float:

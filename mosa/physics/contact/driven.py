@@ -24,6 +24,9 @@ from mosa.physics.contact.reference import signed_distance
 from mosa.settings import Expected, Section, Text, Weight, Whole
 from mosa.system.npz import read_npz
 
+FARTHEST = 0.5
+"""Of the body's size: no particle is meant by a point that is farther from all of them."""
+
 
 def sample_paths(
     motions: Sequence, count: int, dt: float, start: float, first: int = 0
@@ -62,7 +65,10 @@ class Driven:
                 raise ConfigError(f"{where}: expected a region, or points that move, found neither")
             region = self.motion.at(torch.zeros(1, dtype=torch.float64))[0].detach()
         if isinstance(region, Tensor) and region.ndim == 2:
-            return torch.cdist(region.double().cpu(), place).argmin(1).unique()
+            away, found = torch.cdist(region.double().cpu(), place).min(1)
+            if float(away.max()) > FARTHEST * float((place.amax(0) - place.amin(0)).max()):
+                raise ConfigError(f"{where}: points: expected places on the body, found one beside")
+            return found.unique()
         if isinstance(region, Tensor | Sequence):
             found = torch.as_tensor(region, dtype=torch.int64).cpu().unique()
             if len(found) and not 0 <= int(found[0]) <= int(found[-1]) < len(x):

@@ -166,6 +166,8 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
         triangles = np.array(
             [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)], dtype=np.int64
         ).reshape(-1, 3)
+        if not len(vertices) or not len(triangles):
+            raise ConfigError(f"mesh: {path}: expected triangles, found none: empty, or damaged?")
     except DataError as error:
         raise ConfigError(f"mesh: {error}") from error
     except ConfigError:

@@ -19,7 +19,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.mesh import field_of_triangles, read_mesh
 from mosa.reconstruction.geometry.field import at, gradient
 from mosa.reconstruction.geometry.refinement import signed_distance
-from mosa.reconstruction.geometry.shell import solid_of
+from mosa.reconstruction.geometry.shell import solid_of, together
 from mosa.system.ply import check_ply
 from mosa.types import KnownBody, Splats
 
@@ -33,6 +33,8 @@ DEEP, FILLED = 0.75, 0.3
 """Spacings below the surface, and the share of a cloud's points that lie deeper, from which on it
 fills a body and is no scan of its surface. A dense, noisy scan that passes for one is made larger by
 half of its small spacing."""
+FEWEST, NEAR = 27, 1e-4
+"""Nodes inside of a solid; least extent of a cloud, of its way to the origin (single precision)."""
 THIN = 1e-2
 """Standard deviation of a scanned point, in spacings."""
 
@@ -99,11 +101,14 @@ def known_solid(body: KnownBody) -> Solid:
     except ConfigError as error:
         raise DataError(f"scene.body.shape: {error}") from error
     lattice = Volume(field.values.float(), torch.tensor(field.origin).float(), field.spacing)
-    return centred(lattice, unit, torch.from_numpy(middle))
+    return centred(lattice, unit, torch.from_numpy(middle), path)
 
 
-def centred(distance: Volume, unit: float, middle: Tensor) -> Solid:
-    """About the centre of what is inside. middle: (3,) of the file, where the lattice has 0."""
+def centred(distance: Volume, unit: float, middle: Tensor, path: Path) -> Solid:
+    """About the centre of what is inside. middle: (3,) of the file, where the lattice has 0.
+    Errors: DataError where next to nothing is inside."""
+    if int((distance.values < 0).sum()) < FEWEST:
+        raise DataError(f"scene.body.shape: {path}: expected a solid, found nothing inside: open?")
     centre = distance.points()[distance.values < 0].mean(0)
     moved = Volume(distance.values, distance.origin - centre, distance.pitch)
     return Solid(moved, unit, (middle + unit * centre).float())
@@ -112,6 +117,8 @@ def centred(distance: Volume, unit: float, middle: Tensor) -> Solid:
 def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
     """What Gaussians enclose. Errors: DataError."""
     chosen = splats.opacities >= OPAQUE
+    if int(chosen.sum()) > 1:
+        chosen[chosen.clone()] = together(splats.means[chosen])
     kept = Splats(*(value[chosen] for value in vars(splats).values()))
     if len(kept.means) < 100:
         raise DataError(
@@ -120,8 +127,8 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
         )
     middle = kept.means.median(0).values
     unit = float((kept.means.amax(0) - kept.means.amin(0)).max())
-    if not 0 < unit < np.inf:
-        raise DataError(f"scene.body.shape: {path}: expected an extent, found {unit:.3g}")
+    if not NEAR * float(middle.abs().max()) < unit < np.inf:
+        raise DataError(f"scene.body.shape: {path}: expected an extent near 0, found {unit:.3g}")
     kept = Splats(
         (kept.means - middle) / unit,
         kept.scales / unit,
@@ -134,12 +141,13 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
     except DataError as error:
         raise DataError(f"scene.body.shape: {path}: {error}") from error
     inside = Volume((solid.values > 0.5).float(), solid.origin, solid.pitch)
-    return centred(signed_distance(inside), unit, middle)
+    return centred(signed_distance(inside), unit, middle, path)
 
 
 def solid_of_points(points: Tensor, path: Path) -> Solid:
     """What a cloud encloses: points of the surface, or particles that fill the body, whose surface
     is half a spacing beyond the outermost. Errors: DataError."""
+    points = points.unique(dim=0)
     n = len(points)
     places = points.double().numpy()
     gap = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if n > 1 else 0.0
@@ -153,4 +161,4 @@ def solid_of_points(points: Tensor, path: Path) -> Solid:
     fills = float((depth > DEEP * gap).float().mean()) > FILLED
     surface = float(depth[depth < gap].median()) - (0.5 * gap if fills else 0.0)
     moved = Volume(grid.values + surface, grid.origin, grid.pitch)
-    return centred(moved, found.unit, found.centre)
+    return centred(moved, found.unit, found.centre, path)

@@ -13,6 +13,8 @@ from itertools import product
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -33,6 +35,8 @@ LEVEL = 0.3
 """Opacity at which the widened shell begins."""
 WIDER = 0.6
 """Of the typical distance to the fourth neighbour, by which Gaussians are widened, and of a voxel where that is more."""
+GAP, PART = 0.1, 0.01
+"""Of the extent of nine tenths of the Gaussians, and of their number: smaller groups that lie farther away are strays."""
 OUTERMOST = 0.05
 """Share of the Gaussians whose centres lie nearest to the surface: of the others many hide below it."""
 HALF = 1.13
@@ -132,3 +136,16 @@ def solid_of(
     beneath = float(np.quantile(centres, OUTERMOST)) - HALF * float(splats.scales.amin(1).median())
     values = np.clip(0.5 + (depth - max(beneath, 0.0)) / pitch, 0, 1).astype(np.float32)
     return Volume(torch.from_numpy(values), origin, pitch)
+
+
+def together(means: Tensor) -> Tensor:
+    """(N,) which Gaussians are the object: with those that are at most `GAP` of its extent away, at least `PART` of all."""
+    x = means.double().numpy()
+    extent, near = np.ptp(np.quantile(x, [0.05, 0.95], axis=0), axis=0), cKDTree(x).query(x, k=2)[0]
+    gap = max(GAP * float(extent.max()), 3 * float(np.median(near[:, 1])), 1e-30)
+    cells, at = np.unique(np.floor(x / gap), axis=0, return_inverse=True)
+    pairs = cKDTree(cells).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells),) * 2)
+    piece = connected_components(links, directed=False)[1][at.reshape(-1)]
+    count = np.bincount(piece)[piece]
+    return torch.from_numpy(count > PART * len(means))

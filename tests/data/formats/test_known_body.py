@@ -22,6 +22,7 @@ def test_a_body_is_its_file_and_scale(tmp_path):
     [
         ({"scale": 0.1}, ConfigError, r"scene\.body\.scale: expected scene\.body\.shape beside it"),
         ({"shape": "missing.ply"}, DataError, r"scene\.body\.shape: .* found missing\.ply"),
+        ({"shape": "a" * 5000 + ".obj"}, DataError, r"scene\.body\.shape: .* found aaa"),
         ({"shape": __file__}, DataError, r"expected a file \.ply, \.obj, \.stl"),
         ({"shape": "a.ply", "scale": -1.0}, ConfigError, r"scene\.body\.scale"),
         ({"shape": "a.ply", "size": 1.0}, ConfigError, r"scene\.body\.size"),

@@ -117,12 +117,33 @@ def test_points_in_line_align_nothing():
 @pytest.mark.parametrize(
     "keys, said",
     [({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
-     ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads")],
+     ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads"),
+     *(({key: wrong}, f"^scene.{key}: expected") for key, wrong in (
+         ("start", [0.5]), ("duration", "a"), ("duration", math.nan), ("holdout_frames", 1.5), ("tracked", "a"),
+         ("tracked", []), ("points", {"a": "abc"}), ("points", [1]), ("up", "abc"), ("up", [0, 0, 0]),
+         ("gravity", [0, 1]))),
+     ({"fps": 1e9}, "2 frames or more, and 100000 at most"), ({"up": [0, math.nan, 0]}, "scene.up"),
+     ({"points": dict(zip("abcd", (1000 * let_go()[1][0]).tolist()))}, "scene.points: .*another unit")],
 )  # fmt: skip
 def test_a_mistake_names_its_key(tmp_path, keys, said):
     path = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1])
     with pytest.raises(ConfigError, match=said):
         load_scene(**{"format": "markers", "path": str(path), "body": BOX, "density": 900.0} | keys)
+
+
+def test_up_has_unit_length(tmp_path):
+    path = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1])
+    scene = load_scene(format="markers", path=str(path), body=BOX, density=900.0, up=[0, 2, 0])
+    assert scene.up.tolist() == [0.0, 1.0, 0.0]
+
+
+def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
+    times, positions = let_go()
+    with pytest.raises(DataError, match="expected times in seconds, found samples 10 s apart"):
+        read_markers(write(tmp_path / "fall.csv", 1e3 * times, "abcd", positions))
+    times = np.arange(300) / 100
+    with pytest.raises(DataError, match="expected rest at first, found points moving"):
+        released(times, positions[:1] + [0.0, 0.1, 0.0] * times[:, None, None], "here")
 
 
 @pytest.fixture(scope="module")

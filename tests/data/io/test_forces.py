@@ -133,6 +133,18 @@ def test_a_force_of_nothing_is_refused(tmp_path):
         forces_from_config([{"of": "low", "file": "a.csv", "sd": -1.0}])
     with pytest.raises(DataError, match=r"none.csv: expected a csv of time, fx, fy, fz"):
         forces_from_config([{"of": "low", "file": str(tmp_path / "none.csv")}])
+    late = ForceCurve("low", torch.tensor([9.0, 10.0]).double(), torch.ones(2, 3).double())
+    with pytest.raises(
+        ConfigError, match=r"curve of 'low' that covers an interval .* found 9 to 10 s"
+    ):
+        force_residuals(rollout, [late], PRESS, FRAME_DT)
+    for items in (5, "a", [5]):
+        with pytest.raises(ConfigError, match=r"world\.forces: expected a list of sections"):
+            forces_from_config(items)
+    for text in ("", "time,fx\n0,0\n1,0\n", "time,fx\n0,1e300\n1,1\n"):
+        (tmp_path / "bad.csv").write_text(text)
+        with pytest.raises(DataError, match=r"bad.csv: expected"):
+            forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
     (tmp_path / "bad.csv").write_text("t,force\n0,1\n1,2\n")
     with pytest.raises(DataError, match=r"bad.csv: expected columns time, fx, fy, fz"):
         forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Box, Collider, HalfSpace, Particles, Sphere
 from mosa.physics.contact.driven import Driven, driven_from_config, hold, loads
 from mosa.physics.contact.motion import Motion, Points, exponential
@@ -178,6 +178,10 @@ def test_sets_that_hold_nothing_or_the_same_are_refused():
         ConfigError, match="driven set 'far': expected particles of the body inside"
     ):
         Driven(Sphere(0.1), Motion((5.0, 0.0, 0.0)), name="far").chosen(X)
+    with pytest.raises(ConfigError, match="points: expected places on the body, found one"):
+        Driven(torch.tensor([[100.0, 0.0, 0.0]]), name="far").chosen(X)
+    with pytest.raises(DataError, match="/dev/zero: expected an npz file, found none"):
+        driven_from_config([{"motion": {"path": "/dev/zero"}}])
     with pytest.raises(ConfigError, match="without a common particle, found particle"):
         hold([LEFT, LEFT], [Motion(), Motion()], X)
     with pytest.raises(ConfigError, match="after all solids"):

@@ -32,7 +32,7 @@ def box_surface(count: int) -> np.ndarray:
 def write_cloud(path, points: np.ndarray) -> None:
     header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    path.write_text(header + "\n".join(" ".join(f"{v:.6g}" for v in p) for p in points))
+    path.write_text(header + "\n".join(" ".join(f"{v:.10g}" for v in p) for p in points))
 
 
 def filled(step: float) -> np.ndarray:
@@ -72,3 +72,31 @@ def test_files_that_hold_no_solid_are_refused(tmp_path):
         known_solid(body(open_mesh))
     with pytest.raises(DataError, match=r"expected a file \.ply, \.obj or \.stl, found none"):
         known_solid(body(tmp_path / "missing.ply"))
+
+
+def test_strays_and_doubled_points_are_no_part_of_a_cloud(tmp_path, monkeypatch):
+    monkeypatch.setattr("mosa.reconstruction.geometry.known.VOXELS", 40)
+    strays = AT + 50 * UNIT * np.eye(3)
+    write_cloud(tmp_path / "a.ply", np.concatenate([np.repeat(box_surface(10), 2, 0), strays]))
+    found = known_solid(body(tmp_path / "a.ply"))
+    volume = len(found.inside) * (found.distance.pitch * found.unit) ** 3
+    assert volume == pytest.approx(8 * HALF.prod(), rel=0.1)
+
+
+@pytest.mark.parametrize("name, said", [
+    ("empty.obj", "expected triangles, found none"), ("cut.stl", "expected triangles, found none"),
+    ("needle.obj", "expected a solid, found nothing"), ("far.ply", "an extent near 0"),
+])  # fmt: skip
+def test_a_file_that_holds_no_solid_is_named(tmp_path, name, said):
+    path = tmp_path / name
+    if name == "far.ply":
+        write_cloud(path, box_surface(8) + 1e6)
+    elif name == "needle.obj":
+        corners = [(x, y, z) for x in (0, 1) for y in (0, 0.003) for z in (0, 0.003)]
+        sides = ((1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4))
+        path.write_text("".join("v {} {} {}\n".format(*c) for c in corners)
+                        + "".join("f {} {} {} {}\n".format(*f) for f in sides))  # fmt: skip
+    else:
+        path.write_bytes(b"" if name == "empty.obj" else b"\0" * 80 + b"\x0c\0\0\0" + b"\0" * 50)
+    with pytest.raises(DataError, match=said):
+        known_solid(body(path))
