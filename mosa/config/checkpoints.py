@@ -242,7 +242,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
         inflation = INFLATION
     if record is None:
         raise DataError(f"{where}: {path}: expected the checkpoint of an ended fit, found none")
-    count = 0 if adapter is None else len(getattr(adapter, "numbers", ()))
+    count = 0 if adapter is None or not adapter.few_numbers else len(adapter.numbers)
     learned = [*material.learned, *(f"operator[{k}]" for k in range(count))]
     posterior = Posterior.read(record.plain()).only(learned)
     if law.split("~")[0] != material.law.split("~")[0] or not posterior.names:
@@ -250,7 +250,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
             f"{where}: expected numbers of {material.law} that are learned "
             f"({', '.join(learned)}), found {', '.join(record.names)} of {law}: {path}"
         )
-    strain = getattr(adapter, "strain", None)
+    strain = None if adapter is None else adapter.strain
     if len(posterior.names) > sum(name in material.learned for name in posterior.names) and (
         stiffness.get("strain", strain) != strain
     ):

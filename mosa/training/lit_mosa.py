@@ -109,7 +109,7 @@ def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
     if not settings.reconstruction.informed.iterations or not filmed:
         stages = [stage for stage in stages if not stage.looks_again]
     return {
-        "world": replace(world_of(record), forces=forces_from_config(settings.world.forces or ())),
+        "world": replace(world_of(record), forces=forces_from_config(settings.world.forces)),
         "stages": stages,
         "weights": settings.losses.weights(),
         "clip": settings.fit.clip,
