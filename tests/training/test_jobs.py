@@ -306,11 +306,11 @@ HUGE = "9" * 4000
 
 
 @pytest.mark.parametrize("argument, expected", [
-    ("rendering=5", "one of gsplat, warp"), ("+rendering=true", "one of"), ("rendering={a:1}", "one of"),
-    ("~rendering=1.5", None), ("rendering=null", "one of"), ("rendering=", "one of"), ("rendering='~'", "one of"),
+    ("criterion=5", "one of both, corrected, free"), ("+criterion=true", "one of"), ("criterion={a:1}", "one of"),
+    ("~criterion=1.5", None), ("criterion=null", "one of"), ("criterion=", "one of"), ("criterion='~'", "one of"),
     (f"scene.density={HUGE}", "numbers within 1e308"), (f"a.b=[[{HUGE},0,0]]", "numbers within 1e308"),
-    (f"seed=-{HUGE}", "numbers within 1e308"), ("seed=1e400", None), ("rendering=warp,gsplat", None),
-    ("rendering=warp", None), ("rendering=[warp,gsplat]", None), ("rendering=glob(*)", None),
+    (f"seed=-{HUGE}", "numbers within 1e308"), ("seed=1e400", None), ("criterion=free,both", None),
+    ("criterion=free", None), ("criterion=[free,both]", None), ("criterion=glob(*)", None),
 ])  # fmt: skip
 def test_what_hydra_has_no_message_for_is_said_before(capsys, argument, expected):
     if expected is None:
