@@ -14,6 +14,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import mosa
+from mosa.cli import view
 from mosa.config import composition
 from mosa.system import console
 from mosa.viewer import recorded as viewer
@@ -163,8 +164,9 @@ def test_help_of_the_viewer_and_a_start_without_a_driver_are_quick_and_quiet():
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])
-def test_the_viewer_explains_itself(capsys, flag):
-    viewer.main([flag])
+def test_the_viewer_explains_itself(monkeypatch, capsys, flag):
+    monkeypatch.setattr(sys, "argv", ["mosa-view", flag])
+    view.main()
     said = capsys.readouterr().out
     assert said.startswith("usage: mosa-view") and "port" in said
 
