@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.planes import SLOW, THICKNESS, TOUCHING, WHOLE, Plane
 from mosa.physics.contact.touch import GRIP, springs
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -309,3 +311,61 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
     total = state.F_tot + dt * new_C @ state.F_tot
     mapped = return_map(law, trial, p, plastic_operator, norm_eps, F, new_C, dt)
     return ParticleState(x + dt * new_v, new_v, new_C, mapped, mapped if mapped is trial else total)
+
+
+def drawn_operator(n, seed=3, scale=0.1):
+    """What an adapter could answer for n particles, elastic and plastic."""
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return scale * torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    return AdapterOperator(draw(n, 6, 6), 1e3 * draw(n, 6), draw(n, 6, 6), 0.01 * draw(n, 6))
+
+
+def assert_simulated(
+    law, state, parameters, *, operator, density, dx, dt, gravity, planes, twin_parameters=None, steps=4,
+):  # fmt: skip
+    """The simulator's substeps from a state are the twin's, and so are their gradients to the state
+    and to every parameter. parameters: numbers by name; twin_parameters: what the twin takes more."""
+    leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
+    started = ParticleState(*leaves, leaves[3])
+    volume = torch.full((len(state.x),), 0.02**3, dtype=torch.float64)
+    parameters = {
+        k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in parameters.items()
+    }
+    simulator = Simulator(
+        law, dx=dx, substeps=steps, frame_dt=steps * dt, gravity=gravity, planes=planes, dtype=torch.float64
+    )  # fmt: skip
+    adapter = None if operator is None else lambda _: operator
+    rollout = simulator.rollout(
+        started, parameters, volume, density, 2, adapter=adapter, stride=steps, started=True
+    )
+    twin = started
+    for _ in range(steps):
+        twin = substep(
+            law, twin, parameters | (twin_parameters or {}), volume, density, dx=dx, dt=dt, gravity=gravity, planes=planes,
+            operator=operator and operator[:2], plastic_operator=operator and operator[2:],
+        )  # fmt: skip
+    names = ("x", "v", "C_affine", "F", "F_tot")
+    for name in names:
+        value, expected = getattr(rollout.final, name).detach(), getattr(twin, name).detach()
+        assert (value - expected).abs().max() < 1e-12 * steps * max(
+            1.0, float(expected.abs().max())
+        ), name
+
+    generator = torch.Generator().manual_seed(1)
+    weights = {
+        name: torch.randn(getattr(twin, name).shape, generator=generator).double() for name in names
+    }
+
+    def gradient(final):
+        loss = sum((weights[name] * getattr(final, name)).sum() for name in names)
+        return torch.autograd.grad(loss, [*leaves, *parameters.values()])
+
+    for name, found, expected in zip(
+        ("x", "v", "C_affine", "F", *parameters), gradient(rollout.final), gradient(twin)
+    ):
+        assert (found - expected).abs().max() < 1e-9 * expected.abs().max(), name
+        # cohesion acts at the tip of the cone and through tr(eps) - 3c
+        assert float(expected.abs().max()) > 0, name

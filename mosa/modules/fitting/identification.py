@@ -415,6 +415,13 @@ class Identification:
         self.converged = whole and (small or flat or report["share"] == 0)
         return report
 
+    def iterate_until_converged(self, most: int) -> None:
+        """At most so many iterations; `report` is that of the last one."""
+        for _ in range(most):
+            self.iterate()
+            if self.converged:
+                break
+
     def state(self) -> dict:
         """Plain containers and tensors: what going on from a checkpoint needs beside the body."""
         return {

@@ -170,13 +170,10 @@ class NewtonSteps:
         state = own.state()
         other.restore(state | {"iteration": max(state["iteration"], EVIDENCE_ITERATIONS)})
         try:
-            for _ in range(RIVAL_ITERATIONS):
-                cost = other.iterate()["after"]
-                if other.converged:
-                    break
+            other.iterate_until_converged(RIVAL_ITERATIONS)
         except SimulationDiverged:
             return math.inf, other
-        return cost, other
+        return other.report["after"], other
 
     def keep_posterior(self, stage: Stage) -> None:
         """Of the running identification, where it is the last one, after `settle_parts`."""
@@ -207,10 +204,7 @@ class NewtonSteps:
         if not kept:
             body.thaw("prior")
         fewer = self.identifying(stage if kept else self.stages[0], parts=kept)
-        for _ in range(stage.iterations):
-            fewer.iterate()
-            if fewer.converged:
-                break
+        fewer.iterate_until_converged(stage.iterations)
         return fewer
 
     def identify(self) -> None:

@@ -109,6 +109,25 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
         return wp.where(sums[1] > zero, sums[0] / sums[1], zero)
 
     @wp.func
+    def interpolated(nodes: wp.array(dtype=vec4), at: wp.vec3i, f: vec3):
+        """(its derivatives with respect to f, sum_I w_Ip q_I) of a particle."""
+        q = zero
+        gx = zero
+        gy = zero
+        gz = zero
+        for i in range(2):
+            for j in range(2):
+                row = at[0] + i * at[1] + j * at[2]
+                a = node_ratio(load3(nodes, row))
+                b = node_ratio(load3(nodes, row + 1))
+                flat = (one - f[2]) * a + f[2] * b
+                q = q + hat(f[0], i) * hat(f[1], j) * flat
+                gx = gx + slope(i) * hat(f[1], j) * flat
+                gy = gy + hat(f[0], i) * slope(j) * flat
+                gz = gz + hat(f[0], i) * hat(f[1], j) * (b - a)
+        return vec4(gx, gy, gz, q)
+
+    @wp.func
     def own_part(parameters: numbers, mu: int, lam: int, kappa: int):
         """(1 - share, kappa, whether the share depends on the moduli)."""
         part = vec3(own_fluid, one, zero)
@@ -157,15 +176,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
         at = lowest(x[p], inv_dx, window, window_row(p, size))
         if at[0] < 0:
             return
-        f = hats(x[p], inv_dx)
-        q = zero
-        for i in range(2):
-            for j in range(2):
-                row = at[0] + i * at[1] + j * at[2]
-                w = hat(f[0], i) * hat(f[1], j)
-                a = node_ratio(load3(nodes, row))
-                b = node_ratio(load3(nodes, row + 1))
-                q = q + w * ((one - f[2]) * a + f[2] * b)
+        q = interpolated(nodes, at, hats(x[p], inv_dx))[3]
         Fp = wp.mat33d(F[p])
         own = own_part(parameters[p], mu, lam, kappa)
         exponent = _THIRD * wp.float64(one - own[0])
@@ -183,24 +194,11 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
         if at[0] < 0:
             return
         f = hats(x[p], inv_dx)
-        q = zero
-        gx = zero
-        gy = zero
-        gz = zero
-        for i in range(2):
-            for j in range(2):
-                row = at[0] + i * at[1] + j * at[2]
-                a = node_ratio(load3(nodes, row))
-                b = node_ratio(load3(nodes, row + 1))
-                flat = (one - f[2]) * a + f[2] * b
-                q = q + hat(f[0], i) * hat(f[1], j) * flat
-                gx = gx + slope(i) * hat(f[1], j) * flat
-                gy = gy + hat(f[0], i) * slope(j) * flat
-                gz = gz + hat(f[0], i) * hat(f[1], j) * (b - a)
+        found = interpolated(nodes, at, f)
         Fp = wp.mat33d(F[p])
         A = wp.mat33d(adj_F_bar[p])
         J = own_ratio(Fp)
-        mean = _ONE + wp.float64(q)
+        mean = _ONE + wp.float64(found[3])
         own = own_part(parameters[p], mu, lam, kappa)
         share = wp.float64(one - own[0])
         factor = wp.pow(mean / J, _THIRD * share)
@@ -211,7 +209,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
             B = B - (_THIRD * share * seed / J) * cofactor(Fp)
         adj_F[p] = adj_F[p] + mat33(B)
         of_mean = scalar(_THIRD * share * seed / mean)
-        adj_x[p] = adj_x[p] + (of_mean * coarser * inv_dx) * vec3(gx, gy, gz)
+        adj_x[p] = adj_x[p] + (of_mean * coarser * inv_dx) * vec3(found[0], found[1], found[2])
         if own[2] > zero:
             # of own[0] = OWN mu/kappa
             of_own = -scalar(_THIRD * seed * wp.log(mean / J))

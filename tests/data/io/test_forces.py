@@ -86,10 +86,7 @@ def test_the_stiffness_of_a_block_from_a_press_alone(tmp_path):
         settings,
         (False,) * 3,
     )
-    for _ in range(6):
-        found.iterate()
-        if found.converged:
-            break
+    found.iterate_until_converged(6)
     values = {k: float(v) for k, v in body.material.physical().items()}
     assert values["nu"] == pytest.approx(NU) and values["E"] == pytest.approx(E, rel=0.03)
     spread = float(found.posterior().covariance[0, 0].sqrt())

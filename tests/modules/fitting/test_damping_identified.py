@@ -41,10 +41,7 @@ def test_both_are_found_from_a_vibration():
         Criterion(name="free"),
         settings,
     )
-    for _ in range(8):
-        found.iterate()
-        if found.converged:
-            break
+    found.iterate_until_converged(8)
     values = {name: float(value) for name, value in body.material.physical().items()}
     assert values["E"] == pytest.approx(E, rel=0.02)
     assert values["damping"] == pytest.approx(DAMPING, rel=0.1)

@@ -6,7 +6,6 @@ import pytest
 import substep_reference as reference
 import torch
 
-from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
@@ -40,45 +39,10 @@ def leaves_of(law):
 @pytest.mark.parametrize("law", PARAMETERS)
 def test_twin(law, adapted, make_block):
     state = start(make_block(velocity=(0.5, -1.0, 0.2)), law)
-    n, steps = len(state.x), 4
-    leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
-    first = ParticleState(*leaves, leaves[3])
-    volume, parameters = torch.full((n,), 0.02**3, dtype=torch.float64), leaves_of(law)
-    g = torch.Generator().manual_seed(3)
-    draw = lambda *shape: 0.1 * torch.randn(*shape, generator=g, dtype=torch.float64)  # noqa: E731
-    operator = (
-        AdapterOperator(draw(n, 6, 6), 1e3 * draw(n, 6), draw(n, 6, 6), 0.01 * draw(n, 6))
-        if adapted
-        else None
-    )
-    sim = Simulator(
-        law, dx=DX, substeps=steps, frame_dt=steps * DT, planes=PLANES, dtype=torch.float64
-    )
-    rollout = sim.rollout(first, parameters, volume, DENSITY, 2, adapter=(lambda _: operator) if adapted else None,
-                          stride=steps, started=True)  # fmt: skip
-    twin = first
-    for _ in range(steps):
-        twin = reference.substep(
-            law, twin, parameters, volume, DENSITY, dx=DX, dt=DT, gravity=(0.0, -9.8, 0.0), planes=PLANES,
-            operator=operator[:2] if adapted else None, plastic_operator=operator[2:] if adapted else None,
-        )  # fmt: skip
-    names = ("x", "v", "C_affine", "F", "F_tot")
-    for name in names:
-        value, expected = getattr(rollout.final, name).detach(), getattr(twin, name).detach()
-        assert (value - expected).abs().max() < 1e-12 * steps * max(
-            1.0, float(expected.abs().max())
-        ), name
-    weights = {name: torch.randn(getattr(twin, name).shape, generator=g).double() for name in names}
-
-    def gradient(final):
-        loss = sum((weights[name] * getattr(final, name)).sum() for name in names)
-        return torch.autograd.grad(loss, [*leaves, *parameters.values()])
-
-    for name, found, expected in zip(
-        ("x", "v", "C_affine", "F", *parameters), gradient(rollout.final), gradient(twin)
-    ):
-        assert (found - expected).abs().max() < 1e-9 * expected.abs().max(), name
-        assert float(expected.abs().max()) > 0, name
+    reference.assert_simulated(
+        law, state, PARAMETERS[law], operator=reference.drawn_operator(len(state.x)) if adapted else None,
+        density=DENSITY, dx=DX, dt=DT, gravity=(0.0, -9.8, 0.0), planes=PLANES,
+    )  # fmt: skip
 
 
 def rolled(law, state, parameters, dtype=torch.float64, substeps=50):

@@ -30,8 +30,13 @@ def test_the_fit_begins_again_about_the_backbone_that_explains_the_learned_law_b
     numbers = torch.linspace(-0.2, 0.3, 19, dtype=torch.float64)
     take = take_of(small_body(numbers=numbers, law=truth), begins, 9)
     take.again = None
-    body = small_body(E=1.1 * E, on=False)
-    body.material = Material(AUTO, {"E": 1.1 * E, "nu": NU}, candidates=LAWS).double()
+
+    def start_body():
+        body = small_body(E=1.1 * E, on=False)
+        body.material = Material(AUTO, {"E": 1.1 * E, "nu": NU}, candidates=LAWS).double()
+        return body
+
+    body = start_body()
     record = BodyRecord.of(body, WORLD, 0.02, begins)
     stages = [
         Stage(name=name, iterations=3, lr=0.1, optimizer="gauss_newton")
@@ -54,3 +59,7 @@ def test_the_fit_begins_again_about_the_backbone_that_explains_the_learned_law_b
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
     assert checkpoint["mosa"]["fit"]["law_gains"] == module.law_gains
+    resumed = LitMosa.of_parts(start_body(), takes=[take], world=WORLD, background=torch.ones(3),
+                               record=record, weights={"position": 1.0}, stages=stages)  # fmt: skip
+    resumed.on_load_checkpoint(checkpoint)  # which does not begin again once more
+    assert resumed.body.material.law == truth and resumed.law_gains == module.law_gains
