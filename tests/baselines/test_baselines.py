@@ -252,7 +252,9 @@ def rolled(body: Body, device: str, rollouts: int) -> list[torch.Tensor]:
     )
     for _ in range(rollouts):
         first = start()
-        first = type(first)(*(t.to(device).requires_grad_() for t in vars(first).values()))
+        first = type(first)(
+            *(None if t is None else t.to(device).requires_grad_() for t in vars(first).values())
+        )
         weights = list(body.adapter.net.parameters())
         rollout = body.simulate(first, world, 6, FRAME_DT)
         found = torch.autograd.grad(

@@ -9,11 +9,20 @@ import warp as wp
 from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import state_kernel, stress_kernel
 from mosa.physics.constitutive.particle_access import particle_access
-from mosa.physics.launching import aligned
+from mosa.physics.launching import aligned, warp_stream
 
 GPU = pytest.param("cuda", marks=pytest.mark.gpu)
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 SHAPES = {"matrix33": (3, 3), "vector6": (6,), "parameters": (SLOTS,)}
+
+
+def launched(kernel, arrays, adjoints) -> None:
+    """Forward and adjoint on the stream on which torch fills what they read and write."""
+    device = arrays[0].device
+    with warp_stream(torch.device(wp.device_to_torch(device))):
+        wp.launch(kernel, 77, inputs=arrays, device=device)
+        wp.launch(kernel, 77, inputs=arrays, adj_inputs=adjoints, adjoint=True, device=device)
+    wp.synchronize_device(device)
 
 
 def kernel_of(name: str, scalar, own: bool):
@@ -52,12 +61,8 @@ def test_values_and_gradients_are_those_of_plain_indexing(name, dtype, device):
         kernel, field = kernel_of(name, SCALARS[dtype], own)
         out, gradient = torch.zeros(77, dtype=torch.float64, device=device), there.clone()
         arrays = [wp.from_torch(numbers, dtype=field), wp.from_torch(out)]
-        wp.launch(kernel, 77, inputs=arrays, device=arrays[0].device)
         adjoints = [wp.from_torch(gradient, dtype=field), wp.from_torch(seed.clone())]
-        wp.launch(
-            kernel, 77, inputs=arrays, adj_inputs=adjoints, adjoint=True, device=arrays[0].device
-        )
-        wp.synchronize_device(arrays[0].device)
+        launched(kernel, arrays, adjoints)
         found.append((out, gradient))
     for a, b in zip(*found):
         assert torch.equal(a, b)
@@ -119,11 +124,8 @@ def test_a_product_with_an_operator_is_that_of_matrices(shared, dtype, device):
             wp.from_torch(x, dtype=vector),
             wp.from_torch(out),
         ]
-        wp.launch(kernel, 77, inputs=arrays, device=arrays[0].device)
         adjoints = [wp.from_torch(t, dtype=kind) for t, kind in zip(gradients, (field, vector))]
-        wp.launch(kernel, 77, inputs=arrays, adj_inputs=[*adjoints, wp.from_torch(seed.clone())], adjoint=True,
-                  device=arrays[0].device)  # fmt: skip
-        wp.synchronize_device(arrays[0].device)
+        launched(kernel, arrays, [*adjoints, wp.from_torch(seed.clone())])
         found.append((out, *gradients))
     for plain, own in zip(*found):
         if device == "cpu":

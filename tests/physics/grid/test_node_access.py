@@ -8,6 +8,7 @@ import warp as wp
 
 from mosa.physics.grid.node_access import node_access
 from mosa.physics.grid.transfer_kernels import transfer_kernels
+from mosa.physics.launching import warp_stream
 
 GPU = pytest.param("cuda", marks=pytest.mark.gpu)
 KINDS = {torch.float32: (wp.float32, wp.vec4f), torch.float64: (wp.float64, wp.vec4d)}
@@ -54,7 +55,8 @@ def test_loads_stores_and_sums_are_those_of_plain_indexing(longest, dtype, devic
         wp.from_torch(index.int()),
         *(wp.from_torch(t, dtype=vec4) for t in results),
     ]
-    wp.launch(kernel_of(dtype), n, inputs=arrays, device=arrays[0].device)
+    with warp_stream(source.device):
+        wp.launch(kernel_of(dtype), n, inputs=arrays, device=arrays[0].device)
     wp.synchronize_device(arrays[0].device)
     three = source.clone()
     three[:, 3] = 0
