@@ -24,7 +24,7 @@ from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.axes import Axes
 from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.lanes import Lanes
-from mosa.physics.engine.material_operations import first_advance
+from mosa.physics.engine.material_operations import advanced, first_advance
 from mosa.physics.engine.numerics import Numerics, State, Steps, flat
 from mosa.physics.engine.operation import Stretch, advance_segment, wants_gradient
 from mosa.physics.engine.solver import LeftWindow
@@ -98,7 +98,7 @@ class Prepared:
         mapped = first_advance(
             numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"]
         )
-        return state._replace(F=mapped, F_tot=F_tot + dt * (C @ F_tot))
+        return state._replace(F=mapped, F_tot=advanced(F_tot, C, dt))
 
     def reaches(self, columns: int) -> Tensor:
         """(K,) distance [m] of the farthest driven particle from the origin of its pose, 0 of
