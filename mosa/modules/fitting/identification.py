@@ -514,7 +514,7 @@ class Identification:
             return {}
         table = torch.cat([newton.columns, seat.residuals()[:, None].to(newton.columns)], 1)
         squares: list[Tensor] = []
-        positions: list[tuple[Tensor, float, float]] = []
+        positions: list[tuple[Tensor, float, float | None]] = []
         stretches: list[list[int]] = [[] for _ in range(FOLDS * len(self.takes))]
         kind = 0 if self.kinds[0] else self.kinds.index(True)
         width, first = 3 * len(self.chosen), 0
@@ -523,7 +523,7 @@ class Identification:
         forces: list[Tensor] = []
         for k, ((i, _), scales) in enumerate(zip(self.pairs, self.noise)):
             frames = len(scales[0])
-            wrong = self._between_grids(k, kind, frames)
+            wrong = self._between_grids(k, kind)
             own = table[first : first + 3 * frames * width].double().view(3, frames, width, -1)
             first += 3 * frames * width
             if (
@@ -540,7 +540,9 @@ class Identification:
                     stretches[FOLDS * i + FOLDS * after // late].append(len(squares))
                 count = self._share() * self.kinds[kind]
                 unit = float(scales[kind][frame]) / count**0.5
-                positions.append((grams[kind], unit, float(wrong[frame])))
+                positions.append(
+                    (grams[kind], unit, None if wrong is None else float(wrong[frame]))
+                )
                 squares.append(grams[0] + grams[1] + grams[2])
         told = squares + forces
         compared = {k: (len(told) + k, *lengths) for k, (_, *lengths) in enumerate(positions)}
@@ -550,11 +552,11 @@ class Identification:
             [stretch for stretch in stretches if stretch], compared,
         )  # fmt: skip
 
-    def _between_grids(self, pair: int, kind: int, frames: int) -> Tensor:
+    def _between_grids(self, pair: int, kind: int) -> Tensor | None:
         """(frames,) root mean square distance over particles between the predictions on two grids,
-        `grid_error` times; 0 without a second grid."""
+        `grid_error` times; None without a second grid."""
         if self.grid is None:
-            return torch.zeros(frames)
+            return None
         field = list(self.grid[pair])[kind]
         return self.settings.grid_error * field.square().sum(-1).mean(-1).sqrt()
 

@@ -52,7 +52,7 @@ class IdentificationSettings(Settings):
         description=(
             "of the grid, in differences from one that is 1.25 times as coarse: no "
             "frame is trusted beyond it, and a multiple of it is identified beside the "
-            "law; 0: none, and parts of the law may then be learned that only explain the grid"
+            "law; 0: none, and for the parts of the law an assumed one"
         ),
     )
     model_error: float = Field(0.02, ge=0, le=1, description="of all else, in cells")

@@ -10,7 +10,7 @@ from mosa.modules.fitting.gauss_newton import KNOWN, Posterior
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.search.backbone import valleys
-from mosa.modules.fitting.search.parts import WORTH, chosen, held_back
+from mosa.modules.fitting.search.parts import UNKNOWN, WORTH, chosen, held_back
 from mosa.modules.fitting.stages import Stage
 from mosa.training.lit_mosa import LitMosa
 
@@ -18,9 +18,11 @@ OWNERS = ["E", "operator", "operator", "stiffness"]
 FRAMES, ROWS = 8, 40
 
 
-def errors_of(truth: torch.Tensor, noise: float = 0.01, grids: float = 0.0) -> dict[str, float]:
+def errors_of(
+    truth: torch.Tensor, noise: float = 0.01, grids: float | None = 0.0
+) -> dict[str, float]:
     """Of linear data of numbers `truth` (4,), where the fit stands at 0; the rows are positions in
-    units of 2 mm. grids: distance [m] between the predictions on two grids."""
+    units of 2 mm. grids: distance [m] between the predictions on two grids, None where it is unknown."""
     generator = torch.Generator().manual_seed(0)
     J = torch.randn(FRAMES, ROWS, 4, generator=generator, dtype=torch.float64)
     r = -J @ truth + noise * torch.randn(FRAMES, ROWS, generator=generator, dtype=torch.float64)
@@ -55,6 +57,18 @@ def test_a_gain_within_the_error_of_the_grid_is_none():
     assert chosen(sharp).startswith("operator") and chosen(blurred) == "isotropic"
     for name, error in sharp.items():
         assert blurred[name] == pytest.approx(math.hypot(error, 0.1), rel=1e-2)
+
+
+def test_without_a_second_grid_the_grid_is_not_taken_to_be_exact():
+    """A gain of a quarter, which a grid gives an isotropic body, is none; half of the error is one."""
+    truth = torch.tensor([1.0, 1, 1, 0]).double()
+    alone, exact = errors_of(truth, grids=None), errors_of(truth)
+    plain = exact["isotropic"]
+    assert alone["isotropic"] == pytest.approx(plain * math.hypot(1, UNKNOWN), rel=1e-9)
+    for name, error in exact.items():  # to what the frames' means of logarithms allow
+        assert alone[name] == pytest.approx(math.hypot(error, UNKNOWN * plain), rel=0.1)
+    gains = [math.hypot(gain, UNKNOWN) / math.hypot(1, UNKNOWN) for gain in (0.74, 0.65)]
+    assert gains[1] < WORTH < gains[0]
 
 
 def test_a_held_back_frame_is_not_learned_from():
