@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Iterable
@@ -15,6 +16,7 @@ from mosa.system.refused import lacks_memory
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 
+@functools.cache
 def machine_memory() -> int:
     """Bytes of memory of this machine, or of its container where that has a limit."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

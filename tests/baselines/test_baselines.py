@@ -252,9 +252,8 @@ def rolled(body: Body, device: str, rollouts: int) -> list[torch.Tensor]:
     )
     for _ in range(rollouts):
         first = start()
-        first = type(first)(
-            *(None if t is None else t.to(device).requires_grad_() for t in vars(first).values())
-        )
+        moved = {name: t for name, t in vars(first).items() if isinstance(t, torch.Tensor)}
+        first = replace(first, **{n: t.to(device).requires_grad_() for n, t in moved.items()})
         weights = list(body.adapter.net.parameters())
         rollout = body.simulate(first, world, 6, FRAME_DT)
         found = torch.autograd.grad(

@@ -8,6 +8,7 @@ cells. Where neither is needed nothing is computed.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -109,22 +110,30 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
     return turn
 
 
-def shift_to(x: Tensor, turn: Tensor | None, dx: float) -> tuple[float, ...] | None:
-    """`Axes.shift` for particles at x (..., 3) [m] on a grid of dx [m], None where they are near the origin. Errors:
-    ConfigError where the type of x has no digits for the place, or where worlds are too far from each other."""
-    low, high = (t.double().cpu() for t in torch.aminmax(x.detach().flatten(0, -2), dim=0))
-    far, wide = float(torch.maximum(low.abs(), high.abs()).max()), float((high - low).max())
+def ends_of(x: Tensor) -> np.ndarray:
+    """(2, ..., 3) float64 [m]: lowest and highest coordinates of particles at x (..., N, 3), in one look at the device."""
+    return torch.stack(torch.aminmax(x.detach(), dim=-2)).double().cpu().numpy()
+
+
+def shift_to(
+    ends: np.ndarray, dtype: torch.dtype, turn: Tensor | None, dx: float
+) -> tuple[float, ...] | None:
+    """`Axes.shift` for particles between `ends` (`ends_of`), of positions of a type, on a grid of dx [m], None where they are near
+    the origin. Errors: ConfigError where the type has no digits for the place, or where worlds are too far from each other."""
+    low, high = ends.reshape(2, -1, 3)[0].min(0), ends.reshape(2, -1, 3)[1].max(0)
+    far, wide = float(np.abs([low, high]).max()), float((high - low).max())
     if not far < float("inf"):
         return None  # the first substep names the particle
-    if far * torch.finfo(x.dtype).eps > COARSE * dx:
+    if far * torch.finfo(dtype).eps > COARSE * dx:
         raise ConfigError(
-            f"x: particles are {far:.3g} m from the origin, where {x.dtype} has no digits for a grid of {dx:.3g} m: "
+            f"x: particles are {far:.3g} m from the origin, where {dtype} has no digits for a grid of {dx:.3g} m: "
             "give x in float64, or place body, ground and solids nearer to the origin"
         )
-    if x.ndim == 3 and wide > SPREAD * PERIOD * dx:
+    if ends.ndim == 3 and wide > SPREAD * PERIOD * dx:
         raise ConfigError(
             f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
             "meet, and may be in one place"
         )
-    shift = PERIOD * dx * torch.round(Axes(turn).vectors(0.5 * (low + high)) / (PERIOD * dx))
-    return tuple(shift.tolist()) if bool(shift.any()) else None
+    center = Axes(turn).vectors(torch.from_numpy(0.5 * (low + high))).numpy()
+    shift = PERIOD * dx * np.round(center / (PERIOD * dx))
+    return tuple(shift.tolist()) if shift.any() else None

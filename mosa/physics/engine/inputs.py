@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -110,12 +111,19 @@ def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> Non
             )
 
 
-def check_above(numerics: Numerics, x: Tensor) -> None:
-    """x: (..., N, 3) in the axes of the planes. Errors: ConfigError for a body that lies wholly behind
-    the ground or another plane, which would hold it for ever."""
-    planes = numerics.planes[: numerics.plane_count].to(x)
-    highest = (x.detach() @ planes[:, :3].T - planes[:, 3]).amax(-2)
-    if bool((highest < 0).any()):
+def check_above(planes: np.ndarray, ends: np.ndarray, x: Tensor) -> None:
+    """planes: (P, 4) normals and offsets; ends: `ends_of` x (..., N, 3), all in one frame. Errors: ConfigError for a body that lies
+    wholly behind the ground or another plane, which would hold it for ever."""
+    normals, offsets = planes[:, None, :3], planes[:, 3, None]
+    boxes = ends.reshape(2, -1, 3)
+    highest = np.maximum(normals * boxes[0], normals * boxes[1]).sum(-1) - offsets
+    askew = (
+        np.abs(normals[:, 0]).max(-1) < 1
+    )  # a box reaches farther along such normals than the body in it
+    if askew.any():
+        there = x.detach() @ torch.from_numpy(normals[askew, 0]).to(x).T
+        highest[askew] = there.amax(-2).reshape(len(boxes[0]), -1).T.cpu().numpy() - offsets[askew]
+    if (highest < 0).any():
         raise ConfigError(
             "x: expected a body above the ground and in front of the other planes, found all of it "
             f"{-float(highest.min()):.3g} m or more behind one"

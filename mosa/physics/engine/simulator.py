@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from annotated_types import Ge, Le
 from pydantic import InstanceOf
@@ -26,7 +27,7 @@ from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, 
 from mosa.physics.contact.driven import Held, hold, stack_held
 from mosa.physics.contact.motion import Points, sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
-from mosa.physics.engine.axes import Axes, shift_to, turn_along
+from mosa.physics.engine.axes import Axes, ends_of, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.inputs import (
     check_above,
@@ -122,7 +123,7 @@ class Simulator:
             up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
         all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
         axes = self._axes = Axes(turn_along(all_planes))
-        values, modes = pack_planes(all_planes, torch.float64, self.device, float(dx))
+        values, modes = pack_planes(all_planes, torch.float64, torch.device("cpu"), float(dx))
         self.colliders = tuple(colliders)
         packed_colliders = (
             pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
@@ -138,7 +139,7 @@ class Simulator:
         )  # one askew is looked at by `Stepper.through`
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt,
-            gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes, plane_count=len(all_planes),
+            gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes.to(self.device), plane_count=len(all_planes),
             touching=touching, low=low, high=high, box=box, norm_eps=float(options.norm_eps), rebuild=options.rebuild,
             check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain, driven=len(sets),
@@ -312,12 +313,13 @@ class Simulator:
         each = motions_of_worlds(motions, self.colliders, worlds)
         if self.numerics.driven:
             held = self._held(held, state.x, each, start_time)
-        if (shift := self._origin(state.x, held)) != self._axes.shift:
+        ends = ends_of(state.x)
+        if (shift := self._origin(state.x, ends, held)) != self._axes.shift:
             self._move(shift)
         axes = self._axes
         state = axes.state(state, self.dtype)
         if not started:
-            check_above(self.numerics, state.x)
+            check_above(self._walls, ends if axes == Axes() else ends_of(state.x), state.x)
         gravities = (
             None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         )
@@ -368,9 +370,12 @@ class Simulator:
         """The origin of its axes. A stepper that was made before goes on with its own numerics and buffers."""
         offset = torch.tensor(shift or (0.0, 0.0, 0.0), dtype=torch.float64)
         planes = self._planes.clone()
-        planes[:, 3] -= planes[:, :3] @ offset.to(planes.device)
+        planes[:, 3] -= planes[:, :3] @ offset
+        self._walls = planes[: self.numerics.plane_count, :4].numpy()
         low, high = map(tuple, (self._limits - offset).tolist())
-        self.numerics = replace(self.numerics, planes=planes.to(self.dtype), low=low, high=high)
+        self.numerics = replace(
+            self.numerics, planes=planes.to(self.device, self.dtype), low=low, high=high
+        )
         self._axes, self.buffers = replace(self._axes, shift=shift), Buffers()
 
     def _poses(
@@ -451,13 +456,13 @@ class Simulator:
             self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers
         )
 
-    def _origin(self, x: Tensor, held: Held | None) -> tuple[float, ...] | None:
+    def _origin(self, x: Tensor, ends: np.ndarray, held: Held | None) -> tuple[float, ...] | None:
         """Of the axes for particles at x. In float32 it is near driven particles: what they give
         way by under load is little more than the last digit of a place far away, and what is
         rounded off would let them creep."""
         axes, dx = self._axes, self.numerics.dx
         if held is None or not self.numerics.driven or self.dtype == torch.float64:
-            return shift_to(x, axes.turn, dx)
+            return shift_to(ends, x.dtype, axes.turn, dx)
         center = Axes(axes.turn).vectors(x.detach()[held.sets >= 0].double().mean(0).cpu())
         now = torch.tensor(axes.shift or (0.0, 0.0, 0.0), dtype=torch.float64)
         if float((center - now).abs().max()) <= NEAR * dx:
