@@ -2,7 +2,7 @@
 
     python benchmarks/beside_others.py [--device cuda|cpu] [--counts 10000 100000 1000000 10000000]
                                        [--orders cell shuffled] [--substeps 200] [--repeats 5]
-                                       [--programs ours taichi] [--memory 40] [--check]
+                                       [--programs ours taichi] [--memory 16] [--check]
 
 with `pip install taichi`. Both: a block of neo-Hookean material, two particles per cell and axis,
 on a sticky ground; MLS-MPM with APIC and quadratic B-splines, float32 states, one grid spacing and
@@ -58,6 +58,7 @@ ALLOWED = {"center [m]": 1e-6, "rms [m]": 1e-6, "gradient": 1e-4}
 DRAM = {"H200": 4.8e12, "H100 PCIe": 2.0e12, "H100": 3.35e12, "A100": 2.039e12}
 """Bytes a second, as NVIDIA's data sheets have them; the first name that fits counts."""
 L2 = {"H200": 6.6e12, "H100": 6.6e12}
+SHOWN = {"forward": "forward", "both": "forward + backward"}
 MOVED = {"forward": (256, 64, 864), "both": (868, 192, 2592)}
 """Bytes: per particle and per node through DRAM, per particle more through L2."""
 
@@ -114,12 +115,16 @@ def taichi_body(arrays: tuple[torch.Tensor, ...], states: int, gradients: bool, 
         log_level=ti.ERROR,
         cpu_max_num_threads=1,
     )
+    if (device == "cuda") != (ti.cfg.arch == ti.cuda):
+        raise SystemExit(f"taichi: expected {device}, found {ti.cfg.arch}")
     scheme = Scheme(DX, DT, GRAVITY, GROUND, DENSITY * VOLUME, VOLUME, LAM)
     return TaichiBody(scheme, len(arrays[0]), *window(arrays[0]), states, gradients)
 
 
 def numbers(arrays: tuple[torch.Tensor, ...]) -> list[np.ndarray]:
-    return [a.numpy() for a in arrays[:4]]
+    """x, v, C, F for Taichi, F advanced by C as a rollout of ours begins."""
+    x, v, C, F = arrays[:4]
+    return [a.numpy() for a in (x, v, C, F + DT * (C @ F))]
 
 
 def put(arrays: tuple[torch.Tensor, ...], order: str) -> tuple[torch.Tensor, ...]:
@@ -219,7 +224,13 @@ def line(found: dict) -> str:
         "-" if found[k] is None else f"{100 * found[k]:.0f} %" for k in ("dram_share", "l2_share")
     ]
     milli = f"{found['milliseconds']:.4f} ({found['least']:.4f} to {found['most']:.4f})"
-    cells = [found[k] for k in ("particles", "order", "pass", "program", "substeps")]
+    cells = [
+        found["particles"],
+        found["order"],
+        SHOWN[found["pass"]],
+        found["program"],
+        found["substeps"],
+    ]
     rate = f"{found['particle_substeps_per_s'] / 1e9:.4g}"
     return f"| {' | '.join(map(str, [*cells, milli, rate, *shares]))} |"
 
@@ -228,9 +239,9 @@ def record(
     rows: list[dict], count: int, nodes: int, program: str, device: str, order: str, name: str,
     substeps: int, seconds: list[float],
 ) -> None:  # fmt: skip
-    """Adds a line, prints it and writes all so far where OUT says."""
+    """Adds a line and prints it; all so far are written where OUT says."""
     rows.append(row(count, nodes, program, order, name, substeps, seconds, device))
-    print(line(rows[-1]), flush=True)
+    print("done:", line(rows[-1]), flush=True)
     if folder := os.environ.get("OUT"):
         text = json.dumps({"machine": versions(), "rows": rows}, indent=2)
         (Path(folder) / "beside_others.json").write_text(text)
@@ -283,7 +294,7 @@ def main() -> None:
     parser.add_argument(
         "--programs", nargs="+", choices=("ours", "taichi"), default=["ours", "taichi"]
     )
-    parser.add_argument("--memory", type=float, default=40.0, help="GiB of Taichi's states")
+    parser.add_argument("--memory", type=float, default=16.0, help="GiB of Taichi's states")
     parser.add_argument("--check", action="store_true", help="compare the motions, no times")
     options = parser.parse_args()
     if options.substeps < 20 or options.substeps % 20:
@@ -293,15 +304,16 @@ def main() -> None:
     print(versions())
     if options.check:
         return check(options.device)
-    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     rows: list[dict] = []
-    for count in options.counts:
-        nodes = int(window(body(count, DX, torch.float32)[0])[1].prod())
-        for program, measure in (("ours", of_ours), ("taichi", of_taichi)):
-            if program in options.programs:
-                measure(
-                    count, options, partial(record, rows, count, nodes, program, options.device)
-                )
+    for program, measure in (("ours", of_ours), ("taichi", of_taichi)):
+        for count in options.counts if program in options.programs else ():
+            nodes = int(window(body(count, DX, torch.float32)[0])[1].prod())
+            measure(count, options, partial(record, rows, count, nodes, program, options.device))
+    rows.sort(
+        key=lambda found: (found["particles"], found["pass"], found["order"], found["program"])
+    )
+    print(f"\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+    print("\n".join(map(line, rows)))
 
 
 if __name__ == "__main__":

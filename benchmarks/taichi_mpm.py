@@ -52,8 +52,7 @@ class TaichiBody:
         self.velocity = ti.Vector.field(3, ti.f32, **nodes)
 
     def load(self, x, v, C, F, mu: float) -> None:
-        """(N, 3) and (N, 3, 3) arrays as state 0. Like a rollout of ours, F is advanced by C first."""
-        F = F + np.float32(self.scheme.dt) * (C @ F)
+        """(N, 3) and (N, 3, 3) arrays as state 0."""
         self._load(*(np.ascontiguousarray(a, dtype=np.float32) for a in (x, v, C, F)))
         self.mu.fill(mu)
         self.grid.fill(0.0)
