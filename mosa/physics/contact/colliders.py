@@ -100,7 +100,7 @@ class Collider:
 
 class PackedColliders(NamedTuple):
     """K colliders for the kernels, without their motion. shapes: (K, 11): size 3, friction, lattice origin 3 and spacing,
-    stiffness, grip; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
+    stiffness, grip, reach; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
 
     shapes: Tensor
     codes: Tensor
