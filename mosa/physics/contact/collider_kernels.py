@@ -29,7 +29,7 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     shape, touch = shape_functions(scalar), touch_functions(scalar)
     signed_distance, curvature = shape.signed_distance, shape.curvature
-    radius, pushed, adj_pushed = touch.radius, touch.pushed, touch.adj_pushed
+    near, depth, pushed, adj_pushed = touch.near, touch.depth, touch.pushed, touch.adj_pushed
     module = f"mosa.physics.{'exact_' if exact else ''}colliders_{scalar.__name__}"
     vectors = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=vec3)
     matrices = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=mat33)
@@ -81,20 +81,21 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.func
     def struck(
-        v: vec3, x: vec3, r: scalar, kick: scalar, k: int, c: int, substep: int,
+        v: vec3, x: vec3, volume: scalar, kick: scalar, k: int, c: int, substep: int,
         solids: Solids, poses: Poses,
     ):  # fmt: skip
         """Velocity v of a particle after collider k in column c."""
         R = x - poses.position[substep, c]
         Q = poses.rotation[substep, c]
         phi, g = signed_distance(wp.transpose(Q) * R, k, solids.shapes, solids.codes, solids.fields)
+        inside = depth(phi, volume)
         out = v
-        if phi < r:
+        if inside > scalar(0.0):
             V = poses.linear[substep, c] + wp.cross(poses.angular[substep, c], R)
             out = v + pushed(
                 v - V,
                 Q * wp.normalize(g),
-                kick * solids.shapes[k, 8] * (r - phi),
+                kick * solids.shapes[k, 8] * inside,
                 solids.shapes[k, 3],
                 solids.shapes[k, 9],
             )
@@ -108,17 +109,17 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     ):  # fmt: skip
         """Writes v_struck, adds to force and torque of the substep where they are given. size: particles of a world."""
         p = wp.tid()
-        r = radius(volume[p])
-        kick = dt * springs[p]
         u = v[p]
         for k in range(solids.count):
             c = (p / size) * solids.count + k
-            after = struck(u, x[p], r, kick, k, c, substep, solids, poses)
-            f = (mass[p] / dt) * (u - after)
-            if force and wp.dot(f, f) > scalar(0.0):
-                add_vector(force, substep, c, f)
-                add_vector(torque, substep, c, wp.cross(x[p] - poses.position[substep, c], f))
-            u = after
+            R = x[p] - poses.position[substep, c]
+            if near(wp.length(R) - solids.shapes[k, 10], volume[p]):
+                after = struck(u, x[p], volume[p], dt * springs[p], k, c, substep, solids, poses)
+                f = (mass[p] / dt) * (u - after)
+                if force and wp.dot(f, f) > scalar(0.0):
+                    add_vector(force, substep, c, f)
+                    add_vector(torque, substep, c, wp.cross(R, f))
+                u = after
         v_struck[p] = u
 
     @wp.kernel(module=module, enable_backward=False)
@@ -131,7 +132,6 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         """v: velocities as the first collider finds them. Turns adj_v into theirs, adds to the adjoints of x, of the springs, of
         the poses and of the solids' velocities."""
         p = wp.tid()
-        r = radius(volume[p])
         kick = dt * springs[p]
         a = adj_v[p]
         ax = adj_x[p]
@@ -140,26 +140,29 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
             k = solids.count - 1 - reverse
             c = (p / size) * solids.count + k
             R = x[p] - poses.position[substep, c]
+            if not near(wp.length(R) - solids.shapes[k, 10], volume[p]):
+                continue
             Q = poses.rotation[substep, c]
             q = wp.transpose(Q) * R
             phi, g = signed_distance(q, k, solids.shapes, solids.codes, solids.fields)
-            if phi < r:
+            inside = depth(phi, volume[p])
+            if inside > scalar(0.0):
                 u = v[p]
                 for j in range(k):
-                    u = struck(u, x[p], r, kick, j, c - k + j, substep, solids, poses)
+                    u = struck(u, x[p], volume[p], kick, j, c - k + j, substep, solids, poses)
                 omega = poses.angular[substep, c]
                 local = wp.normalize(g)
                 n = Q * local
                 u = u - poses.linear[substep, c] - wp.cross(omega, R)
                 stiffness = solids.shapes[k, 8]
-                push = kick * stiffness * (r - phi)
+                push = kick * stiffness * inside
                 # v' = v + D,  f = -(m/dt) D,  torque = R x f
                 at = adj_torque[substep, c]
                 f = -(mass[p] / dt) * pushed(u, n, push, solids.shapes[k, 3], solids.shapes[k, 9])
                 aD = a - (mass[p] / dt) * (adj_force[substep, c] + wp.cross(at, R))
                 aR = wp.cross(f, at)
                 au, an, aj = adj_pushed(u, n, push, solids.shapes[k, 3], solids.shapes[k, 9], aD)
-                spring = spring + dt * stiffness * (r - phi) * aj
+                spring = spring + dt * stiffness * inside * aj
                 # u = v - V, V = linear + angular x R
                 a = a + au
                 aR = aR + wp.cross(omega, au)

@@ -99,8 +99,8 @@ class Collider:
 
 
 class PackedColliders(NamedTuple):
-    """K colliders for the kernels, without their motion. shapes: (K, 10): size 3, friction, lattice origin 3 and spacing,
-    stiffness, grip; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
+    """K colliders for the kernels, without their motion. shapes: (K, 11): size 3, friction, lattice origin 3 and spacing,
+    stiffness, grip, reach; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
 
     shapes: Tensor
     codes: Tensor
@@ -149,6 +149,8 @@ def pack_colliders(
         )
         shapes[i, packing.STIFFNESS] = 1.0 if collider.mode == "touch" else STIFFER
         codes[i, packing.KIND] = KINDS[type(shape)]
+        # a little more than it is, so that rounding decides nothing
+        shapes[i, packing.REACH] = math.inf if isinstance(shape, HalfSpace) else 1.01 * reach(shape)
         if isinstance(shape, SignedDistanceField):
             shapes[i, packing.ORIGIN : packing.ORIGIN + 3] = torch.as_tensor(
                 shape.origin, dtype=torch.float64

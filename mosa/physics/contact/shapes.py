@@ -18,8 +18,8 @@ import warp as wp
 
 HALF_SPACE, SPHERE, CAPSULE, CYLINDER, BOX, FIELD = range(6)
 
-# columns of the packed shapes (K, 10) and codes (K, 5)
-SIZE, FRICTION, ORIGIN, SPACING, STIFFNESS, HOLD, SHAPE_COLUMNS = 0, 3, 4, 7, 8, 9, 10
+# columns of the packed shapes (K, 11) and codes (K, 5)
+SIZE, FRICTION, ORIGIN, SPACING, STIFFNESS, HOLD, REACH, SHAPE_COLUMNS = 0, 3, 4, 7, 8, 9, 10, 11
 KIND, DIMS, OFFSET, CODE_COLUMNS = 0, 1, 4, 5
 
 _SPHERE = wp.constant(SPHERE)
@@ -33,7 +33,7 @@ _FIELD = wp.constant(FIELD)
 def shape_functions(scalar) -> SimpleNamespace:
     """Warp functions signed_distance -> (phi, gradient) and curvature -> Hessian of phi times a vector, for float32 or float64.
 
-    Arguments: shape k, point q (3,) in its axes [m], packed shapes (K, 10), codes (K, 5) and fields (flat lattice values, z
+    Arguments: shape k, point q (3,) in its axes [m], packed shapes (K, 11), codes (K, 5) and fields (flat lattice values, z
     fastest). Sizes: sphere radius; capsule and cylinder radius, half length; box half edges.
     """
     vec3 = wp.types.vector(length=3, dtype=scalar)

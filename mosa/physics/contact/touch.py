@@ -23,6 +23,8 @@ TOUCH = wp.constant(3)
 """Of `planes.MODES`."""
 STIFFNESS = 1.0
 """Of the spring, over that of a cell of the material."""
+NEAR = 1.001
+"""Volumes of a particle to which the cube of a distance is compared: more than rounding."""
 GRIP = 3.0
 """Most of its sliding velocity that friction takes from a particle in one substep."""
 
@@ -37,14 +39,23 @@ def springs(modulus: Tensor, mass: Tensor, volume: Tensor, dx: float) -> Tensor:
 
 @cache
 def touch_functions(scalar) -> SimpleNamespace:
-    """Warp functions radius(volume), pushed and adj_pushed for wp.float32 or wp.float64."""
+    """Warp functions near, depth(phi, volume), pushed and adj_pushed for wp.float32 or wp.float64."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     third = 1.0 / 3.0
 
     @wp.func
-    def radius(volume: scalar):
-        """Of a particle's ball: half its spacing."""
-        return scalar(0.5) * wp.pow(volume, scalar(wp.static(third)))
+    def near(phi: scalar, volume: scalar):
+        """Whether the ball of a particle, of half its spacing, may reach what is at distance phi of
+        its centre: without the power that tells, which takes as long as all the rest."""
+        return scalar(8.0) * phi * phi * phi < scalar(wp.static(NEAR)) * volume
+
+    @wp.func
+    def depth(phi: scalar, volume: scalar):
+        """How far the ball reaches beyond it, 0 where it does not."""
+        inside = scalar(0.0)
+        if near(phi, volume):
+            inside = wp.max(scalar(0.5) * wp.pow(volume, scalar(wp.static(third))) - phi, inside)
+        return inside
 
     @wp.func
     def pushed(u: vec3, n: vec3, j: scalar, friction: scalar, grip: scalar):
@@ -78,7 +89,7 @@ def touch_functions(scalar) -> SimpleNamespace:
         tilt = wp.dot(at, n)
         return at - tilt * n, j * a - tilt * u - un * at, aj
 
-    return SimpleNamespace(radius=radius, pushed=pushed, adj_pushed=adj_pushed)
+    return SimpleNamespace(near=near, depth=depth, pushed=pushed, adj_pushed=adj_pushed)
 
 
 @cache
@@ -86,14 +97,14 @@ def touch_kernels(scalar) -> SimpleNamespace:
     """Kernels meet and adj_meet for wp.float32 or wp.float64 fields."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     functions = touch_functions(scalar)
-    radius, pushed, adj_pushed = functions.radius, functions.pushed, functions.adj_pushed
+    depth, pushed, adj_pushed = functions.depth, functions.pushed, functions.adj_pushed
     module, grip = f"mosa.physics.touch_{scalar.__name__}", scalar(GRIP)
 
     @wp.func
     def met(
         v: vec3,
         x: vec3,
-        r: scalar,
+        volume: scalar,
         planes: wp.array2d(dtype=scalar),
         modes: wp.array(dtype=int),
         count: int,
@@ -104,9 +115,9 @@ def touch_kernels(scalar) -> SimpleNamespace:
         for i in range(count):
             if modes[i] == TOUCH:
                 n = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                depth = r - (wp.dot(x, n) - planes[i, 3])
-                if depth > scalar(0.0):
-                    u = u + pushed(u, n, kick * depth, planes[i, 4], grip)
+                inside = depth(wp.dot(x, n) - planes[i, 3], volume)
+                if inside > scalar(0.0):
+                    u = u + pushed(u, n, kick * inside, planes[i, 4], grip)
         return u
 
     @wp.kernel(module=module, enable_backward=False)
@@ -115,7 +126,7 @@ def touch_kernels(scalar) -> SimpleNamespace:
         planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, dt: scalar, v_met: wp.array(dtype=vec3),
     ):  # fmt: skip
         p = wp.tid()
-        v_met[p] = met(v[p], x[p], radius(volume[p]), planes, modes, count, dt * springs[p])
+        v_met[p] = met(v[p], x[p], volume[p], planes, modes, count, dt * springs[p])
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_meet(
@@ -125,7 +136,6 @@ def touch_kernels(scalar) -> SimpleNamespace:
     ):  # fmt: skip
         """Turns adj_v from that of the velocities after it to that of those before, and adds to adj_x and adj_springs."""
         p = wp.tid()
-        r = radius(volume[p])
         kick = dt * springs[p]
         a = adj_v[p]
         ax = adj_x[p]
@@ -134,13 +144,13 @@ def touch_kernels(scalar) -> SimpleNamespace:
             i = count - 1 - reverse
             if modes[i] == TOUCH:
                 n = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                depth = r - (wp.dot(x[p], n) - planes[i, 3])
-                if depth > scalar(0.0):
-                    u = met(v[p], x[p], r, planes, modes, i, kick)
-                    au, _an, aj = adj_pushed(u, n, kick * depth, planes[i, 4], grip, a)
+                inside = depth(wp.dot(x[p], n) - planes[i, 3], volume[p])
+                if inside > scalar(0.0):
+                    u = met(v[p], x[p], volume[p], planes, modes, i, kick)
+                    au, _an, aj = adj_pushed(u, n, kick * inside, planes[i, 4], grip, a)
                     a = a + au
                     ax = ax - (kick * aj) * n
-                    spring = spring + dt * depth * aj
+                    spring = spring + dt * inside * aj
         adj_v[p] = a
         adj_x[p] = ax
         adj_springs[p] = adj_springs[p] + spring
