@@ -23,6 +23,7 @@ from mosa.data.formats.particles import kept_cloud
 from mosa.data.formats.scene_from_footage import scene_from_footage
 from mosa.data.formats.views import read_views, split_mask
 from mosa.errors import DataError
+from mosa.settings import Positive, check
 from mosa.system.limits import machine_memory
 from mosa.types import REST, Scene
 
@@ -53,6 +54,7 @@ def load_phystwin(
     metre; holdout_frames: None for those of split.json's test. `world`: other keyword arguments of
     `scene_from_footage`. Errors: DataError naming file and field, ConfigError."""
     folder = Path(path)
+    check("scene.reach", reach, Positive)
     if not folder.is_dir():
         raise DataError(
             f"{folder}: folder not found; set scene.path to a case of PhysTwin (color/, mask/, "
@@ -119,6 +121,8 @@ def read_points(
     found = {}
     for key, axes in (("object_points", 3), ("controller_points", 3), ("surface_points", 2), ("interior_points", 2)):  # fmt: skip
         value = stored.get(key) if isinstance(stored, dict) else None
+        if isinstance(value, np.ndarray) and axes == 2 and not value.size:
+            value = value.reshape(0, 3)  # of a case without a mesh
         if not isinstance(value, np.ndarray) or value.ndim != axes or value.shape[-1] != 3 or value.dtype.kind != "f":  # fmt: skip
             raise DataError(
                 f"{file}, {key}: expected numbers of shape ({'frames, ' if axes == 3 else ''}points, 3), "

@@ -200,12 +200,11 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
     name = item.pop("name", f"driven{number}")
     more = {key: item.pop(key) for key in ("mass", "held") if key in item}
     own = {key: item.pop(key) for key in ("indices", "points") if key in item}
-    motion_keys = set(item.get("motion") or {})
-    moved = _points(item["motion"], where) if motion_keys & {"path", "points"} else None
-    if moved is not None:
-        if motion_keys not in ({"path"}, {"times", "points"}):
+    moved, given = None, set(item.get("motion") or {})
+    if given & {"path", "points"}:
+        if given not in ({"path"}, {"times", "points"}):
             raise ConfigError(f"{where}.motion: expected path alone, or times and points")
-        del item["motion"]
+        moved = _points(item.pop("motion"), where)
         if own:
             raise ConfigError(
                 f"{where}: {next(iter(own))} and motion.path: expected a type, or none"
@@ -245,7 +244,7 @@ def _points(given: Mapping[str, Any], where: str) -> Points:
                 f"{where}.motion: expected lists times [s] and points [m] of shape (T,) and "
                 f"(T, n, 3), found others ({error})"
             ) from error
-    if not isinstance(path, str):
+    if not isinstance(path := given["path"], str):
         raise ConfigError(f"{where}.motion.path: expected an npz file, found {path!r}")
     arrays = read_npz(Path(path))
     if missing := [key for key in ("times", "points") if key not in arrays]:

@@ -63,6 +63,15 @@ def test_the_hand_drives_the_particles_that_it_is_near(blocks, points, case):
     )
 
 
+def test_a_case_without_a_mesh_has_the_points_that_were_seen(points, case):
+    stored(
+        POINTS, lambda d: d.update(surface_points=np.zeros(0), interior_points=np.zeros((0, 3)))
+    )(case)
+    assert len(read_ply(Path(read(case).body.shape))) == len(points[0][0])
+    with pytest.raises(ConfigError, match=r"scene\.reach"):
+        read(case, reach=-1.0)
+
+
 def test_the_run_and_its_record_have_the_set(points, case):
     scene, law = read(case), {"law": "neo_hookean", "parameters": {"E": 1e5, "nu": 0.3}}
     record = measured({"prior": law, "adapter": {"name": None}, "world": {"driven": [
