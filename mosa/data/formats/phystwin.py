@@ -24,7 +24,6 @@ from mosa.data.formats.scene_from_footage import scene_from_footage
 from mosa.data.formats.views import read_views, split_mask
 from mosa.errors import DataError
 from mosa.settings import Positive, check
-from mosa.system.limits import machine_memory
 from mosa.types import REST, Scene
 
 HAND = "hand"
@@ -55,11 +54,6 @@ def load_phystwin(
     `scene_from_footage`. Errors: DataError naming file and field, ConfigError."""
     folder = Path(path)
     check("scene.reach", reach, Positive)
-    if not folder.is_dir():
-        raise DataError(
-            f"{folder}: folder not found; set scene.path to a case of PhysTwin (color/, mask/, "
-            "calibrate.pkl, metadata.json, final_data.pkl)"
-        )
     calibration, masks = read_cameras(folder)
     listed = folder / "color" / "0"
     present = sorted(int(f.stem) for f in listed.glob("*.png") if f.stem.isdecimal())
@@ -178,9 +172,7 @@ class Numbers(pickle.Unpickler):
 def numbers_of(file: Path) -> Any:
     """What a pickle holds. Errors: DataError naming a file that is damaged or names anything else."""
     if not file.is_file():
-        raise DataError(f"{file}: file not found")
-    if file.stat().st_size > machine_memory() / 2:
-        raise DataError(f"{file}: expected a file that fits the memory, found {file.stat().st_size} B")  # fmt: skip
+        raise DataError(f"{file}: file not found; set scene.path to a folder of a case of PhysTwin")
     try:
         with open(file, "rb") as stream:
             return Numbers(stream).load()

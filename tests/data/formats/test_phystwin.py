@@ -128,7 +128,7 @@ POINTS, POSES = "final_data.pkl", "calibrate.pkl"
     (lambda c: (c / "color/1/2.png").unlink(), "color/1/2.png: image not found, though metadata.json lists camera 1"),
     (lambda c: (c / "split.json").write_text("[]"), "split.json, test: expected [first, end]"),
     (lambda c: shutil.rmtree(c / "color" / "0"), "expected pictures 0.png, 1.png and so on"),
-    (lambda c: shutil.rmtree(c), "folder not found; set scene.path to a case of PhysTwin"),
+    (lambda c: shutil.rmtree(c), "file not found; set scene.path to a folder of a case of PhysTwin"),
 ])  # fmt: skip
 def test_a_mistake_names_its_file_and_field(case, act, told, capsys):
     act(case)
