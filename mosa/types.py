@@ -132,6 +132,7 @@ class Scene:
     start: `FALLING`, or `REST`: at frame 0 nothing moves, and the body may be in contact already.
     `markers`: tracked points in place of images, of which there are then none (V = 0).
     `body`: the rest shape, where it is known from elsewhere.
+    `driven`: sets of the body's particles whose motion was measured, entries as in world.driven.
     """
 
     __repr__ = in_brief
@@ -159,6 +160,7 @@ class Scene:
     start: str = FALLING
     markers: Markers | None = None
     body: KnownBody | None = None
+    driven: tuple[dict[str, Any], ...] = ()
 
     @property
     def frames(self) -> int:

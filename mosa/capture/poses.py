@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mosa.capture.colmap import is_model, read_model, read_points
 from mosa.capture.phones import Camera, Phone, plausible
 from mosa.data.formats.footage import read_json
 from mosa.data.formats.transforms import camera_matrix, entries_of, shot_of
 from mosa.data.images.lens import COEFFICIENTS
+from mosa.data.io.colmap import is_model, read_model, read_points
 from mosa.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")

@@ -54,6 +54,7 @@ def world_config(scene: Scene) -> dict[str, Any]:
         "gravity": scene.gravity.tolist(),
         "up": scene.up.tolist(),
         "box": scene.box.tolist(),
+        "driven": list(scene.driven),
     }
 
 
@@ -100,7 +101,7 @@ def world_of(record: BodyRecord) -> World:
             "ground": ground,
             "walls": given.walls,
             "colliders": given.colliders,
-            "driven": given.driven,
+            "driven": [*record.world.driven, *(given.driven or ())],
         }
     )
 

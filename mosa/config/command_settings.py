@@ -205,8 +205,8 @@ class EvalSettings(Settings):
     plan: Annotated[int, Interval(ge=2, le=10**9)] | None = Field(
         None,
         description=(
-            "candidates: instead of the evaluation, rank so many starts by what their "
-            "motion would tell"
+            "candidates: instead of the evaluation, rank drops and presses from so many poses "
+            "by what their motion would tell"
         ),
     )
     scene: Section | None = Field(None, description="another scene to evaluate on; null: the run's")

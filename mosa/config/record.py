@@ -112,11 +112,13 @@ def sequence_names(starts: Any) -> Any:
 
 
 class WorldRecord(Settings):
-    """What a scene says of its world: gravity [m/s^2], up, box [m]. Walls and solids are in the settings."""
+    """What a scene says of its world: gravity [m/s^2], up, box [m], and sets of particles whose motion
+    it measured. Walls and solids are in the settings."""
 
     gravity: Three
     up: Direction
     box: Box
+    driven: list[Section] = []
 
 
 class StartRecord(Settings):

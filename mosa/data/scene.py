@@ -18,6 +18,8 @@ from mosa.types import RUBBING, Ground, Scene
 FORMATS = {
     "pacnerf": "mosa.data.formats.pacnerf:load_pacnerf",
     "spring_gaus": "mosa.data.formats.spring_gaus:load_spring_gaus",
+    "spring_gaus_real": "mosa.data.formats.spring_gaus_real:load_spring_gaus_real",
+    "phystwin": "mosa.data.formats.phystwin:load_phystwin",
     "transforms": "mosa.data.formats.transforms:load_transforms",
     "markers": "mosa.data.formats.markers:load_markers",
     "builtin": "mosa.data.synthetic:load_builtin",
@@ -26,7 +28,7 @@ FORMATS = {
 `register_format` from another package."""
 
 
-MADE = ("name", "footage", "truth", "synthetic", "known_parameters")
+MADE = ("name", "footage", "truth", "synthetic", "known_parameters", "driven")
 """Arguments of `scene_from_footage` that a loader knows itself and no key says."""
 
 
@@ -87,6 +89,8 @@ def load_scene(
         )
     arguments = {k: v for k, v in keys.items() if v is not None}
     arguments["ground"] = ground_from(ground)
+    if "cache" in inspect.signature(loader).parameters:
+        arguments["cache"] = cache
     place = under(root, path)
     if keys.get("particles") is not None:
         found = beside(place, keys["particles"])

@@ -69,6 +69,11 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
         load_scene(**keys_of(keys, where, entry), name=scene.name, sequence=name)
         for (where, entry), name in zip(entries, names)
     ]
+    if other := next((o for o in others if o.driven != scene.driven), None):
+        raise ConfigError(
+            f"scene.also_train, scene.test: expected recordings in one world, found driven sets in {other.sequence} that "
+            "move otherwise than those of scene.path; learn from each alone"
+        )
     check_distinct([scene, *others], ["scene.path", *(f"scene.{where}" for where, _ in entries)])
     return scene, others
 

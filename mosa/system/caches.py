@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 from importlib.metadata import version
+from pathlib import Path
 
 FOLDERS = """HOME TMPDIR XDG_CONFIG_HOME XDG_DATA_HOME XDG_CACHE_HOME WARP_CACHE_PATH CUDA_CACHE_PATH TRITON_HOME TRITON_CACHE_DIR
 TORCHINDUCTOR_CACHE_DIR TORCH_EXTENSIONS_DIR TORCH_HOME NUMBA_CACHE_DIR MPLCONFIGDIR JOBLIB_TEMP_FOLDER U2NET_HOME""".split()
@@ -17,6 +18,11 @@ def cache_home() -> str:
     """The user's folder of caches: $XDG_CACHE_HOME, where that is absolute, or ~/.cache."""
     found = os.environ.get("XDG_CACHE_HOME", "")
     return found if os.path.isabs(found) else os.path.expanduser("~/.cache")
+
+
+def default_cache() -> Path:
+    """$XDG_CACHE_HOME/mosa or ~/.cache/mosa."""
+    return Path(cache_home()) / "mosa"
 
 
 def settle_caches() -> None:

@@ -30,7 +30,6 @@ from mosa.config.record import BodyRecord
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule, on_device
 from mosa.data.observations import Observations, cropped, training_observations
 from mosa.data.sequences import load_sequences, taught_names
-from mosa.data.synthetic.films import default_cache
 from mosa.errors import ConfigError
 from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
 from mosa.evaluation.evaluate import sequences
@@ -47,6 +46,7 @@ from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequen
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.system.caches import default_cache
 from mosa.system.progress import tqdm
 from mosa.training.run_folder import most_particles
 from mosa.types import Reconstruction, Scene

@@ -215,7 +215,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
     if cfg.plan is not None:
-        ranked = plan(twin, count=cfg.plan)
+        ranked = plan(twin, count=cfg.plan, presses=True)
         log.info("\n%s", plan_text(ranked))
         write_whole(folder / "plan.md", plan_text(ranked) + "\n")
         return -ranked[0].gain

@@ -23,7 +23,7 @@ from mosa.evaluation.uncertainty import (
 from mosa.modules.body.material import NU_MAX
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import as_rival, each_law, limits_of, read_numbers
-from mosa.twin.drop_planning import drawn_starts, information, plan
+from mosa.twin.drop_planning import drawn_starts, information, plan, plan_text, press
 from mosa.twin.twin import Twin
 
 
@@ -210,3 +210,24 @@ def test_candidates_begin_with_the_rest_pose_and_the_most_telling_is_first():
         (r.gain for r in ranked), reverse=True
     )
     assert ranked[-1].gain > 0 and plan(twin_of(1e-7), count=2, draws=4, frames=5)[0].gain < 1e-3
+
+
+def test_a_press_is_ranked_among_the_drops():
+    """Its plate ends a fifth of the body's height below its top, and its gain is that of the motions under the plate."""
+    twin = twin_of(0.05)
+    ranked = plan(twin, count=2, draws=4, frames=6, presses=True)
+    gains, pressed = [r.gain for r in ranked], [r for r in ranked if r.plate]
+    assert len(ranked) == 4 and len(pressed) == 2 and gains == sorted(gains, reverse=True)
+    for each in pressed:
+        speed, given = press(twin, each.rotation, 6)
+        start = {"rotation": each.rotation, "height": 0.0, "velocity": (0.0, 0.0, 0.0)}
+        first = twin.simulate(**start, frames=2, **given).x[0] @ twin.world.up
+        tall = float(first.max() - first.min())
+        end = given["colliders"][0]["position"][1] - speed * 5 * 0.01
+        assert speed == each.plate and end == pytest.approx(0.8 * tall, abs=1e-6)
+        numbers = twin.posterior.draws(4, torch.Generator().manual_seed(0))
+        drawn = [twin.simulate(**start, frames=6, **given).x for _ in each_law(twin.body, numbers)]
+        assert each.gain == pytest.approx(information(torch.stack(drawn), 0.004), rel=1e-6)
+        freely = [twin.simulate(**start, frames=6).x for _ in each_law(twin.body, numbers)]
+        assert each.gain > information(torch.stack(freely), 0.004)
+    assert f"at {pressed[0].plate:.3f} m/s" in plan_text(ranked)

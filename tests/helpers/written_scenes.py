@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import pickle
+import struct
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
 
 from mosa.data.formats.footage import OPENGL_TO_OPENCV
-from mosa.types import Scene
+from mosa.types import Cameras, Scene
 
 
 def opengl_pose(w2c: torch.Tensor) -> np.ndarray:
@@ -81,6 +84,74 @@ def export_spring_gaus(scene: Scene, folder: str | Path) -> Path:
     (folder / "camera.json").write_text(json.dumps(cameras, indent=1))
     (folder / "frame.json").write_text(
         json.dumps([{f"{t:03d}": time} for t, time in enumerate(scene.times.tolist())], indent=1)
+    )
+    return folder
+
+
+def export_spring_gaus_real(
+    scene: Scene, folder: str | Path, photographs: Cameras, masks: torch.Tensor, *, ending: str = ".png", hit: int = 3,
+) -> Path:  # fmt: skip
+    """Write a capture with the object `bun` and its sequence `0`; returns the sequence's file. photographs: cameras of static
+    pictures in another unit and pose, masks: (P, H, W) of these; of the film's cameras the focal length is theirs."""
+    static, dynamic = Path(folder) / "static", Path(folder) / "dynamic"
+    for part in ("colmap/bun", "masks/bun"):
+        (static / part).mkdir(parents=True)
+    images = [struct.pack("<Q", len(photographs))]
+    for i, w2c in enumerate(photographs.w2c.double().numpy()):
+        q = np.roll(Rotation.from_matrix(w2c[:3, :3]).as_quat(), 1)
+        images += [
+            struct.pack("<i7di", i + 1, *q, *w2c[:3, 3], 1),
+            f"P{i:03}.JPG\0".encode(),
+            bytes(8),
+        ]
+        mask = np.round(255 * masks[i].numpy()).astype(np.uint8)
+        iio.imwrite(static / "masks" / "bun" / f"P{i:03}.png", mask)
+    K = photographs.K[0].double()
+    size = photographs.width, photographs.height
+    camera = struct.pack("<QiiQQ4d", 1, 1, 1, *size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    (static / "colmap/bun/cameras.bin").write_bytes(camera)
+    (static / "colmap/bun/images.bin").write_bytes(b"".join(images))
+    poses, sequence = {}, {"hit_frame": hit}
+    for v, name in enumerate(scene.cameras.names):
+        w2c = scene.cameras.w2c[v].double().numpy()
+        turn = Rotation.from_matrix(w2c[:3, :3]).as_rotvec()
+        poses[f"C{name}"] = {"rvecs": turn[:, None].tolist(), "tvecs": w2c[:3, 3:].tolist()}
+        sequence[f"C{name}"] = [f"{t:05}{ending}" for t in range(scene.frames)]
+        for t, picture in enumerate(sequence[f"C{name}"]):
+            pixels = rgba(scene, v, t)
+            for kind, part in (("images", pixels[..., :3]), ("masks", pixels[..., 3])):
+                file = dynamic / f"videos_{kind}" / f"C{name}" / picture
+                file.parent.mkdir(parents=True, exist_ok=True)
+                iio.imwrite(file if kind == "images" else file.with_suffix(".png"), part)
+    (dynamic / "sequences" / "bun").mkdir(parents=True)
+    (dynamic / "cameras_calib.json").write_text(json.dumps(poses))
+    (dynamic / "sequences" / "bun" / "0.json").write_text(json.dumps(sequence))
+    return dynamic / "sequences" / "bun" / "0.json"
+
+
+def export_phystwin(
+    scene: Scene, folder: str | Path, body: np.ndarray, controller: np.ndarray, *, test: int
+) -> Path:
+    """Write a case. body: (T, N, 3), controller: (T, n, 3) [m]; test: first frame of the split's test."""
+    folder = Path(folder)
+    for v in range(len(scene.cameras)):
+        (folder / "color" / str(v)).mkdir(parents=True)
+        (folder / "mask" / str(v) / "1").mkdir(parents=True)
+        (folder / "mask" / f"mask_info_{v}.json").write_text('{"0": "hand", "1": "sloth"}')
+        for t in range(scene.frames):
+            pixels = rgba(scene, v, t)
+            iio.imwrite(folder / "color" / str(v) / f"{t}.png", pixels[..., :3])
+            iio.imwrite(folder / "mask" / str(v) / "1" / f"{t}.png", pixels[..., 3])
+    poses = [np.linalg.inv(w2c) for w2c in scene.cameras.w2c.double().numpy()]
+    seen = np.ones(body.shape[:2], bool)
+    points = {"object_points": body, "object_colors": np.zeros_like(body), "object_visibilities": seen,
+              "object_motions_valid": seen, "controller_points": controller,
+              "surface_points": body[0, :1], "interior_points": body[0, :1]}  # fmt: skip
+    for name, value in (("calibrate", poses), ("final_data", points)):
+        (folder / f"{name}.pkl").write_bytes(pickle.dumps(value))
+    (folder / "metadata.json").write_text(json.dumps({"intrinsics": scene.cameras.K.tolist()}))
+    (folder / "split.json").write_text(
+        json.dumps({"frame_len": scene.frames, "train": [0, test], "test": [test, scene.frames]})
     )
     return folder
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import mosa
-from mosa.data.synthetic.films import default_cache
-from mosa.system.caches import FOLDERS, cache_home, settle_caches
+from mosa.system.caches import FOLDERS, cache_home, default_cache, settle_caches
 from mosa.system.refused import disk_message
 
 ROOT = Path(mosa.__file__).parents[1]

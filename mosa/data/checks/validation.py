@@ -355,5 +355,5 @@ def fingerprint(scene: Scene) -> str:
         scene.holdout_cameras,
         scene.holdout_frames,
     )
-    digest.update(repr(facts).encode())
+    digest.update(repr((*facts, scene.driven) if scene.driven else facts).encode())
     return digest.hexdigest()[:16]

@@ -1,18 +1,21 @@
-"""Ground-truth particles: folders of PLY files, one per frame."""
+"""Particles in PLY files: the truth, a file for each frame, and rest shapes that a format brings."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from mosa.errors import DataError
+from mosa.system.caches import default_cache
 from mosa.system.ply import check_ply
+from mosa.system.whole_files import made_folder, written_whole
 
 
 def read_ply(path: Path) -> Tensor:
@@ -35,6 +38,18 @@ def read_ply(path: Path) -> Tensor:
             f"{path}: expected finite positions, found NaN or infinity in {len(bad)} of {len(points)}, first at {bad[0]}"
         )
     return torch.from_numpy(points)
+
+
+def kept_cloud(points: np.ndarray, cache: str | Path | None) -> str:
+    """File of points (M, 3) in the cache folder, for `scene.body.shape`: equal points, equal file."""
+    rows = np.ascontiguousarray(points, "<f4")
+    name = f"{hashlib.sha256(rows.tobytes()).hexdigest()[:16]}.ply"
+    file = made_folder(Path(cache or default_cache()) / "shapes") / name
+    if not file.is_file():
+        vertices = rows.view([(axis, "<f4") for axis in "xyz"])[:, 0]
+        with written_whole(file) as partial:
+            PlyData([PlyElement.describe(vertices, "vertex")]).write(str(partial))
+    return str(file)
 
 
 def read_clouds(folder: Path, frames: Sequence[int]) -> tuple[Tensor, ...]:

@@ -93,6 +93,7 @@ def scene_from_footage(
     holdout_frames=(),
     particles: Path | None = None,
     body: Mapping[str, Any] | None = None,
+    driven: tuple[dict[str, Any], ...] = (),
     known_parameters: dict[str, float] | None = None,
     truth: Truth | None = None,
     synthetic: bool = False,
@@ -101,7 +102,8 @@ def scene_from_footage(
 
     gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; start: falling | rest;
     last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
-    per frame; body: {shape: file, scale} of a known rest shape; fps overrides times.
+    per frame; body: {shape: file, scale} of a known rest shape; driven: as of
+    `Scene`; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
     check_types(footage, f"scene {name} ({sequence})")
@@ -149,7 +151,7 @@ def scene_from_footage(
         holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names, fewest),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
         particles=read_clouds(particles, footage.frames) if particles is not None else None,
-        known_parameters=dict(known_parameters or {}), body=known,
+        known_parameters=dict(known_parameters or {}), body=known, driven=driven,
     )  # fmt: skip
     return replace(scene, fingerprint=fingerprint(scene))
 

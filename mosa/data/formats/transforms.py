@@ -25,14 +25,13 @@ from mosa.data.formats.footage import (
     world_to_camera,
 )  # fmt: skip
 from mosa.data.formats.scene_from_footage import scene_from_footage
+from mosa.data.formats.views import split_alpha, split_mask
 from mosa.data.images.lens import COEFFICIENTS, FOREIGN, is_fisheye, lens_of
 from mosa.data.images.reading import (
     check_amount,
     composite,
     expect_size,
-    faintless,
     fill_holes,
-    matte_of,
     read_image,
     resize,
     scaled_size,
@@ -315,16 +314,13 @@ def clocks(by_camera: dict[str, list[Shot]], fps: float | None) -> str:
 def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     """Colour (H, W, 3) and matte (H, W). Errors: DataError where there is no matte."""
     pixels = read_image(shot.image)
-    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
     if shot.mask is not None:
-        mask = read_image(shot.mask)
-        expect_size(shot.mask, mask, *pixels.shape[1::-1], reason=f"as {shot.image.name}")
-        return color, matte_of(shot.mask, mask)
+        return split_mask(shot.image, pixels, shot.mask)
     if pixels.shape[2] != 4:
         raise DataError(
             f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
         )
-    return color, faintless(shot.image, np.ascontiguousarray(pixels[..., 3]))
+    return split_alpha(shot.image, pixels)
 
 
 def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from mosa.data.images.reading import (
     expect_size,
     faintless,
     fill_holes,
+    matte_of,
     read_image,
     resize,
     scaled_size,
@@ -71,3 +72,11 @@ def split_alpha(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]
             f"{path}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels"
         )
     return pixels[..., :3], faintless(path, np.ascontiguousarray(pixels[..., 3]))
+
+
+def split_mask(picture: Path, pixels: np.ndarray, mask: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) of a picture's pixels and matte (H, W) of its mask, white = object. Errors: DataError."""
+    found = read_image(mask)
+    expect_size(mask, found, *pixels.shape[1::-1], reason=f"as {picture.name}")
+    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+    return color, matte_of(mask, found)

@@ -33,7 +33,7 @@ from mosa.data.synthetic.surface import (
     flowing_surface,
 )
 from mosa.errors import ConfigError, DataError
-from mosa.system.caches import cache_home
+from mosa.system.caches import default_cache
 from mosa.system.npz import read_npz
 from mosa.system.progress import tqdm
 from mosa.system.threads import threaded
@@ -57,11 +57,6 @@ class Film:
     positions: np.ndarray
     rotation: np.ndarray
     velocity: np.ndarray
-
-
-def default_cache() -> Path:
-    """$XDG_CACHE_HOME/mosa or ~/.cache/mosa."""
-    return Path(cache_home()) / "mosa"
 
 
 def cameras_of(body: BuiltinObject, seed: int) -> Cameras:

@@ -180,9 +180,9 @@ def driven_from_config(
     """Driven sets of plain containers, as a YAML file has them; a `Driven` is passed on.
 
     Each: the region as a collider's shape (type with its keys, position, rotation or normal),
-    `indices`, or `points`; motion as a collider's, or {path: an npz with times (T,) [s] and points
-    (T, n, 3) [m]}; mass [kg]; held; name. Errors: ConfigError naming the entry and the field,
-    DataError naming the file.
+    `indices`, or `points`; motion as a collider's, or times (T,) [s] and points (T, n, 3) [m], as
+    {path: an npz} or as lists; mass [kg]; held; name. Errors: ConfigError naming the entry and
+    the field, DataError naming the file.
     """
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
         raise ConfigError(f"{field_name}: expected a list of driven sets, found {items!r}")
@@ -200,11 +200,11 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
     name = item.pop("name", f"driven{number}")
     more = {key: item.pop(key) for key in ("mass", "held") if key in item}
     own = {key: item.pop(key) for key in ("indices", "points") if key in item}
-    path = (item.get("motion") or {}).get("path")
-    moved = None if path is None else _points(path, where)
-    if moved is not None:
-        if set(item.pop("motion")) != {"path"}:
-            raise ConfigError(f"{where}.motion: path stands alone")
+    moved, given = None, set(item.get("motion") or {})
+    if given & {"path", "points"}:
+        if given not in ({"path"}, {"times", "points"}):
+            raise ConfigError(f"{where}.motion: expected path alone, or times and points")
+        moved = _points(item.pop("motion"), where)
         if own:
             raise ConfigError(
                 f"{where}: {next(iter(own))} and motion.path: expected a type, or none"
@@ -232,8 +232,19 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
     return Driven(region, motion, place=place, name=name, **more)
 
 
-def _points(path: Any, where: str) -> Points:
-    if not isinstance(path, str):
+def _points(given: Mapping[str, Any], where: str) -> Points:
+    path = given.get("path")
+    if path is None:
+        try:
+            return Points(
+                *(torch.tensor(given[k], dtype=torch.float64) for k in ("times", "points"))
+            )
+        except (ConfigError, KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{where}.motion: expected lists times [s] and points [m] of shape (T,) and "
+                f"(T, n, 3), found others ({error})"
+            ) from error
+    if not isinstance(path := given["path"], str):
         raise ConfigError(f"{where}.motion.path: expected an npz file, found {path!r}")
     arrays = read_npz(Path(path))
     if missing := [key for key in ("times", "points") if key not in arrays]:

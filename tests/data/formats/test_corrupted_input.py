@@ -230,7 +230,8 @@ def test_corrupted_particles(pacnerf_folder, tmp_path, name):
 KEYS = [
     (
         {"format": "nerf"},
-        "scene.format: expected one of builtin, markers, pacnerf, spring_gaus, transforms, found 'nerf'",
+        "scene.format: expected one of builtin, markers, pacnerf, phystwin, spring_gaus, "
+        "spring_gaus_real, transforms, found 'nerf'",
     ),
     ({"path": None}, "scene.path: expected the folder"),
     ({"colour": "red"}, "scene.colour: not a key of this format"),

@@ -159,6 +159,8 @@ def test_points_of_a_file_lead_what_is_nearest(tmp_path):
     write_npz(tmp_path / "led.npz", {"times": torch.tensor([0.0, 0.1]).numpy(), "points": points})
     (led,) = driven_from_config([{"motion": {"path": str(tmp_path / "led.npz")}}])
     assert len(led.chosen(X)) == 2 and led.motion.points.shape == (2, 2, 3)
+    (same,) = driven_from_config([{"motion": {"times": [0.0, 0.1], "points": points.tolist()}}])
+    assert torch.equal(same.motion.points, led.motion.points)
 
 
 @pytest.mark.parametrize("entry, said", [
@@ -167,6 +169,8 @@ def test_points_of_a_file_lead_what_is_nearest(tmp_path):
     ({"indices": [-1]}, r"driven\[0\].indices: expected a list of numbers of particles"),
     ({"indices": [1], "mass": -2.0}, r"driven\[0\].mass"),
     ({"type": "sphere"}, "a sphere needs radius"),
+    ({"motion": {"times": [0.0, 1.0], "points": [[[1, 2, 3]], [[1, 2]]]}}, r"driven\[0\].motion: expected lists times"),
+    ({"motion": {"points": [[[1, 2, 3]]]}}, r"driven\[0\].motion: expected path alone, or times and points"),
 ])  # fmt: skip
 def test_a_wrong_entry_names_its_key(entry, said):
     with pytest.raises(ConfigError, match=said):

@@ -8,10 +8,10 @@ import pytest
 from filming import cameras, in_world
 from scipy.spatial.transform import Rotation
 
-from mosa.capture.colmap import MODELS, read_model, read_points
 from mosa.capture.phones import Camera
 from mosa.capture.poses import belongs, read_phones, read_poses, scene_points
 from mosa.data.formats.footage import OPENGL_TO_OPENCV
+from mosa.data.io.colmap import MODELS, read_model, read_points
 from mosa.errors import DataError
 
 LENS = (0.05, -0.02, 0.001, -0.002)
