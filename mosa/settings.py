@@ -79,7 +79,6 @@ Whole = Annotated[int, Ge(0), Le(MOST)]
 Width = Annotated[int, Ge(1), Le(WIDEST)]
 Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
 Text = Annotated[str, Expected("a text")]
-Names = Annotated[list[str], Expected("a list of names like [a, b]")]
 Section = Annotated[dict[str, Any], Expected("a section of keys")]
 Entries = Annotated[list[dict[str, Any]], Expected("a list of sections")]
 Three = Annotated[
@@ -116,6 +115,10 @@ def folder(value: str) -> str:
     return value
 
 
+Names = Annotated[
+    list[str], Expected("a list of names like [a, b], each once"),
+    such(lambda v: len(set(v)) == len(v)),
+]  # fmt: skip
 Folder = Annotated[str, Expected("the path of a folder"), AfterValidator(folder)]
 
 
@@ -217,6 +220,9 @@ def nearest(key: str, known: list[str], where: str) -> str:
 
 def shown(value: Any) -> str:
     text = repr(value)
+    if shape := getattr(value, "shape", ()):  # of an array the kind is what matters
+        kind = (str(getattr(value, part, "")) for part in ("dtype", "layout", "device"))
+        text = f"{type(value).__name__} ({' '.join(kind)}) of shape {tuple(shape)}"
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 

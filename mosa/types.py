@@ -15,6 +15,8 @@ def in_brief(held: Any) -> str:
 
     def said(value: Any) -> str:
         if isinstance(value, Tensor):
+            if not dense(value):
+                return f"{value.layout} on {value.device}"
             return str(tuple(value.shape)) if value.numel() > 3 else str(value.tolist())
         if isinstance(value, (tuple, list, dict)) and len(value) > 3:
             return f"{len(value)} items"
@@ -23,6 +25,13 @@ def in_brief(held: Any) -> str:
     parts = ((f.name, getattr(held, f.name)) for f in fields(held) if f.repr)
     shown = ", ".join(f"{name}={said(value)}" for name, value in parts if value is not None)
     return f"{type(held).__name__}({shown})"
+
+
+def dense(value: Any) -> bool:
+    """Whether it is a tensor whose numbers lie in memory: not sparse, nested, quantised or meta."""
+    if not isinstance(value, Tensor) or value.is_quantized or value.is_nested:
+        return False
+    return value.layout is torch.strided and not value.is_meta
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ What is promised, and what is not, is in docs/safety.md.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import pickletools
@@ -20,24 +19,21 @@ import torch
 from torch import Tensor
 
 from mosa.config.record import VERSION, BodyRecord, PosteriorRecord, RunRecord, SplatsRecord
+from mosa.data.formats.footage import read_json
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.uncertainty import INFLATION
 from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.settings import Names, check
 from mosa.system.limits import machine_memory
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
 RESUMED = (
-    "epoch",
-    "global_step",
-    "pytorch-lightning_version",
-    "loops",
-    "callbacks",
-    "optimizer_states",
+    "epoch", "global_step", "pytorch-lightning_version", "loops", "callbacks", "optimizer_states",
     "lr_schedulers",
-)
+)  # fmt: skip
 """What Lightning reads where a fit goes on."""
 NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter",
          *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte",
@@ -222,10 +218,11 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
     that its results say. Errors: DataError naming the file, ConfigError naming `where`."""
     if os.path.isfile(path) and Path(path).suffix == ".json":
         try:
-            found = json.loads(Path(path).read_text())
+            found = read_json(Path(path))
             law, stiffness = str(found["law"]), dict(found["stiffness"] or {})
             own = found["posterior"]
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
+            check("posterior.names", own["names"], Names)
             named = [_as_operator(name) for name in own["names"]]
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,

@@ -14,7 +14,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from annotated_types import Interval
 from pydantic import AllowInfNan, BeforeValidator, model_validator
-from torch import Tensor
 
 from mosa.config.command_settings import BodySections
 from mosa.data.scene import GroundSettings
@@ -38,12 +37,14 @@ from mosa.settings import (
     such,
 )
 from mosa.system.limits import machine_memory
-from mosa.types import AUTO, Ground
+from mosa.types import AUTO, Ground, dense
 
 VERSION = 3
 """Of a record; grows whenever its fields change. There is one reader, of this version."""
 STRONGEST, WIDEST = 1e4, 1e5
 """[m/s^2] of gravity and [m] of a world's box."""
+LARGEST_MEAN = 300.0
+"""Of a posterior's numbers, most of which are logarithms."""
 BOUND_BYTES = 4000
 """Of a splat while it is bound to its neighbours."""
 SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,),
@@ -53,7 +54,7 @@ SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "co
 def finite(value: Any, *shapes: Sequence[int | None]) -> bool:
     """Whether it is a dense tensor of finite floating point numbers, of one of these shapes; None: any length."""
     return (
-        isinstance(value, Tensor)
+        dense(value)
         and value.is_floating_point()
         and bool(torch.isfinite(value).all())
         and (not shapes or any(len(s) == value.ndim and all(a in (None, b) for a, b in zip(s, value.shape)) for s in shapes))
@@ -220,8 +221,17 @@ class PosteriorRecord(Settings):
                 raise ConfigError(
                     f"mosa.posterior.{name}: expected {' x '.join(map(str, shape))} finite numbers"
                 )
-        if not float(torch.linalg.eigvalsh(self.covariance.double()).min()) > 0:
-            raise ConfigError("mosa.posterior.covariance: expected a positive definite matrix")
+        C = self.covariance.double()
+        spread = torch.linalg.eigvalsh(C)
+        even = float((C - C.mT).abs().max()) <= 1e-6 * float(C.abs().max())
+        if not even or not 1e-30 < float(spread.min()) <= float(spread.max()) < 1e30:
+            raise ConfigError(
+                "mosa.posterior.covariance: expected a symmetric, positive definite matrix"
+            )
+        if float(self.mean.abs().max()) > LARGEST_MEAN:
+            raise ConfigError(
+                f"mosa.posterior.mean: expected logarithms, numbers within {LARGEST_MEAN:g}"
+            )
         return self
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from mosa.config.build import build_adapter
+from mosa.data.formats.footage import read_json
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation.analysis.law_stress import described, in_double, operator
 from mosa.export.energies import ENERGIES, STIFFNESS, Energy, energy
@@ -42,7 +43,7 @@ def read_source(path: str | Path) -> Source:
 def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
     """What `mosa-material` wrote. Errors: DataError naming the file and what is wrong."""
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
+        found: dict[str, Any] = read_json(path)
         material = in_double(Material(found["law"], found["parameters"]))
         for name in material.directions:  # starts at its own value: the angles are 0
             getattr(material, f"frame_{name}").data = getattr(material, f"frame_{name}").double()

@@ -32,8 +32,9 @@ from mosa.physics.engine.axes import entered
 from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.numerics import State, flat
 from mosa.physics.time.clock import Moment
+from mosa.settings import shown
 from mosa.twin.start import check_wants_no_gradients
-from mosa.types import ParticleState, in_brief
+from mosa.types import ParticleState, dense, in_brief
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
 
@@ -123,6 +124,7 @@ class Episode:
             "frame_dt": frame_dt,
             "model": body.model(variant),
             "substeps": substeps,
+            "enough": True,
         }
         with self._gradients():
             if self.worlds is None:
@@ -171,18 +173,10 @@ class Episode:
         now = self.state
         for f in fields(TwinState):
             found, known = getattr(state, f.name), getattr(now, f.name)
-            if (
-                not isinstance(found, Tensor)
-                or found.shape != known.shape
-                or found.dtype != known.dtype
-            ):
-                what = (
-                    f"{found.dtype} {tuple(found.shape)}"
-                    if isinstance(found, Tensor)
-                    else repr(found)
-                )
+            if not dense(found) or found.shape != known.shape or found.dtype != known.dtype:
                 raise ConfigError(
-                    f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}"
+                    f"state.{f.name}: expected a dense tensor {known.dtype} {tuple(known.shape)}, "
+                    f"found {shown(found)}"
                 )
             if not bool(torch.isfinite(found.detach()).all()):
                 raise ConfigError(
@@ -246,13 +240,8 @@ class Episode:
             )
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
-        again = dict(
-            zip(
-                which,
-                starts if starts is not None else [self._starts[b] for b in which],
-                strict=True,
-            )
-        )
+        starts = [self._starts[b] for b in which] if starts is None else starts
+        again = dict(zip(which, starts, strict=True))
         with self._gradients():
             moved = chosen[:, None] & self._driven  # solids that are back
             poses = tuple(torch.where(moved.view(*moved.shape, *(1,) * (first.ndim - 2)), first, now)

@@ -6,9 +6,10 @@ from strangers import checkpoint, cube, saved
 
 from mosa.config.build import build_body, world_of
 from mosa.config.checkpoints import known_numbers
-from mosa.config.record import BodyRecord, RunRecord
+from mosa.config.record import BodyRecord, PosteriorRecord, RunRecord
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.uncertainty import INFLATION
+from mosa.export.source import read_source
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import blocks_of, tensors_of
@@ -76,5 +77,23 @@ def test_what_a_fit_said_is_read_from_its_checkpoint(tmp_path):
     found = known_numbers(str(path), Material(law, {"E": 1e5, "nu": 0.3}), None, "known")
     assert found.names == ["E"] and float(found.mean) == 11.0
     assert float(found.covariance) == pytest.approx(INFLATION**2 * 0.04)
+    for key, value, message in (
+        (
+            "covariance",
+            covariance + torch.triu(torch.full((3, 3), 1e-3), 1),
+            "a symmetric, positive definite",
+        ),
+        ("covariance", 1e-40 * covariance, "a symmetric, positive definite"),
+        ("mean", said["mean"] + 1e3, "logarithms, numbers within 300"),
+        ("names", ["E", "contact", "E"], "a list of names .*, each once"),
+    ):
+        with pytest.raises(ConfigError, match=f"expected {message}"):
+            PosteriorRecord.read(said | {key: value})
+    twice = tmp_path / "material.json"
+    twice.write_text('{"law": "corotated", "stiffness": null, "stiffness": {}}')
+    with pytest.raises(DataError, match=r"material\.json.*'stiffness' twice"):
+        known_numbers(str(twice), Material(law, {"E": 1e5, "nu": 0.3}), None, "known")
+    with pytest.raises(DataError, match=r"material\.json.*'stiffness' twice"):
+        read_source(twice)
     with pytest.raises(DataError, match=r"known: .*: expected the checkpoint of an ended fit"):
         known_numbers(str(checkpoint(tmp_path / "b.ckpt")), Material(law, {"E": 1e5, "nu": 0.3}), None, "known")  # fmt: skip

@@ -38,6 +38,17 @@ def twin(precision=64, world=WORLD, **options):
     )
 
 
+def test_fewer_substeps_than_the_law_needs_are_refused_by_number():
+    made = twin()
+    made.reset(substeps=7)
+    laws = read_numbers(made.body).expand(2, -1)
+    for begin in (made.reset, made.worlds(2).reset, made.worlds(2, laws).reset):
+        with pytest.raises(
+            ConfigError, match=r"7 substeps per frame needed .* limit is 6: .* or raise substeps"
+        ):
+            begin(substeps=6)
+
+
 @pytest.mark.parametrize("adaptive", [False, True])
 @pytest.mark.parametrize("added", [1e8, 1e9, 3e38])
 def test_a_state_of_any_speed_is_refused_by_what_it_takes(added, adaptive):
@@ -52,10 +63,15 @@ def test_a_state_of_any_speed_is_refused_by_what_it_takes(added, adaptive):
 
 def test_a_step_that_is_too_long_for_its_speed_is_refused():
     made = twin()
-    made.reset(velocity=(2e5, 0, 0), control_dt=1, substeps=1)
+    with pytest.raises(
+        ConfigError, match=r"10014701 substeps per frame needed .* or raise substeps"
+    ):
+        made.reset(velocity=(2e5, 0, 0), control_dt=1, substeps=1)
+    state = made.reset(control_dt=1, substeps=600)
+    made.state = replace(state, v=state.v + 2e5 * torch.eye(3)[0])
     with pytest.raises(
         SimulationDiverged,
-        match=r"particles spread over 1e\+07 x .* \(speeds to 2e\+05 m/s\): use more substeps",
+        match=r"particles spread over 533344 x .* \(speeds to 2e\+05 m/s\): use more substeps",
     ):
         made.step()
 
@@ -500,9 +516,14 @@ def test_errors_of_starts_and_states():
         made.state = replace(made.state, substeps=torch.tensor(2**62))
     with pytest.raises(
         ConfigError,
-        match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)",
+        match=r"state\.x: expected a dense tensor torch.float64 \(120, 3\), found Tensor \(torch.float64 .* \(7, 3\)",
     ):
         made.state = replace(made.state, x=torch.zeros(7, 3).double())
+    for other in (made.state.F.to_sparse(), made.state.F.to("meta"), None):
+        with pytest.raises(
+            ConfigError, match=r"state\.F: expected a dense tensor .*, found (None|Tensor)"
+        ):
+            made.state = replace(made.state, F=other)
     made.reset(colliders=[PUSHER])
     for name, value, message in (
         ("position", math.nan, "finite numbers, found nan"),

@@ -6,16 +6,19 @@ import hashlib
 import math
 import warnings
 from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import InstanceOf
 
 from mosa.data.checks.cameras import check_agreement, holes_report
 from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
 from mosa.data.checks.tangents import check_pictures
 from mosa.data.formats.footage import TIME_JITTER, Footage
-from mosa.errors import DataError
-from mosa.types import Scene
+from mosa.errors import ConfigError, DataError
+from mosa.settings import Expected, Positive, Text, Whole, check_values, fits, such
+from mosa.types import FALLING, REST, Cameras, Ground, KnownBody, Markers, Scene, Truth, dense
 
 FULL = 0.99
 """Share of an image from which on a matte says nothing."""
@@ -41,12 +44,37 @@ MAX_FOCAL_RATIO, USUAL_FOCAL_RATIO = 2.0, 1.05
 """Ratios of a camera's two focal lengths that are an error, and above which a warning is given: sensors have square pixels."""
 
 
+Dense = Annotated[
+    Any, Expected("a dense tensor of torch.float32 without gradients"),
+    such(lambda t: dense(t) and t.dtype == torch.float32 and not t.requires_grad),
+]  # fmt: skip
+Indices = Annotated[tuple[int, ...], Expected("a tuple of numbers")]
+PARTS: dict[str, Any] = {
+    **dict.fromkeys(("images", "mattes", "times", "background", "gravity", "up", "box"), Dense),
+    "cameras": Annotated[
+        Any, Expected("Cameras of dense tensors of torch.float32, with texts as names"),
+        such(lambda c: isinstance(c, Cameras) and fits(tuple[str, ...], c.names)
+             and fits(Dense, c.K) and fits(Dense, c.w2c)),
+    ],
+    "name": Text, "sequence": Text, "density": Positive, "synthetic": bool,
+    "start": Literal[FALLING, REST], "last_free_frame": Whole | None,
+    "holdout_cameras": Indices, "holdout_frames": Indices,
+    "particles": Annotated[Any, Expected("None or a tuple of dense tensors"),
+                           such(lambda p: p is None or all(map(dense, p)))],
+    "ground": Annotated[InstanceOf[Ground] | None, Expected("a Ground or None")],
+    "truth": Annotated[InstanceOf[Truth] | None, Expected("a Truth or None")],
+    "markers": Annotated[InstanceOf[Markers] | None, Expected("Markers or None")],
+    "body": Annotated[InstanceOf[KnownBody] | None, Expected("a KnownBody or None")],
+}  # fmt: skip
+"""Types of the parts of a `Scene` and of `Footage`."""
+
+
 def validate(scene: Scene) -> Scene:
     """The scene itself. Errors: DataError naming camera and frame, what was expected and what was found.
 
     Suspicious holes in the mattes of real footage are a warning: only who took it knows whether they are openings.
     """
-    if scene.markers is not None:  # which its reader has checked
+    if isinstance(scene.markers, Markers):  # which its reader has checked
         return scene
     label = f"scene {scene.name} ({scene.sequence})"
     check_types(scene, label)
@@ -89,23 +117,34 @@ def validate(scene: Scene) -> Scene:
 
 
 def check_types(film: Scene | Footage, label: str) -> None:
-    """Every array is a tensor of the type and shape that `Footage` states. Errors: DataError."""
+    """Every part is of its type, every array of its shape, and what is held out is there.
+    Errors: DataError."""
+    try:
+        check_values(vars(film), PARTS, label)
+    except ConfigError as error:
+        raise DataError(str(error)) from None
     cameras = film.cameras
     V, H, W = len(cameras.names), cameras.height, cameras.width
-    T = film.frames if isinstance(film, Scene) else len(film.frames)
-    for name, found, shape in (
-        ("images", film.images, (V, T, H, W, 3)), ("mattes", film.mattes, (V, T, H, W)), ("times", film.times, (T,)),
-        ("background", film.background, (3,)), ("cameras.K", cameras.K, (V, 3, 3)), ("cameras.w2c", cameras.w2c, (V, 4, 4)),
-    ):  # fmt: skip
-        if getattr(found, "dtype", None) != torch.float32:
-            kind = f"{type(found).__name__} of {getattr(found, 'dtype', 'no numbers')}"
+    T = len(film.frames) if isinstance(film, Footage) else film.times.numel()
+    shapes = {"times": (T,), "images": (V, T, H, W, 3), "mattes": (V, T, H, W), "background": (3,),
+              "gravity": (3,), "up": (3,), "box": (2, 3), "cameras.K": (V, 3, 3),
+              "cameras.w2c": (V, 4, 4)}  # fmt: skip
+    own = vars(film) | {"cameras.K": cameras.K, "cameras.w2c": cameras.w2c}
+    for name, shape in shapes.items():
+        if name in own and tuple(own[name].shape) != shape:
             raise DataError(
-                f"{label}: {name}: expected a torch.float32 tensor, found {kind}; torch.as_tensor(..., dtype=torch.float32)"
+                f"{label}: {name}: expected shape {shape}, found {tuple(own[name].shape)}"
             )
-        if tuple(found.shape) != shape:
-            raise DataError(f"{label}: {name}: expected shape {shape}, found {tuple(found.shape)}")
-    if other := [name for name in cameras.names if not isinstance(name, str)]:
-        raise DataError(f"{label}: cameras.names: expected strings, found {other[0]!r}")
+    if isinstance(film, Footage):
+        return
+    last = range(T - len(film.holdout_frames), T)
+    known = set(film.holdout_cameras) <= set(range(V)) and (film.last_free_frame or 0) < T
+    if not known or sorted(film.holdout_frames) != list(last):
+        raise DataError(
+            f"{label}: expected holdout_cameras below {V}, last_free_frame below {T} and "
+            f"holdout_frames that are the last ones, found {film.holdout_cameras}, "
+            f"{film.last_free_frame} and {film.holdout_frames}"
+        )
 
 
 def check_background(scene: Scene, label: str) -> None:
@@ -334,26 +373,14 @@ def fingerprint(scene: Scene) -> str:
     """Hash of everything that learning can depend on: images, mattes, cameras, times, world, and what is held out."""
     digest = hashlib.sha256()
     for tensor in (
-        scene.images,
-        scene.mattes,
-        scene.cameras.K,
-        scene.cameras.w2c,
-        scene.times,
-        scene.gravity,
-        scene.up,
-        scene.box,
-        scene.background,
-    ):
+        scene.images, scene.mattes, scene.cameras.K, scene.cameras.w2c, scene.times, scene.gravity,
+        scene.up, scene.box, scene.background,
+    ):  # fmt: skip
         digest.update(str(tuple(tensor.shape)).encode())
         digest.update(tensor.detach().cpu().contiguous().numpy())
     facts = (
-        scene.cameras.width,
-        scene.cameras.height,
-        scene.ground,
-        scene.density,
-        scene.last_free_frame,
-        scene.holdout_cameras,
-        scene.holdout_frames,
-    )
+        scene.cameras.width, scene.cameras.height, scene.ground, scene.density,
+        scene.last_free_frame, scene.holdout_cameras, scene.holdout_frames,
+    )  # fmt: skip
     digest.update(repr((*facts, scene.driven) if scene.driven else facts).encode())
     return digest.hexdigest()[:16]

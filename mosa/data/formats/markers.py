@@ -36,23 +36,13 @@ WIDE = 3.0
 
 
 def load_markers(
-    *,
-    path: Path,
-    body: Mapping[str, Any],
-    density: float,
-    ground: Ground | None = None,
-    name: str | None = None,
-    sequence: str = "train",
-    points: Mapping[str, Sequence[float]] | None = None,
-    tracked: Sequence[str] | None = None,
-    start: float | str = AUTO,
-    duration: float | None = None,
-    fps: float | None = None,
-    up: Sequence[float] = (0, 1, 0),
-    gravity: Sequence[float] = (0, -9.8, 0),
-    loads: Sequence[Mapping[str, Any]] = (),
-    holdout_frames: int = 0,
-) -> Scene:
+    *, path: Path, body: Mapping[str, Any], density: float, ground: Ground | None = None,
+    name: str | None = None, sequence: str = "train",
+    points: Mapping[str, Sequence[float]] | None = None, tracked: Sequence[str] | None = None,
+    start: float | str = AUTO, duration: float | None = None, fps: float | None = None,
+    up: Sequence[float] = (0, 1, 0), gravity: Sequence[float] = (0, -9.8, 0),
+    loads: Sequence[Mapping[str, Any]] = (), holdout_frames: int = 0,
+) -> Scene:  # fmt: skip
     """A sequence without cameras, whose frame 0 is when the body was let go at rest, undeformed.
 
     path: the recording (`read_markers`); body: {type: box, size} or {type: mesh, path, scale} with
@@ -122,31 +112,18 @@ def load_markers(
                 "what holds it belongs to world.driven"
             )
     nothing = torch.zeros(0, frames, 1, 1)
+    at_rest, tracks = (torch.from_numpy(each).float() for each in (rest, moving))
     return Scene(
-        name=name or Path(path).stem,
-        sequence=sequence,
+        name=name or Path(path).stem, sequence=sequence, mattes=nothing,
         images=nothing[..., None].expand(-1, -1, -1, -1, 3),
-        mattes=nothing,
         cameras=Cameras(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4), 1, 1, ()),
-        times=torch.arange(frames) / rate,
-        gravity=pull,
-        up=upright,
-        ground=ground,
-        box=torch.stack([low - far, high + far]).float(),
-        density=float(density),
-        background=torch.ones(3),
-        synthetic=False,
-        last_free_frame=0,
+        times=torch.arange(frames) / rate, gravity=pull, up=upright, ground=ground,
+        box=torch.stack([low - far, high + far]).float(), density=float(density),
+        background=torch.ones(3), synthetic=False, last_free_frame=0,
         holdout_frames=tuple(range(frames - holdout_frames, frames)),
         fingerprint=hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16],
-        markers=Markers(
-            names,
-            torch.from_numpy(rest).float(),
-            torch.from_numpy(moving).float(),
-            solid,
-            tuple(dict(each) for each in loads),
-        ),
-    )
+        markers=Markers(names, at_rest, tracks, solid, tuple(dict(each) for each in loads)),
+    )  # fmt: skip
 
 
 def medians(places: np.ndarray) -> np.ndarray:
@@ -161,7 +138,8 @@ def medians(places: np.ndarray) -> np.ndarray:
 
 def solid_of(body: Mapping[str, Any], folder: Path):
     """The body at rest as a solid with a pose. folder: of relative paths. Errors: ConfigError."""
-    if not isinstance(body, Mapping) or body.get("type") not in ("box", "mesh"):
+    moves = isinstance(body, Mapping) and body.get("motion")
+    if moves or not isinstance(body, Mapping) or body.get("type") not in ("box", "mesh"):
         raise ConfigError(
             "scene.body: expected {type: box, size: [x, y, z]} or {type: mesh, path: <file>}, with "
             f"position and rotation, found {body!r}"

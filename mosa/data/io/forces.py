@@ -3,12 +3,13 @@ takes in a rollout."""
 
 from __future__ import annotations
 
+import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,22 +97,25 @@ def forces_from_config(
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     """Errors: DataError naming the file, what was expected and found."""
     try:
-        found = np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8-sig")
-    except (OSError, ValueError, IndexError) as error:
-        raise DataError(f"{path}: expected a csv of {', '.join(COLUMNS)}, found {error}") from error
-    names = found.dtype.names or ()
-    if "time" not in names or not set(names) & set(COLUMNS[1:]):
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file, skipinitialspace=True) if "".join(row).strip()]
+        names, *rows = [[cell.strip() for cell in row] for row in rows if row[0][:1] != "#"] or [[]]
+        known = [name for name in names if name in COLUMNS]
+        if len(set(known)) < max(2, len(known)) or "time" not in known:
+            raise ValueError(f"the columns {', '.join(names)}")
+        found = {name: [float(row[names.index(name)] or "nan") for row in rows] for name in known}
+    except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(
-            f"{path}: expected columns {', '.join(COLUMNS)} (SI units), found {', '.join(names) or 'none'}"
-        )
-    found = np.atleast_1d(found)
-    blank = np.full(len(found), np.nan)
-    times = torch.from_numpy(np.array(found["time"]))
-    columns = [found[name] if name in names else blank for name in COLUMNS[1:]]
-    forces = torch.from_numpy(np.stack(columns, 1))
+            f"{path}: expected a csv of {', '.join(COLUMNS)} (SI units), found {error}"
+        ) from error
+    blank = [math.nan] * len(rows)
+    times, *columns = (
+        torch.tensor(found.get(name, blank), dtype=torch.float64) for name in COLUMNS
+    )
+    forces = torch.stack(columns, 1)
     if len(times) < 2 or not bool((times.diff() > 0).all()):
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
-    there = forces[torch.isfinite(forces)]
+    there = forces[~torch.isnan(forces)]
     if not len(there) or not 0 < float(there.abs().max()) <= LARGEST:
         raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")
     return ForceCurve(of, times, forces, sd)

@@ -27,6 +27,13 @@ EARLY = 0.4
 """Of the largest displacement: up to there it grows as the square of the time since the release."""
 SWINGS = 4
 """Periods of an oscillation that say when it began."""
+MIRRORED = 1 / 3
+"""Of the distance of aligned points: that of points mirrored, below which they are said to be."""
+JUMP = 0.3
+"""Of the points' extent: no body is deformed by so much within a sample."""
+FROZEN, DIGITS = 0.1, 4
+"""Of the largest step, and last digits: a point that moves by more before and after does not stand
+still between."""
 GAP = 2.5
 """Samples apart between which a recording is interpolated; a longer gap stays one."""
 
@@ -84,7 +91,40 @@ def read_markers(path: Path) -> Recording:
         raise DataError(f"{path}: expected times in seconds, found samples {apart:g} s apart")
     if len(set(found.names)) < len(found.names):
         raise DataError(f"{path}: expected every point's name once, found {found.names}")
+    check_moves_on(found, str(path))
     return found
+
+
+def check_moves_on(found: Recording, where: str) -> None:
+    """No point stands still to the last digit and moves on, or jumps away from the others. Errors:
+    DataError naming the point and the times."""
+    moves = np.diff(found.positions, axis=0)
+    steps = np.linalg.norm(moves, axis=-1)
+    digit = np.abs(moves[np.nan_to_num(moves) != 0]).min(initial=np.inf)  # of a rounded file
+    fast = steps > max(FROZEN * np.nan_to_num(steps).max(), DIGITS * digit)
+    for m, name in enumerate(found.names):
+        ends = np.flatnonzero(np.diff(np.r_[False, steps[:, m] == 0, False])).reshape(-1, 2)
+        for first, last in ends[ends[:, 0] > 0]:
+            before, long, over = first - 1, last - first > 1, last == len(steps)
+            if not over and not long:  # one sample, of all points: of one of them it is chance
+                long = moves[before, m] @ moves[last, m] > 0 and not (steps[first] > 0).any()
+            if fast[before, m] and long and (over or fast[last, m]):
+                raise DataError(
+                    f"{where}: expected points that move on, found {name!r} at one place from "
+                    f"{found.times[first]:g} to {found.times[last]:g} s in the middle of a motion: "
+                    "a recording that froze? Leave these rows out"
+                )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of frames in which nothing is seen
+        place = np.nanmedian(found.positions, 0)
+        size = np.nanmax(np.nanmax(place, 0) - np.nanmin(place, 0))
+        alone = np.linalg.norm(moves - np.nanmedian(moves, 1, keepdims=True), axis=-1)
+    for t, m in np.argwhere(alone > JUMP * size)[:1]:
+        raise DataError(
+            f"{where}: expected points that move with the others, found {found.names[m]!r} "
+            f"{alone[t, m]:.2g} m away from them within one sample at {found.times[t + 1]:g} s: "
+            "exchanged names? Leave these rows out"
+        )
 
 
 def _read_c3d(path: Path) -> Recording:
@@ -227,9 +267,15 @@ def alignment(
         raise ConfigError(f"{where}: expected three points that are seen at rest, found fewer")
     a, b = seen[there], target[there]
     p, q = a - a.mean(0), b - b.mean(0)
-    S = np.linalg.svd(p.T @ q, compute_uv=False)
+    U, S, Vh = np.linalg.svd(p.T @ q)
     if S[1] < 1e-6 * S[0]:
         raise ConfigError(f"{where}: expected points that are not on one line")
     R = Rotation.align_vectors(q, p)[0].as_matrix()
     t = b.mean(0) - R @ a.mean(0)
-    return R, t, float(np.sqrt(((a @ R.T + t - b) ** 2).sum(1).mean()))
+    off, mirrored = (np.sqrt(((p @ M.T - q) ** 2).sum(1).mean()) for M in (R, (U @ Vh).T))
+    if mirrored < MIRRORED * off:  # where U Vh is a rotation, both are the same
+        raise ConfigError(
+            f"{where}: expected a recording in right-handed axes, found its points {1e3 * off:.2g} "
+            f"mm (rms) from their places, and {1e3 * mirrored:.2g} mm with one axis mirrored"
+        )
+    return R, t, float(off)

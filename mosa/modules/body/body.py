@@ -55,28 +55,16 @@ class Body(nn.Module):
     """The last simulator, and for what it was made."""
 
     def __init__(
-        self,
-        *,
-        rest: Tensor,
-        volume: Tensor,
-        colors: Tensor,
-        opacities: Tensor,
-        covariances: Tensor,
-        density: float,
-        material: Material,
-        heterogeneity: StiffnessField | None,
-        adapter: Adapter | None,
-        settings: SimulationSettings,
-        law_options: LawOptions = AS_USUAL,
-    ) -> None:
+        self, *, rest: Tensor, volume: Tensor, colors: Tensor, opacities: Tensor,
+        covariances: Tensor, density: float, material: Material,
+        heterogeneity: StiffnessField | None, adapter: Adapter | None,
+        settings: SimulationSettings, law_options: LawOptions = AS_USUAL,
+    ) -> None:  # fmt: skip
         super().__init__()
         for name, value in (
-            ("rest", rest),
-            ("volume", volume),
-            ("colors", colors),
-            ("opacities", opacities),
+            ("rest", rest), ("volume", volume), ("colors", colors), ("opacities", opacities),
             ("covariances", covariances),
-        ):
+        ):  # fmt: skip
             self.register_buffer(name, value.detach().clone())
         self.splats: CarriedSplats | None = None
         self.density, self.settings, self.law_options = float(density), settings, law_options
@@ -178,26 +166,21 @@ class Body(nn.Module):
         return self.adapter.stiffening(self.material.poisson()) if adapted else 1.0
 
     def substeps(
-        self,
-        parameters_modulus: float,
-        frame_dt: float,
-        speed: float,
-        adapted: bool,
-        viscosity: float = 0.0,
-    ) -> int:
-        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter and to `EVEN`."""
+        self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool,
+        viscosity: float = 0.0, given: int | None = None,
+    ) -> int:  # fmt: skip
+        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the
+        adapter and to `EVEN`; those that are given, where they are enough. Errors: ConfigError
+        naming how many are needed."""
         settings = self.settings
         count = required_substeps(
-            modulus_max=parameters_modulus,
-            density=self.density,
-            frame_dt=frame_dt,
-            dx=settings.dx,
-            v_max=speed,
-            factor=self.stiffening(adapted),
-            courant=settings.courant,
-            limit=settings.max_substeps,
-            viscosity=viscosity,
-        )
+            modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt,
+            dx=settings.dx, v_max=speed, factor=self.stiffening(adapted), courant=settings.courant,
+            limit=settings.max_substeps if given is None else given, viscosity=viscosity,
+            limited_by="simulation.max_substeps" if given is None else "substeps",
+        )  # fmt: skip
+        if given is not None:
+            return given
         multiple = settings.strides(EVEN)
         return -(-count // multiple) * multiple
 
@@ -210,21 +193,12 @@ class Body(nn.Module):
         )  # fmt: skip
 
     def simulate(
-        self,
-        start: Start,
-        world: World,
-        frames: int,
-        frame_dt: float,
-        *,
-        model: Model | None = None,
-        collect: Callable | None = None,
+        self, start: Start, world: World, frames: int, frame_dt: float, *,
+        model: Model | None = None, collect: Callable | None = None,
         progress: Callable[[int], None] | None = None,
-        counts: Sequence[int] | None = None,
-        observed: Tensor | None = None,
-        gain: float = 0.0,
-        unseen: Callable[[Tensor, int], Tensor] | None = None,
-        substeps: int | None = None,
-    ) -> Rollout:
+        counts: Sequence[int] | None = None, observed: Tensor | None = None, gain: float = 0.0,
+        unseen: Callable[[Tensor, int], Tensor] | None = None, substeps: int | None = None,
+    ) -> Rollout:  # fmt: skip
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
         model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
@@ -238,20 +212,16 @@ class Body(nn.Module):
             start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps
         )
         return ready.simulate(
-            frames,
-            world.solids,
-            collect=collect,
-            progress=progress,
-            observed=observed,
-            gain=gain,
+            frames, world.solids, collect=collect, progress=progress, observed=observed, gain=gain,
             unseen=unseen,
-        )
+        )  # fmt: skip
 
     def ready(
         self, start: Start, world: World, frames: int, frame_dt: float, *, model: Model | None = None,
-        counts: Sequence[int] | None = None, substeps: int | None = None,
+        counts: Sequence[int] | None = None, substeps: int | None = None, enough: bool = False,
     ) -> Ready:  # fmt: skip
-        """The body at `start`, ready to be simulated; arguments and errors as `simulate`."""
+        """The body at `start`, ready to be simulated; arguments and errors as `simulate`.
+        enough: check that `substeps`, which a user gave, are as many as the bound asks for."""
         model = self.model() if model is None else model
         material, adapter = model.material, model.adapter
         if adapter is not None:
@@ -268,14 +238,16 @@ class Body(nn.Module):
             timing = Adaptive(control, lag=0.0) if counts is None else Replay(counts, lag=0.0)
             substeps = self.settings.max_substeps
             state = self.initial_state(start, 0.0, gravity)
-        elif substeps is not None:
+        elif substeps is not None and not enough:
             state = self.initial_state(start, frame_dt / substeps, gravity)
         else:
-            speed = world.fastest(start, self.size, frames * frame_dt)
+            # of given substeps, the speed of colliders has a message of its own
+            met = world if substeps is None else replace(world, colliders=())
+            speed = met.fastest(start, self.size, frames * frame_dt)
             # one time step for all variants of a body: their difference is then the law's, not the integrator's
             substeps = self.substeps(
                 float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None,
-                float(material.max_viscosity(factor.detach())),
+                float(material.max_viscosity(factor.detach())), substeps,
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
         lift = model.contact.lift(world.ground, self.settings.dx) * up
@@ -285,12 +257,9 @@ class Body(nn.Module):
             state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
         else:
             simulator = self.simulator(
-                material.law,
-                substeps,
-                frame_dt,
-                world,
-                adapter.strain if adapter is not None else None,
-            )
+                material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else
+                None,
+            )  # fmt: skip
         state = replace(state, x=state.x + lift)
         state = state.to(dtype)
         arguments = {
@@ -322,20 +291,10 @@ class Body(nn.Module):
         if self._made is None or self._made[0] is not world or self._made[1] != key:
             dtype = torch.float64 if settings.precision == 64 else torch.float32
             simulator = Simulator(
-                law,
-                dx=settings.dx,
-                substeps=substeps,
-                frame_dt=frame_dt,
-                gravity=world.gravity,
-                up=world.up,
-                ground=self.contact.at_nodes(world.ground, settings.dx),
-                planes=world.planes,
-                colliders=world.solids,
-                box=world.box,
-                dtype=dtype,
-                device=device,
-                strain=strain,
-                options=options,
-            )
+                law, dx=settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity,
+                up=world.up, ground=self.contact.at_nodes(world.ground, settings.dx),
+                planes=world.planes, colliders=world.solids, box=world.box, dtype=dtype,
+                device=device, strain=strain, options=options,
+            )  # fmt: skip
             self._made = world, key, simulator
         return self._made[2]

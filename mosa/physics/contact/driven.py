@@ -209,6 +209,10 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
             raise ConfigError(
                 f"{where}: {next(iter(own))} and motion.path: expected a type, or none"
             )
+    if not more.get("held", True) and (not more.get("mass") or "motion" in item):
+        raise ConfigError(
+            f"{where}: expected a mass and no motion with held: false, found {sorted(item | more)}"
+        )
     if unknown := [key for key in ("mode", "friction") if key in item]:
         raise ConfigError(f"{where}: unknown: {unknown[0]}; particles that are held do not slide")
     if len(own) + ("type" in item) > 1 or not (own or "type" in item or moved):

@@ -14,11 +14,16 @@ from mosa.physics.constitutive.laws import SLOTS, Law
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.motion import Motion, Trajectory
 from mosa.physics.engine.numerics import Numerics, State
-from mosa.types import ParticleState
+from mosa.settings import shown
+from mosa.types import ParticleState, dense
 
 UNBOUNDED = 1e30
 FASTEST = 1e6
 """[m/s], [rad/s] of a start: the time step would be refused far below."""
+
+
+MODULI = {"mu": "mu >= 0", "lam": "lam + 2 mu/3 >= 0", "kappa": "kappa >= 0"}
+"""Without which a body at rest is unstable."""
 
 
 def numbers(
@@ -74,6 +79,8 @@ def pack_parameters(
         if not isinstance(value, Tensor):  # a copy from the host would wait for CUDA
             value = numbers(f"parameters.{name}", value, "finite numbers", dtype=like.dtype)
             value = value if value.ndim else like.new_full((), float(value))
+        elif not dense(value):
+            raise ConfigError(f"parameters.{name}: expected a dense tensor, found {shown(value)}")
         value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
         if name == "yield_stress" and "von_mises" in law.name.split("+"):
             value = value * yield_factor  # the other laws that yield have their radius fixed
@@ -130,8 +137,11 @@ def check_above(planes: np.ndarray, ends: np.ndarray, x: Tensor) -> None:
         )
 
 
-def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Tensor, float]:
-    """(density, mean mass of a particle [kg]), also checks the volumes: one look at the host for all.
+def checked_density(
+    density: float | Tensor, volume: Tensor, law: Law, packed: Tensor
+) -> tuple[float | Tensor, float]:
+    """(density, mean mass of a particle [kg]), also checks the volumes and the moduli among the
+    packed parameters (N, SLOTS): one look at the host for all.
 
     A number stays one: arithmetic, and so every bit, is that of a body of one material. Errors: ConfigError."""
     if not isinstance(density, Tensor) or density.ndim == 0:
@@ -141,18 +151,31 @@ def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Te
             raise ConfigError(f"density: expected {expected}, found {density}")
         valid = torch.ones((), dtype=torch.bool, device=volume.device)
     else:
-        if density.shape != volume.shape:
+        if density.shape != volume.shape or not dense(density):
             raise ConfigError(
-                f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}"
+                f"density: expected a number or shape {tuple(volume.shape)}, found {shown(density)}"
             )
         density = density.detach().to(volume)
         valid = (torch.isfinite(density) & (density > 0)).all()
-    told = [((volume > 0) & volume.isfinite()).all(), valid, (density * volume).mean()]
-    volumes, densities, mass = torch.stack([n.double() for n in told]).tolist()
+    own = {name: packed.detach()[:, at] for name, at in law.offsets.items() if name in MODULI}
+    if "mu" in own and "lam" in own:
+        own["lam"] = own["lam"] + 2 / 3 * own["mu"]
+    told = [
+        ((volume > 0) & volume.isfinite()).all(),
+        valid,
+        (density * volume).mean(),
+        *(each.nan_to_num().min() for each in own.values()),  # NaN: of another law of a mixture
+    ]
+    volumes, densities, mass, *least = torch.stack([n.double() for n in told]).tolist()
     if not volumes:
         raise ConfigError("volume: expected positive, finite numbers [m^3] for all particles")
     if not densities:
         raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
+    for name, found in zip(own, least):
+        if found < 0:
+            raise ConfigError(
+                f"parameters.{name}: expected {MODULI[name]} for all particles, found {found:g}"
+            )
     return density, mass
 
 

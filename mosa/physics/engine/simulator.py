@@ -51,18 +51,18 @@ from mosa.physics.launching import SCALARS
 from mosa.physics.time.adaptive_steps import StepChooser, check_counts
 from mosa.physics.time.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.time.time_step import MOST_SUBSTEPS
-from mosa.settings import Count, Expected, Number, Positive, Text, such, typed
+from mosa.settings import Count, Expected, Number, Positive, Text, shown, such, typed
 from mosa.system.limits import counted, named_device
-from mosa.types import Ground, ParticleState, Rollout
+from mosa.types import Ground, ParticleState, Rollout, dense
 
 Substeps = Annotated[int, Ge(1), Le(MOST_SUBSTEPS)]
 Planes = Annotated[Sequence[InstanceOf[Plane]], Expected("a list of Planes")]
 Colliders = Annotated[Sequence[InstanceOf[Collider]], Expected("a list of Colliders")]
 Motions = Annotated[Sequence[Any], Expected("a motion for each collider, or such a list a world")]
-State = Annotated[ParticleState, InstanceOf, such(lambda state: all(isinstance(part, Tensor) for part in vars(state).values())),
-                  Expected("a ParticleState of tensors")]  # fmt: skip
+State = Annotated[ParticleState, InstanceOf, Expected("a ParticleState of dense tensors"),
+                  such(lambda state: all(map(dense, vars(state).values())))]  # fmt: skip
 Values = Annotated[dict[str, Any], Expected("values of a law by their names")]
-Array = Annotated[Tensor, InstanceOf, Expected("a tensor")]
+Array = Annotated[Tensor, InstanceOf, such(dense), Expected("a dense tensor")]
 Asked = Annotated[Callable[[MaterialState], AdapterOperator] | Sequence[Callable[..., Any]],
                   Expected("a function of a MaterialState, or one for each world")]  # fmt: skip
 Timing = Annotated[InstanceOf[Adaptive] | InstanceOf[Replay], Expected("an Adaptive or a Replay")]
@@ -328,19 +328,9 @@ class Simulator:
                 map(tuple, axes.vectors(torch.tensor(gravities, dtype=torch.float64)).tolist())
             )
         prepared = self._prepare(
-            state,
-            parameters,
-            volume,
-            density,
-            adapter,
-            stride,
-            collect,
-            frames,
-            worlds,
-            gravities,
-            together,
-            held,
-        )
+            state, parameters, volume, density, adapter, stride, collect, frames, worlds,
+            gravities, together, held,
+        )  # fmt: skip
         choose = None
         if isinstance(timing, Replay):
             counts = check_counts(timing.counts, frames)
@@ -351,14 +341,9 @@ class Simulator:
             )
             density = density if isinstance(density, Tensor) and density.ndim else float(density)
             chooser = StepChooser(
-                timing.control,
-                self.numerics,
-                parameters,
-                prepared.packed,
-                density,
-                self.frame_dt,
+                timing.control, self.numerics, parameters, prepared.packed, density, self.frame_dt,
                 solids,
-            )
+            )  # fmt: skip
             choose = chooser.choose
         clock = Clock(self.frame_dt, self.substeps, None if frames == 1 else choose)
         lag = 0.0 if timing is None else timing.lag
@@ -417,11 +402,11 @@ class Simulator:
             each=4 * (3 + 3 + 9 + 9),
         )
         volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
-        density, mean_mass = checked_density(density, volume)
         F = state.F if worlds is None else state.F.flatten(0, 1)
         packed = self.pack(
             parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds
         )
+        density, mean_mass = checked_density(density, volume, self.law, packed)
         cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
@@ -433,17 +418,10 @@ class Simulator:
                 t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density)
             )
             solvers = [
-                SegmentSolver(
-                    self.numerics,
-                    volume,
-                    density,
-                    cutoff,
-                    gravities[i : i + size],
-                    i,
-                    held and Held(*(t[i : i + size].flatten(0, 1) for t in held)),
-                )
+                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i,
+                              held and Held(*(t[i : i + size].flatten(0, 1) for t in held)))
                 for i in range(0, worlds, size)
-            ]
+            ]  # fmt: skip
         if isinstance(adapter, Sequence):
             adapter = Several(adapter, count)
         if adapter is not None and stride is not None and self.numerics.moduli is not None:
@@ -483,10 +461,19 @@ class Simulator:
                 for each, place in zip(own, places, strict=True)
             ]
             held = found[0] if x.ndim == 2 else stack_held(found)
-        if tuple(held.local.shape) != tuple(x.shape):
+        shapes = [x.shape[:-1], x.shape, x.shape[:-1]]
+        if not all(map(dense, held)) or [part.shape for part in held] != shapes:
             raise ConfigError(
-                f"held: expected places of shape {tuple(x.shape)}, found {tuple(held.local.shape)}"
+                f"held: expected dense tensors, of places of shape {tuple(x.shape)}, found "
+                f"{', '.join(map(shown, held))}"
             )
+        places = (held.sets, solids, len(self.colliders)), (held.points, 0, self.numerics.points)
+        for found, low, high in places:
+            if len(odd := found[(found != -1) & ((found < low) | (found >= high))]):
+                raise ConfigError(
+                    f"held: expected driven sets and points from {low} below {high}, or -1, found "
+                    f"{int(odd[0])}"
+                )
         kinds = torch.int32, self.dtype, torch.int32
         return Held(*(t.to(self.device, kind) for t, kind in zip(held, kinds)))
 

@@ -37,10 +37,12 @@ def step_rate(
 def required_substeps(
     modulus_max: float, density: float, frame_dt: float, dx: float, v_max: float, factor: float = 1.0,
     courant: float = 0.6, limit: int = 10_000, viscosity: float = 0.0,
+    limited_by: str = "simulation.max_substeps",
 ) -> int:  # fmt: skip
     """Fewest substeps per frame with c dt/dx <= courant and v_max dt <= dx/2 (SI units), less where a stress is viscous.
 
     viscosity [Pa s]: physical value of the largest one that acts explicitly (`Law.viscosity`), see `step_rate`.
+    limited_by: the argument that sets `limit`.
     Errors: ConfigError when an argument is not positive, or when more than `limit` substeps would be needed.
     """
     values = {"modulus_max": modulus_max, "density": density, "frame_dt": frame_dt, "dx": dx}
@@ -63,6 +65,6 @@ def required_substeps(
         raise ConfigError(
             f"time step: {count} substeps per frame needed (wave speed {speed:.3g} m/s, modulus {modulus_max:.3g} Pa, density "
             f"{density:.4g} kg/m^3, dx {dx:.3g} m, frame {frame_dt:.3g} s, speed {v_max:.3g} m/s{viscous}), the limit is {limit}: "
-            f"use a coarser grid (dx), {way}, or raise simulation.max_substeps"
+            f"use a coarser grid (dx), {way}, or raise {limited_by}"
         )
     return count

@@ -94,9 +94,9 @@ def known_solid(body: KnownBody) -> Solid:
         vertices, triangles = read_mesh(path)
         low, high = vertices.min(0), vertices.max(0)
         unit = float((high - low).max())
-        if not 0 < unit < np.inf:
-            raise ConfigError(f"{path}: expected a mesh with an extent, found {unit:.3g}")
         middle = (low + high) / 2
+        if not NEAR * float(np.abs(middle).max()) < unit < np.inf:
+            raise ConfigError(f"{path}: expected a mesh with an extent near 0, found {unit:.3g}")
         field = field_of_triangles((vertices - middle) / unit, triangles, 1 / NODES)
     except ConfigError as error:
         raise DataError(f"scene.body.shape: {error}") from error
@@ -130,12 +130,9 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
     if not NEAR * float(middle.abs().max()) < unit < np.inf:
         raise DataError(f"scene.body.shape: {path}: expected an extent near 0, found {unit:.3g}")
     kept = Splats(
-        (kept.means - middle) / unit,
-        kept.scales / unit,
-        kept.rotations,
-        kept.opacities,
+        (kept.means - middle) / unit, kept.scales / unit, kept.rotations, kept.opacities,
         kept.colors,
-    )
+    )  # fmt: skip
     try:
         solid = solid_of(kept, resolution=VOXELS)
     except DataError as error:

@@ -303,7 +303,7 @@ def test_mistaken_keys(pacnerf_folder, keys, message):
             lambda s: replace(s, mattes=s.mattes[:, :4]),
             r"mattes: expected shape \(3, 5, 32, 32\), found \(3, 4, 32, 32\)",
         ),
-        (lambda s: replace(s, times=s.times[:2]), r"times: expected shape \(5,\)"),
+        (lambda s: replace(s, times=s.times[:2]), r"images: expected shape \(3, 2, 32, 32, 3\)"),
         (
             lambda s: replace(s, cameras=replace(s.cameras, w2c=-s.cameras.w2c)),
             "expected a rotation",

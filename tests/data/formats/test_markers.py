@@ -108,6 +108,57 @@ def test_a_gap_stays_one(tmp_path):
     assert np.isnan(resampled[1, 2]).all() and np.isfinite(resampled[[0, 2]]).all()
 
 
+@pytest.mark.parametrize(
+    "first, last, points", [(60, 62, slice(None)), (60, 61, slice(None)), (50, 79, 2), (55, 60, 1)]
+)
+def test_a_recording_that_freezes_is_named(tmp_path, first, last, points):
+    """In free fall, for a while or to its end: all points for a sample, or one of them for longer."""
+    times, positions = let_go()
+    positions[first : last + 1, points] = positions[first, points]
+    with pytest.raises(
+        DataError, match=rf"at one place from {times[first]:g} to {times[last]:g} s"
+    ):
+        read_markers(write(tmp_path / "frozen.csv", times, "abcd", positions))
+
+
+@pytest.mark.parametrize("change", ["jump", "exchanged"])
+def test_a_point_that_leaves_the_others_within_a_sample_is_named(tmp_path, change):
+    times, positions = let_go()
+    if change == "jump":
+        positions[60, 1] += 0.3
+    else:
+        positions[60:] = positions[60:, [1, 0, 2, 3]]
+    with pytest.raises(
+        DataError, match=r"move with the others, found .* within one sample at 0\.6 s"
+    ):
+        read_markers(write(tmp_path / "odd.csv", times, "abcd", positions))
+
+
+def test_a_rounded_oscillation_stands_still_at_its_turning_points(tmp_path):
+    times = np.arange(120) / 100
+    moved = np.round(
+        0.01 * np.cos(2 * np.pi * 4 * (times + 0.005)), 4
+    )  # samples on both sides of each
+    positions = np.stack([0 * times, moved, 0 * times], -1)[:, None].repeat(4, 1)
+    assert (np.diff(positions, axis=0) == 0).all((1, 2)).any()
+    read_markers(write(tmp_path / "swing.csv", times, "abcd", positions))
+
+
+def test_a_mirrored_axis_of_a_flat_body_is_said():
+    """The points lie in a plane to a fortieth of their extent, which another unit is not told by."""
+    known = np.array([[0.2, 0, 0], [0, 0.2, 0.005], [-0.2, 0, 0], [0, -0.2, 0], [0.1, 0.1, 0.01]])
+    named = dict(zip("abcde", known.tolist()))
+    noise = 2e-4 * np.random.default_rng(0).normal(size=known.shape)
+    assert alignment(known + noise, named, "scene.points")[2] < 1e-3
+    for axis in range(3):
+        mirrored = known * np.where(np.arange(3) == axis, -1, 1)
+        with pytest.raises(
+            ConfigError,
+            match=r"scene\.points: .*right-handed axes, found .* with one axis mirrored",
+        ):
+            alignment(mirrored + noise, named, "scene.points")
+
+
 def test_points_in_line_align_nothing():
     line = np.arange(3)[:, None] * np.ones(3)
     with pytest.raises(ConfigError, match="one line"):
@@ -117,6 +168,7 @@ def test_points_in_line_align_nothing():
 @pytest.mark.parametrize(
     "keys, said",
     [({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
+     ({"body": BOX | {"motion": {"velocity": [1, 0, 0]}}}, "scene.body"),
      ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads"),
      *(({key: wrong}, f"^scene.{key}: expected") for key, wrong in (
          ("start", [0.5]), ("duration", "a"), ("duration", math.nan), ("holdout_frames", 1.5), ("tracked", "a"),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_bodies import FREE, NU, E, cues_of, small_body, start, take_of
 
-from mosa.data.io.forces import ForceCurve, force_residuals, forces_from_config
+from mosa.data.io.forces import ForceCurve, force_residuals, forces_from_config, read_forces
 from mosa.errors import ConfigError, DataError
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
@@ -119,6 +119,14 @@ def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told):
         assert found["with"] == {}
 
 
+def test_an_empty_cell_was_not_measured_and_notes_are_passed_over(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("# load cell 3\ntime, fz, note\n0.1, 1.5, on\n0.2, , off\n\n0.3, 2.5, on\n")
+    curve = read_forces(path, "clamp")
+    assert curve.times.tolist() == [0.1, 0.2, 0.3] and curve.forces[::2, 2].tolist() == [1.5, 2.5]
+    assert torch.isnan(curve.forces).sum() == 7
+
+
 def test_a_force_of_nothing_is_refused(tmp_path):
     curve = ForceCurve("wall", torch.tensor([0.0, 1.0]).double(), torch.ones(2, 3).double())
     _, _, rollout = pressed()
@@ -138,10 +146,11 @@ def test_a_force_of_nothing_is_refused(tmp_path):
     for items in (5, "a", [5]):
         with pytest.raises(ConfigError, match=r"world\.forces: expected a list of sections"):
             forces_from_config(items)
-    for text in ("", "time,fx\n0,0\n1,0\n", "time,fx\n0,1e300\n1,1\n"):
+    for text in ("", "time,fx\n0,0\n1,0\n", "time,fx\n0,1e300\n1,1\n", "time,fx\n0,inf\n1,1\n",
+                 "time,fx\n0,off\n1,1\n", "time,fx,fx\n0,1,2\n1,1,2\n", "time,fx\n0\n1,1\n"):  # fmt: skip
         (tmp_path / "bad.csv").write_text(text)
         with pytest.raises(DataError, match=r"bad.csv: expected"):
             forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
     (tmp_path / "bad.csv").write_text("t,force\n0,1\n1,2\n")
-    with pytest.raises(DataError, match=r"bad.csv: expected columns time, fx, fy, fz"):
+    with pytest.raises(DataError, match=r"bad.csv: .*found the columns t, force"):
         forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])

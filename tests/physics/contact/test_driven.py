@@ -171,6 +171,8 @@ def test_points_of_a_file_lead_what_is_nearest(tmp_path):
     ({"type": "sphere"}, "a sphere needs radius"),
     ({"motion": {"times": [0.0, 1.0], "points": [[[1, 2, 3]], [[1, 2]]]}}, r"driven\[0\].motion: expected lists times"),
     ({"motion": {"points": [[[1, 2, 3]]]}}, r"driven\[0\].motion: expected path alone, or times and points"),
+    ({"indices": [1], "held": False}, r"driven\[0\]: expected a mass and no motion with held: false"),
+    ({"indices": [1], "held": False, "mass": 1.0, "motion": {}}, "found .*'motion'"),
 ])  # fmt: skip
 def test_a_wrong_entry_names_its_key(entry, said):
     with pytest.raises(ConfigError, match=said):
@@ -190,6 +192,14 @@ def test_sets_that_hold_nothing_or_the_same_are_refused():
         hold([LEFT, LEFT], [Motion(), Motion()], X)
     with pytest.raises(ConfigError, match="after all solids"):
         rollout(sets(NUMBERS)[::-1])
+    colliders = sets(NUMBERS)
+    good = held(colliders)
+    for name, value in (
+        ("sets", good.sets + 9), ("sets", 0 * good.sets - 7), ("points", good.points + 9),
+        ("sets", good.sets.to_sparse()), ("local", good.local.to("meta")), ("points", good.points[:3]),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=r"held: expected (dense tensors|driven sets)"):
+            rollout(colliders, held=good._replace(**{name: value}))
 
 
 def test_the_example_of_the_page_runs():

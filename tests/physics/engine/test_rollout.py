@@ -566,6 +566,10 @@ class TestErrors:
             ({"mu": 1.0}, "missing: lam"),
             ({"mu": 1.0, "lam": 1.0, "E": 1.0}, "unknown: E"),
             ({"mu": torch.ones(3), "lam": 1.0}, "'mu': expected shape"),
+            ({"mu": torch.ones(64).to_sparse(), "lam": 1.0}, "mu: expected a dense tensor"),
+            ({"mu": -1.0, "lam": 3.0}, r"parameters\.mu: expected mu >= 0 .*found -1"),
+            ({"mu": torch.linspace(-1, 9, 64), "lam": 3.0}, r"mu >= 0 .*found -1"),
+            ({"mu": 1.0, "lam": -1.0}, r"parameters\.lam: expected lam \+ 2 mu/3 >= 0"),
         ],
     )
     def test_parameters(self, parameters, match, make_block):
@@ -592,6 +596,16 @@ class TestErrors:
 
     def test_shapes(self, make_block):
         state = make_block()
+        for v in (state.v.to_sparse(), state.v.to("meta"), None):
+            with pytest.raises(
+                ConfigError, match="state: expected a ParticleState of dense tensors"
+            ):
+                self.run(replace(state, v=v))
+        density = torch.full((64,), DENSITY, device="meta")
+        with pytest.raises(ConfigError, match=r"density: expected .*meta"):
+            simulator().rollout(state, self.PARAMETERS, volume_of(state), density, 2)
+        with pytest.raises(ConfigError, match="volume: expected a dense tensor"):
+            simulator().rollout(state, self.PARAMETERS, volume_of(state).to_sparse(), DENSITY, 2)
         with pytest.raises(ConfigError, match=r"v: expected shape \(64, 3\)"):
             self.run(replace(state, v=state.v[:5]))
         with pytest.raises(ConfigError, match=r"x: expected.*float64.*float32"):

@@ -70,6 +70,11 @@ def test_files_that_hold_no_solid_are_refused(tmp_path):
     open_mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
     with pytest.raises(DataError, match="expected a closed surface"):
         known_solid(body(open_mesh))
+    open_mesh.write_text(
+        "v 9e5 0 0\nv 900001 0 0\nv 9e5 1 0\nv 9e5 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4"
+    )
+    with pytest.raises(DataError, match="expected a mesh with an extent near 0, found 1"):
+        known_solid(body(open_mesh))
     with pytest.raises(DataError, match=r"expected a file \.ply, \.obj or \.stl, found none"):
         known_solid(body(tmp_path / "missing.ply"))
 
