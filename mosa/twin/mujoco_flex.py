@@ -103,7 +103,7 @@ def save_mujoco(path: Path, twin: Any, values: dict[str, np.ndarray]) -> Path:
     ]
     friction = 0.0
     if ground is not None:
-        friction = 10.0 if ground.mode == "sticky" else ground.friction
+        friction = 1.0 if ground.mode == "sticky" else ground.friction
         up = world.up.double().cpu().numpy()
         bodies.append(
             f'<geom name="ground" type="plane" size="0 0 0.05" pos="{text(ground.height * up)}" '

@@ -346,7 +346,7 @@ class Twin:
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
-        images show in `formats` (`data.io.splat_formats.FORMATS`: 3DGS PLY, gltf, sog, usd, rrd) below `splats/`. colliders: those that
+        images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
         the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
         solids = self._met(rollout, colliders)
         folder = made_folder(Path(folder) / "ply").parent
