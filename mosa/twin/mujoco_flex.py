@@ -40,8 +40,8 @@ def tetrahedra(
     cells = np.argwhere(filled >= 0.5 * sides.prod())
     if not len(cells):
         raise ConfigError(
-            f"formats: mujoco and obj need a body that fills cells of {spacing:.3g} m at least by half, "
-            "found a thinner one"
+            f"formats: mujoco and obj need a body that fills cells of {spacing:.3g} m at least by "
+            "half, found a thinner one"
         )
     paths = []  # from corner 000 to 111 along the three axes, in each order
     for order in itertools.permutations(range(3)):
@@ -53,8 +53,8 @@ def tetrahedra(
 
 
 def meshed(twin: Any, values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes (M, 3) [m] and their velocities (M, 3) [m/s] as the training starts, and tetrahedra (K, 4)
-    of a twin with the given `particles`. Errors: ConfigError where no cell is half full."""
+    """Nodes (M, 3) [m], velocities (M, 3) [m/s] as the training starts, and tetrahedra (K, 4) of a
+    twin with the given `particles`. Errors: ConfigError where no cell is half full."""
     body = twin.body
     rest = body.rest.double().cpu().numpy()
     nodes, elements = tetrahedra(rest, values["volume"], body.settings.dx)
@@ -63,7 +63,7 @@ def meshed(twin: Any, values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 
 
 def save_surface(path: Path, twin: Any, values: dict[str, np.ndarray]) -> Path:
-    """Write the mesh's closed surface [m] as OBJ, its normals outwards, where the training starts."""
+    """Write the mesh's closed surface [m] as OBJ, normals outwards, where the training starts."""
     points, _, elements = meshed(twin, values)
     faces = np.concatenate(
         [elements[:, list(f)] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))]
@@ -77,8 +77,8 @@ def save_surface(path: Path, twin: Any, values: dict[str, np.ndarray]) -> Path:
 
 
 def save_mujoco(path: Path, twin: Any, values: dict[str, np.ndarray]) -> Path:
-    """Write the body where its training starts, with its velocities as keyframe 0, the gravity and a
-    plane for the ground, in the scene's axes. values: its `particles`; E is the mean of theirs.
+    """Write the body where its training starts, with its velocities as keyframe 0, the gravity and
+    a plane for the ground, in the scene's axes. values: its `particles`; E is the mean of theirs.
 
     Errors: ConfigError for a law without E, or for a body that is thinner than a cell."""
     material, world, spacing = twin.material, twin.world, twin.body.settings.dx

@@ -64,8 +64,8 @@ def test_a_law_without_E_is_refused(tmp_path):
 
 
 def test_mujoco_drops_the_body(tmp_path):
-    """Free fall as ours; then MuJoCo's nodes lose their velocity at contact: its rebound is 9 % lower,
-    its centre up to 25 % of that away within 0.3 s of contact (docs/simulators.md)."""
+    """Free fall as ours; then MuJoCo's nodes lose their velocity at contact: its rebound is 9 %
+    lower, its centre up to 25 % of that away within 0.3 s of contact (docs/simulators.md)."""
     mujoco = pytest.importorskip("mujoco")
     made = twin(stiff=1e5)
     made.material.damping = 1e-3

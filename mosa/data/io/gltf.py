@@ -1,10 +1,11 @@
 """Gaussians as binary glTF with KHR_gaussian_splatting, which engines and web viewers read.
 
-Source: the extension's text, KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. Kernel
-`ellipse`; SCALE are standard deviations [m], not their logarithms, ROTATION unit quaternions xyzw,
-OPACITY in [0, 1], SH_DEGREE_l_COEF_n harmonics with Condon-Shortley phase, m = -l ... l. All are
-float32: the extension allows smaller integers, but not for harmonics. The colours are display values
-(`srgb_rec709_display`); COLOR_0, linear by glTF, is for readers that show points.
+Source: the extension's text (KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting,
+2026). Kernel `ellipse`; SCALE are standard deviations [m], not their logarithms, ROTATION unit
+quaternions xyzw, OPACITY in [0, 1], SH_DEGREE_l_COEF_n harmonics with Condon-Shortley phase, m = -l
+... l. All are float32: smaller integers are allowed, but not for harmonics. The colours are display
+values (`srgb_rec709_display`); COLOR_0, linear by glTF, is for readers that show points. The text
+defines no animation of splats: a motion is a file for each frame.
 """
 
 from __future__ import annotations

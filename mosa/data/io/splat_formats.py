@@ -62,7 +62,8 @@ def check_formats(formats: Sequence[str]) -> None:
 
 
 def splats_at(shown: Seen, frame: int, turn: Tensor | None = None) -> Appearance:
-    """The Gaussians of a frame in the world's axes, or turned from them by `turn` (3, 3), and in that frame's light, on the CPU."""
+    """The Gaussians of a frame in the world's axes, or turned from them by `turn` (3, 3), in that
+    frame's light, on the CPU."""
     turn = torch.eye(3).to(shown.means) if turn is None else turn.to(shown.means)
     harmonics = (
         shown.harmonics
@@ -88,7 +89,8 @@ def upright(up: Tensor) -> Tensor:
 
 
 def save_sog(path: str | Path, shown: Appearance) -> Path:
-    """Write SOG (webp images in a zip archive) by PlayCanvas' converter, on the CPU. Errors: DataError with the program's text."""
+    """Write SOG (webp images in a zip archive) by PlayCanvas' converter, on the CPU. Errors:
+    DataError with the program's text."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -155,8 +157,8 @@ def save_usd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
 
 
 def save_rrd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up: Tensor) -> Path:
-    """Write a recording of rerun: its Gaussians at every frame of the timeline `time`, and the vertical, the nearest of y and z.
-    rerun keeps mean colours and opacities in 8 bits, harmonics in 16."""
+    """Write a recording of rerun: Gaussians at every frame of the timeline `time` [s], and the
+    vertical, the nearest of y and z. rerun keeps mean colours and opacities in 8 bits, harmonics in 16."""
     import rerun as rr
 
     path = Path(path)
@@ -200,8 +202,8 @@ def save_frames(
     rate: float = 30.0,
     up: Tensor | None = None,
 ) -> Path:
-    """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `gltf/000.glb`, `sog/000.sog` and so on, and for all of them
-    `splats.usdc` and `splats.rrd`.
+    """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `gltf/000.glb`,
+    `sog/000.sog` and so on, and for all of them `splats.usdc` and `splats.rrd`.
 
     rate [1/s], up (3,): of the motion. Errors: ConfigError as `check_formats`; DataError.
     """
