@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mosa import __version__
 from mosa.rendering.appearance.spherical_harmonics import degree_of
 from mosa.system.whole_files import written_whole
 from mosa.types import Appearance
@@ -57,7 +56,7 @@ def save_glb(path: str | Path, shown: Appearance) -> Path:
     primitive = {"attributes": {name: k for k, name in enumerate(values)}, "mode": POINTS,
                  "extensions": {EXTENSION: kernel}}  # fmt: skip
     document = {
-        "asset": {"version": "2.0", "generator": f"mosa {__version__}"},
+        "asset": {"version": "2.0", "generator": "mosa"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
