@@ -94,10 +94,8 @@ def save_sog(path: str | Path, shown: Appearance) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        source, made = (
-            save_ply(Path(folder) / "a.ply", shown.splats, shown.harmonics),
-            Path(folder) / "a.sog",
-        )
+        made = Path(folder) / "a.sog"
+        source = save_ply(made.with_suffix(".ply"), shown.splats, shown.harmonics)
         words = [CONVERTER, "-q", "-g", "cpu", "--max-workers", "0", str(source), str(made)]
         run = subprocess.run(words, capture_output=True, text=True)
         if run.returncode or not made.is_file():
