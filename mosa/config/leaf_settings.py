@@ -108,7 +108,7 @@ class SplatsSettings(LawSections):
     rate: Positive = Field(30, description="frames per second")
     formats: Names = Field(
         ["ply"],
-        description=("ply, a file for each frame; usd (needs usd-core) is one file"),
+        description="ply, gltf, sog: a file for each frame; usd, rrd: one file (docs/splats.md)",
     )
     video: bool = Field(True, description="film it")
 

@@ -19,7 +19,7 @@ from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
 from mosa.config.record import RunRecord
 from mosa.data.checks.cameras import lines_of_sight, misses
-from mosa.data.io.splat_formats import Formats
+from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.modules.body.body import Body, Start, World
@@ -28,7 +28,6 @@ from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
-from mosa.settings import check
 from mosa.system.limits import counted
 from mosa.twin.twin import Twin
 from mosa.types import Scene
@@ -66,7 +65,7 @@ def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
     settings = SplatsSettings.read(values)
     if settings.video:
         ffmpeg("video")
-    check("formats", settings.formats, Formats)
+    check_formats(settings.formats)
     colliders_from_config(settings.colliders or (), "colliders")
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)

@@ -32,7 +32,8 @@ PRESETS: dict[str, Preset] = {
         {"E": 4.1e5, "nu": 0.45},
         1070.0,
         "Gent's relation between Shore A hardness and E, at 10 A (Gent 1958, Rubber Chem. Technol. "
-        "31, 896); nu is below the true 0.5; the density is that of common platinum-cure silicones",
+        "31, 896; 0.28 to 0.56 MPa at 5 to 15 A); nu is below the true 0.5; the density is that of "
+        "common platinum-cure silicones",
     ),
     "natural_rubber": Preset(
         "neo_hookean",
@@ -46,8 +47,8 @@ PRESETS: dict[str, Preset] = {
         {"E": 5.1e6, "nu": 0.45, "yield_stress": 2.4e4},
         1900.0,
         "undrained shear strength 17 kPa at a liquidity index of 0.5 (Wroth and Wood 1978, Can. "
-        "Geotech. J. 15, 137), times sqrt(2) as this law measures yield; E is 300 times the "
-        "strength, a usual ratio",
+        "Geotech. J. 15, 137; 1.7 to 170 kPa from liquid to plastic limit), times sqrt(2) as this "
+        "law measures yield; E is 300 times the strength, a usual ratio",
     ),
     "honey": Preset(
         "newtonian",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from annotated_types import Gt, Le
 from scipy.spatial.transform import Rotation
@@ -179,3 +180,14 @@ def start_in(
                 f"found {below:.0%} of it below (height is that of its lowest point above the ground)"
             )
     return start, world
+
+
+@torch.no_grad()
+def as_started(body: Body, start: Start, places: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """(points [m], velocities [m/s]), (M, 3) both, float64, of places (M, 3) [m] of the rest shape
+    at a start."""
+    Q, spin = start.rotation.to(places), start.angular_velocity.to(places)
+    arm = (places - body.center) @ Q.T
+    moving = start.velocity.to(arm) + torch.linalg.cross(spin.expand_as(arm), arm)
+    points = arm + start.center.to(arm)
+    return points.double().cpu().numpy(), moving.double().cpu().numpy()

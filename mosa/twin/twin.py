@@ -54,8 +54,8 @@ from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.material import TwinMaterial, summary
-from mosa.twin.newton_usd import Formats as MaterialFormats
-from mosa.twin.newton_usd import export_material
+from mosa.twin.material_files import Formats as MaterialFormats
+from mosa.twin.material_files import export_material
 from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
@@ -346,7 +346,7 @@ class Twin:
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
-        images show in `formats` (`data.io.splat_formats.FORMATS`: 3DGS PLY, usd) below `splats/`. colliders: those that
+        images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
         the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
         solids = self._met(rollout, colliders)
         folder = made_folder(Path(folder) / "ply").parent
@@ -377,8 +377,9 @@ class Twin:
     ) -> Path:
         """Write the material for other simulators into `folder`: `material.json` (E, nu, density,
         damping, 6x6 stiffness, and what these leave out), `particles.npz` (points, volume, mass, E
-        and nu of every particle), and with newton_usd in `formats` `newton.usda`. SI units.
-        Errors: ConfigError for an unknown format, or without usd-core."""
+        and nu of every particle), and with newton_usd, mujoco or obj in `formats` `newton.usda`,
+        `mujoco.xml` or `surface.obj`. SI units. Errors: ConfigError for an unknown format, without
+        usd-core, or for a body thinner than a cell of the grid."""
         return export_material(self, folder, formats)
 
     def summary(self) -> str:

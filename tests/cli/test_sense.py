@@ -115,7 +115,7 @@ def test_a_body_starts_above_the_ground():
     (lambda t: t.worlds(2).reset(5), "starts: expected what Twin.simulate takes"),
     (lambda t: t.worlds(2).restart(5), "which: expected a list of numbers of worlds, found 5"),
     (lambda t: t.export(t.simulate(frames=2), "/proc/nowhere", video=False), "export: expected a folder that can be written"),
-    (lambda t: t.export(t.simulate(frames=2), "x", formats="ply"), "formats: expected a list of some of ply, usd"),
+    (lambda t: t.export(t.simulate(frames=2), "x", formats="ply"), "formats: expected a list of some of ply, gltf, sog, usd, rrd"),
 ])  # fmt: skip
 def test_calls_of_a_twin_that_mean_nothing(call, message):
     with pytest.raises(ConfigError, match=message):

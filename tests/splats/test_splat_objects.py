@@ -208,7 +208,7 @@ def test_the_command_makes_all_of_it(tmp_path):
         (
             "formats",
             ["obj"],
-            "formats: expected a list of some of ply, usd, found",
+            "formats: expected a list of some of ply, gltf, sog, usd, rrd, found",
         ),
         ("box", [[0, 0, 0]], "box: expected two corners"),
         ("up", [0, 1], "up: expected three"),

@@ -12,8 +12,8 @@ from mosa.system.npz import read_npz
 from mosa.twin.newton_usd import STEP
 from mosa.twin.twin import Twin
 
-SUBSTEPS = 8
-"""Of a frame, in newton."""
+SUBSTEPS = 32
+"""Of a frame, in newton: longer steps of its implicit integration damp the rebound."""
 
 
 def twin(height=0.12, **options):
@@ -43,7 +43,7 @@ def test_numbers_of_every_particle_and_what_they_leave_out(tmp_path):
     begun = made.reset(frames=2).positions
     assert found["points"] == pytest.approx(begun.numpy(), abs=1e-6)
     with pytest.raises(
-        ConfigError, match="expected a list of some of json, npz, newton_usd, found"
+        ConfigError, match="expected a list of some of json, npz, newton_usd, mujoco, obj, found"
     ):
         made.export_material(tmp_path, ["urdf"])
 
@@ -91,15 +91,24 @@ def fall_in_newton(newton, path, times):
 
 @pytest.mark.slow
 def test_newton_drops_an_isotropic_body(tmp_path):
-    """Alike until newton's contact begins; then it rebounds, less than ours (docs/simulators.md)."""
+    """Its centre is where ours is to 10 % of the rebound, from contact to 0.3 s after it, and
+    rebounds as high to 10 % (docs/simulators.md). newton's contact begins up to half a cell higher:
+    its motion is compared later by at most the time that the body takes for that way."""
     pytest.importorskip("pxr")
     newton = pytest.importorskip("newton")
     made = twin(adapter=False, height=0.16)
-    rollout = made.simulate(frames=8)
+    rollout = made.simulate(frames=24)
     path = made.export_material(tmp_path, ["newton_usd"]) / "newton.usda"
-    heights = fall_in_newton(newton, path, rollout.times.tolist())
+    times = rollout.times.numpy()
+    heights = fall_in_newton(newton, path, times.tolist())
     ours = rollout.x[:, :, 1].mean(1).numpy()
     # backward Euler is ahead of the parabola by g t dt/2
-    ahead = 9.8 * rollout.times.numpy() * (FRAME_DT / SUBSTEPS) / 2
+    ahead = 9.8 * times * (FRAME_DT / SUBSTEPS) / 2
     assert (np.abs(heights - ours) < ahead + 1e-3)[:4].all()
-    assert 0.02 < heights.min() < heights[-1] - 0.01
+    low = int(ours.argmin())
+    rebound = ours[low:].max() - ours.min()
+    assert heights[low:].max() - heights.min() == pytest.approx(rebound, rel=0.1)
+    speed = (ours[3] - ours[4]) / FRAME_DT
+    delays = np.linspace(0, 0.5 * DX / speed, 20)
+    away = [np.abs(np.interp(times, times + d, heights) - ours)[4:23].max() for d in delays]
+    assert min(away) < 0.1 * rebound

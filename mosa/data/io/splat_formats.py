@@ -1,13 +1,18 @@
-"""Moving splats as files: 3DGS PLY or a USD stage, for the viewers, editors and converters that read them.
+"""Moving splats as files for the viewers, editors and converters that read them.
 
 Each frame is written in the world's axes and in its own light: covariances are taken apart into scales and rotations, harmonics are
-turned with the body, and a factor of the colours becomes part of the harmonics, which no format keeps apart.
+turned with the body, and a factor of the colours becomes part of the harmonics, which no format keeps apart. glTF alone has a
+vertical of its own, y, to which its frames are turned.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
-from collections.abc import Sequence
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -15,48 +20,96 @@ import torch
 from torch import Tensor
 
 from mosa.data.io.gaussian_ply import save_ply
-from mosa.errors import ConfigError
+from mosa.data.io.gltf import save_glb
+from mosa.errors import ConfigError, DataError
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import Y0, degree_of, mean_colors, rotated
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.settings import Expected, check, such
+from mosa.system.threads import threaded
 from mosa.system.whole_files import written_whole
 from mosa.types import Appearance, Splats
 
-FORMATS = ("ply", "usd")
+FORMATS = ("ply", "gltf", "sog", "usd", "rrd")
 Formats = Annotated[
     Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: all(name in FORMATS for name in v))
 ]  # fmt: skip
+FRAMES = {"ply": ".ply", "gltf": ".glb", "sog": ".sog"}
+"""Formats of a file for each frame, and how its name ends."""
+PACKAGES = {"usd": ("pxr.UsdVol", "ParticleField3DGaussianSplat", "usd-core, 26.3 or newer", "usd"),
+            "rrd": ("rerun", "GaussianSplats3D", "rerun-sdk, 0.41 or newer", "rerun")}  # fmt: skip
+CONVERTER = "splat-transform"
+"""PlayCanvas' program, which writes SOG."""
 
 
-def splats_at(shown: Seen, frame: int) -> Appearance:
-    """The Gaussians of a frame in the world's axes and in that frame's light, on the CPU."""
+def check_formats(formats: Sequence[str]) -> None:
+    """Errors: ConfigError for an unknown format, or where its package or program is missing."""
+    check("formats", formats, Formats)
+    for name in formats:
+        if name in PACKAGES:
+            module, known, package, extra = PACKAGES[name]
+            try:
+                getattr(importlib.import_module(module), known)
+            except (ImportError, AttributeError) as error:
+                raise ConfigError(
+                    f"formats: {name} needs the package {package}: pip install 'mosa[{extra}]'"
+                ) from error
+    if "sog" in formats and shutil.which(CONVERTER) is None:
+        raise ConfigError(
+            f"formats: sog needs the program {CONVERTER} on the PATH: npm install --global "
+            "@playcanvas/splat-transform (Node 22 or newer)"
+        )
+
+
+def splats_at(shown: Seen, frame: int, turn: Tensor | None = None) -> Appearance:
+    """The Gaussians of a frame in the world's axes, or turned from them by `turn` (3, 3), in that
+    frame's light, on the CPU."""
+    turn = torch.eye(3).to(shown.means) if turn is None else turn.to(shown.means)
     harmonics = (
         shown.harmonics
         if shown.rotations is None
-        else rotated(shown.harmonics, shown.rotations[frame])
+        else rotated(shown.harmonics, turn @ shown.rotations[frame])
     )
     if shown.shades is not None:
         shade = shown.shades[frame][:, None, None]
         harmonics = harmonics * shade
         harmonics[:, :1] += (shade - 1) * 0.5 / Y0  # the colour is 1/2 plus the harmonics
-    scales, rotations = scales_and_rotations(shown.covariances[frame])
-    splats = Splats(shown.means[frame], scales, rotations, shown.opacities, mean_colors(harmonics))
+    scales, rotations = scales_and_rotations(turn @ shown.covariances[frame] @ turn.T)
+    means = shown.means[frame] @ turn.T
+    splats = Splats(means, scales, rotations, shown.opacities, mean_colors(harmonics))
     return Appearance(splats, harmonics).to("cpu")
 
 
-def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up: Tensor) -> Path:
-    """Write a USD stage with one `ParticleField3DGaussianSplat`, all of its attributes sampled at every frame. rate: frames per
-    second; up: (3,), the stage's is the nearest of y and z. Errors: ConfigError without a usd-core that knows Gaussians."""
-    try:
-        from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+def upright(up: Tensor) -> Tensor:
+    """(3, 3): the shortest turn that brings `up` (3,) to y."""
+    up, y = up / up.norm(), torch.tensor([0.0, 1, 0]).to(up)
+    middle = up + y if float((up + y).norm()) > 1e-6 else torch.tensor([1.0, 0, 0]).to(up)
+    half_turns = [2 * torch.outer(a, a) / (a @ a) - torch.eye(3).to(up) for a in (middle, up)]
+    return half_turns[0] @ half_turns[1]
 
-        define = UsdVol.ParticleField3DGaussianSplat.Define
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            "formats: usd needs the package usd-core, 26.3 or newer: pip install 'mosa[usd]', or usd-core by "
-            "itself"
-        ) from error
+
+def save_sog(path: str | Path, shown: Appearance) -> Path:
+    """Write SOG (webp images in a zip archive) by PlayCanvas' converter, on the CPU. Errors:
+    DataError with the program's text."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "a.sog"
+        source = save_ply(made.with_suffix(".ply"), shown.splats, shown.harmonics)
+        words = [CONVERTER, "-q", "-g", "cpu", "--max-workers", "0", str(source), str(made)]
+        run = subprocess.run(words, capture_output=True, text=True)
+        if run.returncode or not made.is_file():
+            raise DataError(f"{path}: {CONVERTER} failed: {(run.stderr or run.stdout)[-500:]}")
+        with written_whole(path) as partial:
+            shutil.copyfile(made, partial)
+    return path
+
+
+def save_usd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up: Tensor) -> Path:
+    """Write a USD stage with one `ParticleField3DGaussianSplat`, all of its attributes sampled at every frame. rate: frames per
+    second; up: (3,), the stage's is the nearest of y and z."""
+    from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(
@@ -71,18 +124,20 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)
     stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(frames) - 1)
-    field = define(stage, "/body")
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/body")
     stage.SetDefaultPrim(field.GetPrim())
-    field.GetRadianceSphericalHarmonicsDegreeAttr().Set(degree_of(frames[0].harmonics))
-    field.GetOpacitiesAttr().Set(
-        Vt.FloatArray.FromNumpy(frames[0].splats.opacities.contiguous().numpy())
-    )
+
+    def vectors(values: Tensor) -> Vt.Vec3fArray:
+        return Vt.Vec3fArray.FromNumpy(values.reshape(-1, 3).contiguous().numpy())
+
     for t, frame in enumerate(frames):
-        splats, vectors = (
-            frame.splats,
-            lambda values: Vt.Vec3fArray.FromNumpy(values.reshape(-1, 3).contiguous().numpy()),
-        )
+        splats = frame.splats
+        if t == 0:
+            field.GetRadianceSphericalHarmonicsDegreeAttr().Set(degree_of(frame.harmonics))
+            field.GetOpacitiesAttr().Set(
+                Vt.FloatArray.FromNumpy(splats.opacities.contiguous().numpy())
+            )
+        stage.SetEndTimeCode(t)
         field.GetPositionsAttr().Set(vectors(splats.means), t)
         field.GetScalesAttr().Set(vectors(splats.scales), t)
         field.GetOrientationsAttr().Set(
@@ -96,6 +151,37 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
     stage.Save()
     with written_whole(path) as partial:
         os.replace(unfinished, partial)
+    return path
+
+
+def save_rrd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up: Tensor) -> Path:
+    """Write a recording of rerun: Gaussians at every frame of the timeline `time` [s], and the
+    vertical, the nearest of y and z. rerun keeps mean colours and opacities in 8 bits, harmonics in 16."""
+    import rerun as rr
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    z_up = int(up.abs().argmax()) == 2
+    axes = rr.ViewCoordinates.RIGHT_HAND_Z_UP if z_up else rr.ViewCoordinates.RIGHT_HAND_Y_UP
+    with written_whole(path) as partial:
+        recording = rr.RecordingStream("mosa")
+        recording.save(partial)
+        recording.log("/", axes, static=True)
+        for t, frame in enumerate(frames):
+            splats, higher = frame.splats, frame.harmonics[:, 1:]
+            colors = torch.cat([splats.colors, splats.opacities[:, None]], 1).clamp(0, 1)
+            padded = torch.nn.functional.pad(higher, (0, 0, 0, 15 - higher.shape[1])).numpy()
+            recording.set_time("time", duration=t / rate)
+            shown = rr.GaussianSplats3D(
+                splats.means.numpy(),
+                scales=splats.scales.numpy(),
+                quaternions=splats.rotations[:, [1, 2, 3, 0]].numpy(),
+                colors=(255 * colors + 0.5).byte().numpy(),
+                sh_coefficients=padded if higher.shape[1] else None,
+                spherical_harmonics_degree=degree_of(frame.harmonics),
+            )
+            recording.log("body", shown)
+        recording.disconnect()
     return path
 
 
@@ -114,18 +200,36 @@ def save_frames(
     rate: float = 30.0,
     up: Tensor | None = None,
 ) -> Path:
-    """Write every frame of moving Gaussians: `<folder>/ply/000.ply` and so on, and `splats.usdc` for all.
+    """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `gltf/000.glb`,
+    `sog/000.sog` and so on, and for all of them `splats.usdc` and `splats.rrd`.
 
-    rate [1/s], up (3,): of the USD stage. Errors: ConfigError for another format, or where a package is missing; DataError.
+    rate [1/s], up (3,): of the motion. Errors: ConfigError as `check_formats`; DataError.
     """
-    check("formats", formats, Formats)
-    folder = Path(folder)
-    drop_later_frames(folder / "ply", ".ply", len(shown.means))
-    frames = [splats_at(shown, t) for t in range(len(shown.means))] if formats else []
-    if "ply" in formats:
-        for t, frame in enumerate(frames):
+    check_formats(formats)
+    folder, count = Path(folder), len(shown.means)
+    up = torch.tensor([0.0, 1, 0]) if up is None else up
+    turn = upright(up)
+    for name, suffix in FRAMES.items():
+        drop_later_frames(folder / name, suffix, count)
+
+    def save(t: int) -> None:
+        frame = splats_at(shown, t)
+        if "ply" in formats:
             save_ply(folder / "ply" / f"{t:03d}.ply", frame.splats, frame.harmonics)
-    if "usd" in formats:
-        up = torch.tensor([0.0, 1, 0]) if up is None else up
-        save_usd(folder / "splats.usdc", frames, rate=rate, up=up)
+        if "gltf" in formats:
+            save_glb(folder / "gltf" / f"{t:03d}.glb", splats_at(shown, t, turn))
+        if "sog" in formats:
+            save_sog(folder / "sog" / f"{t:03d}.sog", frame)
+
+    if set(formats) & set(FRAMES):
+        for _ in threaded(save, range(count)):
+            pass
+    for name, write in (("usdc", save_usd), ("rrd", save_rrd)):
+        if name[:3] in formats:
+            write(
+                folder / f"splats.{name}",
+                (splats_at(shown, t) for t in range(count)),
+                rate=rate,
+                up=up,
+            )
     return folder

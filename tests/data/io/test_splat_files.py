@@ -6,7 +6,7 @@ import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from mosa.data.io.splat_formats import save_frames, splats_at
+from mosa.data.io.splat_formats import save_frames, splats_at, upright
 from mosa.errors import ConfigError
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import basis, colors_in
@@ -65,7 +65,7 @@ def test_plyfile_reads_what_is_seen(tmp_path):
 
 
 def test_another_format_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="formats: expected a list of some of ply, usd, found"):
+    with pytest.raises(ConfigError, match="some of ply, gltf, sog, usd, rrd, found"):
         save_frames(drawn(0), tmp_path, ("ply", "obj"))
     assert not (tmp_path / "ply").exists()
 
@@ -93,9 +93,97 @@ def test_a_usd_stage_has_the_gaussians_of_every_frame(tmp_path):
         assert np.allclose(found, frame.harmonics.numpy(), atol=1e-6)
 
 
+def of_glb(path, name: str) -> np.ndarray:
+    """The values of an attribute, through pygltflib."""
+    gltf = pytest.importorskip("pygltflib")
+    file = gltf.GLTF2().load(path)
+    accessor = file.accessors[vars(file.meshes[0].primitives[0].attributes)[name]]
+    view = file.bufferViews[accessor.bufferView]
+    assert accessor.componentType == gltf.FLOAT
+    values = np.frombuffer(file.binary_blob(), "<f4", view.byteLength // 4, view.byteOffset)
+    return values.reshape(accessor.count, -1)
+
+
+@pytest.mark.parametrize("up", [[0.0, 1, 0], [0.0, 0, 1], [0.0, -1, 0]])
+def test_a_glb_has_the_gaussians_upright(tmp_path, up):
+    """Read by pygltflib: places, covariances, colours in directions, all turned so that up is y."""
+    gltf = pytest.importorskip("pygltflib")
+    shown, up = drawn(2), torch.tensor(up)
+    turn = upright(up)
+    assert torch.allclose(turn @ up, torch.tensor([0.0, 1, 0]), atol=1e-6)
+    assert torch.allclose(turn @ turn.T, torch.eye(3), atol=1e-6) and torch.linalg.det(turn) > 0
+    save_frames(shown, tmp_path, ("gltf",), up=up)
+    path, prefix, t = tmp_path / "gltf" / "001.glb", "KHR_gaussian_splatting:", 1
+    file = gltf.GLTF2().load(path)
+    primitive = file.meshes[0].primitives[0]
+    assert file.extensionsUsed == [prefix[:-1]] and primitive.mode == gltf.POINTS
+    assert primitive.extensions[prefix[:-1]] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+    }
+    places = of_glb(path, "POSITION")
+    assert np.allclose(places, shown.means[t] @ turn.T, atol=1e-6)
+    assert np.allclose(file.accessors[0].min, places.min(0))
+    axes = Rotation.from_quat(of_glb(path, prefix + "ROTATION")).as_matrix()
+    found = axes * of_glb(path, prefix + "SCALE")[:, None] ** 2 @ axes.transpose(0, 2, 1)
+    assert np.allclose(found, turn @ shown.covariances[t] @ turn.T, rtol=1e-3, atol=1e-8)
+    assert np.allclose(of_glb(path, prefix + "OPACITY")[:, 0], shown.opacities, atol=1e-6)
+    names = [f"{prefix}SH_DEGREE_{l}_COEF_{n}" for l in range(3) for n in range(2 * l + 1)]
+    c = np.stack([of_glb(path, name) for name in names], 1)
+    directions = torch.randn(12, 3, generator=torch.Generator().manual_seed(9))
+    found = 0.5 + np.einsum("dk,mkc->dmc", basis(directions @ turn.T, 2).numpy(), c)
+    back = (directions[:, None, None, :] @ shown.rotations[t])[:, :, 0]
+    wanted = (0.5 + torch.einsum("dmk,mkc->dmc", basis(back, 2), shown.harmonics)) * shown.shades[
+        t
+    ][:, None]
+    assert np.allclose(found, wanted.numpy(), atol=1e-5)
+
+
+def test_sog_is_what_the_converter_reads_back(tmp_path):
+    """Codes of 16 bits for places, palettes of 256 for scales and colours: as near as these are."""
+    import shutil
+    import subprocess
+
+    if shutil.which("splat-transform") is None:
+        pytest.skip("no splat-transform")
+    shown = drawn(0)
+    save_frames(shown, tmp_path, ("sog",))
+    words = ["splat-transform", "-q", str(tmp_path / "sog" / "000.sog"), str(tmp_path / "a.ply")]
+    subprocess.run(words, check=True)
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    found, places = np.stack([vertex[a] for a in "xyz"], -1), shown.means[0].numpy()
+    nearest = np.linalg.norm(found[:, None] - places, axis=-1)
+    order = nearest.argmin(0)
+    assert len(np.unique(order)) == M and nearest.min(0).max() < 1e-3 * np.ptp(places)
+    wanted = shown.covariances[0].numpy()
+    size = np.linalg.norm(wanted, axis=(1, 2))
+    assert (np.linalg.norm(covariance(vertex)[order] - wanted, axis=(1, 2)) < 0.05 * size).all()
+
+
+def test_a_recording_of_rerun_can_be_verified(tmp_path):
+    import subprocess
+    import sys
+
+    pytest.importorskip("rerun")
+    shown = drawn(1)
+    save_frames(shown, tmp_path, ("rrd",), rate=24)
+    path = str(tmp_path / "splats.rrd")
+    words = [sys.executable, "-m", "rerun", "rrd", "print", "-vvv", path]
+    said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    assert "GaussianSplats3D:centers" in said and "time" in said
+
+
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     import sys
 
-    monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(ConfigError, match="usd needs the package usd-core"):
-        save_frames(drawn(0), tmp_path, ("usd",))
+    for module, format, package in (
+        ("pxr.UsdVol", "usd", "usd-core"),
+        ("rerun", "rrd", "rerun-sdk"),
+    ):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(ConfigError, match=f"{format} needs the package {package}"):
+            save_frames(drawn(0), tmp_path, (format,))
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ConfigError, match="sog needs the program splat-transform on the PATH: npm"):
+        save_frames(drawn(0), tmp_path, ("sog",))
+    assert not list(tmp_path.iterdir())
