@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -149,32 +150,31 @@ def checked_density(
         density = float(numbers("density", density, expected, (), dtype=torch.float64))
         if not density > 0:
             raise ConfigError(f"density: expected {expected}, found {density}")
-        valid = torch.ones((), dtype=torch.bool, device=volume.device)
+        ends: tuple[Tensor, ...] = tuple(torch.aminmax(volume))
     else:
         if density.shape != volume.shape or not dense(density):
             raise ConfigError(
                 f"density: expected a number or shape {tuple(volume.shape)}, found {shown(density)}"
             )
         density = density.detach().to(volume)
-        valid = (torch.isfinite(density) & (density > 0)).all()
-    own = {name: packed.detach()[:, at] for name, at in law.offsets.items() if name in MODULI}
-    if "mu" in own and "lam" in own:
-        own["lam"] = own["lam"] + 2 / 3 * own["mu"]
-    told = [
-        ((volume > 0) & volume.isfinite()).all(),
-        valid,
-        (density * volume).mean(),
-        *(each.nan_to_num().min() for each in own.values()),  # NaN: of another law of a mixture
-    ]
-    volumes, densities, mass, *least = torch.stack([n.double() for n in told]).tolist()
-    if not volumes:
+        ends = (*torch.aminmax(volume), *torch.aminmax(density))
+    names = [name for name in law.offsets if name in MODULI]
+    moduli = packed.detach()[:, [law.offsets[name] for name in names]]
+    least = moduli.nan_to_num().amin(0)  # NaN: of another law of a mixture
+    masses = density * volume
+    told = torch.cat([torch.stack([*ends, masses.mean()]).to(least), least]).tolist()
+    found, mass, own = told[: len(ends)], told[len(ends)], dict(zip(names, told[len(ends) + 1 :]))
+    if not (found[0] > 0 and found[1] < math.inf):
         raise ConfigError("volume: expected positive, finite numbers [m^3] for all particles")
-    if not densities:
+    if found[2:] and not (found[2] > 0 and found[3] < math.inf):
         raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
-    for name, found in zip(own, least):
-        if found < 0:
+    if own.get("lam", 0) < 0 and "mu" in names:  # seldom
+        mu, lam = (moduli[:, names.index(name)].nan_to_num() for name in ("mu", "lam"))
+        own["lam"] = float((lam + 2 / 3 * mu).min())
+    for name, value in own.items():
+        if value < 0:
             raise ConfigError(
-                f"parameters.{name}: expected {MODULI[name]} for all particles, found {found:g}"
+                f"parameters.{name}: expected {MODULI[name]} for all particles, found {value:g}"
             )
     return density, mass
 
