@@ -66,9 +66,10 @@ def parameters(
     write_table(file, [experiment.rows, *columns], rows)
     header = [experiment.rows, "parameter", "truth", "found", "off [%]", "posterior sd [%]", ""]
     return (
-        "Every parameter, ± over the seeds. *met*: as near as asked, and *by chance* where twice its posterior's deviation is "
-        "more than was asked; *not determined*: further off, and twice the deviation covers it; *missed*: further off than "
-        "that. The deviation of a modulus is one of its logarithm.\n\n" + markdown(header, lines)
+        "Each scene states a largest error of its parameters. *met*: the error is at most that. *met, by chance*: so it is, "
+        "but two standard deviations of the posterior are more than that. *not determined*: the error is larger, and two standard "
+        "deviations cover it. *missed*: they do not. ± is the spread over the seeds, not the posterior's standard deviation, "
+        "which for a modulus is that of its logarithm.\n\n" + markdown(header, lines)
     ), []
 
 

@@ -88,12 +88,14 @@ def test_the_rows_that_a_note_names_are_in_its_table(quick):
 
 def test_the_paper_s_figures_are_those_of_its_tables():
     text = printed_table("generalisation")
-    row = next(line for line in text.splitlines() if line.startswith("| MoSA"))
-    values = [[float(v) for v in cell.split("/")] for cell in row.split("|")[2:-1]]
-    assert values[-1] == [31.35, 92.3]  # printed beside them
-    assert np.mean([psnr for psnr, _ in values[:-1]]) == pytest.approx(
+    rows = [line for line in text.splitlines() if line.startswith("| MoSA")]
+    psnr, ssim = ([float(cell) for cell in row.split("|")[2:-1]] for row in rows)
+    assert (psnr[-1], ssim[-1]) == (31.35, 92.3)  # printed beside them
+    assert np.mean(psnr[:-1]) == pytest.approx(
         31.52, abs=0.01
     )  # the paper's own mean is not theirs
+    found = printed_table("identification")
+    assert "| cream      | yield_stress   | 3      | 3.16     | 2.98  | 2.97  |" in found
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -453,7 +455,7 @@ def test_the_page_says_where_its_figures_come_from_and_what_is_missing(tmp_path)
     )
     text = page.read_text()
     for part in ("| ours ", "11.0 ± 1.4", "`the command`", "seeds: 0, 1", "a machine", "6 of 8 jobs complete",
-                 "12.0 minutes", "The paper prints", "31.35 / 92.3", "made.png"):  # fmt: skip
+                 "12.0 minutes", "The paper prints", "31.35", "made.png"):  # fmt: skip
         assert part in text, part
     assert text.count("- not run: ") == 2
     assert (tmp_path / "results" / "made.png").stat().st_size > 1000 and (

@@ -32,7 +32,7 @@ data were not released: the bodies here are simulated, so their true motion is k
 tables](reproduce.md)).
 
 - **ours** is the default of this program (`adapter=operator`, [fitted](uncertainty.md) by
-  Gauss-Newton).
+  Gauss-Newton): the row *adapted* of a run's `results.md`. **prior only** is its row *prior*.
 - **four networks (paper)** is the paper's adapter (`adapter=mosa`) with alpha = 0.1, as in its
   text. Two things differ from the paper: the correction of the stress is bounded
   (`adapter.l_max`) and vanishes at rest (`adapter.rest_free`). It learns for 40 steps. [The other

@@ -12,10 +12,20 @@ PRINTED = Path(__file__).with_name("printed.yaml")
 
 
 def printed_table(name: str) -> str:
-    """The paper's own figures as Markdown. Errors: KeyError for an entry that is not there."""
+    """The paper's own figures as Markdown, a table for each label; parameters, whose cells are lists, have a row each. Errors:
+    KeyError for an entry that is not there."""
     entry = yaml.safe_load(PRINTED.read_text())[name]
-    lines = [[row, *(" / ".join("" if v is None else str(v) for v in values) for values in cells)]
-             for row, cells in entry["rows"].items()]  # fmt: skip
-    return f"The paper prints ({entry['title']}; {' / '.join(entry['labels'])}):\n\n" + markdown(
-        ["", *entry["columns"]], lines
-    )
+    rows, columns = entry["rows"], entry["columns"]
+    parts = [f"The paper prints ({entry['title']}):"]
+    if "parameters" in rows:
+        values = {row: [str(cell).split(", ") for (cell,) in cells] for row, cells in rows.items()}
+        lines = [[column, *each] for k, column in enumerate(columns)
+                 for each in zip(*(cells[k] for cells in values.values()))]  # fmt: skip
+        return "\n\n".join([*parts, markdown(["", "parameter", *list(rows)[1:]], lines)])
+    for k, label in enumerate(entry["labels"]):
+        lines = [
+            [row, *("" if cell[k] is None else str(cell[k]) for cell in cells)]
+            for row, cells in rows.items()
+        ]
+        parts += [label, markdown(["", *columns], lines)]
+    return "\n\n".join(parts)

@@ -14,7 +14,7 @@ from mosa.evaluation.analysis.tables import markdown
 from mosa.experiments.collecting import Cell, Record, best_of, footnotes, records_of, table
 from mosa.experiments.commits import commit
 from mosa.experiments.report.drawing import BETTER, draw, save
-from mosa.experiments.report.page import write_json
+from mosa.experiments.report.page import listed, verdict, write_json
 from mosa.experiments.report.printed import printed_table
 from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
 from mosa.system.whole_files import write_whole, written_whole
@@ -51,6 +51,9 @@ def markdown_page(
         parts.append(
             "Quick variant: small and short. It shows that the experiment runs; its figures say nothing about the methods."
         )
+    if experiment.claims and not experiment.quick:
+        whole = (listed(c.text, verdict(experiment, c, tables)) for c in experiment.claims)
+        parts.append("\n".join(each.partition("\n")[0] for each in whole))
     if experiment.note:
         parts.append(experiment.note.strip())
     bold = "{}" if experiment.plot == "map" else "**{}**"  # of a map no column has a best row

@@ -183,11 +183,7 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
         assert f"## {load_experiment(PAPER, name).title}" in text
     assert "](results/table_generalisation.md)" in text and "`the command`" not in text
     whole = (tmp_path / "docs" / "results" / "table_generalisation.md").read_text()
-    assert (
-        "`the command`" in whole
-        and "31.35 / 92.3" in whole
-        and "](table_generalisation.png)" in whole
-    )
+    assert "`the command`" in whole and "31.35" in whole and "](table_generalisation.png)" in whole
     least = "our default has the smallest error of all"
     assert (
         f"{least}: **holds against those that were run**\n    - 10.0 against 20.0 (prior only; better in 2 of 2)\n"
