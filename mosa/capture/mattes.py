@@ -1,4 +1,4 @@
-"""Mattes of phone footage: from plates, from a matting library, or from videos made elsewhere; and what they say of the object."""
+"""Mattes of phone footage, from plates or from mask videos of another program, and the outlines that follow from them."""
 
 from __future__ import annotations
 

@@ -72,19 +72,21 @@ class SceneSection(Settings):
     where: ClassVar[str] = "scene"
 
     also_train: Sequences | None = Field(
-        None, description="further sequences that are learned from"
+        None, description="further sequences to learn from (docs/several_recordings.md)"
     )
-    test: Sequences | None = Field(None, description="sequences that are held out")
+    test: Sequences | None = Field(
+        None, description="held-out sequences, which results report as test/<name>"
+    )
     cache: Folder | None = Field(
-        None, description="folder of what is made; null: mosa/ in the user's cache folder"
+        None, description="folder of computed files; null: mosa/ in the user's cache folder"
     )
 
 
 class LawSections(Settings):
     """What a body's law is built from."""
 
-    seed: Seed = Field(0, description="of everything that is drawn")
-    prior: PriorSection = Field(description="the law")
+    seed: Seed = Field(0, description="seed of all random numbers")
+    prior: PriorSection = Field(description="the isotropic law")
     simulation: SimulationSection = Field(SimulationSection(), description="grid and time steps")
     heterogeneity: HeterogeneitySettings = Field(
         HeterogeneitySettings(), description="variation of the stiffness"
@@ -95,20 +97,22 @@ class LawSections(Settings):
 class BodySections(LawSections):
     """What a body and its world are built from."""
 
-    world: WorldSection = Field(WorldSection(), description="what stands in the world")
+    world: WorldSection = Field(WorldSection(), description="surroundings of the body")
 
 
 class DataSections(Settings):
     """What a scene's data are made by."""
 
-    seed: Seed = Field(0, description="of everything that is drawn")
+    seed: Seed = Field(0, description="seed of all random numbers")
     scene: SceneSection = Field(description="the films")
     reconstruction: ReconstructionSettings = Field(
         ReconstructionSettings(), description="body and motion from images"
     )
     simulation: SimulationSection = Field(SimulationSection(), description="grid and time steps")
-    fit: FitSection = Field(FitSection(), description="the stages")
-    rendering: RenderingSettings = Field(RenderingSettings(), description="images")
+    fit: FitSection = Field(FitSection(), description="stages of the fit")
+    rendering: RenderingSettings = Field(
+        RenderingSettings(), description="images that are rendered"
+    )
 
 
 class TrainSettings(BodySections, DataSections):
@@ -135,12 +139,14 @@ class TrainSettings(BodySections, DataSections):
     optimized_metric: Figure = Field(
         "test/rms_m",
         description=(
-            "what a sweep gets back: val/loss where something is held out and the sweep"
-            " is to choose by it; the first of its fallbacks that exists is used where "
-            "it does not"
+            "figure that a run returns to a sweep; a run that lacks it returns test/rms_m,"
+            " train/rms_m or a PSNR. A search needs val/loss, which has no substitute, and held-out"
+            " cameras or frames: otherwise it chooses by the test films"
         ),
     )
-    criterion: Criterion = Field(Criterion(), description="what is compared")
+    criterion: Criterion = Field(
+        Criterion(), description="simulation that is compared with the cues"
+    )
     trainer: Section = Field({}, description="arguments of Lightning's Trainer")
     callbacks: Section | None = Field({}, description="callbacks by name, each with _target_")
     logger: Section | None = Field({}, description="loggers by name, each with _target_")
@@ -148,7 +154,9 @@ class TrainSettings(BodySections, DataSections):
         IdentificationSettings(), description="Gauss-Newton"
     )
     losses: LossWeights = Field(LossWeights(), description="weights of the loss terms")
-    evaluation: EvaluationSettings = Field(EvaluationSettings(), description="figures")
+    evaluation: EvaluationSettings = Field(
+        EvaluationSettings(), description="evaluation of the learned law"
+    )
 
 
 class SimulateSection(Settings):
@@ -180,9 +188,12 @@ class SimulateSection(Settings):
         None, description="in place of the world's: a list as world.driven of train.py"
     )
     frames: Count = Field(
-        30, description="frames; this and variant count with one of the six above"
+        30,
+        description=("number of frames; has an effect with one of the keys above, as variant does"),
     )
-    variant: Literal["adapted", "prior_eta", "prior"] = Field("adapted", description="the model")
+    variant: Literal["adapted", "prior_eta", "prior"] = Field(
+        "adapted", description="model to simulate: prior, prior_eta or adapted (docs/figures.md)"
+    )
 
 
 class EvalSettings(Settings):
@@ -195,12 +206,12 @@ class EvalSettings(Settings):
     cache: Folder | None = Field(
         None,
         description=(
-            "folder for made scenes; null: ~/.cache/mosa. The one that a checkpoint "
-            "names is not used"
+            "folder of computed files; null: ~/.cache/mosa, never the folder "
+            "that a checkpoint names"
         ),
     )
     appearance: Literal["splats", "particles"] | None = Field(
-        None, description="what images show; null: as the run showed it"
+        None, description="splats or particles in images; null: as in the run"
     )
     plan: Annotated[int, Interval(ge=2, le=10**9)] | None = Field(
         None,
@@ -210,5 +221,7 @@ class EvalSettings(Settings):
         ),
     )
     scene: Section | None = Field(None, description="another scene to evaluate on; null: the run's")
-    evaluation: EvaluationSettings = Field(EvaluationSettings(), description="figures")
-    simulate: SimulateSection = Field(SimulateSection(), description="a new start")
+    evaluation: EvaluationSettings = Field(
+        EvaluationSettings(), description="evaluation of the learned law"
+    )
+    simulate: SimulateSection = Field(SimulateSection(), description="simulate a new start")

@@ -42,7 +42,7 @@ class GroundSection(Settings):
     where: ClassVar[str] = "ground"
 
     mode: Literal["sticky", "slip", "separate", "touch"] = Field(
-        "separate", description="how it is touched"
+        "separate", description="kind of contact (docs/twin.md#colliders)"
     )
     friction: Weight = Field(0.5, description="Coulomb's coefficient, of separate and touch")
 
@@ -59,7 +59,10 @@ class SplatsSettings(LawSections):
     size: Positive | None = Field(
         None, description="m, of the object's longest side; null: the file is in metres"
     )
-    up: Three = Field([0, 1, 0], description="in the file's axes; [0, -1, 0] where it has COLMAP's")
+    up: Three = Field(
+        [0, 1, 0],
+        description="upwards in the file's axes, which the scene keeps; COLMAP: [0, -1, 0]",
+    )
     box: (
         Annotated[
             list[Three], Expected("two corners [[x, y, z], [x, y, z]]"), such(lambda v: len(v) == 2)
@@ -71,19 +74,19 @@ class SplatsSettings(LawSections):
             "[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all"
         ),
     )
-    opacity: Share = Field(0.1, description="Gaussians below are left out")
+    opacity: Share = Field(0.1, description="Gaussians with a smaller opacity are left out")
     open_below: bool = Field(False, description="the underside was never filmed: it is closed")
     resolution: int = Field(
         80,
         ge=8,
         le=512,
-        description="voxels along the longest side, of the solid that the Gaussians enclose",
+        description="voxels along the longest side of the solid that the Gaussians enclose",
     )
     share: float = Field(
         0.9,
         gt=0,
         le=1,
-        description="of 26 directions that have to end at Gaussians where it is inside",
+        description="a place is inside if this share of 26 rays from it ends at Gaussians",
     )
     density: Positive | None = Field(None, description="kg/m^3; null: 1000, or that of the run")
     gravity: Weight = Field(9.81, description="m/s^2")
@@ -93,24 +96,29 @@ class SplatsSettings(LawSections):
         [],
         description=(
             "obstacles, such as {type: sphere, radius: 0.05, position: [0, 0.05, 0]}: as "
-            "world.colliders of train.py, in the scene's axes and metres"
+            "world.colliders of train.py, in the file's axes, in metres"
         ),
     )
     recentre: bool = Field(
         False, description="the origin becomes the point of the ground below the object's middle"
     )
     rotation: Four | None = Field(
-        None, description="[ax, ay, az, degrees] about the body's centre, before it falls"
+        None,
+        description="[ax, ay, az, degrees] about the body's centre, in the file's axes, before it falls",
     )
     velocity: Three = Field([0, 0, 0], description="m/s")
     angular_velocity: Three = Field([0, 0, 0], description="rad/s")
-    frames: Count = Field(40, description="frames")
-    rate: Positive = Field(30, description="frames per second")
+    frames: Count = Field(40, description="number of frames")
+    rate: Positive = Field(
+        30, description="simulated frames per second; the video plays 0.3 times as many"
+    )
     formats: Names = Field(
         ["ply"],
         description="ply, gltf, sog: a file for each frame; usd, rrd: one file (docs/splats.md)",
     )
-    video: bool = Field(True, description="film it")
+    video: bool = Field(
+        True, description="make simulation.mp4, 400 px wide and high, from a fixed view"
+    )
 
 
 class PhoneSection(Settings):
@@ -169,9 +177,7 @@ class CaptureSettings(Settings):
     )
     phones: dict[str, PhoneSection] | None = Field(
         None,
-        description=(
-            "what one phone has otherwise: {phone3: {fps: 240, scan: left, readout: 0.01}}"
-        ),
+        description=("settings of single phones: {phone3: {fps: 240, scan: left, readout: 0.01}}"),
     )
     max_offset: Seconds = Field(5.0, description="s by which the videos' beginnings may be apart")
     flight: Period | None = Field(
@@ -188,7 +194,10 @@ class CaptureSettings(Settings):
             such(lambda v: len(v) == 3 and any(v)),
         ]
         | None
-    ) = Field(None, description="in the poses' world; null: from its direction")
+    ) = Field(
+        None,
+        description=("upwards in the poses' world; null: against the acceleration of the fall"),
+    )
     ground: Three | None = Field(
         None,
         description="a point of the floor in the poses' world; null: where the object is lowest",
@@ -197,13 +206,19 @@ class CaptureSettings(Settings):
         None, description="frames per second that are written; null: the slowest phone's"
     )
     before: Seconds = Field(0.1, description="s of free fall that are written")
-    after: Seconds = Field(0.25, description="s that are written from its end on")
+    after: Seconds = Field(0.25, description="s after the end of the free fall that are written")
     interpolation: Literal["flow", "shift", "none"] = Field(
         "flow",
-        description="between frames; shift: the nearest frame, moved; none: the nearest frame",
+        description=(
+            "images between frames; shift: the nearest frame, moved; none: the nearest frame"
+        ),
     )
     colours: Literal["floor", "none"] = Field(
-        "floor", description="floor: phones get one colour of the floor, of plates"
+        "floor",
+        description=(
+            "floor: the phones' colours are matched by the floor that all "
+            "plates show; none: no matching"
+        ),
     )
 
 
@@ -212,11 +227,9 @@ class TruthSection(Settings):
 
     where: ClassVar[str] = "truth"
 
-    scene: Text | None = Field(
-        None, description="a built-in one; null: the one that the run learned from"
-    )
+    scene: Text | None = Field(None, description="built-in scene; null: that of the run")
     spacing: Spacing | None = Field(
-        None, description="m, of the truth's particles; null: those of the films"
+        None, description="m, particle spacing of the truth; null: that of the films"
     )
 
 
@@ -225,25 +238,26 @@ class SearchSection(Settings):
 
     where: ClassVar[str] = "search"
 
-    iterations: Count = Field(60, description="iterations")
-    batch: int = Field(16, ge=1, le=10**5, description="trials of an iteration")
+    iterations: Count = Field(60, description="number of iterations")
+    batch: int = Field(16, ge=1, le=10**5, description="trials per iteration")
     rate: float = Field(
         0.02, gt=0, le=10, description="gradient: Adam's learning rate, falling to a tenth"
     )
     clip: Positive = Field(
-        0.5, description="gradient: largest norm of one trial's with respect to one action"
+        0.5,
+        description=("gradient: largest norm of one trial's gradient with respect to one action"),
     )
-    every: Count = Field(10, description="iterations between looks at the validation trials")
-    validation: Count = Field(32, description="trials, of the simulator trained in")
+    every: Count = Field(10, description="iterations between validations")
+    validation: Count = Field(32, description="validation trials, in the training simulator")
     candidates: int = Field(
         32,
         ge=4,
         le=10**9,
-        description="model: so many batches an iteration",
+        description="model: candidate batches per iteration",
     )
     spread: Positive = Field(
         0.4,
-        description="model: first standard deviation of actions about the policy's",
+        description=("model: initial standard deviation of actions about those of the policy"),
     )
 
 
@@ -259,7 +273,7 @@ class EnvironmentsSettings(Settings):
 
     task: Text = Field("placement", description="placement or hanging")
     checkpoint: Text | None = Field(
-        None, description="of a run: what the learned and the isotropic twin are read from"
+        None, description="checkpoint of a run: source of the learned and of the isotropic twin"
     )
     simulator: Annotated[
         Any,
@@ -272,31 +286,33 @@ class EnvironmentsSettings(Settings):
         ),
     ] = Field(
         "learned",
-        description="learned, isotropic or truth to train in; a list of them is the table",
+        description=("simulator to train in: learned, isotropic or truth; a list makes a table"),
     )
-    seed: Seed = Field(0, description="of one policy")
+    seed: Seed = Field(0, description="seed of one policy")
     seeds: Annotated[list[Seed], Expected("a list of whole numbers"), such(bool)] = Field(
-        [0, 1, 2], description="of the table"
+        [0, 1, 2], description="seeds of the table"
     )
     policy: Text = Field(
         "gradient",
         description="gradient or model",
     )
-    trials: Count = Field(100, description="tested, in the truth and in the simulator trained in")
+    trials: Count = Field(
+        100, description="number of tests, in the truth and in the training simulator"
+    )
     device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
     worlds: Count | Literal["auto"] = Field(
-        "auto", description="tested at a time; auto: 8 on a CPU, all of them on a GPU"
+        "auto", description="tests that run together; auto: 8 on a CPU, all of them on a GPU"
     )
     out: Text | None = Field(None, description="folder of the results; null: the run folder")
     jobs_only: bool = Field(
         False,
         description=(
-            "of a list: its jobs without the table, for several processes that share "
-            "one `out`; `none` is one too"
+            "run the jobs of a list without making the table: for several "
+            "processes that share one `out`"
         ),
     )
     films: int = Field(
-        3, ge=0, le=100, description="trials, of the first tested ones, that are filmed"
+        3, ge=0, le=100, description="number of tests that are filmed, the first ones"
     )
     options: Annotated[
         dict[str, Any],
@@ -304,7 +320,7 @@ class EnvironmentsSettings(Settings):
         such(lambda v: all(value is None or is_number(value) for value in v.values())),
     ] = Field(
         dict.fromkeys(OPTIONS),
-        description="of the task, the fields of its class (docs/environments.md); null: its own",
+        description=("fields of the task's class (docs/environments.md); null: their defaults"),
     )
     truth: TruthSection = Field(TruthSection(), description="the hidden truth")
     search: SearchSection = Field(SearchSection(), description="the search of a policy")
@@ -317,15 +333,21 @@ class MaterialSettings(LawSections):
     tests: Text = Field(
         description="csv: test, mode, first, stress_1, ... (docs/material_tests.md)"
     )
-    unit: Literal["Pa", "kPa", "MPa"] = Field("Pa", description="of the file's stresses")
+    unit: Literal["Pa", "kPa", "MPa"] = Field("Pa", description="unit of the file's stresses")
     incompressible: bool = Field(
         True,
-        description="false: free faces carry no stress at the stretches that are solved for",
+        description=(
+            "true: the volume is constant; false: lateral stretches are solved "
+            "for so that free faces carry no stress"
+        ),
     )
     symmetry: Literal["full", "orthotropic"] = Field(
-        "full", description="of the learned stiffness; orthotropic: mirrors across x, y and z"
+        "full",
+        description=("symmetry of the learned stiffness; orthotropic: mirrors across x, y and z"),
     )
-    starts: int = Field(4, ge=1, le=100, description="of the least squares; the best is kept")
+    starts: int = Field(
+        4, ge=1, le=100, description="starts of the least squares; the best result is kept"
+    )
     leave_out: bool = Field(
         True, description="fit once more without each test, and predict that test"
     )
@@ -336,7 +358,9 @@ class MaterialSettings(LawSections):
             "numbers is their prior (docs/several_recordings.md)"
         ),
     )
-    density: Positive = Field(1000, description="kg/m^3, of the cube in checkpoints/specimen.ckpt")
+    density: Positive = Field(
+        1000, description="kg/m^3, density of the cube in checkpoints/specimen.ckpt"
+    )
 
 
 COMMANDS: dict[str, type[Settings]] = {

@@ -5,12 +5,15 @@ With the name of a command, and of a key, it says what that is:  python -m mosa.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from mosa.config.composition import configuration
 from mosa.config.leaf_settings import COMMANDS
 from mosa.settings import Settings, annotation_of, described, model_in
 
@@ -40,12 +43,20 @@ The tables below list every key of every command with its default, its range and
 values that differ from these defaults. `key=value` on the command line or in `mosa.compose` changes one.
 `python -m mosa.config.reference train fit.joint` prints a part.
 
-Keys under `adapter` are arguments of the named adapter. Keys under `scene` are arguments of the format's loader
-([data](../data.md)).
+Keys under `adapter` and `scene` depend on the option that you choose: [Adapters](#options-of-a-law-and-arguments-of-the-adapters),
+[Scenes](#keys-of-a-scene).
 
 The settings models generate this page (`python -m mosa.config.reference`), and a test compares both. The models are in
 `mosa/config/command_settings.py`, `mosa/config/leaf_settings.py` and in the package of each section.
 """
+SCENES = {
+    "transforms": "films in files",
+    "markers": "`scene=markers`",
+    "rabbit": "built-in bodies",
+}
+"""File in conf/scene -> the options whose keys it shows."""
+IN_SCENES = """The column *Expected* names the options that take a key. Defaults are those of `conf/scene/transforms.yaml`,
+`markers.yaml` and `rabbit.yaml`; the file of your option may have others."""
 
 
 def default_of(f: FieldInfo) -> str:
@@ -73,19 +84,37 @@ def rows(model: type[Settings], instance: Settings | None, where: str = "") -> I
         yield key, shown, described(kind), str(f.description)
 
 
+def in_file(group: str, option: str) -> dict[str, tuple[str, str]]:
+    """key -> (value, comment) of the lines of conf/<group>/<option>.yaml."""
+    text = (Path(configuration()) / group / f"{option}.yaml").read_text()
+    lines = re.findall(r"^(?:  )?(\w+): +([^#\n]*?)(?: +# *(.*))?$", text, re.M)
+    return {key: (value, comment) for key, value, comment in lines}
+
+
 def arguments() -> Iterator[tuple[str, str, str, str]]:
-    """Of the adapters, and of `prior.options`."""
-    from mosa.modules.adapters.registry import ADAPTERS, adapter_class
+    """Of `prior.options`, and of the adapters, whose files say what their keys mean."""
+    from mosa.modules.adapters.registry import adapter_class
     from mosa.physics.engine.law_options import LawOptions
     from mosa.settings import arguments_of
 
     yield from rows(LawOptions, LawOptions(), "prior.options.")
-    for name in ADAPTERS:
-        if (build := adapter_class({"name": name})) is not None:
-            model = arguments_of(build, "adapter")  # type: ignore[arg-type]
-            for key, default, kind, about in rows(model, None, "adapter."):
-                note = "" if about == "None" else f": {about}"
-                yield key, default, kind, f"name={name}{note}"
+    for option in ("operator", "mosa", "direct", "nclaw", "neuma", "interaction"):
+        written = in_file("adapter", option)
+        build = adapter_class({"name": written["name"][0]})
+        model = arguments_of(build, "adapter")  # type: ignore[arg-type]
+        for key, default, kind, _ in rows(model, None, "adapter."):
+            about = written[key.removeprefix("adapter.")][1]
+            yield key, default, kind, f"`adapter={option}`: {about}"
+
+
+def of_scenes() -> Iterator[tuple[str, str, str, str]]:
+    """Keys of the formats' loaders, as their files say them; of a later format those that differ."""
+    said: set[tuple[str, str]] = set()
+    for option, where in SCENES.items():
+        for key, (value, about) in in_file("scene", option).items():
+            if key != "format" and (key, about) not in said:
+                said.add((key, about))
+                yield f"scene.{key}", value, where, about
 
 
 def table(found: Iterator[tuple[str, str, str, str]]) -> str:
@@ -102,6 +131,7 @@ def page() -> str:
     for name, model in COMMANDS.items():
         parts += [f"## {model.__doc__}", f"`conf/{name}.yaml`", table(rows(model, None))]
     parts += ["## Options of a law and arguments of the adapters", table(arguments())]
+    parts += ["## Keys of a scene", IN_SCENES, table(of_scenes())]
     return "\n\n".join(parts) + "\n"
 
 
@@ -112,7 +142,8 @@ def main(words: list[str]) -> None:
     if words[0] not in COMMANDS:
         print(f"expected one of {', '.join(COMMANDS)}, found {words[0]}", file=sys.stderr)
         sys.exit(2)
-    found = [*rows(COMMANDS[words[0]], None), *(arguments() if words[0] == "train" else ())]
+    beside = (*arguments(), *of_scenes()) if words[0] == "train" else ()
+    found = [*rows(COMMANDS[words[0]], None), *beside]
     for key, default, kind, about in found:
         if len(words) == 1 or f"{key}.".startswith(f"{words[1]}."):
             print(

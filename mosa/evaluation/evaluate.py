@@ -417,7 +417,7 @@ def law_figures(body: Body) -> dict[str, float]:
     figures["id/growth_per_period"] = growth
     if growth > GROWTH_LIMIT:
         warn(
-            f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
+            f"the learned law creates energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
             "adapter=operator has an energy and cannot",
             stacklevel=2,
         )

@@ -78,8 +78,8 @@ def warn_of_other_bodies(body: Body, found: Mapping[str, Start], scenes: Sequenc
             warnings.warn(
                 f"{prefix}: in its first frame the body of the training film fills {match.outline:.0%} of the outlines, "
                 f"where it looks most like it, and {own.outline:.0%} of its own: another body, a pose that was not "
-                "found, or a shape that the training film tells too little of (few cameras)? figures of this sequence "
-                "count on it",
+                "found, or a shape that the training film hardly shows (few cameras)? figures of this sequence "
+                "depend on it",
                 stacklevel=2,
             )
         off = match.color - own.color

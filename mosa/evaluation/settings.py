@@ -16,12 +16,10 @@ class EvaluationSettings(Settings):
 
     floor: bool = Field(
         True,
-        description=(
-            "roll the true law out on the learner's own grid where it is known (synthetic scenes)"
-        ),
+        description=("built-in scenes: simulate the true law on the learner's grid (row floor)"),
     )
     samples: Count = Field(8192, description="points of the chamfer distance")
     assignment: Count = Field(
         2048, description="points of the exact assignment of the earth mover's distance"
     )
-    video: bool = Field(True, description="film a comparison")
+    video: bool = Field(True, description="make video.mp4 and strip.png")

@@ -75,7 +75,8 @@ def source(material: Material, adapter: object) -> Source:
     """Errors: ConfigError naming the law or the adapter that has no energy as text."""
     if material.law not in ENERGIES:
         raise ConfigError(
-            f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow or have no energy"
+            f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow, are "
+            "damped or have no energy"
         )
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
         raise ConfigError(

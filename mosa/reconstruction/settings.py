@@ -41,24 +41,25 @@ class FitSettings(Settings):
 
     iterations: Whole = Field(400, description="steps")
     views: Count = Field(2, description="images in a step")
-    lr_positions: Weight = Field(0.03, description="step of positions, in units of the mean scale")
-    lr_scales: Weight = Field(0.02, description="step of the logarithms of scales")
-    ssim: Share = Field(0.2, description="weight of 1 - SSIM against L1")
-    matte: Weight = Field(1.0, description="weight of the alpha term")
+    lr_positions: Weight = Field(
+        0.03, description="learning rate of positions, in units of the mean scale"
+    )
+    lr_scales: Weight = Field(0.02, description="learning rate of the logarithms of scales")
+    ssim: Share = Field(0.2, description="weight of 1 - SSIM; the rest is L1")
+    matte: Weight = Field(1.0, description="weight of the matte's error")
     keep: Weight = Field(
         0.0,
-        description=(
-            "what a Gaussian's first colour (a particle's: from nearby Gaussians) "
-            "counts for, in pixels of an image"
-        ),
+        description=("weight of the initial colour, in pixels of an image"),
     )
-    largest: AtLeastOne = Field(2.0, description="bound of a scale in units of its start")
+    largest: AtLeastOne = Field(
+        2.0, description="largest scale of a Gaussian, over its initial scale"
+    )
     shape: Literal["isotropic", "anisotropic"] = Field(
         "isotropic",
         description="anisotropic: three scales and a rotation each, which start isotropic",
     )
     axis_ratio: AtLeastOne = Field(
-        10.0, description="an anisotropic one's largest scale over its smallest, at most"
+        10.0, description="anisotropic Gaussians: largest over smallest scale, at most"
     )
 
 
@@ -69,9 +70,7 @@ class StaticSettings(FitSettings):
 
     relocate_every: Whole = Field(
         100,
-        description=(
-            "steps after which vanished Gaussians are moved to where opaque ones are; 0: never"
-        ),
+        description=("steps between relocations of vanished Gaussians to opaque ones; 0: never"),
     )
 
 
@@ -82,21 +81,19 @@ class CarriedSettings(FitSettings):
     needs: ClassVar[dict[str, str]] = {"[!i]*": "iterations!=0"}
 
     views: Count = Field(4, description="images in a step")
-    keep: Weight = Field(
-        1.0, description="what a Gaussian's first colour counts for, in pixels of an image"
-    )
+    keep: Weight = Field(1.0, description="weight of the initial colour, in pixels of an image")
     shape: Literal["isotropic", "anisotropic"] = Field(
         "anisotropic", description="anisotropic: three scales and a rotation each"
     )
-    degree: int = Field(1, ge=0, le=3, description="of the spherical harmonics")
+    degree: int = Field(1, ge=0, le=3, description="degree of the spherical harmonics")
     keep_harmonics: Weight = Field(
         10.0,
         description=(
-            "what those count for in pixels of an image, since what no training camera "
-            "sees along has no other reason to be dull"
+            "weight of zero harmonics, in pixels of an image: keeps colours "
+            "plain in directions that no training camera sees"
         ),
     )
-    light: bool = Field(True, description="fit light that stays while the body turns")
+    light: bool = Field(True, description="fit a light that stays fixed while the body turns")
 
 
 class InformedSettings(Settings):
@@ -107,25 +104,25 @@ class InformedSettings(Settings):
         "views lr elastic bending response carriers": "iterations!=0"
     }
 
-    iterations: Whole = Field(80, description="steps; 0: never")
+    iterations: Whole = Field(80, description="steps; 0: no second fit")
     views: Count = Field(1, description="images of every frame in a step")
     lr: Positive = Field(
         0.02,
-        description="step, in units of the object's radius",
+        description="learning rate, in units of the object's radius",
     )
     elastic: Weight = Field(
         0.3,
-        description="weight of the elastic energy, counted from the prediction",
+        description="weight of the elastic energy of the difference from the prediction",
     )
     bending: Weight = Field(
         1.0,
-        description="weight of the curvature, counted from the prediction",
+        description="weight of the curvature of the difference from the prediction",
     )
     response: Whole = Field(
         4,
         description=(
-            "views of every frame that say how much of the prediction stays in what is "
-            "seen; 0: cues count as they are"
+            "views of every frame from which the cues' bias towards the "
+            "prediction is measured; 0: it is not removed"
         ),
     )
     carriers: Literal["auto", "fitted", "first"] = Field(
@@ -154,25 +151,26 @@ class DynamicSettings(Settings):
     carriers: Literal["static", "particles"] = Field(
         "static",
         description=(
-            "what is compared with the images: static: Gaussians of the static stage, "
-            "moved by the same motion and finer; particles: the paper"
+            "Gaussians compared with the images: static: those of the static "
+            "stage, moved by the motion; particles: one for each particle (the "
+            "paper)"
         ),
     )
     modes: Count = Field(120, description="number of modes")
     free_shape: bool = Field(
         False,
         description=(
-            "the Gaussians' scale and rotation are free, in place of following the "
-            "deformation; always so for the network"
+            "scale and rotation of the Gaussians are free and do not follow the "
+            "deformation; always true for the network"
         ),
     )
     track_iterations: Whole = Field(40, description="steps of a frame in the first pass")
     track_views: Count = Field(4, description="images in a step of the first pass")
     iterations: Whole = Field(150, description="steps of the joint refinement")
     views: Count = Field(1, description="images of every frame in a step of the refinement")
-    lr: Weight = Field(0.01, description="step of the refinement")
-    ssim: Share = Field(0.0, description="weight of 1 - SSIM against L1")
-    matte: Weight = Field(1.0, description="weight of the alpha term")
+    lr: Weight = Field(0.01, description="learning rate of the refinement")
+    ssim: Share = Field(0.0, description="weight of 1 - SSIM; the rest is L1")
+    matte: Weight = Field(1.0, description="weight of the matte's error")
     elastic: Weight = Field(0.01, description="weight of the mean St. Venant-Kirchhoff energy")
     bending: Weight = Field(
         3.5, description="weight of the modes' mean squared curvature, in units of the body's size"
@@ -199,7 +197,7 @@ class DynamicSettings(Settings):
     time_frequencies: int = Field(
         5, ge=0, le=16, description="network: sines and cosines of the time; GIC: 6"
     )
-    lr_network: Weight = Field(5e-4, description="network: step")
+    lr_network: Weight = Field(5e-4, description="network: learning rate")
 
 
 class ReconstructionSettings(Settings):
@@ -216,8 +214,7 @@ class ReconstructionSettings(Settings):
         ge=0,
         le=10**4,
         description=(
-            "rounds the hull where two silhouettes' cones meet, from which "
-            "geometry.source=images starts; 0: the hull itself"
+            "passes that round the hull's ridges, where the cones of two outlines meet; 0: none"
         ),
     )
     points: int = Field(3000, ge=8, le=10**8, description="static Gaussians")
@@ -225,20 +222,23 @@ class ReconstructionSettings(Settings):
         20,
         ge=4,
         le=1000,
-        description="of the least-squares deformation gradient; fewer than 4 leave it open",
+        description=(
+            "neighbours from which a particle's deformation gradient is fitted; "
+            "fewer than 4 do not determine it"
+        ),
     )
     cue: Literal["neighbourhood", "gaussian"] = Field(
         "neighbourhood",
         description=(
-            "of rotation and stretch (docs/cues.md); gaussian needs "
-            "dynamic.free_shape=true or the network"
+            "source of the cues of rotation and stretch (docs/cues.md); "
+            "gaussian needs dynamic.free_shape=true or the network"
         ),
     )
     margin: int = Field(
         6,
         ge=0,
         le=256,
-        description="px of the windows around mattes, which are in memory all at once",
+        description="px around the mattes in the windows that are kept in memory",
     )
     splats: Text | None = Field(
         None,
@@ -247,16 +247,21 @@ class ReconstructionSettings(Settings):
             " static stage"
         ),
     )
-    geometry: GeometrySection = Field(GeometrySection(), description="what of the hull is the body")
+    geometry: GeometrySection = Field(
+        GeometrySection(), description="the body inside the visual hull"
+    )
     static: StaticSettings = Field(StaticSettings(), description="static Gaussians")
     appearance: FitSettings = Field(
         FitSettings(keep=1.0), description="appearance of the particles"
     )
-    dynamic: DynamicSettings = Field(DynamicSettings(), description="motion")
+    dynamic: DynamicSettings = Field(DynamicSettings(), description="motion of the body")
     carried: CarriedSettings = Field(
         CarriedSettings(), description="Gaussians carried by the motion"
     )
-    informed: InformedSettings = Field(InformedSettings(), description="the motion once more")
+    informed: InformedSettings = Field(
+        InformedSettings(),
+        description="second fit of the motion, from the calibrated law's prediction",
+    )
 
     @property
     def looks_again(self) -> bool:

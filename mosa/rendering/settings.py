@@ -20,7 +20,7 @@ class RenderingSettings(Settings):
     appearance: Literal["splats", "particles"] = Field(
         "splats",
         description=(
-            "what evaluation, video, viewer and export show: the static stage's splats,"
-            " carried by the rollout, or particles"
+            "Gaussians in evaluation, video, viewer and export: splats carried "
+            "by the rollout, or particles"
         ),
     )

@@ -50,7 +50,8 @@ ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3
 STIFFNESS_COST = 1.5
 """Of a rollout with an adapter that is a stiffness over one without."""
 SIDE_BY_SIDE = 10
-"""Worlds that take a GPU as long as one rollout: 32 of 4040 particles took 3.3 times as long (docs/performance.md)."""
+"""Worlds that take a GPU as long as one rollout, rounded down: 32 of 4040 particles take 2.4 times as long as one, 2.9 times with
+gradients (docs/performance.md)."""
 KERNELS = 3.0
 """Seconds of a fit that no step takes: the trainer, and kernels that its last stage is the first to need."""
 MEASURED = 20_000

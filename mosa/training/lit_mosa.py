@@ -9,7 +9,7 @@
     module = LitMosa.load_from_checkpoint(path)               # to use, to test, or to fit on
 
 Any Trainer drives it. A stage runs by Gauss-Newton (`newton_steps.py`: an epoch is one iteration, over all views) or by Adam
-(`gradient_steps.py`: an epoch is a pass over the training views). `Stages`, a callback that the module brings along, leads from one
+(`adam_steps.py`: an epoch is a pass over the training views). `Stages`, a callback that the module brings along, leads from one
 stage to the next.
 """
 

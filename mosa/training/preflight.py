@@ -158,8 +158,8 @@ def warn_of_little(
         after = sum(frame >= first_contact(body, start, scene) for frame in scene.training_frames)  # type: ignore[arg-type]  # a body has the parts of its rest shape
         if after < DEFORMED:
             warnings.warn(f"{prefix}: {after} of the {len(scene.training_frames)} frames that are learned from come after first "
-                          f"contact: expected {DEFORMED} at least, in which the object deforms; what the film does not tell stays "
-                          "where the search begins, and its standard deviations do not say so (scene.frames, "
+                          f"contact: expected {DEFORMED} at least, in which the object deforms; numbers that the film does "
+                          "not determine stay at their start, and their standard deviations are too small (scene.frames, "
                           "scene.holdout_frames, scene.last_free_frame)", stacklevel=2)  # fmt: skip
 
 

@@ -116,7 +116,7 @@ def train(cfg: DictConfig) -> float | None:
         log.info(estimate_text(parts, memory))
     else:
         log.info(
-            "tracked points alone: no reconstruction from images, no figures of images, no video"
+            "tracked points only: no reconstruction from images, no figures of images, no video"
         )
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
@@ -132,8 +132,8 @@ def train(cfg: DictConfig) -> float | None:
     if not resolved.enough:
         warnings.warn(
             f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
-            f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "
-            f"{resolved.particles} particles would resolve them",
+            f"{ENOUGH:g}: the grid makes them too stiff and the learned law compensates for it, so it may predict worse "
+            f"than its prior; take about {resolved.particles} particles, or adapter=none",
             stacklevel=1,
         )
     with clock.measure("starts"):

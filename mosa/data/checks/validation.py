@@ -105,7 +105,7 @@ def validate(scene: Scene) -> Scene:
                 check_film(scene, label)
         except DataError as error:
             warnings.warn(
-                f"{error} (nothing is learned from cameras that are held out; figures of their images count on them)",
+                f"{error} (nothing is learned from cameras that are held out; figures of their images depend on them)",
                 stacklevel=2,
             )
     if not scene.synthetic:

@@ -29,7 +29,7 @@ from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
 from mosa.rendering.observer import deformed_covariances, observe
 from mosa.types import Cameras, Rollout, Scene
 
-TITLES = {"prior": "prior", "adapted": "adapted (MoSA)"}
+TITLES = {"prior": "prior", "adapted": "adapted (learned law)"}
 DIFFERENCE = 0.5
 """Largest image difference that has a colour of its own."""
 NEAR_BACKGROUND = 12

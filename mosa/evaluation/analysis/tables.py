@@ -18,6 +18,12 @@ from mosa.modules.fitting.search.ground_choice import (
 from mosa.modules.fitting.search.parts import WORTH, chosen, named
 from mosa.types import RUBBING
 
+ROWS = {
+    "floor": "the true law on the learner's grid and particles",
+    "prior": "the calibrated isotropic law",
+    "prior + eta": "the prior with a stiffness that varies over the body",
+    "adapted": "the learned law",
+}
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {
     "rms_m": ("rms [mm]", 1e3, 2),
@@ -49,8 +55,8 @@ def results_table(
 
 
 def columns_text(figures: Mapping[str, float], recording: str) -> str:
-    """What the columns of `results_table` are, in a sentence; empty where nothing of the training sequence was measured. recording:
-    name of the scene that is learned from first, which no column has."""
+    """What the rows and columns of `results_table` are, in two sentences; empty where nothing of the training sequence was
+    measured. recording: name of the scene that is learned from first, which no column has."""
     columns = _sequences(figures)
     if "train" not in columns:
         return ""
@@ -61,7 +67,10 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
     parts += ["`test/...` those held out, `test` their mean"] * any(
         column.startswith("test/") for column in columns
     )
-    return f"Columns: {', '.join(parts)}."
+    prefixes = dict(MODELS)
+    rows = [f"*{name}*: {about}" for name, about in ROWS.items()
+            if any(f"{prefixes[name]}{column}/{metric}" in figures for column in columns for metric in UNITS)]  # fmt: skip
+    return f"Rows: {'; '.join(rows)}. Columns: {', '.join(parts)}."
 
 
 def _sequences(figures: Mapping[str, float]) -> list[str]:
@@ -149,7 +158,7 @@ def _asked(gains: Mapping[str, float]) -> str:
     better = (
         f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f} of the logarithm of the likelihood"
     )
-    said = f"About the learned law, a body that {_words(best)} explains the motion {better}."
+    said = f"With the learned law, a body that {_words(best)} explains the motion {better}."
     if -EXPLAINED < gain <= EXPLAINED:
         said += f" Which of the two it is, is *not* determined: that takes {EXPLAINED:g}."
     return said
@@ -163,13 +172,13 @@ def form_text(errors: Mapping[str, float]) -> str:
     listed = "; ".join(f"{words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
     taken = chosen(errors)
     said = (
-        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, with what the "
-        f"grid gets wrong: {listed}."
+        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, plus the "
+        f"error of the grid: {listed}."
     )
     if taken == named(()) and len(errors) > 1:
         said += (
-            f" A richer law is only learned where this error is below {WORTH:g} of the isotropic one, as errors of "
-            "contact and cues look like a little of it."
+            f" A richer law is only learned where this error is below {WORTH:g} of the isotropic one, because "
+            "errors of contact and cues can look like slight anisotropy."
         )
     return said
 
@@ -270,7 +279,7 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         if f"posterior/{name}_numbers" in figures:
             lines.append(
                 f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
-                f"{figures[f'posterior/{name}_determined']:.1f}; the rest is where the prior has it."
+                f"{figures[f'posterior/{name}_determined']:.1f}; the others keep their prior values."
             )
     if "posterior/test/sd_m" in figures:
         sure = figures.get("posterior/test/coverage")
@@ -278,7 +287,8 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             "" if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations"
         )
         lines.append(
-            f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms){covered}."
+            "- Held-out positions after contact have a predicted standard deviation (not an error) of "
+            f"{figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms){covered}."
         )
     return "\n".join(lines)
 
@@ -295,7 +305,7 @@ def geometry_lines(figures: Mapping[str, float]) -> str:
     elif get("uncertain_share") is not None:
         lines.append(
             f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not "
-            "told by the images to 0.7 particle spacings and is guessed between outlines; "
+            "determined by the images to 0.7 particle spacings and is interpolated between outlines; "
             f"{get('free_frames'):.0f} free frames were used."
         )
     elif get("carved_share") is not None:

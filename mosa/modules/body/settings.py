@@ -61,10 +61,10 @@ class PriorSection(Settings):
     where: ClassVar[str] = "prior"
 
     law: Text = Field(
-        description="name of the law (docs/theory_to_code.md); auto: chosen among `candidates`"
+        description="name of the law, which prior=<law> sets (docs/choosing.md); auto: chosen among `candidates`"
     )
     parameters: Section = Field(
-        description="where the fit starts, by name, in SI units; a direction is three numbers"
+        description="parameters of the law by name, in SI units: where a fit starts; the material of mosa-splats"
     )
     frozen: Names | None = Field(None, description="parameters that are not learned")
     modulated: Names | None = Field(
@@ -73,7 +73,7 @@ class PriorSection(Settings):
     candidates: Names | None = Field(
         None, description="with law=auto: the laws that are calibrated and compared"
     )
-    options: Section | None = Field(None, description="how the law is taken (`LawOptions`)")
+    options: Section | None = Field(None, description="options of the law (below)")
 
 
 class WorldSection(Settings):
@@ -103,8 +103,8 @@ class WorldSection(Settings):
     forces: Entries | None = Field(
         [],
         description=(
-            "measured on colliders and driven sets, such as {of: clamp, file: force.csv, "
-            "sd: 0.02} (docs/driven.md)"
+            "forces measured on colliders and driven sets, such as {of: clamp, "
+            "file: force.csv, sd: 0.02} (docs/driven.md)"
         ),
     )
 

@@ -28,7 +28,12 @@ class TimeStepping(Settings):
     )
     max_substeps: Substeps = Field(400, description="substeps of a frame, at most")
     courant: float = Field(
-        0.6, gt=0, le=1, description="wave speed times dt/dx; beyond 1 an explicit step is unstable"
+        0.6,
+        gt=0,
+        le=1,
+        description=(
+            "Courant number, wave speed times dt/dx; above 1 an explicit step is unstable"
+        ),
     )
     adaptive: bool = Field(
         False,
@@ -43,10 +48,7 @@ class TimeStepping(Settings):
     )
     contact_offset: bool = Field(
         True,
-        description=(
-            "learn by how much the grid's contact lies above the ground [m] (a grid "
-            "feels a wall before it is reached)"
-        ),
+        description=("learn the height [m] above the ground at which the grid stops the body"),
     )
 
     def strides(self, least: int) -> int:
@@ -72,8 +74,10 @@ class SimulationSection(TimeStepping):
             "on a CPU and to 30000 on a GPU"
         ),
     )
-    particles_per_cell: float = Field(4, ge=1, le=64, description="particles in a cell of the grid")
-    dx: Positive | None = Field(None, description="grid spacing [m]; null: of the particles")
+    particles_per_cell: float = Field(4, ge=1, le=64, description="particles per grid cell")
+    dx: Positive | None = Field(
+        None, description="grid spacing [m]; null: from particles and particles_per_cell"
+    )
 
     @model_validator(mode="after")
     def _whole_strides(self) -> SimulationSection:

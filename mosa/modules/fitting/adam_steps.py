@@ -104,7 +104,7 @@ class GradientSteps:
             if not self.retreat.back(self.running_optimizer, learned):
                 raise
             log.warning(
-                "stage %s, iteration %d: the step before is taken back, and steps are half as long from here: %s",
+                "stage %s, iteration %d: the last step is undone, and steps are half as long from here: %s",
                 stage.name,
                 iteration,
                 error,
@@ -136,7 +136,7 @@ class GradientSteps:
         except SimulationDiverged as error:
             if not self.retreat.back(self.running_optimizer, self.learned()):
                 raise
-            log.warning("stage %s: its last step is taken back: %s", stage.name, error)
+            log.warning("stage %s: its last step is undone: %s", stage.name, error)
 
     def descend(
         self,

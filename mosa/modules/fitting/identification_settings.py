@@ -28,7 +28,10 @@ class Criterion(Settings):
         0.5,
         gt=0,
         le=1,
-        description="share of the distance that the corrected velocity would close within a frame",
+        description=(
+            "corrected: share of the distance from the observation that the "
+            "corrected velocity closes in a frame"
+        ),
     )
 
     @property
@@ -55,7 +58,9 @@ class IdentificationSettings(Settings):
             "law; 0: none, and for the parts of the law an assumed one"
         ),
     )
-    model_error: float = Field(0.02, ge=0, le=1, description="of all else, in cells")
+    model_error: float = Field(
+        0.02, ge=0, le=1, description="error of the simulation from other causes, in grid cells"
+    )
     operator_sd: Positive = Field(
         0.1,
         description=(
@@ -66,14 +71,14 @@ class IdentificationSettings(Settings):
     stiffness_sd: Positive = Field(
         0.12,
         description=(
-            "of the stiffness modes, likewise; of a wave number k it falls as (1 + "
-            "(k/2)^2)^(-smoothness/2)"
+            "prior standard deviation of the stiffness modes; it falls with the "
+            "wave number k as (1 + (k/2)^2)^(-smoothness/2)"
         ),
     )
-    smoothness: Weight = Field(1.0, description="power of that fall")
+    smoothness: Weight = Field(1.0, description="exponent of this fall")
     evidence: bool = Field(
         True,
-        description="find the size of both from the data (MacKay)",
+        description="find both prior standard deviations from the data (MacKay)",
     )
     known: Text | None = Field(
         None,
@@ -110,27 +115,27 @@ class LossWeights(Settings):
     mask: Weight = Field(1.0, description="rendered mattes")
     flow: Weight = Field(1.0, description="optical flow")
     rotation: Weight = Field(
-        0.1, description="cue of rotation; Gauss-Newton asks whether it is above 0"
+        0.1, description="cue of rotation; Gauss-Newton uses it if the weight is above 0"
     )
     stretch: Weight = Field(
-        0.1, description="cue of stretch; Gauss-Newton asks whether it is above 0"
+        0.1, description="cue of stretch; Gauss-Newton uses it if the weight is above 0"
     )
     heterogeneity: Weight = Field(0.1, description="size of the heterogeneity")
     position: Weight = Field(
         1.0,
         description=(
-            "not in the paper: particle positions of the reconstruction, over the "
-            "object's size; Gauss-Newton asks whether it is above 0"
+            "not in the paper: particle positions of the reconstruction, over "
+            "the object's size; Gauss-Newton uses it if the weight is above 0"
         ),
     )
     operator: Weight = Field(
         0.0,
         description=(
-            "not in the paper: root mean square of the entries of C and of L_pre, "
-            "L_post: a departure from the prior has to earn its keep, as in a group "
-            "lasso. The weight holds where the calibrated prior misses the "
-            "reconstruction by 1 % of the object's size, and falls as 1 / misfit^2 "
-            "(misfit: of the model that the joint stage starts from, at least 0.1 %)"
+            "not in the paper: root mean square of the entries of C and of "
+            "L_pre, L_post, as in a group lasso. The weight applies if the "
+            "calibrated prior misses the reconstruction by 1 % of the object's "
+            "size, and falls as 1 / misfit^2 (misfit: of the model that the "
+            "joint stage starts from, at least 0.1 %)"
         ),
     )
     operator_variance: Weight = Field(

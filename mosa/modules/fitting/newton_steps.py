@@ -113,7 +113,7 @@ class NewtonSteps:
         moves = not begins_again and learned_on(named(found), self.ground_gains) == named(best)
         log.info("ground: %s explains the motion %s than %s (by %.1f of the logarithm of the likelihood)%s", named(best),
                  "better" if gains[best] > 0 else "worse", named(found), abs(gains[best]),
-                 "; the fit begins again" if begins_again else "; the fit goes there" if moves else "")  # fmt: skip
+                 "; the fit begins again with it" if begins_again else "; the fit continues with it" if moves else "")  # fmt: skip
         if moves:
             self.go_to(best, fits[best])
         return best if begins_again else None
@@ -130,8 +130,8 @@ class NewtonSteps:
         best = max(self.law_gains, key=self.law_gains.get, default=None)
         if best is None or self.law_gains[best] <= EXPLAINED:
             return None
-        log.info("prior=auto: about what was learned, %s explains the motion better than %s (by %.1f of the logarithm of the "
-                 "likelihood); the fit begins again", best, self.body.material.law, self.law_gains[best])  # fmt: skip
+        log.info("prior=auto: with the learned correction %s explains the motion better than %s (by %.1f of the logarithm of "
+                 "the likelihood); the fit begins again with it", best, self.body.material.law, self.law_gains[best])  # fmt: skip
         return best
 
     def goes_back(self, stage: Stage) -> bool:
@@ -193,7 +193,7 @@ class NewtonSteps:
         self.parts = own.held_back()
         if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):
             return own
-        log.info("the law is %s: error of held-back frames %s", best, ", ".join(
+        log.info("parts of the law that are kept: %s; errors of held-back frames: %s", best, ", ".join(
             f"{name} {1e3 * error:.2f} mm" for name, error in self.parts.items()))  # fmt: skip
         kept = [part for part in PARTS if part in best.split("+")]
         with torch.no_grad():

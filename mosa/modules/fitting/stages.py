@@ -25,17 +25,16 @@ class StageSettings(Settings):
     optimizer: Literal["auto", "gauss_newton", "adam"] = Field(
         "auto",
         description=(
-            "auto: Gauss-Newton where all that the stage learns has few numbers "
-            "(adapter=operator or none, heterogeneity.kind=modes), Adam where there are"
-            " networks"
+            "auto: Gauss-Newton if the stage learns no network "
+            "(adapter=operator or none, heterogeneity.kind=modes), else Adam"
         ),
     )
     newton_iterations: Count = Field(8, description="iterations of Gauss-Newton, at most")
     looks: Whole = Field(
         0,
         description=(
-            "of `prior`, where nothing else is learned and Gauss-Newton does: "
-            "calibrations that follow, each about the motion found once more"
+            "stage `prior` by Gauss-Newton: further calibrations, each after a "
+            "second fit of the motion"
         ),
     )
     iterations: Whole = Field(description="steps of Adam; 0 leaves the stage out")
@@ -56,7 +55,7 @@ class StageSettings(Settings):
         ),
     )
     start: Literal["prior", "prior_eta"] | None = Field(
-        None, description="of `joint`: the stage whose global parameters and eta it starts from"
+        None, description="stage `joint`: the stage from whose parameters and eta it starts"
     )
 
 
@@ -162,7 +161,7 @@ class FitSection(Settings):
     where: ClassVar[str] = "fit"
     needs: ClassVar[dict[str, str]] = {"views clip": "adam"}
 
-    views: Count = Field(2, description="cameras rendered in a step of Adam")
+    views: Count = Field(2, description="Adam: cameras that a step renders")
     clip: Positive = Field(
         1.0,
         description="Adam: bound of the gradient norm of the networks",

@@ -79,7 +79,7 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
         cues, found = take.again.with_response(free, other, take.cues.positions, take.first_contact)
     moved = float((cues.positions - take.cues.positions).square().sum(-1).mean().sqrt())
     log.info(
-        "motion of %s once more, about the calibrated backbone's: moved by %.2g mm (root mean square)",
+        "motion of %s fitted again, from the calibrated law's prediction: changed by %.2g mm (root mean square)",
         take.again.scene.sequence,
         1e3 * moved,
     )

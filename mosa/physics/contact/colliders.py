@@ -229,9 +229,9 @@ def colliders_from_config(
 ) -> tuple[Collider, ...]:
     """Colliders of plain containers, as a YAML file has them; a `Collider` is passed on.
 
-    Each: type: plane | sphere | capsule | cylinder | box | mesh, with radius, length [m], size (3 edges) [m], or path (OBJ or PLY,
-    with spacing [m] of the lattice, and scale); plane takes `normal` instead of rotation; mode, friction, name;
-    position (3,) [m]; rotation (ax, ay, az, degrees); motion: {velocity, angular_velocity [rad/s], times} or
+    Each: type: plane | sphere | capsule | cylinder | box | mesh, with radius, length [m], size (3 edges) [m], or path (OBJ, PLY, or
+    STL, which needs trimesh; with spacing [m] of the lattice, and scale); plane takes `normal` instead of rotation; mode, friction,
+    name; position (3,) [m]; rotation (ax, ay, az, degrees); motion: {velocity, angular_velocity [rad/s], times} or
     {waypoints: [{time, position, rotation}, ...]}. Errors: ConfigError naming the entry and the field.
     """
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):

@@ -15,7 +15,7 @@ class LawOptions(Settings):
     where: ClassVar[str] = "prior.options"
 
     yield_convention: Literal["paper", "sqrt23"] = Field(
-        "paper", description="of von Mises; sqrt23 is PAC-NeRF's"
+        "paper", description="factor of von Mises' yield stress: 1 (paper) or sqrt(2/3) (PAC-NeRF)"
     )
     friction_cone: Literal["klar", "printed"] = Field(
         "klar",
@@ -24,14 +24,14 @@ class LawOptions(Settings):
             "printed: the root over all of it, as the paper prints"
         ),
     )
-    norm_eps: Weight = Field(0.0, description="under the root of yield norms")
+    norm_eps: Weight = Field(0.0, description="number added under the root of yield norms")
     rebuild: bool = Field(
         False, description="write U S V^T back also where nothing yielded (PAC-NeRF does)"
     )
     on_inversion: Literal["warn", "ignore", "error"] = Field(
         "warn",
         description=(
-            "where det F <= 0 and the law has a value there; it is an error where it has none"
+            "reaction to det F <= 0 in laws that have a stress there; in others it is an error"
         ),
     )
     init_affine: Literal["spin", "zero"] = Field(

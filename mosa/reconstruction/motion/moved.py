@@ -196,7 +196,7 @@ class SecondLook:
         frames = len(positions) - 1
         with tqdm(
             total=frames,
-            desc=f"what images of {scene.sequence} tell",
+            desc=f"{scene.sequence}: how far images determine the motion",
             disable=not self.progress,
             leave=False,
         ) as steps:
@@ -215,8 +215,8 @@ class SecondLook:
             parts.scaffold.modes, matrices, about, positions, second[1], second[0], first_contact
         )
         log.info(
-            "motion of %s: what holds it where images tell little is %.3g of what they tell in the median direction; that "
-            "explains %.0f%% of what another prediction changed",
+            "motion of %s: its bias towards the prediction is measured by a second prediction: the weight of the prediction is "
+            "%.3g of the images' (median direction), which explains %.0f%% of the change",
             scene.sequence,
             strength,
             100 * (1 - left),
@@ -277,7 +277,7 @@ class SecondLook:
     ) -> tuple[Tensor, Tensor] | None:
         """(positions, the shapes that they were sought from), (T, N, 3) [m] each; None where the prediction is no guide."""
         parts, settings, sequence = self.reconstruction.moving, self.settings, self.scene.sequence
-        title = f"motion of {sequence} about the prediction"
+        title = f"{sequence}: motion fitted to images from the prior's prediction"
         with tqdm(
             total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False
         ) as steps:
@@ -286,8 +286,8 @@ class SecondLook:
                                     seed=self.seed, judging=parts.carried, progress=steps.update)  # fmt: skip
         if found is None:
             log.warning(
-                "reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
-                "motion stays",
+                "reconstruction.informed: a motion of %s that starts from the calibrated law's prediction follows the images "
+                "much worse than the first reconstruction, which is kept",
                 sequence,
             )
             return None

@@ -67,7 +67,7 @@ def test_a_person_reads_how_sure_the_body_is(scene, particles):
         "geometry/free_frames": 4.0,
     }
     assert (
-        "3.1% of the visual hull is air. 7.2% of the surface is not told by the images"
+        "3.1% of the visual hull is air. 7.2% of the surface is not determined by the images"
         in geometry_lines(figures)
     )
     assert "left out; no refinement by colours" in geometry_lines({"geometry/carved_share": 0.02})

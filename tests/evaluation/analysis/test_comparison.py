@@ -159,7 +159,7 @@ def test_the_distance_to_the_truth_is_painted(body):
     found = shown(body)
     assert (found.label, found.high) == ("distance to the true motion", "50 mm")
     viridis = matplotlib.colormaps["viridis"]
-    for title, share in (("prior", SHIFT / 0.05), ("adapted (MoSA)", 0.0)):
+    for title, share in (("prior", SHIFT / 0.05), ("adapted (learned law)", 0.0)):
         wanted = 255 * np.array(viridis(share)[:3])
         for image in found.errors[title]:
             inside = (

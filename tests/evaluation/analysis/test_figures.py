@@ -52,7 +52,8 @@ def test_an_ffmpeg_that_writes_nothing_is_said(tmp_path, monkeypatch, program):
 
 
 @pytest.mark.parametrize(
-    "text", ["real", "adapted (MoSA): distance to the true motion, blue 0, yellow 20 mm", "x" * 300]
+    "text",
+    ["real", "adapted (learned law): distance to the true motion, blue 0, yellow 20 mm", "x" * 300],
 )
 def test_a_caption_fits_into_its_share(text):
     """Three columns of 230 px, as in the rabbit's strip: no caption ends in its neighbour's or beyond the picture."""

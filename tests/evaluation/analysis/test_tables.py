@@ -82,12 +82,12 @@ def test_the_recording_that_no_column_names_is_said():
         f"{part}/psnr_crop": 30.0 for part in ("train", "train/drop_2", "test", "test/drop_3")
     }
     assert columns_text(figures, "drop_1") == (
-        "Columns: `train` is the recording drop_1, `train/...` the others that were learned "
+        "Rows: *adapted*: the learned law. Columns: `train` is the recording drop_1, `train/...` the others that were learned "
         "from, `test/...` those held out, `test` their mean."
     )
-    assert (
-        columns_text({"train/psnr_crop": 30.0}, "drop_1")
-        == "Columns: `train` is the recording drop_1."
+    assert columns_text({"train/rms_m": 1.0, "floor/train/rms_m": 1.0}, "drop_1") == (
+        "Rows: *floor*: the true law on the learner's grid and particles; *adapted*: the learned law. "
+        "Columns: `train` is the recording drop_1."
     )
     assert (
         columns_text({"test/a/psnr_crop": 30.0}, "a") == ""
