@@ -7,8 +7,9 @@ from torch import Tensor
 
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
-from mosa.modules.adapters.stress import Hidden, RestFree, Scale, StressBound, rested
+from mosa.modules.adapters.stress import rested
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
+from mosa.settings import Positive, Width
 
 
 class DirectAdapter(Adapter):
@@ -21,10 +22,10 @@ class DirectAdapter(Adapter):
     def __init__(
         self,
         *,
-        l_max: StressBound = 0.1,
-        input_scale: Scale = 10.0,
-        hidden: Hidden = 64,
-        rest_free: RestFree = True,
+        l_max: Positive | None = 0.1,
+        input_scale: Positive = 10.0,
+        hidden: Width = 64,
+        rest_free: bool = True,
     ) -> None:
         super().__init__()
         self.l_max, self.scale, self.rest_free = l_max, input_scale, rest_free

@@ -189,7 +189,7 @@ class SimulateSection(Settings):
     )
     frames: Count = Field(
         30,
-        description=("number of frames; has an effect with one of the keys above, as variant does"),
+        description="number of frames; has an effect with one of the keys above, as variant does",
     )
     variant: Literal["adapted", "prior_eta", "prior"] = Field(
         "adapted", description="model to simulate: prior, prior_eta or adapted (docs/figures.md)"

@@ -70,9 +70,7 @@ class SplatsSettings(LawSections):
         | None
     ) = Field(
         None,
-        description=(
-            "[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all"
-        ),
+        description="[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all",
     )
     opacity: Share = Field(0.1, description="Gaussians with a smaller opacity are left out")
     open_below: bool = Field(False, description="the underside was never filmed: it is closed")
@@ -149,13 +147,11 @@ class CaptureSettings(Settings):
     )
     mattes: Literal["plates", "masks"] = Field(
         "plates",
-        description=("plates: empty backgrounds; masks: videos of masks, of any other program"),
+        description="plates: empty backgrounds; masks: videos of masks, of any other program",
     )
     plates: Folder | None = Field(
         None,
-        description=(
-            "folder of <phone>.png, .jpg or .mp4; null: plates beside or in the videos' folder"
-        ),
+        description="folder of <phone>.png, .jpg or .mp4; null: plates beside or in the videos' folder",
     )
     plate_seconds: Period | None = Field(
         None, description="[from, to] of each video's clock in which it shows the empty background"
@@ -165,9 +161,7 @@ class CaptureSettings(Settings):
     )
     fps: Rate | None = Field(
         None,
-        description=(
-            "frames per second as they were taken; null: what the videos say (slow motion: set it)"
-        ),
+        description="frames per second as they were taken; null: what the videos say (slow motion: set it)",
     )
     scan: Scan = Field(
         "auto", description="where the sensor's next row lies in the picture; auto: from the video"
@@ -177,7 +171,7 @@ class CaptureSettings(Settings):
     )
     phones: dict[str, PhoneSection] | None = Field(
         None,
-        description=("settings of single phones: {phone3: {fps: 240, scan: left, readout: 0.01}}"),
+        description="settings of single phones: {phone3: {fps: 240, scan: left, readout: 0.01}}",
     )
     max_offset: Seconds = Field(5.0, description="s by which the videos' beginnings may be apart")
     flight: Period | None = Field(
@@ -196,7 +190,7 @@ class CaptureSettings(Settings):
         | None
     ) = Field(
         None,
-        description=("upwards in the poses' world; null: against the acceleration of the fall"),
+        description="upwards in the poses' world; null: against the acceleration of the fall",
     )
     ground: Three | None = Field(
         None,
@@ -209,9 +203,7 @@ class CaptureSettings(Settings):
     after: Seconds = Field(0.25, description="s after the end of the free fall that are written")
     interpolation: Literal["flow", "shift", "none"] = Field(
         "flow",
-        description=(
-            "images between frames; shift: the nearest frame, moved; none: the nearest frame"
-        ),
+        description="images between frames; shift: the nearest frame, moved; none: the nearest frame",
     )
     colours: Literal["floor", "none"] = Field(
         "floor",
@@ -245,7 +237,7 @@ class SearchSection(Settings):
     )
     clip: Positive = Field(
         0.5,
-        description=("gradient: largest norm of one trial's gradient with respect to one action"),
+        description="gradient: largest norm of one trial's gradient with respect to one action",
     )
     every: Count = Field(10, description="iterations between validations")
     validation: Count = Field(32, description="validation trials, in the training simulator")
@@ -257,7 +249,7 @@ class SearchSection(Settings):
     )
     spread: Positive = Field(
         0.4,
-        description=("model: initial standard deviation of actions about those of the policy"),
+        description="model: initial standard deviation of actions about those of the policy",
     )
 
 
@@ -286,7 +278,7 @@ class EnvironmentsSettings(Settings):
         ),
     ] = Field(
         "learned",
-        description=("simulator to train in: learned, isotropic or truth; a list makes a table"),
+        description="simulator to train in: learned, isotropic or truth; a list makes a table",
     )
     seed: Seed = Field(0, description="seed of one policy")
     seeds: Annotated[list[Seed], Expected("a list of whole numbers"), such(bool)] = Field(
@@ -320,7 +312,7 @@ class EnvironmentsSettings(Settings):
         such(lambda v: all(value is None or is_number(value) for value in v.values())),
     ] = Field(
         dict.fromkeys(OPTIONS),
-        description=("fields of the task's class (docs/environments.md); null: their defaults"),
+        description="fields of the task's class (docs/environments.md); null: their defaults",
     )
     truth: TruthSection = Field(TruthSection(), description="the hidden truth")
     search: SearchSection = Field(SearchSection(), description="the search of a policy")
@@ -343,7 +335,7 @@ class MaterialSettings(LawSections):
     )
     symmetry: Literal["full", "orthotropic"] = Field(
         "full",
-        description=("symmetry of the learned stiffness; orthotropic: mirrors across x, y and z"),
+        description="symmetry of the learned stiffness; orthotropic: mirrors across x, y and z",
     )
     starts: int = Field(
         4, ge=1, le=100, description="starts of the least squares; the best result is kept"

@@ -16,7 +16,7 @@ class EvaluationSettings(Settings):
 
     floor: bool = Field(
         True,
-        description=("built-in scenes: simulate the true law on the learner's grid (row floor)"),
+        description="built-in scenes: simulate the true law on the learner's grid (row floor)",
     )
     samples: Count = Field(8192, description="points of the chamfer distance")
     assignment: Count = Field(

@@ -49,7 +49,7 @@ class FitSettings(Settings):
     matte: Weight = Field(1.0, description="weight of the matte's error")
     keep: Weight = Field(
         0.0,
-        description=("weight of the initial colour, in pixels of an image"),
+        description="weight of the initial colour, in pixels of an image",
     )
     largest: AtLeastOne = Field(
         2.0, description="largest scale of a Gaussian, over its initial scale"
@@ -70,7 +70,7 @@ class StaticSettings(FitSettings):
 
     relocate_every: Whole = Field(
         100,
-        description=("steps between relocations of vanished Gaussians to opaque ones; 0: never"),
+        description="steps between relocations of vanished Gaussians to opaque ones; 0: never",
     )
 
 
@@ -151,9 +151,8 @@ class DynamicSettings(Settings):
     carriers: Literal["static", "particles"] = Field(
         "static",
         description=(
-            "Gaussians compared with the images: static: those of the static "
-            "stage, moved by the motion; particles: one for each particle (the "
-            "paper)"
+            "Gaussians compared with the images: static: those of the static stage, moved by the "
+            "motion; particles: one for each particle (the paper)"
         ),
     )
     modes: Count = Field(120, description="number of modes")
@@ -213,9 +212,7 @@ class ReconstructionSettings(Settings):
         24,
         ge=0,
         le=10**4,
-        description=(
-            "passes that round the hull's ridges, where the cones of two outlines meet; 0: none"
-        ),
+        description="passes that round the hull's ridges, where the cones of two outlines meet; 0: none",
     )
     points: int = Field(3000, ge=8, le=10**8, description="static Gaussians")
     neighbours: int = Field(

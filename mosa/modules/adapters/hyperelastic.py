@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from mosa.modules.adapters.base import Adapter
@@ -88,8 +87,7 @@ class HyperelasticAdapter(Adapter):
 
     few_numbers = True
 
-    def __init__(self, *, strain: Annotated[Literal["hencky", "biot", "green"], Field(
-            description="strain measure E of the energy mu E : S : E")] = "green") -> None:  # fmt: skip
+    def __init__(self, *, strain: Literal["hencky", "biot", "green"] = "green") -> None:
         super().__init__()
         self.strain = strain
         self.numbers = nn.Parameter(torch.zeros(NUMBERS))

@@ -20,31 +20,9 @@ from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.adapters.network_evaluation import backward_at_hand
 from mosa.settings import Expected, Positive, Width
 
-Bound = Annotated[float, Field(gt=0, lt=1, description="bound of the entries of the LU factors")]
-NormalBound = Annotated[
-    float | None,
-    Field(gt=0, lt=1, description="of those of C_xyz; null: alpha (the paper's two alphas)"),
-]
-StressBound = Annotated[
-    Positive | None, Field(description="bound of L_pre and L_post, in units of E_ref; null: none")
-]
-Scale = Annotated[Positive, Field(description="factor of what the networks read")]
-Hidden = Annotated[Width, Field(description="width of the networks")]
-Factors = Annotated[
-    Literal["residual", "printed"],
-    Field(
-        description="C = (I + L)(I + U) - I, or the paper's C = (L + 0.01 I)(U + 0.01 I) of "
-        "triangular L, U"
-    ),
-]
-RestFree = Annotated[
-    bool, Field(description="an undeformed body stays stress-free; false: the paper's literal form")
-]
-Fused = Annotated[
-    bool | Literal["auto"],
-    Expected("auto, true or false"),
-    Field(description="Triton kernels on CUDA; auto: where they can"),
-]
+Bound = Annotated[float, Field(gt=0, lt=1)]
+NormalBound = Annotated[float | None, Field(gt=0, lt=1)]
+Fused = Annotated[bool | Literal["auto"], Expected("auto, true or false")]
 
 
 class StressAdapter(Adapter):
@@ -62,11 +40,11 @@ class StressAdapter(Adapter):
     """
 
     def __init__(
-        self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: StressBound = 0.1, input_scale: Scale = 10.0,
-        hidden: Hidden = 64, rest_free: RestFree = True, plastic: bool = False, major_symmetry: bool = False,
+        self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: Positive | None = 0.1, input_scale: Positive = 10.0,
+        hidden: Width = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
         state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
         precision: Literal["accurate", "tf32"] = "accurate",
-        factors: Factors = "residual",
+        factors: Literal["residual", "printed"] = "residual",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()

@@ -87,17 +87,15 @@ class WorldSection(Settings):
     colliders: Entries | None = Field(
         [],
         description=(
-            "rigid solids, such as {type: sphere, radius: 0.1, position: [0, 0, 0], "
-            "mode: separate, friction: 0.3, motion: {velocity: [1, 0, 0]}} "
-            "(docs/twin.md)"
+            "rigid solids, such as {type: sphere, radius: 0.1, position: [0, 0, 0], mode: "
+            "separate, friction: 0.3, motion: {velocity: [1, 0, 0]}} (docs/twin.md)"
         ),
     )
     driven: Entries | None = Field(
         [],
         description=(
-            "sets of the body's particles that are held, moved or loaded, such as "
-            "{name: clamp, type: box, size: [0.1, 0.1, 0.1], position: [0, 0, 0]} "
-            "(docs/driven.md)"
+            "sets of the body's particles that are held, moved or loaded, such as {name: clamp, "
+            "type: box, size: [0.1, 0.1, 0.1], position: [0, 0, 0]} (docs/driven.md)"
         ),
     )
     forces: Entries | None = Field(

@@ -31,9 +31,7 @@ class TimeStepping(Settings):
         0.6,
         gt=0,
         le=1,
-        description=(
-            "Courant number, wave speed times dt/dx; above 1 an explicit step is unstable"
-        ),
+        description="Courant number, wave speed times dt/dx; above 1 an explicit step is unstable",
     )
     adaptive: bool = Field(
         False,
@@ -48,7 +46,7 @@ class TimeStepping(Settings):
     )
     contact_offset: bool = Field(
         True,
-        description=("learn the height [m] above the ground at which the grid stops the body"),
+        description="learn the height [m] above the ground at which the grid stops the body",
     )
 
     def strides(self, least: int) -> int:

@@ -89,9 +89,7 @@ class IdentificationSettings(Settings):
     )
     tolerance: Positive = Field(
         0.3,
-        description=(
-            "a stage ends when its last step is this small, in standard deviations of the posterior"
-        ),
+        description="a stage ends when its last step is this small, in standard deviations of the posterior",
     )
     threads: int = Field(
         0,
@@ -131,10 +129,9 @@ class LossWeights(Settings):
     operator: Weight = Field(
         0.0,
         description=(
-            "not in the paper: root mean square of the entries of C and of "
-            "L_pre, L_post, as in a group lasso. The weight applies if the "
-            "calibrated prior misses the reconstruction by 1 % of the object's "
-            "size, and falls as 1 / misfit^2 (misfit: of the model that the "
+            "not in the paper: root mean square of the entries of C and of L_pre, L_post, as in a "
+            "group lasso. The weight applies if the calibrated prior misses the reconstruction by "
+            "1 % of the object's size, and falls as 1 / misfit^2 (misfit: of the model that the "
             "joint stage starts from, at least 0.1 %)"
         ),
     )

@@ -30,9 +30,7 @@ class LawOptions(Settings):
     )
     on_inversion: Literal["warn", "ignore", "error"] = Field(
         "warn",
-        description=(
-            "reaction to det F <= 0 in laws that have a stress there; in others it is an error"
-        ),
+        description="reaction to det F <= 0 in laws that have a stress there; in others it is an error",
     )
     init_affine: Literal["spin", "zero"] = Field(
         "spin", description="spin takes a start's C_affine, zero replaces it by 0"
