@@ -105,7 +105,7 @@ CURVES = (
     Curve(
         "epoch",
         "-",
-        "steps before this one, as Lightning counts them",
+        "epochs before this one ([Lightning's](own_training_script.md#a-fit)): iterations of Gauss-Newton, passes over the views by Adam",
     ),
     Curve(
         "final/<figure>",
