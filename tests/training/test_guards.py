@@ -44,6 +44,7 @@ def test_walls_beside_a_ground_that_slopes_are_refused_before_the_reconstruction
         gravity=-9.8 * up,
         up=up,
         box=torch.tensor([[-1.0] * 3, [1.0] * 3]),
+        driven=(),
     )
     cfg = OmegaConf.create(composed("debug=default", "world.walls={mode: separate}"))
     with pytest.raises(
