@@ -105,7 +105,7 @@ CURVES = (
     Curve(
         "epoch",
         "-",
-        "epochs before this one ([Lightning's](own_training_script.md#a-fit)): iterations of Gauss-Newton, passes over the views by Adam",
+        "epochs before this one: iterations of Gauss-Newton, passes over the views by Adam",
     ),
     Curve(
         "final/<figure>",
