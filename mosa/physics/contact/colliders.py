@@ -77,6 +77,8 @@ force there, and from 2 on a particle that is alone in its cells would go back a
 Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField | Particles
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
          Box: packing.BOX, SignedDistanceField: packing.FIELD, Particles: packing.SPHERE}  # fmt: skip
+"""A shape of one's own goes in here, below in `_sizes`, `half_width`, `reach` and `_FIELDS`, in `keys.KEYS`, in
+`shape_functions`, in `reference.signed_distance`, and to be seen in `twin.shown_solids` and `viewer.pages`."""
 NOWHERE = -1e30
 """Radius [m] of the ball that stands for driven particles among the solids: nothing ever meets it.
 """
@@ -169,6 +171,7 @@ def pack_colliders(
 
 
 def _sizes(shape: Shape) -> tuple[float, ...]:
+    """[m] as `shape_functions` reads them; none of a half space, of a field, of driven particles."""
     if isinstance(shape, Sphere):
         return (shape.radius,)
     if isinstance(shape, Capsule | Cylinder):

@@ -1,4 +1,5 @@
-"""Pure torch float64 twin of the colliders: slow and obvious, for tests; gradients by plain autograd."""
+"""Pure torch float64 twin of the colliders: slow and obvious, for tests and for bodies that overlap solids at the start (`overlap`);
+gradients by plain autograd."""
 
 import torch
 from torch import Tensor
@@ -32,6 +33,8 @@ def signed_distance(shape, q: Tensor) -> Tensor:
         d = torch.stack([q[:, :2].norm(dim=1) - shape.radius, q[:, 2].abs() - shape.length / 2], 1)
     elif isinstance(shape, Box):
         d = q.abs() - 0.5 * torch.tensor(shape.size, dtype=torch.float64)
+    else:
+        raise NotImplementedError(f"no signed distance of a {type(shape).__name__}")
     outside = (d > 0).any(1)
     distance = torch.zeros(len(q), dtype=torch.float64)
     distance = distance.index_put((outside,), d[outside].clamp_min(0).norm(dim=1))

@@ -49,7 +49,7 @@ class Stretch:
     leaves the colliders' force [N] and torque about each collider's origin [N m], (S, W K, 3) each,
     then the `statistics` of its kind.
 
-    first: number of its first substep, for messages; steps: times of the substeps."""
+    first: number of its first substep since the motion began; steps: times of the substeps."""
 
     lanes: Lanes
     first: int

@@ -91,7 +91,7 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
 @pytest.mark.parametrize(
     "item, match",
     [
-        ({"type": "torus"}, r"world\.colliders\[0\]\.type: expected one of plane, sphere.*'torus'"),
+        ({"type": "blob"}, r"world\.colliders\[0\]\.type: expected one of plane, sphere.*'blob'"),
         ({"type": "sphere"}, "a sphere needs radius"),
         ({"type": "sphere", "radius": 1, "length": 2}, "unknown: length"),
         ({"type": "sphere", "radius": "wide"}, r"\[0\]\.radius: expected a number above 0.*, found 'wide'"),
