@@ -1,5 +1,5 @@
-"""Pure torch float64 twin of the colliders: slow and obvious, for tests and for bodies that overlap solids at the start (`overlap`);
-gradients by plain autograd."""
+"""Pure torch float64 twin of the colliders: slow and obvious, for tests and for bodies that overlap
+solids at the start (`overlap`); gradients by plain autograd."""
 
 import torch
 from torch import Tensor

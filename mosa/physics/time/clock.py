@@ -34,7 +34,8 @@ class Replay:
 
 class Moment(NamedTuple):
     """Where a motion is that is advanced frame by frame. state: (N, ...) or, of B worlds, (B, N, ...); substeps: done since its
-    start, in how many frames, also of worlds that were begun again later (`Episode.restart`); lag [s]: the last substep's dt, before the first as in `Adaptive`, where counts vary."""
+    start, in how many frames, also of worlds that were begun again later (`Episode.restart`); lag [s]: the last substep's dt,
+    before the first as in `Adaptive`, where counts vary."""
 
     state: ParticleState
     substeps: int = 0
