@@ -48,7 +48,8 @@ def test_every_shape_of_a_link_is_a_collider(tmp_path):
         (tmp_path / folder).mkdir()
     trimesh.creation.box((20, 40, 60)).export(tmp_path / "meshes" / "a.dae")
     arm = """<robot name="arm"><link name="a"><collision><geometry>
-    <mesh filename="package://robot/meshes/a.dae" scale="0.001 0.001 0.001"/></geometry></collision></link><link name="b"><collision>
+    <mesh filename="package://robot/meshes/a.dae" scale="0.001 0.001 0.001"/></geometry></collision></link>
+    <link name="b"><collision>
     <origin xyz="0 0 0.1"/><geometry><cylinder radius="0.02" length="0.2"/></geometry></collision>
     </link><joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
     <limit lower="-3" upper="3" effort="1" velocity="1"/></joint></robot>"""
