@@ -129,9 +129,7 @@ class SplatsSettings(LawSections):
     velocity: Three = Field([0, 0, 0], description="m/s")
     angular_velocity: Three = Field([0, 0, 0], description="rad/s")
     frames: Count = Field(40, description="number of frames")
-    rate: Positive = Field(
-        30, description="simulated frames per second"
-    )
+    rate: Positive = Field(30, description="simulated frames per second")
     formats: Names = Field(
         ["ply"],
         description="ply, gltf, sog: a file for each frame; usd, rrd: one file (docs/splats.md)",

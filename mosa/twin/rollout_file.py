@@ -65,8 +65,8 @@ def shape_of(numbers: Sequence[float]) -> Shape | None:
     kind = int(numbers[0]) - 1
     if kind not in range(len(DRAWN)) or not all(0 <= each < 1e6 for each in numbers[1:]):
         return None
-    sizes = tuple(map(float, numbers[1:]))
-    return Box(sizes) if DRAWN[kind] is Box else DRAWN[kind](*sizes[: 1 if kind == 0 else 2])
+    a, b, c = map(float, numbers[1:])
+    return (Sphere(a), Capsule(a, b), Cylinder(a, b), Box((a, b, c)))[kind]
 
 
 def poses(colliders: Sequence[Collider], times: Tensor) -> tuple[Tensor, Tensor]:

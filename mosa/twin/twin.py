@@ -279,7 +279,7 @@ class Twin:
         view: Sequence[float] | None = None,
     ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
-        rollout was simulated with (None: the world's). Half spaces and meshes are not drawn. view: (3,) from the body to the
+        rollout was simulated with (None: the world's). Half spaces are not drawn. view: (3,) from the body to the
         camera, None for a view from the side and a little above."""
         body, up = self.body, self.world.up.to(self.body.rest)
         solids = self._met(rollout, colliders)
@@ -328,10 +328,13 @@ class Twin:
                     lines,
                     1,
                     torch.ones(3),
-                    sum(
-                        ground_shadow(part, self.world, camera, body.size)
-                        for part in points.tensor_split([len(alone.opacities)])
-                    ).clip(max=1),
+                    np.max(
+                        [
+                            ground_shadow(part, self.world, camera, body.size)
+                            for part in points.tensor_split([len(alone.opacities)])
+                        ],
+                        0,
+                    ),
                 )
                 for image, points in zip(images, shown.means)
             ]

@@ -208,9 +208,9 @@ class Viewer:
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
                     self.body(name, frame, place * clip.side, under=name == below)
-            for (name, place), nodes in self.solids.items():
+            for (name, place), solids in self.solids.items():
                 shown = name == clip.name and (place == 0 or layout == "side by side")
-                for k, node in enumerate(nodes):
+                for k, node in enumerate(solids):
                     if node is not None:
                         node.visible = shown
                     if node is not None and shown:

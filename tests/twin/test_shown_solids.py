@@ -5,10 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.comparison import ground_shadow
 from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Sphere, colliders_from_config
+from mosa.physics.contact.mesh import field_of_triangles
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
@@ -49,6 +51,21 @@ def test_points_lie_on_the_solid_and_leave_no_hole(shape, area):
     near = drawn[outside(shape, drawn).abs() < 1e-3]
     assert len(near) > 50 and torch.cdist(near, points).amin(1).max() < pitch
     assert 0.8 < len(points) * pitch**2 / area < 1.6
+
+
+def test_a_mesh_is_drawn_on_its_surface():
+    """A box as triangles: its points lie on the box, and leave no hole wider than the lattice."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = ConvexHull(corners)
+    inwards = (np.cross(*(corners[faces.simplices[:, i]] - corners[faces.simplices[:, 0]]
+                          for i in (1, 2))) * faces.equations[:, :3]).sum(1) < 0  # fmt: skip
+    faces.simplices[inwards] = faces.simplices[inwards][:, ::-1]
+    size = np.array([0.2, 0.1, 0.3])
+    mesh = field_of_triangles(0.5 * size * corners, faces.simplices)
+    points = surface(mesh, 0.01)
+    box = Box(tuple(size))
+    assert outside(box, points).abs().max() < 0.5 * mesh.spacing
+    assert torch.cdist(surface(box, 0.01), points).amin(1).max() < 1.5 * mesh.spacing
 
 
 def picture(shown, frame):
