@@ -47,6 +47,22 @@ class GroundSection(Settings):
     friction: Weight = Field(0.5, description="Coulomb's coefficient, of separate and touch")
 
 
+class FilmSection(Settings):
+    """The video of an object that falls."""
+
+    where: ClassVar[str] = "film"
+
+    size: int = Field(400, ge=8, le=8192, description="px, of its width and height")
+    fps: Positive | None = Field(
+        None,
+        description="frames per second; null: 0.3 of real time; the value of `rate`: real time",
+    )
+    view: Three | None = Field(
+        None,
+        description="direction from the object to the camera; null: from the side, a little above",
+    )
+
+
 class SplatsSettings(LawSections):
     """python -m mosa.splats"""
 
@@ -86,7 +102,13 @@ class SplatsSettings(LawSections):
         le=1,
         description="a place is inside if this share of 26 rays from it ends at Gaussians",
     )
-    density: Positive | None = Field(None, description="kg/m^3; null: 1000, or that of the run")
+    density: Positive | None = Field(
+        None, description="kg/m^3; null: 1000, or that of the run or preset"
+    )
+    preset: Text | None = Field(
+        None,
+        description="jelly, silicone_10A, natural_rubber, clay, honey or dry_sand, in place of prior",
+    )
     gravity: Weight = Field(9.81, description="m/s^2")
     height: Weight = Field(0.2, description="m, of the lowest particle above the ground")
     ground: GroundSection = Field(GroundSection(), description="the ground")
@@ -107,16 +129,13 @@ class SplatsSettings(LawSections):
     velocity: Three = Field([0, 0, 0], description="m/s")
     angular_velocity: Three = Field([0, 0, 0], description="rad/s")
     frames: Count = Field(40, description="number of frames")
-    rate: Positive = Field(
-        30, description="simulated frames per second; the video plays 0.3 times as many"
-    )
+    rate: Positive = Field(30, description="simulated frames per second")
     formats: Names = Field(
         ["ply"],
         description="ply, gltf, sog: a file for each frame; usd, rrd: one file (docs/splats.md)",
     )
-    video: bool = Field(
-        True, description="make simulation.mp4, 400 px wide and high, from a fixed view"
-    )
+    video: bool = Field(True, description="make simulation.mp4")
+    film: FilmSection = Field(FilmSection(), description="the video")
 
 
 class PhoneSection(Settings):

@@ -27,6 +27,7 @@ from mosa.data.formats.scene_from_footage import check_density
 from mosa.data.io.gaussian_ply import read_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
+from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.inputs import numbers
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.geometry.filling import fill
@@ -37,6 +38,7 @@ from mosa.rendering.appearance.carried_splats import CarriedSplats
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
+from mosa.twin.rollout_file import poses
 from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
@@ -234,7 +236,17 @@ def object_twin(
         take_law(body, learned.body)
     body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
-    return Twin(body.eval(), world_of(record), frame_dt, record, start)
+    twin = Twin(body.eval(), world_of(record), frame_dt, record, start)
+    for k, solid in enumerate(twin.world.colliders):
+        middle = poses([solid], torch.zeros(1))[0][0, 0].to(direction)
+        above, far = float(middle @ direction) - met["height"], reach(solid.shape)
+        if far > 0 and above < -0.99 * far:
+            warnings.warn(
+                f"colliders[{k}]: its position {middle.tolist()} is {-above:.3g} m below the ground, where "
+                f"nothing meets it: up is {direction.tolist()}",
+                stacklevel=2,
+            )
+    return twin
 
 
 @torch.no_grad()
@@ -307,6 +319,10 @@ def drop(cfg: DictConfig) -> None:
         middle,
         len(twin.world.colliders),
     )
+    if cfg.preset is not None:
+        twin.material.preset(cfg.preset)
+        if cfg.density is not None:
+            twin.material.set(density=cfg.density)
     save_twin(twin, folder / "checkpoints" / "last.ckpt")
     rollout = twin.simulate(
         frames=cfg.frames,
@@ -314,5 +330,6 @@ def drop(cfg: DictConfig) -> None:
         box=[[-ANYWHERE] * 3, [ANYWHERE] * 3],
         **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")},
     )
-    twin.export(rollout, folder, video=cfg.video, title="object", formats=values["formats"])
+    kinds = {"formats": values["formats"], "video": cfg.video, **values["film"]}
+    twin.export(rollout, folder, title="object", **kinds)
     log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)

@@ -29,6 +29,7 @@ from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
 from mosa.system.limits import counted
+from mosa.twin.presets import preset
 from mosa.twin.twin import Twin
 from mosa.types import Scene
 
@@ -66,6 +67,8 @@ def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
     if settings.video:
         ffmpeg("video")
     check_formats(settings.formats)
+    if settings.preset is not None:
+        preset(settings.preset)
     colliders_from_config(settings.colliders or (), "colliders")
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)

@@ -9,7 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    Particles,
+    Shape,
+    Sphere,
+)
 from mosa.physics.contact.motion import Motion, Points, Trajectory, rotation_matrices
 from mosa.system.npz import write_npz
 from mosa.types import MotionCues, Rollout
@@ -22,7 +30,8 @@ def save_rollout(
 
     Where there are K colliders also reactions [T - 1, substeps, K, 6]: force (N) and torque about each one's origin (N m) of
     every substep (one mean where the substeps vary), and collider_position [T, K, 3] (m), collider_rotation [T, K, 3, 3] at the
-    frames, in the order of the configuration.
+    frames, in the order of the configuration, and collider_shape [K, 4]: 1 sphere, 2 capsule,
+    3 cylinder (radius, length), 4 box (edges) (m), 0 others, -1 driven particles.
     """
     arrays: dict[str, np.ndarray] = {}
     for name, rollout in parts.items():
@@ -34,8 +43,30 @@ def save_rollout(
             tensors["collider_position"], tensors["collider_rotation"] = poses(
                 colliders, rollout.times
             )
+            tensors["collider_shape"] = torch.tensor(
+                [_numbers(each.shape) for each in colliders], dtype=torch.float64
+            )
         arrays |= {f"{name}/{key}": t.detach().cpu().numpy() for key, t in tensors.items()}
     write_npz(path, arrays)
+
+
+DRAWN = (Sphere, Capsule, Cylinder, Box)
+
+
+def _numbers(shape: Shape) -> list[float]:
+    if not isinstance(shape, DRAWN):
+        return [-1.0 if isinstance(shape, Particles) else 0.0, 0.0, 0.0, 0.0]
+    sizes = shape.size if isinstance(shape, Box) else tuple(vars(shape).values())
+    return [1.0 + DRAWN.index(type(shape)), *sizes, 0.0, 0.0][:4]
+
+
+def shape_of(numbers: Sequence[float]) -> Shape | None:
+    """The shape of a row of collider_shape, None for those that are not drawn."""
+    kind = int(numbers[0]) - 1
+    if kind not in range(len(DRAWN)) or not all(0 <= each < 1e6 for each in numbers[1:]):
+        return None
+    a, b, c = map(float, numbers[1:])
+    return (Sphere(a), Capsule(a, b), Cylinder(a, b), Box((a, b, c)))[kind]
 
 
 def poses(colliders: Sequence[Collider], times: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, Shape, Sphere
+from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.twin.rollout_file import poses
@@ -30,11 +31,18 @@ def lattice(a: float, b: float, pitch: float) -> Tensor:
 
 
 def surface(shape: Shape, pitch: float) -> Tensor:
-    """(K, 3) points about `pitch` [m] apart on a solid, in its own axes; none on a half space or a mesh."""
+    """(K, 3) points about `pitch` [m] apart on a solid, in its own axes; none on a half space; on a
+    mesh as far apart as the nodes of its lattice."""
     if isinstance(shape, Box):
         return torch.cat(
             [_face(shape.size, axis, side, pitch) for axis in range(3) for side in (-0.5, 0.5)]
         )
+    if isinstance(shape, SignedDistanceField):
+        near = shape.values.abs() < 0.75 * shape.spacing
+        slope = torch.stack(torch.gradient(shape.values, spacing=shape.spacing), -1)[near]
+        slope = slope / slope.norm(dim=1, keepdim=True).clamp_min(0.1)
+        nodes = torch.tensor(shape.origin) + shape.spacing * near.nonzero()
+        return (nodes - shape.values[near, None] * slope).float()
     if not isinstance(shape, (Sphere, Capsule, Cylinder)):
         return torch.zeros(0, 3)
     length, radius = getattr(shape, "length", 0.0), shape.radius
@@ -89,6 +97,7 @@ def with_solids(
         points = surface(collider.shape, pitch)
         coarse = pitch * max(1.0, math.sqrt(len(points) / MOST))
         points = (points if coarse == pitch else surface(collider.shape, coarse)).to(body.means)
+        coarse = max(coarse, getattr(collider.shape, "spacing", 0.0))
         if len(points):
             parts.append(points @ turned[:, k].mT + at[:, k, None])
             wide.append(torch.full((len(points),), WIDTH * coarse))

@@ -30,7 +30,7 @@ from mosa.config.checkpoints import (
 from mosa.config.record import BodyRecord
 from mosa.data.io.splat_formats import Formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation.analysis.comparison import ground_lines, on_ground
+from mosa.evaluation.analysis.comparison import ground_lines, ground_shadow, on_ground
 from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_video
 from mosa.evaluation.uncertainty import (
     DRAWS,
@@ -44,6 +44,7 @@ from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
 from mosa.physics.contact.driven import Driven
+from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
@@ -275,9 +276,11 @@ class Twin:
         rollout: Motion,
         size: Pixels = 400,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        view: Sequence[float] | None = None,
     ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
-        rollout was simulated with (None: the world's). Half spaces and meshes are not drawn."""
+        rollout was simulated with (None: the world's). Half spaces are not drawn. view: (3,) from the body to the
+        camera, None for a view from the side and a little above."""
         body, up = self.body, self.world.up.to(self.body.rest)
         solids = self._met(rollout, colliders)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
@@ -297,7 +300,15 @@ class Twin:
         )
         focal = 1.6 * size
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
-        eye = target + distance * (side / side.norm() + 0.25 * up)
+        toward = side / side.norm() + 0.25 * up
+        if view is not None:
+            given = numbers("view", view, "a direction (x, y, z)", (3,)).to(up)
+            if not float(torch.linalg.cross(given, up).norm()) > 1e-3 * float(given.norm()):
+                raise ConfigError(
+                    f"view: expected a direction that is not up or down, found {view}"
+                )
+            toward = float(toward.norm()) * given / given.norm()
+        eye = target + distance * toward
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         camera = Cameras(
             K[None].to(body.rest),
@@ -306,13 +317,27 @@ class Twin:
             size,
             ("view",),
         )
-        shown = with_solids(
-            seen(body, rollout.x, rollout.F_tot), solids, rollout.times, up, body.size / 30
-        )
+        alone = seen(body, rollout.x, rollout.F_tot)
+        shown = with_solids(alone, solids, rollout.times, up, body.size / 30)
         images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
         lines = ground_lines(self.world, camera, body.size)
         drawn = (
-            [on_ground(to_uint8(image), lines, 1, torch.ones(3)) for image in images]
+            [
+                on_ground(
+                    to_uint8(image),
+                    lines,
+                    1,
+                    torch.ones(3),
+                    np.max(
+                        [
+                            ground_shadow(part, self.world, camera, body.size)
+                            for part in points.tensor_split([len(alone.opacities)])
+                        ],
+                        0,
+                    ),
+                )
+                for image, points in zip(images, shown.means)
+            ]
             if lines
             else []
         )
@@ -343,11 +368,13 @@ class Twin:
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        size: Pixels = 400, fps: float | None = None, view: Sequence[float] | None = None,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
-        the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
+        the rollout was simulated with, None for the world's. Of the video: size [px] and view, as
+        `render` takes them; fps, None for 0.3 of real time. Errors: ConfigError where they are not."""
         solids = self._met(rollout, colliders)
         folder = made_folder(Path(folder) / "ply").parent
         save_body(folder / BODY_FILE, self.body, self.world)
@@ -362,8 +389,9 @@ class Twin:
         )
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            frames = side_by_side({title: self.render(rollout, colliders=solids)}, footer=moments)
-            write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
+            images = self.render(rollout, size, solids, view)
+            frames = side_by_side({title: images}, footer=moments)
+            write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / self.frame_dt))
         return folder
 
     @property

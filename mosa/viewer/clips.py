@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -17,10 +18,12 @@ from scipy.spatial import cKDTree
 
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import World
+from mosa.physics.contact.colliders import Shape
 from mosa.reconstruction.motion.cues import neighbourhood
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.rendering.observer import deformed_covariances
 from mosa.system.npz import read_npz
+from mosa.twin.rollout_file import shape_of
 from mosa.twin.shown_body import FILE, ShownBody
 from mosa.twin.twin import Twin
 from mosa.viewer.pages import cell, horizontal
@@ -101,7 +104,8 @@ class Clip:
     stiffness differs from the law's; spread: (T, N) [m] predicted standard deviation of the learned positions, None where the run
     left none; points: (2, T, M, 3) [m] of tracked points, measured and predicted, None where there are
     none; splat_opacities: (M,), splat_particles: (M,) nearest particles of the splats that all bodies carry, where the run has
-    them."""
+    them; solids: shapes of K colliders, None for those that are not drawn; solid_poses: their
+    positions (T, K, 3) [m] and rotations (T, K, 3, 3)."""
 
     name: str
     times: np.ndarray
@@ -114,6 +118,8 @@ class Clip:
     points: np.ndarray | None = None
     splat_opacities: np.ndarray | None = None
     splat_particles: np.ndarray | None = None
+    solids: tuple[Shape | None, ...] = ()
+    solid_poses: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def learned(self) -> ShownMotion:
@@ -267,7 +273,8 @@ class Clip:
             )
         if self.world.ground is not None:
             said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
-        hidden = {"walls": len(self.world.planes), "colliders": len(self.world.colliders)}
+        solids = len(self.world.colliders) if self.solid_poses is None else self.solids.count(None)
+        hidden = {"walls": len(self.world.planes), "colliders": solids}
         if any(hidden.values()):
             said += "  \nNot drawn: " + ", ".join(
                 f"{kind} ({count})" for kind, count in hidden.items() if count
@@ -328,7 +335,8 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
             bodies[kind] = ShownMotion(x, covariances(stored, name, body), carried_by(body, x))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
                           body.factor.numpy(), body.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
-                          points_of(tracked, name, shape[0], folder / "markers.npz"), **splat_keys(body)))  # fmt: skip
+                          points_of(tracked, name, shape[0], folder / "markers.npz"), **splat_keys(body),
+                          **solids_of(rollouts, name, shape[0], paths["learned"])))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
     return clips
@@ -346,6 +354,22 @@ def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
         )
     twin = Twin.load(path)
     return ShownBody.of(twin.body, twin.world)
+
+
+def solids_of(stored: dict[str, np.ndarray], name: str, frames: int, path: Path) -> dict[str, Any]:
+    """What a clip has of the colliders that the file has the shapes of. Errors: DataError naming file and entry."""
+    keys = [f"{name}/collider_{part}" for part in ("shape", "position", "rotation")]
+    if keys[0] not in stored:
+        return {}
+    found = [stored.get(key) for key in keys]
+    count = len(found[0])
+    expected = ((count, 4), (frames, count, 3), (frames, count, 3, 3))
+    for key, each, shape in zip(keys, found, expected):
+        if each is None or each.shape != shape or not np.isfinite(each).all():
+            raise DataError(f"{path}: {key}: expected finite numbers of shape {shape}")
+    solid = found[0][:, 0] >= 0
+    poses = found[1][:, solid], found[2][:, solid]
+    return {"solids": tuple(map(shape_of, found[0][solid])), "solid_poses": poses}
 
 
 def carried_by(body: ShownBody, x: np.ndarray) -> ShownSplats | None:

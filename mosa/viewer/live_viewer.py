@@ -218,7 +218,7 @@ class LiveViewer:
             said += f"  \nGround grid: {1e3 * cell(live.size):g} mm"
         hidden = len(live.twin.world.planes) + sum(node is None for node in self.solids)
         if hidden:
-            said += f"  \nNot drawn: {hidden} walls, half spaces or meshes"
+            said += f"  \nNot drawn: {hidden} walls or half spaces"
         self.caption.content = said
         self.message.content = f"**{live.message}**" if live.message else ""
 

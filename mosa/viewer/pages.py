@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Shape, Sphere
-from mosa.twin.shown_solids import SOLID
+from mosa.physics.contact.mesh import SignedDistanceField
+from mosa.twin.shown_solids import SOLID, surface
 
 PANEL = 0.12
 """Of the window's height, by which the first view's contents stand left of the middle: viser's panel covers its right."""
@@ -173,7 +174,7 @@ def turn(rotation: np.ndarray) -> np.ndarray:
 def add_solid(
     scene: Any, name: str, shape: Shape, color: tuple[int, int, int] = SOLID, **options
 ) -> Any | None:
-    """A node for a collider's shape; None for half spaces and meshes, which are not drawn."""
+    """A node for a collider's shape, of a mesh as points; None for half spaces, which are not drawn."""
     import trimesh  # viser brings it
 
     if isinstance(shape, Sphere):
@@ -185,6 +186,9 @@ def add_solid(
     elif isinstance(shape, Capsule):
         mesh = trimesh.creation.capsule(radius=shape.radius, height=shape.length)
         mesh.apply_translation(-mesh.bounds.mean(0))
+    elif isinstance(shape, SignedDistanceField):
+        points = surface(shape, shape.spacing).numpy()
+        return scene.add_point_cloud(name, points, color, point_size=shape.spacing, **options)
     else:
         return None
     return scene.add_mesh_simple(name, np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), color=color,

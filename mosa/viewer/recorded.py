@@ -25,7 +25,16 @@ from mosa.twin.twin import Twin
 from mosa.viewer.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.viewer.live import Live
 from mosa.viewer.live_viewer import LiveViewer
-from mosa.viewer.pages import add_ground, aim, beside_panel, offered, open_server, view_of
+from mosa.viewer.pages import (
+    add_ground,
+    add_solid,
+    aim,
+    beside_panel,
+    offered,
+    open_server,
+    turn,
+    view_of,
+)
 
 GEOMETRY = ("splats", "particles")
 
@@ -127,6 +136,14 @@ class Viewer:
                 scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
             )
 
+        self.solids = {
+            (each.name, place): [
+                add_solid(scene, f"/solids/{each.name}/{place}/{k}", shape, visible=False)
+                for k, shape in enumerate(each.solids)
+            ]
+            for each in clips
+            for place in range(len(each.bodies))
+        }
         self.points = [
             scene.add_point_cloud(
                 f"/points/{kind}",
@@ -191,6 +208,14 @@ class Viewer:
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
                     self.body(name, frame, place * clip.side, under=name == below)
+            for (name, place), solids in self.solids.items():
+                shown = name == clip.name and (place == 0 or layout == "side by side")
+                for k, node in enumerate(solids):
+                    if node is not None:
+                        node.visible = shown
+                    if node is not None and shown:
+                        at, turned = (part[frame, k] for part in clip.solid_poses)
+                        node.position, node.wxyz = at + place * clip.side, turn(turned)
             place = list(clip.bodies).index("learned") if layout == "side by side" else 0
             for k, node in enumerate(self.points):
                 node.visible = clip.points is not None and (

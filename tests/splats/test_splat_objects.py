@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -154,6 +155,14 @@ def test_it_falls_on_an_obstacle_that_its_checkpoint_keeps(tmp_path):
     assert torch.equal(again.simulate(frames=8).x, rollout.x)
 
 
+def test_an_obstacle_below_the_ground_is_said():
+    made = {"particles": 100, "up": (0, -1, 0), "resolution": 32, "recentre": True}
+    ends = [{"type": "sphere", "radius": 0.05, "position": [0, y, 0]} for y in (-0.05, 0.05)]
+    with pytest.warns(UserWarning, match=r"colliders\[1\]: its position .* 0.05 m below") as said:
+        object_twin(ball(600, 0.007), LAW, colliders=ends, **made)
+    assert len([each for each in said if "below the ground" in str(each.message)]) == 1
+
+
 def test_a_density_of_nothing_is_refused_and_an_unlikely_one_is_said():
     for density in (0.01, 1e-9, 1e6, math.nan, -1.0, True):
         with pytest.raises(ConfigError, match=r"^density: expected a number of at least 0\.1"):
@@ -187,6 +196,7 @@ def test_the_command_makes_all_of_it(tmp_path):
     arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply]", "prior=corotated",
                  "recentre=true", "colliders=[{type:sphere,radius:0.05,position:[0,0.05,0]}]",
                  "velocity=[60,0,0]",  # farther than any box around the object
+                 "preset=jelly", "film={size:64,fps:30,view:[1,0.3,0]}",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True
@@ -199,6 +209,10 @@ def test_the_command_makes_all_of_it(tmp_path):
         "checkpoints/last.ckpt",
     ):
         assert (tmp_path / "run" / name).is_file(), name
+    dropped = Twin.load(tmp_path / "run" / "checkpoints" / "last.ckpt").material
+    assert (dropped.E, dropped.density) == pytest.approx((4.3e3, 1010.0))
+    film = cv2.VideoCapture(str(tmp_path / "run" / "simulation.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 64 and film.get(cv2.CAP_PROP_FPS) == 30
 
 
 @pytest.mark.parametrize(
@@ -212,6 +226,7 @@ def test_the_command_makes_all_of_it(tmp_path):
         ),
         ("box", [[0, 0, 0]], "box: expected two corners"),
         ("up", [0, 1], "up: expected three"),
+        ("preset", "rubber", "preset: expected one of jelly, "),
         ("colliders", [{"type": "sphere"}], "colliders"),
     ],
 )

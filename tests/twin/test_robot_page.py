@@ -8,10 +8,11 @@ import pytest
 import torch
 from small_bodies import FRAME_DT, WORLD, small_body, start
 
+from mosa.physics.contact.mesh import read_mesh
 from mosa.twin.twin import Twin
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robots.md").read_text()
-JAW = """<link name="{name}"><collision><origin xyz="0 0 0" rpy="0 0 0"/>
+JAW = """<link name="{name}"><collision>
 <geometry><box size="0.06 0.12 0.16"/></geometry></collision></link>
 <joint name="{name}_slide" type="prismatic"><parent link="lift"/><child link="{name}"/>
 <origin xyz="{x} 0 0"/><axis xyz="{side} 0 0"/>
@@ -42,17 +43,23 @@ def test_a_gripper_lifts_a_body_and_carries_its_weight(tmp_path, monkeypatch):
 
 def test_every_shape_of_a_link_is_a_collider(tmp_path):
     pytest.importorskip("yourdfpy")
-    arm = """<robot name="arm"><link name="a"><collision><origin xyz="0 0 0"/><geometry>
-    <mesh filename="a.stl"/></geometry></collision></link><link name="b"><collision>
+    trimesh = pytest.importorskip("trimesh")
+    for folder in ("meshes", "urdf"):
+        (tmp_path / folder).mkdir()
+    trimesh.creation.box((20, 40, 60)).export(tmp_path / "meshes" / "a.dae")
+    arm = """<robot name="arm"><link name="a"><collision><geometry>
+    <mesh filename="package://robot/meshes/a.dae" scale="0.001 0.001 0.001"/></geometry></collision></link>
+    <link name="b"><collision>
     <origin xyz="0 0 0.1"/><geometry><cylinder radius="0.02" length="0.2"/></geometry></collision>
     </link><joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
     <limit lower="-3" upper="3" effort="1" velocity="1"/></joint></robot>"""
-    (tmp_path / "arm.urdf").write_text(arm)
+    (tmp_path / "urdf" / "arm.urdf").write_text(arm)
     names: dict = {}
     exec(re.findall(r"```python\n(.*?)```", PAGE, re.S)[0], names)
-    robot = names["Links"](tmp_path / "arm.urdf")
+    robot = names["Links"](tmp_path / "urdf" / "arm.urdf")
     mesh, solid = robot.colliders({"j": np.pi / 2})
-    assert mesh["path"] == str(tmp_path / "a.stl") and mesh["position"] == [0, 0, 0]
+    assert np.ptp(read_mesh(Path(mesh["path"]))[0], 0) == pytest.approx([0.02, 0.04, 0.06])
+    assert mesh["position"] == [0, 0, 0]
     assert solid["position"] == pytest.approx([0, -0.1, 0]) and solid["length"] == 0.2
     assert solid["rotation"] == pytest.approx([1, 0, 0, 90])
     pose = robot.action({"j": np.pi / 2})["b"]

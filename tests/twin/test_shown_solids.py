@@ -5,9 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.comparison import ground_shadow
 from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Sphere, colliders_from_config
+from mosa.physics.contact.mesh import field_of_triangles
 from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
@@ -48,6 +51,21 @@ def test_points_lie_on_the_solid_and_leave_no_hole(shape, area):
     near = drawn[outside(shape, drawn).abs() < 1e-3]
     assert len(near) > 50 and torch.cdist(near, points).amin(1).max() < pitch
     assert 0.8 < len(points) * pitch**2 / area < 1.6
+
+
+def test_a_mesh_is_drawn_on_its_surface():
+    """A box as triangles: its points lie on the box, and leave no hole wider than the lattice."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = ConvexHull(corners)
+    inwards = (np.cross(*(corners[faces.simplices[:, i]] - corners[faces.simplices[:, 0]]
+                          for i in (1, 2))) * faces.equations[:, :3]).sum(1) < 0  # fmt: skip
+    faces.simplices[inwards] = faces.simplices[inwards][:, ::-1]
+    size = np.array([0.2, 0.1, 0.3])
+    mesh = field_of_triangles(0.5 * size * corners, faces.simplices)
+    points = surface(mesh, 0.01)
+    box = Box(tuple(size))
+    assert outside(box, points).abs().max() < 0.5 * mesh.spacing
+    assert torch.cdist(surface(box, 0.01), points).amin(1).max() < 1.5 * mesh.spacing
 
 
 def picture(shown, frame):
@@ -102,7 +120,27 @@ def test_an_exported_motion_has_its_solids_and_the_ground(tmp_path):
         1,
         3,
     )
+    with pytest.raises(ConfigError, match="view: expected a direction that is not up or down"):
+        one.render(alone, size=96, view=(0, 2, 0))
     # grey lines on the ground, of which a picture in space has none
     images = one.render(alone, size=96)
     lines = ((images - 120 / 255).abs().amax(-1) < 0.3) & (images.amax(-1) - images.amin(-1) < 0.02)
     assert lines[0].float().mean() > 0.01
+
+
+def test_a_shadow_lies_below_the_body_and_sharpens_as_it_lands():
+    """Seen from above: a ball of 1 m whose shadow is where it is, and wider while it is high."""
+    K = torch.tensor([[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]])
+    w2c = look_at(torch.tensor([0.0, 10.0, 0.01]), torch.zeros(3), UP)
+    camera = Cameras(K[None], w2c[None], 64, 64, ("view",))
+    ball = surface(Sphere(0.5), 0.05) + torch.tensor([1.0, 0.5, 0.0])
+    low, high = (ground_shadow(ball + h * UP, twin().world, camera, 1.0) for h in (0.0, 1.0))
+    for shade in (low, high):
+        assert 0 <= shade.min() and shade.max() <= 1
+        at = (shade * np.arange(64)).sum() / shade.sum()
+        assert at == pytest.approx(42, abs=1.0)  # px: 1 m at 10 m
+    area = np.pi * 5**2
+    assert low.max() > 0.9 and area < (low > 0.5).sum() < 1.6 * area
+    assert (high > 0.02).sum() > 1.2 * (low > 0.02).sum()
+    buried = ground_shadow(ball - 2 * UP, twin().world, camera, 1.0)
+    assert buried.shape == (64, 64) and not buried.any()

@@ -17,7 +17,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, SimulationSettings, Start
 from mosa.modules.body.heterogeneity import HeterogeneityField, HeterogeneitySettings
 from mosa.modules.body.material import Material
-from mosa.physics.contact.colliders import domain_walls
+from mosa.physics.contact.colliders import colliders_from_config, domain_walls
 from mosa.rendering.appearance.carried_splats import CarriedSplats
 from mosa.twin.rollout_file import save_observed, save_rollout
 from mosa.twin.twin import Twin
@@ -683,6 +683,37 @@ def test_the_server_shows_a_learned_body_alone(run):
         )
     finally:
         shown.stop()
+
+
+def test_the_solids_of_a_motion_move_beside_every_body(run):
+    pytest.importorskip("viser")
+    moved = [
+        {"type": "box", "size": [0.1, 0.2, 0.3], "motion": {"velocity": [0, 1.0, 0]}},
+        {"type": "cylinder", "radius": 0.05, "length": 0.4},
+        {"type": "plane"},
+    ]
+    solids = colliders_from_config(moved)
+    save_rollout(run / "rollout.npz", {"train": rollout(0), "test/test_60": rollout(0.2)}, solids)
+    clips = read_run(run)
+    assert clips[0].solids == (*(each.shape for each in solids[:2]), None)
+    assert "Not drawn: colliders (1)" in clips[0].caption(0)
+    shown = viewer.Viewer(clips)
+    try:
+        shown.frame.value = 2
+        nodes = [shown.solids["train", place] for place in range(3)]
+        for place, (box, cylinder, plane) in enumerate(nodes):
+            assert box.visible and cylinder.visible and plane is None
+            assert np.allclose(box.position, place * clips[0].side + [0, 0.04, 0], atol=1e-6)
+        assert not shown.solids["test/test_60", 0][0].visible
+        shown.layout.value = "learned"
+        assert nodes[0][0].visible and not nodes[1][0].visible
+    finally:
+        shown.stop()
+    broken = dict(np.load(run / "rollout.npz"))
+    broken["train/collider_position"] = broken["train/collider_position"][1:]
+    np.savez(run / "rollout.npz", **broken)
+    with pytest.raises(DataError, match="train/collider_position: expected finite numbers"):
+        read_run(run)
 
 
 def test_the_server_shows_tracked_points_on_the_learned_body(run):
