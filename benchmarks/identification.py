@@ -249,7 +249,7 @@ def figures(case: SimpleNamespace) -> dict:
         "fibre_deg": None if fibre is None else float(angle_between(axis, torch.tensor(fibre))),
         "cone_deg": determined(body, posterior)["posterior/stiffest_cone_deg"], "coverage": coverage(case, found, posterior),
         "eta": float(torch.corrcoef(torch.stack([factor.float(), true]))[0, 1]) if varies else None,
-        "grid": case.joint.multiple(), "iterations": case.iterations,
+        "grid": case.joint.grid_share(), "iterations": case.iterations,
     } | {name: float(value.detach()) for name, value in body.material.physical().items()}  # fmt: skip
 
 

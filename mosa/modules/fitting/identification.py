@@ -70,7 +70,7 @@ class Identification:
 
     Errors of the grid must not be taken for the law's. The two later stages roll the same numbers
     out on a grid `COARSER` times as coarse too. The difference, frame by frame, is noise that no
-    frame is trusted beyond, and its direction is free: a multiple of it, known to within
+    frame is trusted beyond, and its direction is free: a share of it, known to within
     `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
 
     parts: those of `search.parts` that the law may have; known: what another experiment said of its
@@ -117,19 +117,11 @@ class Identification:
         self.iteration, self.noise, self.substeps = 0, None, None
         self._remembered: OrderedDict[tuple, list[residuals.Fields]] = OrderedDict()
         self._lock = threading.Lock()
-        self.grid: list[residuals.Fields] | None = (
-            None  # differences between the two grids, of every pair
-        )
-        if self.knows_grid:
-            blocks.append(
-                Block(
-                    "grid",
-                    torch.zeros(1),
-                    torch.full((1,), float(settings.grid_error)),
-                    0.2,
-                    nuisance=True,
-                )
-            )
+        # of every pair, on the coarser grid from those on the body's own
+        self.grid_difference: list[residuals.Fields] | None = None
+        if self.two_grids:
+            sd = torch.full((1,), float(settings.grid_error))
+            blocks.append(Block("grid", torch.zeros(1), sd, 0.2, nuisance=True))
         self.newton = GaussNewton(
             blocks,
             [self._seat(each) for each in bodies],
@@ -140,9 +132,8 @@ class Identification:
             self.newton.known = shared
         self.converged = False
         self.report: dict[str, float] = {}
-        self._residuals: Tensor | None = (
-            None  # at the numbers as they stand, between `prepare` and `iterate`
-        )
+        # at the numbers as they stand, between `prepare` and `iterate`
+        self._residuals: Tensor | None = None
 
     def threads(self, numbers: int) -> int:
         """Rollouts side by side, of as many numbers."""
@@ -153,12 +144,12 @@ class Identification:
         return max(1, min(self.settings.threads or min(cores, MOST_THREADS), numbers))
 
     def _seat(self, body: Body) -> Seat:
-        multiple = torch.zeros(1, dtype=torch.float64)
+        share = torch.zeros(1, dtype=torch.float64)
         tensors = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
-        if self.knows_grid:
-            tensors.append(multiple)
+        if self.two_grids:
+            tensors.append(share)
         return Seat(
-            tensors, lambda: self._whitened(body, float(multiple)), lambda: self._possible(body)
+            tensors, lambda: self._whitened(body, float(share)), lambda: self._possible(body)
         )
 
     def _possible(self, body: Body) -> None:
@@ -174,19 +165,16 @@ class Identification:
         return [part for part, on in zip(PARTS, (self.adapter, self.heterogeneity)) if on]
 
     @property
-    def knows_grid(self) -> bool:
-        """Whether there is a second grid, and with it a last number: the multiple of the difference."""
+    def two_grids(self) -> bool:
+        """Whether there is a second grid, and with it a last number: the share of their difference."""
         return self.settings.grid_error > 0 and not self.calibrating
 
     @property
     def softly(self) -> tuple[float, ...]:
         """Shares of the data that the first iterations count, all of it afterwards. A calibration, one drop, and a stage too short
         for it count in full."""
-        return (
-            SOFTLY
-            if len(self.takes) > 1 and not self.calibrating and self.iterations >= 2 * len(SOFTLY)
-            else ()
-        )
+        long = self.iterations >= 2 * len(SOFTLY)
+        return SOFTLY if len(self.takes) > 1 and not self.calibrating and long else ()
 
     @property
     def pairs(self) -> list[tuple[int, float]]:
@@ -240,10 +228,8 @@ class Identification:
                 )
                 for k, own in enumerate(rollout.worlds()):
                     found[first + k].append(self._differences(own, i))
-        multiples = rows[:, -1].tolist() if self.knows_grid else [0.0] * len(rows)
-        return torch.stack(
-            [self._compared(own, multiple) for own, multiple in zip(found, multiples)]
-        )
+        shares = rows[:, -1].tolist() if self.two_grids else [0.0] * len(rows)
+        return torch.stack([self._compared(own, share) for own, share in zip(found, shares)])
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
         """Of every pair; those that were found last are remembered."""
@@ -253,10 +239,10 @@ class Identification:
         with self._lock:
             found = self._remembered.get(key)
         if found is None:
-            found = [
-                self._differences(self.rollout(body, i, gain, self.substeps[i]), i)
-                for i, gain in self.pairs
-            ]
+            rollouts = (
+                (i, self.rollout(body, i, gain, self.substeps[i])) for i, gain in self.pairs
+            )
+            found = [self._differences(rollout, i) for i, rollout in rollouts]
             with self._lock:
                 self._remembered[key] = found
                 while len(self._remembered) > REMEMBERED:
@@ -274,37 +260,32 @@ class Identification:
         force = force_residuals(rollout, curves, self.world, take.frame_dt)
         return replace(found, force=force)
 
-    def _whitened(self, body: Body, multiple: float) -> Tensor:
+    def _whitened(self, body: Body, grid_share: float) -> Tensor:
         # torch's switch is a thread's own, and these may be other threads than the one that switched it
         with torch.no_grad():
-            return self._compared(self._fields(body), multiple)
+            return self._compared(self._fields(body), grid_share)
 
     def _share(self) -> float:
         """Independent data that a frame counts as, of each kind."""
-        share = (
-            self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
-        )
-        return share * self._soft()
+        counted = COUNTED_AT_FIRST if self.calibrating else 1
+        return self.settings.count / len(self.gains) * counted * self._soft()
 
     def _soft(self) -> float:
         """Share of the data that this iteration counts."""
         return self.softly[self.iteration] if self.iteration < len(self.softly) else 1.0
 
-    def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
-        counts = tuple(self._share() * on for on in self.kinds)
-        return residuals.whitened(
-            self._along(found, multiple),
-            self.noise,
-            [counts] * len(self.pairs),
-            self._soft() / len(self.gains),
-        )
+    def _compared(self, found: list[residuals.Fields], grid_share: float) -> Tensor:
+        counts = [tuple(self._share() * on for on in self.kinds)] * len(self.pairs)
+        forces = self._soft() / len(self.gains)
+        return residuals.whitened(self._along(found, grid_share), self.noise, counts, forces)
 
-    def _along(self, found: list[residuals.Fields], multiple: float) -> list[residuals.Fields]:
-        return found if self.grid is None else residuals.along(found, self.grid, multiple)
+    def _along(self, found: list[residuals.Fields], grid_share: float) -> list[residuals.Fields]:
+        difference = self.grid_difference
+        return found if difference is None else residuals.along(found, difference, grid_share)
 
-    def multiple(self) -> float:
-        """Of the difference between the two grids that is identified beside the numbers; 0 where none is."""
-        return float(self.newton.seats[0].tensors[-1]) if self.knows_grid else 0.0
+    def grid_share(self) -> float:
+        """Of the difference between the two grids, which is identified beside the numbers; 0 where none is."""
+        return float(self.newton.seats[0].tensors[-1]) if self.two_grids else 0.0
 
     def _coarser(self) -> list[residuals.Fields] | None:
         """What the numbers predict on a coarser grid; None where it cannot simulate them."""
@@ -319,22 +300,15 @@ class Identification:
     def _measure_noise(self) -> None:
         """Noise and what the grid gets wrong, at the numbers in use."""
         found = self._fields(self.body)
-        if self.knows_grid:
-            coarser = self._coarser()
-            if coarser is not None:
-                self.grid = residuals.difference(found, coarser)
-        least = residuals.floors(
-            self.body.settings.dx, 0.0 if self.calibrating else self.settings.model_error
-        )
-        wrong = (
-            None
-            if self.grid is None
-            else [
-                residuals.Fields(*(self.settings.grid_error * field for field in each))
-                for each in self.grid
-            ]
-        )
-        self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
+        if self.two_grids and (coarser := self._coarser()) is not None:
+            self.grid_difference = residuals.difference(found, coarser)
+        model_error = 0.0 if self.calibrating else self.settings.model_error
+        least = residuals.floors(self.body.settings.dx, model_error)
+        wrong = self.grid_difference and [
+            residuals.Fields(*(self.settings.grid_error * field for field in each))
+            for each in self.grid_difference
+        ]
+        self.noise = residuals.spread(self._along(found, self.grid_share()), least, wrong)
 
     @property
     def offsets(self) -> tuple[float | None, ...]:
@@ -427,11 +401,10 @@ class Identification:
         return {
             "iteration": self.iteration,
             "factors": [b.factor for b in self.newton.blocks],
-            "noise": None
-            if self.noise is None
-            else [[t.cpu() for t in each] for each in self.noise],
-            "multiple": self.multiple(),
-            "grid": None if self.grid is None else [[t.cpu() for t in each] for each in self.grid],
+            "noise": self.noise and [[t.cpu() for t in each] for each in self.noise],
+            "multiple": self.grid_share(),
+            "grid": self.grid_difference
+            and [[t.cpu() for t in each] for each in self.grid_difference],
         }
 
     def restore(self, state: dict) -> None:
@@ -440,14 +413,13 @@ class Identification:
         for block, factor in zip(self.newton.blocks, state["factors"], strict=True):
             block.factor = float(factor)
         device = self.body.rest.device
-        self.noise = (
-            None
-            if state["noise"] is None
-            else [tuple(t.to(device) for t in each) for each in state["noise"]]
-        )
+        found = state["noise"]
+        self.noise = found and [tuple(t.to(device) for t in each) for each in found]
         if state.get("grid") is not None:
-            self.grid = [residuals.Fields(*(t.to(device) for t in each)) for each in state["grid"]]
-        if self.knows_grid:
+            self.grid_difference = [
+                residuals.Fields(*(t.to(device) for t in each)) for each in state["grid"]
+            ]
+        if self.two_grids:
             self.newton.seats[0].tensors[-1].fill_(float(state.get("multiple", 0.0)))
 
     @torch.no_grad()
@@ -466,9 +438,8 @@ class Identification:
             there = self._fields(self.body)
             share, wrong = self.independent(there), self._grids_part(there)
         posterior = self.newton.posterior(share, wrong)
-        return replace(
-            posterior, model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals()
-        )
+        error = (sum(found) / len(found)) ** 0.5
+        return replace(posterior, model_error=error, rivals=self.rivals())
 
     def _grids_part(self, there: list[residuals.Fields]) -> Tensor | None:
         """Of a calibration: `grid_error` times the difference of `there`, its residuals where it stands, from those on the coarser
@@ -485,11 +456,8 @@ class Identification:
         own, newton = self.body.material.law, self.newton
         if self.calibrating or own not in RIVALS:
             return {}
-        kept, found = (
-            len(newton.seats[0].read()) - self.knows_grid,
-            {},
-        )  # the grid's multiple is last
-        own_cost = self.cost()
+        kept = len(newton.seats[0].read()) - self.two_grids  # the share of the grids is last
+        found, own_cost = {}, self.cost()
         for law in RIVALS:
             if law == own:
                 continue
@@ -526,9 +494,7 @@ class Identification:
             wrong = self._between_grids(k, kind)
             own = table[first : first + 3 * frames * width].double().view(3, frames, width, -1)
             first += 3 * frames * width
-            if (
-                felt and i == 0
-            ):  # the rows of its forces follow those of its fields, as in `whitened`
+            if felt and i == 0:  # its forces' rows follow those of its fields, as in `whitened`
                 rows = table[first : first + felt].double()
                 forces.append((rows.mT @ rows).cpu())
                 first += felt
@@ -540,9 +506,8 @@ class Identification:
                     stretches[FOLDS * i + FOLDS * after // late].append(len(squares))
                 count = self._share() * self.kinds[kind]
                 unit = float(scales[kind][frame]) / count**0.5
-                positions.append(
-                    (grams[kind], unit, None if wrong is None else float(wrong[frame]))
-                )
+                between = None if wrong is None else float(wrong[frame])
+                positions.append((grams[kind], unit, between))
                 squares.append(grams[0] + grams[1] + grams[2])
         told = squares + forces
         compared = {k: (len(told) + k, *lengths) for k, (_, *lengths) in enumerate(positions)}
@@ -555,9 +520,9 @@ class Identification:
     def _between_grids(self, pair: int, kind: int) -> Tensor | None:
         """(frames,) root mean square distance over particles between the predictions on two grids,
         `grid_error` times; None without a second grid."""
-        if self.grid is None:
+        if self.grid_difference is None:
             return None
-        field = list(self.grid[pair])[kind]
+        field = list(self.grid_difference[pair])[kind]
         return self.settings.grid_error * field.square().sum(-1).mean(-1).sqrt()
 
     def cost(self) -> float:
@@ -571,13 +536,10 @@ class Identification:
 
         What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
         patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
-        each, cues = (
-            COUNTED_AT_FIRST * self.settings.count,
-            3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2,
-        )
+        each = COUNTED_AT_FIRST * self.settings.count / len(self.gains)
+        cues = 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
         counted, wrong, late = 0.0, 0.0, []
         share = 1 / len(self.pairs)
-        each = each / len(self.gains)
         for (i, _), scales, found in zip(self.pairs, self.noise, there or self._fields(self.body)):
             frames = slice(min(self.takes[i].first_contact, len(scales[0])) - 1, None)
             wrong += share * (1 - cues / float(scales[0][frames].square().mean()))

@@ -423,7 +423,9 @@ def test_what_a_grid_gets_wrong_is_not_taken_for_the_law():
         run(found)
         wrong[known] = abs(values(body)["E"] / E - 1) + float(body.adapter.numbers.detach().norm())
         assert (
-            found.multiple() == pytest.approx(-1.0, abs=0.1) if known else found.multiple() == 0.0
+            found.grid_share() == pytest.approx(-1.0, abs=0.1)
+            if known
+            else found.grid_share() == 0.0
         )
         assert "grid" not in found.posterior().names
     assert wrong[1.0] < 0.02 and wrong[0.0] > 3 * wrong[1.0]
@@ -539,7 +541,7 @@ def test_a_stopped_stage_goes_on_with_what_it_knew_of_the_grid():
     again.newton.seats[0].write(part.newton.seats[0].read())
     again.restore(part.state())
     again.iterate()
-    assert again.multiple() == whole.multiple() != 0.0
+    assert again.grid_share() == whole.grid_share() != 0.0
     assert torch.equal(again.newton.seats[0].read(), whole.newton.seats[0].read())
 
 
