@@ -13,7 +13,7 @@ from written_scenes import export_particles, export_transforms
 
 from mosa.data.scene import load_scene
 from mosa.evaluation.evaluate import run_sequences
-from mosa.modules.fitting.search.ground_choice import named, taken_of
+from mosa.modules.fitting.search.ground import named, taken_of
 from mosa.training import workflow as pipeline
 from mosa.twin.twin import Twin
 

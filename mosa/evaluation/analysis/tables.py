@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from mosa.evaluation.metrics import IMAGE_METRICS, MOTION_METRICS
 from mosa.modules.body.material import RELATIVE, unit_of
-from mosa.modules.fitting.search.ground_choice import (
+from mosa.modules.fitting.search.ground import (
     EXPLAINED,
     NEARER,
     alike,

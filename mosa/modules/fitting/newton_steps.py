@@ -7,23 +7,29 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from mosa.errors import DataError, SimulationDiverged
+from mosa.modules.body.body import Body
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.fitting.search.backbone import choose_law
-from mosa.modules.fitting.search.ground import RIVAL_ITERATIONS, better_friction, choose_ground
-from mosa.modules.fitting.search.ground_choice import EXPLAINED, alike, learned_on, named, rivals_of
+from mosa.modules.fitting.search.ground import (
+    EXPLAINED,
+    RIVAL_ITERATIONS,
+    choose_ground,
+    gains_of_contacts,
+    learned_on,
+    named,
+)  # fmt: skip
 from mosa.modules.fitting.search.parts import PARTS, chosen
 from mosa.modules.fitting.search.parts import named as named_parts
 from mosa.modules.fitting.stages import Stage
 from mosa.system.progress import tqdm
-from mosa.types import RUBBING, Ground
+from mosa.types import Ground
 
 log = logging.getLogger(__name__)
 
@@ -78,35 +84,12 @@ class NewtonSteps:
         that the fit takes the best, and stays where it was fitted to it."""
         if not stage.learns_adapter or not self.grounds or self.ground_gains:
             return None
-        found = self.world.ground
-        slides, rivals = found.mode in RUBBING, rivals_of(self.grounds)
-        if not slides and not rivals:
+        found, running = self.world.ground, self.identification
+        gains, fit = gains_of_contacts(
+            found, self.grounds, running, lambda ground: self.fitted_on(ground, stage)
+        )
+        if not gains:
             return None
-        # gone on for as long, as a fit gains by that wherever it goes on; as it stands where it cannot go on
-        own = min(self.identification.cost(), self.fitted_on(found, stage)[0])
-        gains: dict[Ground, float] = {}
-        fits: dict[Ground, Identification] = {}
-
-        def gain(mode: str, friction: float) -> float:
-            ground = replace(found, mode=mode, friction=friction)
-            cost, fit = self.fitted_on(ground, stage)
-            better = own - cost
-            if better > max(
-                gains.values(), default=-math.inf
-            ):  # of equals the first, as max() has it below
-                fits.clear()
-                fits[ground] = fit  # one is kept, as each has a body
-            gains[ground] = better
-            return better
-
-        if slides:
-            friction, most = better_friction(found.friction, partial(gain, found.mode))
-            for mode in RUBBING:
-                if mode != found.mode and alike(self.grounds, mode):
-                    gain(mode, friction if most > 0 else found.friction)
-        else:
-            for mode, friction in rivals:
-                gain(mode, friction)
         self.ground_gains = {named(ground): each for ground, each in gains.items()}
         best = max(gains, key=gains.get)
         begins_again = gains[best] > EXPLAINED
@@ -115,7 +98,7 @@ class NewtonSteps:
                  "better" if gains[best] > 0 else "worse", named(found), abs(gains[best]),
                  "; the fit begins again with it" if begins_again else "; the fit continues with it" if moves else "")  # fmt: skip
         if moves:
-            self.go_to(best, fits[best])
+            self.go_to(best, fit)
         return best if begins_again else None
 
     def better_law(self, stage: Stage) -> str | None:
@@ -155,19 +138,9 @@ class NewtonSteps:
         """(cost, fit) of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same
         noise; infinite where the body cannot be simulated there. The fit itself stays where it stands. law: of the backbone; None:
         as it is."""
-        own, body = self.identification, copy.deepcopy(self.body)
+        body, state = copy.deepcopy(self.body), self.identification.state()
         body.material.law = law or body.material.law
-        other = Identification(
-            body,
-            self.takes,
-            replace(self.world, ground=ground),
-            stage,
-            self.criterion,
-            self.settings,
-            own.kinds,
-            known=self.known,
-        )
-        state = own.state()
+        other = self.identifying(stage, ground, body=body)
         other.restore(state | {"iteration": max(state["iteration"], EVIDENCE_ITERATIONS)})
         try:
             other.iterate_until_converged(RIVAL_ITERATIONS)
@@ -177,9 +150,8 @@ class NewtonSteps:
 
     def keep_posterior(self, stage: Stage) -> None:
         """Of the running identification, where it is the last one, after `settle_parts`."""
-        alone = (
-            self.body.adapter is None and self.body.heterogeneity is None
-        )  # then the calibration is all there is
+        # then the calibration is all there is
+        alone = self.body.adapter is None and self.body.heterogeneity is None
         if stage.learns_adapter:
             names = self.identification.newton.names()
             self.posterior = self.settle_parts(stage).posterior().among(names)
@@ -222,25 +194,18 @@ class NewtonSteps:
             self.end(stage)
 
     def identifying(
-        self, stage: Stage, ground: Ground | None = None, parts: Sequence[str] = PARTS
-    ) -> Identification:
+        self, stage: Stage, ground: Ground | None = None, parts: Sequence[str] = PARTS, body: Body | None = None
+    ) -> Identification:  # fmt: skip
         """A stage's identification on the takes, from where the body stands. ground: another one than the world's; parts: those
-        that the law may have."""
+        that the law may have; body: another one than `self.body`."""
         world = self.world if ground is None else replace(self.world, ground=ground)
         kinds = tuple(
             self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch")
         )
         return Identification(
-            self.body,
-            self.takes,
-            world,
-            stage,
-            self.criterion,
-            self.settings,
-            kinds,
-            parts=parts,
-            known=self.known,
-        )
+            body or self.body, self.takes, world, stage, self.criterion, self.settings, kinds,
+            parts=parts, known=self.known,
+        )  # fmt: skip
 
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
         """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""

@@ -8,7 +8,7 @@ from mosa.config.record import BodyRecord
 from mosa.modules.body.material import AUTO, Material
 from mosa.modules.fitting import newton_steps
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
-from mosa.modules.fitting.search.ground_choice import EXPLAINED
+from mosa.modules.fitting.search.ground import EXPLAINED
 from mosa.modules.fitting.stages import Stage
 from mosa.training.lit_mosa import LitMosa
 

@@ -26,9 +26,14 @@ from mosa.modules.fitting.identification_settings import Criterion, Identificati
 from mosa.modules.fitting.newton_steps import NewtonSteps
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.modules.fitting.search import ground as ground_search
-from mosa.modules.fitting.search import ground_choice
-from mosa.modules.fitting.search.ground import better_friction, choose_ground
-from mosa.modules.fitting.search.ground_choice import contact, named, rivals_of, taken_of
+from mosa.modules.fitting.search.ground import (
+    better_friction,
+    choose_ground,
+    contact,
+    named,
+    rivals_of,
+    taken_of,
+)
 from mosa.modules.fitting.stages import Stage
 from mosa.training.lit_mosa import LitMosa
 from mosa.types import AUTO, Ground
@@ -345,7 +350,7 @@ def stages_begun(module: LitMosa, monkeypatch) -> list[tuple[str, Ground]]:
 def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(monkeypatch, truth):
     """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
     friction with which the isotropic law is nearest."""
-    monkeypatch.setattr(ground_choice, "NEARER", 0.0)
+    monkeypatch.setattr(ground_search, "NEARER", 0.0)
     module = learning(truth)
     begun = stages_begun(module, monkeypatch)
     module.identify()
@@ -354,7 +359,7 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     assert begun == [("prior", sticks), ("joint", sticks), *again]
     gains = module.ground_gains
     assert set(gains) == {"separate_1.2", "touch_1.2"} and module.world.ground.mode == truth.mode
-    assert (max(gains.values()) > ground_choice.EXPLAINED) == bool(again)
+    assert (max(gains.values()) > ground_search.EXPLAINED) == bool(again)
     assert gains.get(named(truth), 0.0) == max(0.0, *gains.values())
     assert (
         float(module.body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1)
@@ -369,8 +374,8 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
 
 def test_a_fit_goes_to_a_friction_that_is_a_little_better(monkeypatch):
     """With the numbers and the posterior of the fit there, and without beginning again: 0.6 is taken at first, 0.5 true."""
-    monkeypatch.setattr(newton_steps, "better_friction", lambda own, gain: (0.5, gain(0.5)))
-    for each in (ground_choice, newton_steps):
+    monkeypatch.setattr(ground_search, "better_friction", lambda own, gain: (0.5, gain(0.5)))
+    for each in (ground_search, newton_steps):
         monkeypatch.setattr(each, "EXPLAINED", 1e6)
     monkeypatch.setattr(NewtonSteps, "find_ground", lambda self, stage: found(self))
     module = learning(Ground(0.0, "separate", 0.5))
@@ -430,7 +435,7 @@ def test_a_fit_begins_again_with_the_friction_that_explains_the_learned_law_bett
     )  # nodes or particles is told by the isotropic law here, so it is not asked
     assert set(gains) == ({"separate_0.3"} if truth == 0.3 else {"separate_0.3", "separate_1.2"})
     assert module.world.ground == Ground(0.0, "separate", truth)
-    assert (max(gains.values()) > ground_choice.EXPLAINED) == (truth == 0.3)
+    assert (max(gains.values()) > ground_search.EXPLAINED) == (truth == 0.3)
 
 
 def test_a_contact_that_cannot_be_simulated_gains_nothing(monkeypatch):
