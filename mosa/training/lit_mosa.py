@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -38,6 +39,7 @@ from mosa.config.effects import warn_of_idle
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
 from mosa.data.io.forces import forces_from_config
+from mosa.data.observations import Observations
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
 from mosa.evaluation.evaluate import evaluate, run_sequences
@@ -60,7 +62,7 @@ from mosa.modules.fitting.training_sequences import Take, seen_again, with_posit
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
 from mosa.reconstruction.rest_shape import RestShape
-from mosa.rendering.observer import deformed_covariances, observe
+from mosa.rendering.observer import Views, deformed_covariances, observe
 from mosa.types import Ground, Rollout
 
 log = logging.getLogger(__name__)
@@ -153,48 +155,37 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if body is not None:
             check_terms(weights, body.adapter)
         self.body, self.world, self.background = body, world, background
+        self.record, self.weights, self.clip = record, dict(weights), clip
+        self.criterion = criterion or Criterion(name="free")
+        self.settings = settings or IdentificationSettings()
         self.takes, self.first_takes, self.stages = list(takes), list(takes), list(stages)
-        self.weights, self.clip, self.record = dict(weights), clip, record
+        # of the training sequence
+        self.start = takes[0].start.written() if takes and takes[0] is not None else None
+        # where the fit is: stage, losses of its iterations, steps of all stages
         self.stage_index, self.losses, self.steps_done, self.stage_over = 0, [], 0, False
-        self.start = (
-            takes[0].start.written() if takes and takes[0] is not None else None
-        )  # of the training sequence
-        self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
-        self.last: dict[str, float] = {}
-        self.criterion, self.settings = (
-            criterion or Criterion(name="free"),
-            settings or IdentificationSettings(),
-        )
-        self.identification: Identification | None = (
-            None  # of the running stage, where it is Gauss-Newton's
-        )
-        self.saved_identification: dict | None = (
-            None  # its state in the checkpoint that the fit goes on from
-        )
-        self.posterior: Posterior | None = None
-        self.retreat, self.saved_retreat, self.taken_back = (
-            Retreat(),
-            None,
-            False,
-        )  # of the running stage, where it is Adam's
         self.running_optimizer: torch.optim.Optimizer | None = None
+        # of a stage of Gauss-Newton, and its state in the checkpoint that the fit goes on from
+        self.identification: Identification | None = None
+        self.saved_identification: dict | None = None
+        # of a stage of Adam
+        self.retreat, self.saved_retreat, self.taken_back = Retreat(), None, False
+        self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
         self.norms: dict[str, float] = {}  # of the last step's gradient, by parameter group
         self.terms_of_step: dict[str, Tensor] = {}
+        self.last: dict[str, float] = {}  # what was logged last
         self.saved_cues: tuple | None = None  # those of a checkpoint that was loaded without data
         self.informed = False  # whether the takes have the cues about the calibrated backbone
-        self.compared: dict[
-            str, float
-        ] = {}  # mean distance [m] of the calibrated candidates for the backbone
-        self.parts: dict[str, float] = {}  # error [m] of held-back frames, by what the law has
-        self.ground_gains: dict[
-            str, float
-        ] = {}  # of other contacts about the learned law, once it has been asked
-        self.law_gains: dict[str, float] = {}  # of other backbones, likewise
+        # what was found: mean distances [m] of the calibrated candidates for the backbone and of the
+        # contacts, gains of others about the learned law, errors [m] of held-back frames by parts
+        self.compared: dict[str, float] = {}
+        self.grounds: dict[str, float] = {}
+        self.law_gains: dict[str, float] = {}
+        self.ground_gains: dict[str, float] = {}
+        self.parts: dict[str, float] = {}
+        self.posterior: Posterior | None = None
+        self._known: dict[str, Posterior] = {}  # by law
         begins_again = body is not None and (self.ground_is_sought or body.material.candidates)
         self.untouched = copy.deepcopy(body.state_dict()) if begins_again else None
-        self.grounds: dict[
-            str, float
-        ] = {}  # mean distance [m] of the contacts with the ground that were tried
 
     @classmethod
     def of_parts(
@@ -258,13 +249,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             own = {key: measured.settings[key] for key in OF_DATA if key in measured.settings}
             record = measured.but(settings=self.cfg | own)
             body = body_of(data.shape, record)
-            self._begin(
-                record,
-                body,
-                (),
-                data.scene.background.to(body.rest.device),
-                **parts_of(record, body),
-            )
+            background = data.scene.background.to(body.rest.device)
+            self._begin(record, body, (), background, **parts_of(record, body))
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
             raise ConfigError(
@@ -273,14 +259,17 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 "simulation.particles"
             )
         if fitting and not self.takes:
-            plastic = lambda: law_named(self.body.material.law).plastic  # noqa: E731
             self.takes = [
-                replace(take, again=take.again and replace(take.again, plastic=plastic))
+                replace(take, again=take.again and replace(take.again, plastic=self.is_plastic))
                 for take in data.takes
             ]
             self.first_takes = list(self.takes)
             if self.saved_cues is not None:
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
+
+    def is_plastic(self) -> bool:
+        """Whether the law yields, which candidates for it may not agree on."""
+        return law_named(self.body.material.law).plastic
 
     # ---------------------------------------------------------------- state
     @property
@@ -333,12 +322,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             )
         if self.record is not None:
             check_same_data(record, self.record.data, "the checkpoint")
-        self.stage_index, self.losses, self.steps_done = (
-            saved.stage,
-            list(saved.losses),
-            saved.steps_done,
-        )
-        self.stage_over, self.start = saved.stage_over, record.start.plain()
+        self.stage_index, self.stage_over = saved.stage, saved.stage_over
+        self.losses, self.steps_done = list(saved.losses), saved.steps_done
+        self.start = record.start.plain()
         self.misfit = saved.misfit
         self.saved_identification = saved.identification and saved.identification.plain()
         self.saved_retreat = saved.retreat and saved.retreat.plain()
@@ -375,10 +361,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     @property
     def known(self) -> Posterior | None:
         """What another experiment said of the law's numbers (`identification.known`)."""
-        if self.settings.known is None:
-            return None
-        where = "identification.known"
-        return known_numbers(self.settings.known, self.body.material, self.body.adapter, where)
+        path, material = self.settings.known, self.body.material
+        if path is not None and material.law not in self._known:
+            found = known_numbers(path, material, self.body.adapter, "identification.known")
+            self._known[material.law] = found
+        return self._known.get(material.law)
 
     @property
     def ground_is_sought(self) -> bool:
@@ -465,9 +452,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         except (SimulationDiverged, ConfigError) as error:
             log.warning("validation: the law cannot be simulated: %s", error)
         else:
-            seen, x, F = part.observations, rollout.x[part.frames], rollout.F_tot[part.frames]
-            shown = observe(x, deformed_covariances(F, body.covariances), body.opacities, body.colors, seen.cameras,
-                            self.background)  # fmt: skip
+            seen = part.observations
+            shown = self.shown(rollout.x[part.frames], rollout.F_tot[part.frames], seen)
             terms = {
                 "image": losses.image_loss(shown.images, seen.images),
                 "mask": losses.mask_loss(shown.mattes, seen.mattes),
@@ -475,9 +461,16 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             loss = sum(self.weights.get(name, 0.0) * float(value) for name, value in terms.items())
             psnr = metrics.psnr(shown.images.clamp(0, 1).flatten(0, 1), seen.images.flatten(0, 1))
             values = {"loss": loss, "psnr": psnr}
-        self.log_dict({f"val/{name}": value for name, value in values.items()}, batch_size=1)
-        self.log_dict(
-            {f"val/{part.name}/{name}": value for name, value in values.items()}, batch_size=1
+        for place in ("val", f"val/{part.name}"):
+            self.log_dict(
+                {f"{place}/{name}": value for name, value in values.items()}, batch_size=1
+            )
+
+    def shown(self, x: Tensor, F_tot: Tensor, observations: Observations) -> Views:
+        """Images of the body's particles in the cameras of `observations`."""
+        body, covariances = self.body, deformed_covariances(F_tot, self.body.covariances)
+        return observe(
+            x, covariances, body.opacities, body.colors, observations.cameras, self.background
         )
 
     def test_dataloader(self) -> DataLoader:
@@ -557,23 +550,17 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def inform(self, response: bool = True) -> None:
         """The cues of the takes once more, about what the calibrated backbone predicts; response: and what they keep of that."""
         if any(take.again for take in self.takes):
-            self.takes, self.informed = (
-                [seen_again(take, self.body, self.world, response) for take in self.takes],
-                True,
-            )
+            self.takes = [seen_again(take, self.body, self.world, response) for take in self.takes]
+            self.informed = True
 
     @torch.no_grad()
     def measure_misfit(self) -> float:
         """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
-        misfits = []
+        misfits, body = [], self.body
         for take in self.takes:
-            model = self.body.model().only(adapter=False)
-            rollout = self.body.simulate(
-                take.start, self.world, len(take.cues.positions), take.frame_dt, model=model
-            )
-            misfits.append(
-                float(losses.position_loss(rollout.x, take.cues.positions, self.body.size))
-            )
+            model, seen = body.model().only(adapter=False), take.cues.positions
+            x = body.simulate(take.start, self.world, len(seen), take.frame_dt, model=model).x
+            misfits.append(float(losses.position_loss(x, seen, body.size)))
         return sum(misfits) / len(misfits)
 
     def finish(self) -> None:
@@ -595,6 +582,18 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.retreat, self.stage_over = Retreat(), False
 
     # ---------------------------------------------------------------- logs
+    def figures(self) -> dict[str, float]:
+        """What was searched: distances [m] and gains of backbones and contacts, errors [m] of held-back
+        frames."""
+        found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
+        found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
+        found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}
+        touched = {f"{contact}_m": each for contact, each in self.grounds.items()}
+        touched |= {f"{contact}_gain": gain for contact, gain in self.ground_gains.items()}
+        return found | {
+            f"id_prior/ground/{name}": each for name, each in touched.items() if math.isfinite(each)
+        }
+
     def log_values(self, values: dict[str, Tensor | float]) -> None:
         """These scalars and the parameters, into the logs and `last`."""
         for name, value in self.body.material.physical().items():
@@ -615,13 +614,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         frames = len(take.cues.positions)
         rollout = body.simulate(take.start, self.world, frames, take.frame_dt)
         targets = take.observations.select([view], frames)
-        seen = observe(
-            rollout.x,
-            deformed_covariances(rollout.F_tot, body.covariances),
-            body.opacities,
-            body.colors,
-            targets.cameras,
-            self.background,
-        )
+        seen = self.shown(rollout.x, rollout.F_tot, targets)
         rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
         return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)
