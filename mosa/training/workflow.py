@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 import warnings
 from contextlib import contextmanager
@@ -30,7 +29,7 @@ from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
-from mosa.training.assembly import assemble, scenes
+from mosa.training.assembly import Run, assemble, scenes
 from mosa.training.costs import before_data, estimate, estimate_text, peak_memory
 from mosa.training.fitting import build_trainer, fit
 from mosa.training.loggers import log_outcome
@@ -56,9 +55,14 @@ from mosa.training.run_folder import (
 from mosa.twin.drop_planning import plan, plan_text
 from mosa.twin.rollout_file import save_observed
 from mosa.twin.twin import Twin
-from mosa.types import AUTO
+from mosa.types import AUTO, Scene
 
 log = logging.getLogger(__name__)
+
+ANOTHER_START = (
+    "velocity", "rotation", "position", "height", "angular_velocity", "colliders", "driven",
+)  # fmt: skip
+"""Keys of `simulate` that ask eval.py for a rollout from a new start."""
 
 
 class StageTimes:
@@ -95,24 +99,19 @@ def train(cfg: DictConfig) -> float | None:
     device = str(trainer.strategy.root_device)
     run = assemble(cfg, device)
     data = run.data
-    log.info(before_data(settings.plain(), most_particles(device)))
+    most = most_particles(device)
+    log.info(before_data(settings.plain(), most))
     with clock.measure("data"):
         scene, others = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
-    sequences_taught = 1 + len(data.taught)
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
         parts, memory = estimate(
-            settings.plain(),
-            scene,
-            len(others),
-            sequences_taught,
-            device,
-            stored=data.reconstructed(),
-            most=most_particles(device),
-        )
+            settings.plain(), scene, len(others), 1 + len(data.taught), device,
+            stored=data.reconstructed(), most=most,
+        )  # fmt: skip
         log.info(estimate_text(parts, memory))
     else:
         log.info(
@@ -122,12 +121,8 @@ def train(cfg: DictConfig) -> float | None:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
         shape, dx = data.shape, data.dx
-    log.info(
-        "body: %d particles, %.4g cm^3, grid spacing %.4g m",
-        len(shape.rest),
-        1e6 * float(shape.volume.sum()),
-        dx,
-    )
+    cm3 = 1e6 * float(shape.volume.sum())
+    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), cm3, dx)
     resolved = resolution(shape.rest, data.reconstruction.spacing, dx)
     if not resolved.enough:
         warnings.warn(
@@ -139,58 +134,24 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("starts"):
         starts = data.starts
     for prefix, start in starts.items():
-        log.info(
-            "start of %s: velocity (%s) m/s",
-            prefix,
-            ", ".join(f"{v:.3f}" for v in start.velocity.tolist()),
-        )
+        velocity = ", ".join(f"{v:.3f}" for v in start.velocity.tolist())
+        log.info("start of %s: velocity (%s) m/s", prefix, velocity)
     with clock.measure("fit"):
-        module, world = run.module, run.world
-        body = module.body
-        check_starts(world, body, starts)
-        warn_of_little(world, body, starts, [scene, *others])
-        warn_of_other_bodies(body, starts, [scene, *others])
-        if not filmed and not all(stage.newton for stage in module.stages):
-            raise ConfigError(
-                "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
-                "found Adam (fit.<stage>.optimizer): choose adapter=operator or adapter=none"
-            )
-        log.info(
-            "fit: %d particles, %d frames, at most %d steps",
-            len(body.rest),
-            len(module.takes[0].cues.positions),
-            sum(stage.iterations for stage in module.stages),
-        )
-        cut = fit(trainer, module, data, cfg.ckpt_path)
-        warn_of_ends(body.material)
+        cut = learn(run, trainer, [scene, *others], starts, cfg.ckpt_path)
+    module, body = run.module, run.module.body
     world = module.world  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
     if filmed:
-        save_observed(
-            folder / "observed.npz",
-            {prefix: take.cues for prefix, take in zip(learned_from, module.takes)},
-        )
+        seen = {prefix: take.cues for prefix, take in zip(learned_from, module.takes)}
+        save_observed(folder / "observed.npz", seen)
     with clock.measure("evaluation"):
         evaluated = run.sequences
         figures, kept = figures_of(
             settings.evaluation, body, evaluated, world, module.posterior, folder
         )
-        figures |= start_figures(starts["train"]) | data.reconstruction.geometry
-        figures |= {
-            f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()
-        }
-        figures |= {f"id_prior/gain/{law}": gain for law, gain in module.law_gains.items()}
-        figures |= {f"held_back/{name}_m": error for name, error in module.parts.items()}
-        touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
-        touched |= {f"{contact}_gain": gain for contact, gain in module.ground_gains.items()}
-        figures |= {
-            f"id_prior/ground/{name}": value
-            for name, value in touched.items()
-            if math.isfinite(value)
-        }
-    figures |= (
-        clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
-    )
+        figures |= start_figures(starts["train"]) | data.reconstruction.geometry | module.figures()
+    sizes = {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    figures |= clock.figures | cost(device) | sizes
     figures["geometry/cells_across"] = resolved.cells
     figures |= {
         k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith(VALIDATION)
@@ -198,6 +159,36 @@ def train(cfg: DictConfig) -> float | None:
     log_outcome(trainer.loggers, plain(cfg), figures)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world, cut)
     return optimized(figures, cfg.optimized_metric)
+
+
+def learn(
+    run: Run,
+    trainer: L.Trainer,
+    recordings: list[Scene],
+    starts: dict[str, Start],
+    ckpt_path: str | None,
+) -> str:
+    """The run's fit, from its checks to its warnings. Returns what `fit` does. recordings: the
+    run's sequences, the first of them taught. Errors: MosaError."""
+    module, world = run.module, run.world
+    body = module.body
+    check_starts(world, body, starts)
+    warn_of_little(world, body, starts, recordings)
+    warn_of_other_bodies(body, starts, recordings)
+    if recordings[0].markers is not None and not all(stage.newton for stage in module.stages):
+        raise ConfigError(
+            "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
+            "found Adam (fit.<stage>.optimizer): choose adapter=operator or adapter=none"
+        )
+    log.info(
+        "fit: %d particles, %d frames, at most %d steps",
+        len(body.rest),
+        len(module.takes[0].cues.positions),
+        sum(stage.iterations for stage in module.stages),
+    )
+    cut = fit(trainer, module, run.data, ckpt_path)
+    warn_of_ends(body.material)
+    return cut
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> float | None:
@@ -221,18 +212,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         return -ranked[0].gain
     show(twin.body, cfg.appearance)
     simulate = plain(cfg.simulate)
-    if any(
-        simulate[k] is not None
-        for k in (
-            "velocity",
-            "rotation",
-            "position",
-            "height",
-            "angular_velocity",
-            "colliders",
-            "driven",
-        )
-    ):
+    if any(simulate[k] is not None for k in ANOTHER_START):
         rollout = twin.simulate(**simulate, progress=True)
         readers = {"colliders": colliders_from_config, "driven": driven_from_config}
         given = {
