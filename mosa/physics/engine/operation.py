@@ -141,16 +141,9 @@ class Stretch:
         work, held = self.buffers(solver, pool, acting, full)
         work.set_window(*windows)
         work.load(
-            state,
-            held,
-            solver.volume,
-            solver.mass,
-            solver.cutoff,
-            poses,
-            self.steps,
-            solver.gravities,
-            solver.driven,
-        )
+            state, held, solver.volume, solver.mass, solver.cutoff, poses, self.steps,
+            solver.gravities, solver.driven,
+        )  # fmt: skip
         return work
 
     def forward(
@@ -177,15 +170,9 @@ class Stretch:
             else:
                 fastest = int(work.flags[WINDOW])
                 raise LeftWindow if self.cut else solver.error(WINDOW, fastest, self.first, dt)
-            left = [
-                *([] if work.colliders is None else work.colliders.reaction),
-                *self.statistics(work),
-            ]
-            return (
-                final,
-                copies(left),
-                Kept(windows, solver.budget.keep(work.tape()) if kept else []),
-            )
+            left = [] if work.colliders is None else work.colliders.reaction
+            tape = solver.budget.keep(work.tape()) if kept else []
+            return final, copies([*left, *self.statistics(work)]), Kept(windows, tape)
 
         finals, left, kept = zip(
             *self.lanes.each(self._kind("advance", others), run, *self._parts(state, others))
@@ -199,34 +186,19 @@ class Stretch:
     ) -> tuple[list[Tensor], list[Tensor | None]]:  # fmt: skip
         """Gradients of (state, others), of as many states as there are seeds: without F_tot where the law does not yield."""
 
-        def run(
-            solver: SegmentSolver,
-            pool: dict,
-            kept: Kept,
-            state: State,
-            acting: tuple,
-            poses: tuple,
-            seeds: tuple,
-            other_seeds: tuple,
-        ):
+        def run(solver, pool, kept: Kept, state: State, acting, poses, seeds, other_seeds):
             work = self._loaded(solver, pool, state, acting, poses, kept.windows, True)
             tape = kept.take()
             solver.budget.used(tape)
             if tape:
                 work.rewind(tape)
-            slot, slots, statistics = (
-                self.substeps % 2,
-                work.adjoint_slots(),
-                self.statistics_seeds(),
-            )
-            reaction, of_poses = (
-                ([], [])
-                if work.colliders is None
-                else (work.colliders.adj_reaction, work.colliders.adj_poses)
-            )
+            slots, statistics = work.adj_states, self.statistics_seeds()
+            reaction, of_poses = [], []
+            if work.colliders is not None:
+                reaction, of_poses = work.colliders.adj_reaction, work.colliders.adj_poses
             if work.driven is not None and work.driven.count:
                 of_poses = [*of_poses, *work.driven.adj_paths]
-            targets = [*(target[slot] for target in slots), *reaction, *statistics]
+            targets = [*(part[self.substeps % 2] for part in slots), *reaction, *statistics]
             seeded = list(zip(targets, (*seeds, *other_seeds), strict=True))
             if unseeded := [target for target, seed in seeded if seed is None]:
                 torch._foreach_zero_(unseeded)
@@ -235,30 +207,14 @@ class Stretch:
             penalised = any(seed is not None for seed in other_seeds[len(reaction) :])
             self.adjoint(work, acting, not tape, penalised)
             of_acting = self.adjoint_of(work, acting)
-            found = iter(
-                copies(
-                    [
-                        *(target[0] for target in slots),
-                        *(t for t in of_acting if t is not None),
-                        *of_poses,
-                    ]
-                )
-            )
-            return (
-                [next(found) for _ in slots],
-                [None if t is None else next(found) for t in of_acting],
-                list(found),
-            )
+            given = (t for t in of_acting if t is not None)
+            found = iter(copies([*(part[0] for part in slots), *given, *of_poses]))
+            of_state = [next(found) for _ in slots]
+            return of_state, [None if t is None else next(found) for t in of_acting], list(found)
 
         parts, lanes = self._parts(state, others), self.lanes
-        found = lanes.each(
-            self._kind("adjoint", others),
-            run,
-            kept,
-            *parts,
-            lanes.split(seeds),
-            lanes.split(other_seeds, 1),
-        )
+        given = lanes.split(seeds), lanes.split(other_seeds, 1)
+        found = lanes.each(self._kind("adjoint", others), run, kept, *parts, *given)
         of_state, of_acting, of_poses = zip(*found)
         return lanes.join(of_state), [*lanes.join(of_acting), *lanes.join(of_poses, 1)]
 

@@ -55,18 +55,11 @@ class Workspace:
         pointed: bool = False, worlds: int = 1, shared: bool = False,
     ) -> None:  # fmt: skip
         self.worlds, self.size = worlds, particles // worlds
-        self.numerics, self.particles, self.substeps, self.with_adjoint = (
-            numerics,
-            particles,
-            substeps,
-            with_adjoint,
-        )
-        self.scalar = SCALARS[numerics.dtype]
-        self.exact = needed(numerics.device)
-        self.kernels, self.update = (
-            transfer_kernels(self.scalar, self.exact),
-            update_kernels(self.scalar),
-        )
+        self.numerics, self.particles, self.substeps = numerics, particles, substeps
+        self.with_adjoint = with_adjoint
+        self.scalar, self.exact = SCALARS[numerics.dtype], needed(numerics.device)
+        self.kernels = transfer_kernels(self.scalar, self.exact)
+        self.update = update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(
             numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain
         )
@@ -79,14 +72,12 @@ class Workspace:
         self.C_affine, self.C_affine_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
         self.F, self.F_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
         # the deformation gradient that is never mapped: F itself where the law does not yield
-        self.F_tot, self.F_tot_wp = (
-            self._per_slot(states, (n, 3, 3), self.kernels.mat33)
-            if self.plastic
-            else (self.F, self.F_wp)
-        )
-        self.tau, self.tau_wp = self._per_slot(
-            substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33
-        )
+        self.F_tot, self.F_tot_wp = self.F, self.F_wp
+        if self.plastic:
+            self.F_tot, self.F_tot_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+        self.states = [self.x, self.v, self.C_affine, self.F, *([self.F_tot] * self.plastic)]
+        stresses = substeps if with_adjoint else 1
+        self.tau, self.tau_wp = self._per_slot(stresses, (n, 3, 3), self.kernels.mat33)
         if numerics.moduli is not None:
             self.mean = mean_volume_kernels(self.scalar, SLOTS, self.exact)
             _, self.F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
@@ -106,69 +97,76 @@ class Workspace:
             )
         self._rows = {name: self.held[name][0] for name in ("G", "h")} if shared else {}
         if with_adjoint:
-            self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
-            self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
-            self.adj_C_affine, self.adj_C_affine_wp = self._per_slot(
-                2, (n, 3, 3), self.kernels.mat33
-            )
-            self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-            self.adj_F_tot, self.adj_F_tot_wp = self.adj_F, self.adj_F_wp
-            if self.plastic:
-                self.adj_F_tot, self.adj_F_tot_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-            self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
-            if numerics.moduli is not None:
-                _, self.adj_F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
-            buffer, parts = zeros_in_one(
-                [shape for shape, _ in shapes.values()], numerics.dtype, numerics.device
-            )
-            self.adj_held = dict(zip(shapes, parts))
-            self.adj_held_wp = {
-                name: wp.from_torch(part, dtype=shapes[name][1])
-                for name, part in self.adj_held.items()
-            }
-            # to clear in one launch: all of it, and all but the parameters' part, which comes first
-            self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
-            self.adj_operator_wp = wp.from_torch(
-                buffer[parts[1].storage_offset() :], dtype=self.scalar
-            )
+            self._allocate_adjoint(shapes)
         self.flags, self.flags_wp = self.array((4,), wp.int64, torch.int64)
         self.window, self.window_wp = self.array((3 * worlds, 3), wp.vec3i, torch.int32)
         # what gravity adds to node velocities in the first substep of a segment and in the others
         self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
-        self.colliders, self.springs, self.driven = None, None, None
-        if numerics.touching or numerics.colliders is not None:
-            self.touch = touch_kernels(self.scalar)
-            self.v_met, self.v_met_wp = self.array((n, 3), self.kernels.vec3)
-            self.springs, self.springs_wp = self.array((n,), self.scalar)
-            if with_adjoint:
-                _, self.adj_springs_wp = self.array((n,), self.scalar)
-                # of the springs in the packed parameters
-                self.slopes, self.slopes_wp = self.array((n, SLOTS), self.scalar)
-                self.adj_slots_wp = wp.from_torch(self.adj_held["parameters"], dtype=self.scalar)
-        if numerics.colliders is not None:
-            self.colliders = ColliderBuffers(
-                numerics.colliders, self.scalar, substeps, self, with_adjoint
-            )
-        if numerics.driven:
-            self.driven = DrivenBuffers(
-                self.colliders, self.scalar, substeps, numerics.points, self
-            )
-        # solids are before the driven sets among the colliders
-        self.struck = numerics.colliders is not None and len(numerics.colliders) > numerics.driven
+        self._allocate_contact()
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
         self._placed: np.ndarray | None = None
-        self._given: tuple[np.ndarray, np.ndarray] | None = (
-            None  # the windows that are placed; nobody changes them
-        )
+        # the windows that are placed; nobody changes them
+        self._given: tuple[np.ndarray, np.ndarray] | None = None
         self._pulled: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         strategy = WarpCapture(numerics.device, self.flags_wp.device)
         self._graphs = Graphs(
             strategy, "substeps cannot be captured as a graph and are launched one by one"
         )
+
+    def _allocate_adjoint(self, shapes: dict) -> None:
+        """shapes: of what is held, with Warp's types, by name."""
+        numerics, n = self.numerics, self.particles
+        self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
+        self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
+        self.adj_C_affine, self.adj_C_affine_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+        self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+        self.adj_F_tot, self.adj_F_tot_wp = self.adj_F, self.adj_F_wp
+        if self.plastic:
+            self.adj_F_tot, self.adj_F_tot_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+        # both slots of each
+        self.adj_states = [self.adj_x, self.adj_v, self.adj_C_affine, self.adj_F]
+        self.adj_states += [self.adj_F_tot] * self.plastic
+        self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
+        if numerics.moduli is not None:
+            _, self.adj_F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
+        buffer, parts = zeros_in_one(
+            [shape for shape, _ in shapes.values()], numerics.dtype, numerics.device
+        )
+        self.adj_held = dict(zip(shapes, parts))
+        self.adj_held_wp = {
+            name: wp.from_torch(part, dtype=shapes[name][1]) for name, part in self.adj_held.items()
+        }
+        # to clear in one launch: all of it, and all but the parameters' part, which comes first
+        self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
+        self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
+
+    def _allocate_contact(self) -> None:
+        """What particles meet: planes, solids, driven sets."""
+        numerics, n = self.numerics, self.particles
+        self.colliders, self.springs, self.driven = None, None, None
+        if numerics.touching or numerics.colliders is not None:
+            self.touch = touch_kernels(self.scalar)
+            self.v_met, self.v_met_wp = self.array((n, 3), self.kernels.vec3)
+            self.springs, self.springs_wp = self.array((n,), self.scalar)
+            if self.with_adjoint:
+                _, self.adj_springs_wp = self.array((n,), self.scalar)
+                # of the springs in the packed parameters
+                self.slopes, self.slopes_wp = self.array((n, SLOTS), self.scalar)
+                self.adj_slots_wp = wp.from_torch(self.adj_held["parameters"], dtype=self.scalar)
+        if numerics.colliders is not None:
+            self.colliders = ColliderBuffers(
+                numerics.colliders, self.scalar, self.substeps, self, self.with_adjoint
+            )
+        if numerics.driven:
+            self.driven = DrivenBuffers(
+                self.colliders, self.scalar, self.substeps, numerics.points, self
+            )
+        # solids are before the driven sets among the colliders
+        self.struck = numerics.colliders is not None and len(numerics.colliders) > numerics.driven
 
     def array(
         self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None
@@ -200,10 +198,7 @@ class Workspace:
         self.grid_slots().copy_(tape[-1])
 
     def _particle_slots(self) -> list[Tensor]:
-        parts = [self.x, self.v, self.C_affine, self.F, self.tau] + (
-            [self.F_tot] if self.plastic else []
-        )
-        return [part[0]._base for part in parts]
+        return [part[0]._base for part in (*self.states, self.tau)]
 
     def grid_slots(self) -> Tensor:
         """(2, slots, nodes of the windows, 4): momentum and mass, velocity."""
@@ -237,15 +232,11 @@ class Workspace:
         # where only the last one is wanted a second one, which is cleared while the first is read
         grids, vec4 = self.substeps if self.with_adjoint else 2, self.kernels.vec4
         each = 8 * self.numerics.dtype.itemsize
-        counted(
-            "kept grid nodes",
-            (grids, count),
-            "use more substeps, or a box",
-            each=each,
-            error=SimulationDiverged,
-        )
+        remedy = "use more substeps, or a box"
+        counted("kept grid nodes", (grids, count), remedy, each=each, error=SimulationDiverged)
+        numerics = self.numerics
         self.fields = torch.zeros(
-            (2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device
+            (2, grids, count, 4), dtype=numerics.dtype, device=numerics.device
         )
         self.grid_wp, self.velocity_wp = (
             [wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields
@@ -278,9 +269,8 @@ class Workspace:
             self._pulled = pulled
         if self.colliders is not None:
             self.colliders.load(poses[: len(self.colliders.poses)])
-        slots = (self.x, self.v, self.C_affine, self.F) + ((self.F_tot,) if self.plastic else ())
-        targets = [*(slot[0] for slot in slots), self.volume, self.mass]
-        torch._foreach_copy_(targets, [*state[: len(slots)], volume, mass])
+        targets = [*(part[0] for part in self.states), self.volume, self.mass]
+        torch._foreach_copy_(targets, [*state[: len(self.states)], volume, mass])
         if self.driven is not None:
             self.driven.load(driven, poses[len(self.colliders.poses) :])
         self.hold(held)
@@ -293,10 +283,8 @@ class Workspace:
         given = {name: value for name, value in held.items() if value is not None}
         targets = self.held
         if self._rows:  # a view of one row with a leading dimension has other strides than its target: each is then copied alone
-            targets, given = (
-                self.held | self._rows,
-                given | {name: given[name][0] for name in self._rows},
-            )
+            targets = self.held | self._rows
+            given |= {name: given[name][0] for name in self._rows}
         torch._foreach_copy_([targets[name] for name in given], list(given.values()))
         self._tighten(given.get("parameters"))
 
@@ -327,32 +315,11 @@ class Workspace:
         """Copies of the state after the segment."""
         return State.whole(self.state(self.substeps))
 
-    def adjoint_slots(self) -> list[list[Tensor]]:
-        """Both slots of the adjoints of (x, v, C_affine, F), where the law yields of F_tot too."""
-        return [
-            self.adj_x,
-            self.adj_v,
-            self.adj_C_affine,
-            self.adj_F,
-            *([self.adj_F_tot] if self.plastic else []),
-        ]
-
     def state(self, step: int) -> list[Tensor]:
         """Copies of (x, v, C_affine, F), where the law yields of F_tot too, after `step` substeps: the last ones, or any of those
         whose states are kept."""
         slot = step % len(self.x)
-        return copies(
-            [
-                part[slot]
-                for part in (
-                    self.x,
-                    self.v,
-                    self.C_affine,
-                    self.F,
-                    *((self.F_tot,) if self.plastic else ()),
-                )
-            ]
-        )
+        return copies([part[slot] for part in self.states])
 
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
@@ -465,13 +432,8 @@ class Workspace:
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
         return [
-            self._averaged(state),
-            self.C_affine_wp[state],
-            held["parameters"],
-            held["G"],
-            held["h"],
-            self.tau_wp[slot],
-        ]
+            self._averaged(state), self.C_affine_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot],
+        ]  # fmt: skip
 
     def _mapping_arguments(self, state: int, new: int) -> list:
         held, numerics = self.held_wp, self.numerics
@@ -493,11 +455,8 @@ class Workspace:
             a, b, g, s = step % states, (step + 1) % states, step % grids, step % len(self.tau)
             if step == 0 and not self.exact:
                 self.over_nodes(kernels.clear, [self.grid_wp[g]])
-            cleared = (
-                self.grid_wp[(step + 1) % grids]
-                if step + 1 < self.substeps and not self.exact
-                else None
-            )
+            clears = step + 1 < self.substeps and not self.exact
+            cleared = self.grid_wp[(step + 1) % grids] if clears else None
             self.run(self.stress, n, self._stress_arguments(a, s))
             self.run(kernels.p2g, n, [
                 self.x_wp[a], self._met(a, step), self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], mass, self.volume_wp,
