@@ -126,50 +126,84 @@ def valleys(found: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
     return sorted(low, key=lambda place: found[place])
 
 
-def search(calibration: Calibration) -> float:
-    """Start a calibration near the smallest score [m], which is returned.
+class Starts:
+    """Places at which a calibration may start: unconstrained parameters by name, and their scores."""
 
-    A coarse grid of stiffness and contact offset is searched at a middle Poisson number, further
-    where its best is at an end of the stiffness; the other Poisson numbers at the `NEAREST` best
-    places. Where the grid has several valleys, Gauss-Newton begins in each of the deepest, and the
-    deepest after a few iterations is entered. Laws with further parameters go on by a compass
-    search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003), laws of `MANY` numbers by
-    Gauss-Newton from its end and from other starts (`nearest_end`). Errors: SimulationDiverged
-    where no start of the grid can be simulated; those of `nearest_end`."""
-    body, material = calibration.body, calibration.body.material
-    starts, learned = material.begins, material.learned
-    modulated = [n for n in STIFFNESS if n in learned and n in material.modulated]
-    tried: dict[tuple[float, ...], float] = {}
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration, self.material = calibration, calibration.body.material
+        self.learned, self._begins = self.material.learned, self.material.begins
+        modulated = self.material.modulated
+        self.modulated = [n for n in STIFFNESS if n in self.learned and n in modulated]
+        self._scores: dict[tuple[float, ...], float] = {}
 
-    @torch.no_grad()
-    def start_at(row: dict[str, float]) -> None:
-        for name, value in row.items():
-            (body.contact.cells if name == CONTACT else material.raw[name]).fill_(value)
-
-    def at(row: dict[str, float]) -> float:
-        """Of these unconstrained parameters, infinite where they cannot be simulated."""
-        key = tuple(row.values())
-        if key not in tried:
-            start_at(row)
-            try:
-                tried[key] = calibration.score()
-            except (SimulationDiverged, ConfigError):
-                tried[key] = math.inf
-        return tried[key]
-
-    def row_of(multiple: float, nu: float | None, cells: float | None) -> dict[str, float]:
-        row = {n: starts[n] + math.log(multiple) * (n in modulated) for n in learned}
+    def row(self, multiple: float, nu: float | None, cells: float | None) -> dict[str, float]:
+        """Of a multiple of the stiffness, a Poisson number and a contact offset [cells], None for those that stay."""
+        shift = math.log(multiple)
+        row = {n: self._begins[n] + shift * (n in self.modulated) for n in self.learned}
         row |= {} if nu is None else {"nu": FORMS["nu"].inverse(nu)}
         return row if cells is None else row | {CONTACT: cells}
 
-    middle, *others = POISSON_STEPS if "nu" in learned else (None,)
-    offsets = calibration.offsets
-    multiples = {i: m for i, m in enumerate(STIFFNESS_STEPS)} if modulated else {0: 1.0}
+    @torch.no_grad()
+    def begin_at(self, row: dict[str, float]) -> None:
+        """Set the body's numbers."""
+        cells = self.calibration.body.contact.cells
+        for name, value in row.items():
+            (cells if name == CONTACT else self.material.raw[name]).fill_(value)
+
+    def score(self, row: dict[str, float]) -> float:
+        """[m], infinite where the body cannot be simulated there."""
+        key = tuple(row.values())
+        if key not in self._scores:
+            self.begin_at(row)
+            try:
+                self._scores[key] = self.calibration.score()
+            except (SimulationDiverged, ConfigError):
+                self._scores[key] = math.inf
+        return self._scores[key]
+
+
+def search(calibration: Calibration) -> float:
+    """Start a calibration near the smallest score [m], which is returned.
+
+    The deepest valleys of a coarse grid (`rows_of_grid`) come first; where there are several,
+    Gauss-Newton begins in each, and the deepest after a few iterations is entered. Laws with
+    further parameters go on by a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review
+    45, 2003), laws of `MANY` numbers by Gauss-Newton from its end and from other starts
+    (`nearest_end`). Errors: those of `rows_of_grid` and `nearest_end`."""
+    starts = Starts(calibration)
+    rows, learned = rows_of_grid(starts, calibration.offsets), starts.learned
+    row, further = rows[0], set(learned) - {"E", "nu"}
+    if further:
+        row = compass(starts.score, row, {n: STRIDES.get(n, 1.0) for n in row})
+    if len(learned) >= MANY:
+        multiples = WIDE if starts.modulated else (1.0,)
+        stiffnesses = [starts.row(m, None, row.get(CONTACT)) for m in multiples]
+        wide = [
+            each | {n: each[n] + step for n, step in steps.items()}
+            for each in stiffnesses
+            for steps in moved(learned)
+        ]
+        begun = [row, *sorted(wide, key=starts.score)[:BEGUN]]
+        return nearest_end(calibration, starts.begin_at, begun)
+    if len(rows) > 1 and not further:
+        return nearest_end(calibration, starts.begin_at, rows, kept=0)
+    starts.begin_at(row)
+    return starts.score(row)
+
+
+def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[str, float]]:
+    """The deepest valleys, at most `ENTERED`, the lowest first, of a grid of stiffness and contact `offsets`.
+
+    It is searched at a middle Poisson number, further where its best is at an end of the stiffness;
+    the other Poisson numbers at the `NEAREST` best places. Errors: SimulationDiverged where none
+    can be simulated."""
+    middle, *others = POISSON_STEPS if "nu" in starts.learned else (None,)
+    multiples = dict(enumerate(STIFFNESS_STEPS)) if starts.modulated else {0: 1.0}
     grid: dict[tuple[int, int], float] = {}
 
     def add(i: int) -> None:
         for j, cells in enumerate(offsets):
-            grid[i, j] = at(row_of(multiples[i], middle, cells))
+            grid[i, j] = starts.score(starts.row(multiples[i], middle, cells))
 
     def best() -> tuple[int, int]:
         return min(grid, key=grid.__getitem__)
@@ -178,7 +212,7 @@ def search(calibration: Calibration) -> float:
         add(i)
     for end, step in ((min, -1), (max, 1)):
         while (
-            modulated
+            starts.modulated
             and best()[0] == (i := end(multiples))
             and math.isfinite(grid[best()])
             and 1 / FURTHEST < multiples[i] * FURTHER**step < FURTHEST
@@ -191,27 +225,13 @@ def search(calibration: Calibration) -> float:
             "nearer to the body's, or raise simulation.max_substeps"
         )
     numbers: dict[tuple[int, int], float | None] = {place: middle for place in grid}
-    for place in sorted(grid, key=grid.__getitem__)[:NEAREST]:
+    for i, j in sorted(grid, key=grid.__getitem__)[:NEAREST]:
         for nu in others:
-            found = at(row_of(multiples[place[0]], nu, offsets[place[1]]))
-            if found < grid[place]:
-                grid[place], numbers[place] = found, nu
-    rows = [row_of(multiples[i], numbers[i, j], offsets[j]) for i, j in valleys(grid)[:ENTERED]]
-    row = rows[0]
-    if set(learned) - {"E", "nu"}:
-        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in row})
-    if len(learned) >= MANY:
-        stiffnesses = [row_of(m, None, row.get(CONTACT)) for m in (WIDE if modulated else (1.0,))]
-        wide = [
-            each | {n: each[n] + step for n, step in steps.items()}
-            for each in stiffnesses
-            for steps in moved(learned)
-        ]
-        return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
-    if len(rows) > 1 and not set(learned) - {"E", "nu"}:
-        return nearest_end(calibration, start_at, rows, kept=0)
-    start_at(row)
-    return at(row)
+            found = starts.score(starts.row(multiples[i], nu, offsets[j]))
+            if found < grid[i, j]:
+                grid[i, j], numbers[i, j] = found, nu
+    deepest = valleys(grid)[:ENTERED]
+    return [starts.row(multiples[i], numbers[i, j], offsets[j]) for i, j in deepest]
 
 
 def nearest_end(
