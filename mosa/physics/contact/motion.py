@@ -31,9 +31,8 @@ def exponential(vectors: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable."""
     zero = torch.zeros_like(vectors[..., 0])
     x, y, z = vectors.unbind(-1)
-    return torch.matrix_exp(
-        torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    )
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return torch.matrix_exp(rows.unflatten(-1, (3, 3)))
 
 
 def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
@@ -49,15 +48,9 @@ def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
         raise ConfigError(
             f"rotation: expected rotation vectors or matrices {expected}, found shape {tuple(value.shape)}"
         )
-    defect = (
-        (
-            value.detach() @ value.detach().mT
-            - torch.eye(3, dtype=torch.float64, device=value.device)
-        )
-        .abs()
-        .max()
-    )
-    if not (float(defect) < 1e-4 and bool((torch.linalg.det(value.detach()) > 0).all())):
+    R = value.detach()
+    defect = (R @ R.mT - torch.eye(3, dtype=torch.float64, device=R.device)).abs().max()
+    if not (float(defect) < 1e-4 and bool((torch.linalg.det(R) > 0).all())):
         raise ConfigError(
             f"rotation: expected rotation matrices (R R^T = I, det R = 1), found a defect of {float(defect):.3g}"
         )
@@ -78,12 +71,8 @@ def rotation_vector(R: Tensor) -> Tensor:
     # near pi the sine has no direction, but R + R^T - 2 cos = 2 (1 - cos) n n^T has
     about = R + R.mT - 2 * cosine[..., None, None] * torch.eye(3).to(R)
     about = torch.where((cosine < -0.9)[..., None, None], about, torch.ones_like(about))
-    longest = (
-        about.detach()
-        .diagonal(dim1=-2, dim2=-1)
-        .argmax(-1)[..., None, None]
-        .expand(*R.shape[:-1], 1)
-    )
+    longest = about.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    longest = longest[..., None, None].expand(*R.shape[:-1], 1)
     axis = torch.nn.functional.normalize(about.gather(-1, longest)[..., 0], dim=-1)
     along = (sine * axis).sum(-1, keepdim=True)
     turn = torch.atan2(along.abs(), cosine[..., None]) * torch.where(along < 0, -axis, axis)
@@ -108,17 +97,30 @@ def _vectors(name: str, value: Tensor | Sequence) -> Tensor:
     return value.reshape(-1, 3)
 
 
+def _most(linear: Tensor, angular: Tensor, reach: float) -> float:
+    """Bound of the speed [m/s] within `reach` [m] of the origin, of twists (K, 3)."""
+    linear, angular = (v.detach().norm(dim=1).max() for v in (linear, angular))
+    return float(linear + reach * angular)
+
+
 def _mean(times: Tensor, pieces: Tensor, ends: Tensor, middle: Tensor) -> Tensor:
     """(S, 3) means of velocities `pieces` (K, 3) from `times` (K,) on between `ends` (S + 1,): those in the `middle`, but where a
     piece begins or ends between them, however short it is."""
-    passed = torch.cat(
-        [torch.zeros(1, 3).to(pieces), (pieces[:-1] * times.diff()[:, None]).cumsum(0)]
-    )
+    whole = (pieces[:-1] * times.diff()[:, None]).cumsum(0)
     at = (torch.searchsorted(times, ends, right=True) - 1).clamp_min(0)
-    mean = (passed[at] + (ends - times[at]).clamp_min(0)[:, None] * pieces[at]).diff(
-        dim=0
-    ) / ends.diff()[:, None]
+    passed = torch.cat([torch.zeros(1, 3).to(pieces), whole])[at]
+    passed = passed + (ends - times[at]).clamp_min(0)[:, None] * pieces[at]
+    mean = passed.diff(dim=0) / ends.diff()[:, None]
     return torch.where(torch.isclose(mean, middle, rtol=1e-6, atol=1e-9), middle, mean)
+
+
+Pose = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Of one collider at S substeps, float64, as `Poses`: position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)."""
+
+
+def ends(count: int, dt: float, start: float, first: int) -> Tensor:
+    """(count + 1,) [s]: where substeps of dt from the `first` one after time `start` begin, and the last one ends."""
+    return start + dt * torch.arange(first, first + count + 1, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -157,9 +159,8 @@ class Motion:
             raise ConfigError(
                 f"motion: waypoints: times: expected at least two ascending numbers, found {times.tolist()}"
             )
-        rotations = torch.as_tensor(
-            torch.zeros(count, 3) if rotations is None else rotations, dtype=torch.float64
-        )
+        rotations = torch.zeros(count, 3) if rotations is None else rotations
+        rotations = torch.as_tensor(rotations, dtype=torch.float64)
         R = rotation_matrices(rotations, 1)
         if len(positions) != count or len(R) != count:
             raise ConfigError(
@@ -181,30 +182,22 @@ class Motion:
 
     def shifted(self, offset: Tensor) -> "Motion":
         """The same motion moved by offset (3,) [m]."""
-        return replace(
-            self,
-            position=torch.as_tensor(self.position, dtype=torch.float64).cpu()
-            + offset.double().cpu(),
-        )
+        position = torch.as_tensor(self.position, dtype=torch.float64).cpu()
+        return replace(self, position=position + offset.double().cpu())
 
     def sample(
         self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
-        from the `first` one after time `start`. Errors: ConfigError naming the field."""
-        start_position, R0 = (
-            _vectors("position", self.position).cpu(),
-            rotation_matrices(self.rotation).cpu(),
-        )
-        if len(start_position) != 1:
+    ) -> Pose:
+        """At S = frames * substeps substeps of dt [s] from the `first` one after time `start`.
+        Errors: ConfigError naming the field."""
+        position = _vectors("position", self.position).cpu()
+        attitudes = [rotation_matrices(self.rotation).cpu()]
+        if len(position) != 1:
             raise ConfigError(
-                f"motion: position: expected (3,), found {len(start_position)} vectors: see Motion.waypoints"
+                f"motion: position: expected (3,), found {len(position)} vectors: see Motion.waypoints"
             )
-        position = start_position[0]
-        linear, angular = (
-            _vectors("velocity", self.velocity).cpu(),
-            _vectors("angular_velocity", self.angular_velocity).cpu(),
-        )
+        linear = _vectors("velocity", self.velocity).cpu()
+        angular = _vectors("angular_velocity", self.angular_velocity).cpu()
         times, count = self._pieces(frames, substeps, dt, max(len(linear), len(angular)))
         for name, value in (("velocity", linear), ("angular_velocity", angular)):
             if len(value) not in (1, count):
@@ -213,37 +206,27 @@ class Motion:
                 )
         linear, angular = linear.expand(count, 3), angular.expand(count, 3)
         interval = times.diff()[:, None]
-        knots = torch.cat([position[None], position + ((linear[:-1] * interval).cumsum(0))])
-        turns = exponential(angular[:-1] * interval)
-        attitudes = [R0]
-        for turn in turns:
+        knots = torch.cat([position, position + ((linear[:-1] * interval).cumsum(0))])
+        for turn in exponential(angular[:-1] * interval):
             attitudes.append(turn @ attitudes[-1])
-        attitudes = torch.stack(attitudes)
-        ends = start + dt * torch.arange(first, first + frames * substeps + 1, dtype=torch.float64)
-        t = ends[:-1]
+        limits = ends(frames * substeps, dt, start, first)
+        t = limits[:-1]
         # a substep belongs to the piece that its middle is in
         piece = torch.searchsorted(times, t + 0.5 * dt, right=True) - 1
         resting = (piece < 0)[:, None]
         piece = piece.clamp_min(0)
         since = torch.where(resting, torch.zeros(()), (t - times[piece])[:, None])
         x = knots[piece] + since * linear[piece]
-        R = exponential(since * angular[piece]) @ attitudes[piece]
-        return (
-            x,
-            R,
-            *(_mean(times, value, ends, value[piece] * ~resting) for value in (linear, angular)),
-        )
+        R = exponential(since * angular[piece]) @ torch.stack(attitudes)[piece]
+        linear, angular = (_mean(times, v, limits, v[piece] * ~resting) for v in (linear, angular))
+        return x, R, linear, angular
 
     def _pieces(self, frames: int, substeps: int, dt: float, count: int) -> tuple[Tensor, int]:
         """(start times (K,), K)."""
         if self.times is not None:
             times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
-            if (
-                times.ndim != 1
-                or not len(times)
-                or not bool((times.diff() > 0).all())
-                or not bool(torch.isfinite(times).all())
-            ):
+            ascending = times.ndim == 1 and len(times) and bool((times.diff() > 0).all())
+            if not ascending or not bool(torch.isfinite(times).all()):
                 raise ConfigError(
                     f"motion: times: expected ascending numbers, found {times.tolist()}"
                 )
@@ -276,11 +259,7 @@ class Motion:
 
     def max_speed(self, reach: float) -> float:
         """Bound of the speed [m/s] of a point within `reach` [m] of the origin."""
-        linear, angular = (
-            _vectors("", v).detach().norm(dim=1).max()
-            for v in (self.velocity, self.angular_velocity)
-        )
-        return float(linear + reach * angular)
+        return _most(_vectors("", self.velocity), _vectors("", self.angular_velocity), reach)
 
 
 @dataclass(frozen=True)
@@ -298,16 +277,12 @@ class Trajectory:
 
     def sample(
         self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> Pose:
         """As `Motion.sample`; `start` must be a whole number of substeps into the trajectory."""
         begin, count = round(start / dt), frames * substeps
         first += begin
-        values = (
-            self.position,
-            rotation_matrices(self.rotation, 1),
-            self.velocity,
-            self.angular_velocity,
-        )
+        rotation = rotation_matrices(self.rotation, 1)
+        values = self.position, rotation, self.velocity, self.angular_velocity
         if any(len(v) < first + count for v in values) or not math.isclose(
             begin * dt, start, abs_tol=1e-6 * dt
         ):
@@ -318,10 +293,7 @@ class Trajectory:
         return tuple(v[first : first + count].double().cpu() for v in values)
 
     def max_speed(self, reach: float) -> float:
-        linear, angular = (
-            v.detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity)
-        )
-        return float(linear + reach * angular)
+        return _most(self.velocity, self.angular_velocity, reach)
 
 
 @dataclass(frozen=True)
@@ -344,12 +316,8 @@ class Points:
             raise ConfigError(
                 f"motion: times: expected at least two ascending numbers, found shape {tuple(times.shape)}"
             )
-        if (
-            points.ndim != 3
-            or len(points) != len(times)
-            or not points.shape[1]
-            or points.shape[-1] != 3
-        ):
+        shaped = points.ndim == 3 and points.shape[1] and points.shape[-1] == 3
+        if not shaped or len(points) != len(times):
             raise ConfigError(
                 f"motion: points: expected shape ({len(times)}, n, 3), found {tuple(points.shape)}"
             )
@@ -376,7 +344,7 @@ class Points:
 
     def sample(
         self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> Pose:
         """As `Motion.sample`."""
         mean = self.at(ends(frames * substeps, dt, start, first)).mean(1)
         eye = torch.eye(3, dtype=torch.float64).expand(len(mean) - 1, 3, 3)
@@ -393,10 +361,6 @@ class Points:
         return float((steps / self.times.diff()).max())
 
 
-def ends(count: int, dt: float, start: float, first: int) -> Tensor:
-    return start + dt * torch.arange(first, first + count + 1, dtype=torch.float64)
-
-
 def sample_frame(
     motions: Sequence[Motion | Trajectory], frame: int, frames: int, first: int, count: int, frame_dt: float, start: float,
     replayed: bool,
@@ -409,9 +373,8 @@ def sample_frame(
     dt, sampled = frame_dt / count, []
     for motion in motions:
         if not isinstance(motion, Trajectory):
-            sampled.append(
-                motion.timed(frames, frame_dt).sample(1, count, dt, start + frame * frame_dt)
-            )
+            timed, begins = motion.timed(frames, frame_dt), start + frame * frame_dt
+            sampled.append(timed.sample(1, count, dt, begins))
         elif replayed and start == 0:
             sampled.append(motion.sample(1, count, dt, first=first))
         else:
@@ -434,22 +397,16 @@ def sample_poses(
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
-    counted(
-        "substeps of all frames and colliders",
-        (frames, substeps, len(motions)),
-        "take fewer",
-        each=3 * 8 * (3 + 9 + 3 + 3),
-    )
+    what, each = "substeps of all frames and colliders", 3 * 8 * (3 + 9 + 3 + 3)
+    counted(what, (frames, substeps, len(motions)), "take fewer", each=each)
     return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions])
 
 
 def _poses(sampled: Sequence[Sequence[Tensor]]) -> Poses:
     for i, parts in enumerate(sampled):
         for name, part in zip(Poses._fields, parts):
-            if not bool(torch.isfinite(part.detach()).all()):
-                bad = int(
-                    (~torch.isfinite(part.detach())).reshape(len(part), -1).any(1).nonzero()[0]
-                )
+            if not bool((finite := torch.isfinite(part.detach())).all()):
+                bad = int((~finite).reshape(len(part), -1).any(1).nonzero()[0])
                 raise ConfigError(
                     f"motion of collider {i}: {name}: expected finite numbers, found {part[bad].tolist()} at substep {bad}"
                 )

@@ -73,15 +73,11 @@ class Prepared:
 
     def __post_init__(self) -> None:
         self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
-        alone = (
-            len(self.lanes.solvers) == 1
-            and self.stride is not None
-            and getattr(self.adapter, "flow", None) is None
-        )
+        flows = getattr(self.adapter, "flow", None) is not None
+        alone = len(self.lanes.solvers) == 1 and self.stride is not None and not flows
         if self.gathers and alone and isinstance(self.adapter, nn.Module):
-            self.chains = Chains(
-                self.lanes, self.adapter, self.ask, self.packed, self.collect is not None
-            )
+            collects = self.collect is not None
+            self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, collects)
 
     def first_advance(self, state: State, dt: float) -> State:
         """The advance of F by dt [s] with which a motion begins."""
@@ -90,14 +86,10 @@ class Prepared:
         if not numerics.law.plastic:
             F = first_advance(numerics, F, C, self.packed)
             return state._replace(F=F, F_tot=F)
-        operator = (
-            self.ask(self.adapter, F, C, self.packed, self.collect)
-            if self.adapter is not None
-            else self.held
-        )
-        mapped = first_advance(
-            numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"]
-        )
+        held = self.held
+        if self.adapter is not None:
+            held = self.ask(self.adapter, F, C, self.packed, self.collect)
+        mapped = first_advance(numerics, F, C, self.packed, held["plastic_G"], held["plastic_h"])
         return state._replace(F=mapped, F_tot=advanced(F_tot, C, dt))
 
     def reaches(self, columns: int) -> Tensor:
@@ -113,9 +105,8 @@ class Prepared:
     def settle(self, state: State) -> None:
         """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts segments then."""
         if self.adapter is not None and self.stride is None:
-            self.held.update(
-                self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect)
-            )
+            F, C = state.F, state.C_affine
+            self.held.update(self.ask(self.adapter, F, C, self.packed, self.collect))
             self.adapter = None
 
     def give_memory(self, substeps: int, wanted: bool) -> None:
@@ -152,11 +143,9 @@ class Prepared:
         """Of the segments of a frame; where counts vary, sizes that many of them share."""
         if self.adapter is not None:
             return segments(frame.count, self.stride)
-        return (
-            segments(frame.count, None, alone)
-            if frame.steps is None
-            else segments(frame.count, SEGMENT)
-        )
+        if frame.steps is None:
+            return segments(frame.count, None, alone)
+        return segments(frame.count, SEGMENT)
 
     def frame(
         self, state: State, frame: Frame, poses: tuple[Tensor, ...], pace: Pace, alike: int = 0
@@ -173,17 +162,12 @@ class Prepared:
                 self._collect(collected)
                 return state, forces
             done, collected = [state], []
+            time = count * frame.count * frame.dt
             try:
-                with self.lanes.solvers[0].one_look(
-                    state, count * frame.count * frame.dt, self._margin
-                ):
+                with self.lanes.solvers[0].one_look(state, time, self._margin):
                     for k in range(count):
-                        after, _, more = self._one(
-                            done[-1],
-                            frame._replace(first=frame.first + k * frame.count),
-                            poses,
-                            pace,
-                        )
+                        next_one = frame._replace(first=frame.first + k * frame.count)
+                        after, _, more = self._one(done[-1], next_one, poses, pace)
                         done.append(after)
                         collected += more
             except (LeftWindow, SimulationDiverged) as error:
@@ -200,16 +184,11 @@ class Prepared:
 
     def _together(self, state: State, frame: Frame, frames: int) -> int:
         """How many of `frames` frames alike are launched before the host looks at them."""
-        if (
-            frames < 2
-            or not self.gathers
-            or len(self.lanes.solvers) > 1
-            or (self.adapter is not None and self.chains is None)
-        ):
+        asked_between = self.adapter is not None and self.chains is None
+        if frames < 2 or not self.gathers or len(self.lanes.solvers) > 1 or asked_between:
             return 1
-        return self.lanes.solvers[0].together(
-            state, frames, frame.count * frame.dt, frame.dt, self._margin
-        )
+        frame_dt = frame.count * frame.dt
+        return self.lanes.solvers[0].together(state, frames, frame_dt, frame.dt, self._margin)
 
     def _collect(self, statistics: list) -> None:
         for each in statistics:
@@ -228,13 +207,10 @@ class Prepared:
             if flow is not None:
                 state = state._replace(F=flow(state.F, length * frame.dt))
             if self.adapter is not None:
-                held = held | self.ask(
-                    self.adapter, state.F, state.C_affine, self.packed, self.collect
-                )
-            along = tuple(part[done : done + length] for part in poses)
-            state, reaction = advance_segment(
-                self.lanes, state, held, length, first + done, along, steps
-            )
+                F, C = state.F, state.C_affine
+                held = held | self.ask(self.adapter, F, C, self.packed, self.collect)
+            along, at = tuple(part[done : done + length] for part in poses), first + done
+            state, reaction = advance_segment(self.lanes, state, held, length, at, along, steps)
             forces += [torch.cat(reaction, -1)] if reaction else []
             steps = None if steps is None else Steps(steps.dt, steps.dt)
             done += length
@@ -324,11 +300,8 @@ class Stepper:
             self._check_box(self.axes.world.points(state.x.detach()), frame)
         if forces is not None and frame.steps is not None:
             forces = mean_force(forces, frame.steps)
-        return Step(
-            Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt),
-            forces,
-            frame.count,
-        )
+        after = Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt)
+        return Step(after, forces, frame.count)
 
     def _check_box(self, x: Tensor, frame: Frame) -> None:
         low, high = x.new_tensor(self.prepared.numerics.box)
@@ -404,18 +377,9 @@ class Stepper:
                 f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
                 f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))"
             )
-        x, R, v, w = poses
-        return tuple(
-            map(
-                self._moved,
-                (
-                    self.axes.points(x),
-                    self.axes.gradients(R),
-                    self.axes.vectors(v),
-                    self.axes.vectors(w),
-                ),
-            )
-        )
+        (x, R, v, w), axes = poses, self.axes
+        turned = axes.points(x), axes.gradients(R), axes.vectors(v), axes.vectors(w)
+        return tuple(map(self._moved, turned))
 
     def _moved(self, part: Tensor) -> Tensor:
         """In the simulator's type and on its device: one row where it is the same in all."""
@@ -434,10 +398,7 @@ class Stepper:
         """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
         `moment`, at the times at which a rollout takes them."""
         frame_dt = self.clock.frame_dt
-        motions = [
-            motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion
-            for motion in motions
-        ]
+        motions = [m.timed(None, frame_dt) if isinstance(m, Motion) else m for m in motions]
         first, start = self._times(moment)
         return sample_poses(motions, 1, count, dt, start, first + after)
 
