@@ -31,56 +31,30 @@ CURVES = (
         "-",
         "a term of the loss (`mosa/modules/fitting/losses.py`) before its weight",
     ),
-    Curve(
-        "loss_weighted/<term>",
-        "-",
-        "a term of the loss times its weight in `losses`",
-    ),
+    Curve("loss_weighted/<term>", "-", "a term of the loss times its weight in `losses`"),
     Curve(
         "id/contact_offset",
         "m",
         "height above the ground at which the grid stops the body, after the step",
     ),
-    Curve(
-        "id/<p>",
-        "SI, degrees",
-        "parameter p after the step, without eta",
-    ),
-    Curve(
-        "adapter/mean_abs_C",
-        "-",
-        "mean of |C| in the step, once the adapter is fitted",
-    ),
+    Curve("id/<p>", "SI, degrees", "parameter p after the step, without eta"),
+    Curve("adapter/mean_abs_C", "-", "mean of |C| in the step, once the adapter is fitted"),
     Curve(
         "gradient_norm/<group>",
         "-",
         "norm of the gradient of a group of parameters; of networks before clipping",
     ),
+    Curve("lr/<group>", "-", "Adam: learning rate of the group"),
+    Curve("time/step_s", "s", "wall time of the step"),
     Curve(
-        "lr/<group>",
-        "-",
-        "Adam: learning rate of the group",
-    ),
-    Curve(
-        "time/step_s",
-        "s",
-        "wall time of the step",
-    ),
-    Curve(
-        "fit/stage",
-        "-",
-        "0, 1, 2: prior, prior_eta, joint, without stages that the run leaves out",
+        "fit/stage", "-", "0, 1, 2: prior, prior_eta, joint, without stages that the run leaves out"
     ),
     Curve(
         "fit/frames",
         "-",
         "frames that the step simulated; the first stage begins with those around first contact",
     ),
-    Curve(
-        "fit/inverted",
-        "-",
-        "particles with det F <= 0, summed over frames",
-    ),
+    Curve("fit/inverted", "-", "particles with det F <= 0, summed over frames"),
     Curve(
         "fit/distance_m",
         "m",

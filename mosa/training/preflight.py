@@ -9,11 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
-from mosa.config.checkpoints import (
-    check_resumed,
-    check_same_scene,
-    read_checkpoint,
-)
+from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
 from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings

@@ -391,8 +391,5 @@ class GaussNewton:
             if not nuisance
         ]
         return Posterior(
-            self.names(),
-            self.seats[0].read()[kept],
-            covariance[kept][:, kept],
-            determined[kept],
+            self.names(), self.seats[0].read()[kept], covariance[kept][:, kept], determined[kept]
         )
