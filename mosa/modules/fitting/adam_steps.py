@@ -191,37 +191,19 @@ class GradientSteps:
         body, weights, cues = self.body, self.weights, take.cues
         adapted = stage.learns_adapter and body.adapter is not None
         collected: list = []
+        model = body.model().only(heterogeneity=stage.learns_heterogeneity, adapter=adapted)
         rollout = body.simulate(
-            take.start,
-            self.world,
-            frames,
-            take.frame_dt,
-            model=body.model().only(heterogeneity=stage.learns_heterogeneity, adapter=adapted),
-            collect=collected.append if adapted else None,
-            observed=cues.positions if gain else None,
-            gain=gain,
-        )
-        over_all = (
-            pool(collected) if collected else None
-        )  # a variance over time as well as over particles
+            take.start, self.world, frames, take.frame_dt, model=model, gain=gain,
+            collect=collected.append if adapted else None, observed=cues.positions if gain else None,
+        )  # fmt: skip
+        # a variance over time as well as over particles
+        over_all = pool(collected) if collected else None
         targets = own.observations.select(range(len(own.observations.cameras)), frames)
         varies = stage.learns_heterogeneity and body.heterogeneity is not None
         step = Step(
-            body,
-            take.start,
-            rollout,
-            targets,
-            cues,
-            frames,
-            self.background,
-            varies,
-            over_all,
-            self.misfit,
-            with_flow=weights.get("flow", 0.0) != 0,
-            frame_dt=take.frame_dt,
-            views=own.views,
-            extra=Extra(own.extra),
-        )
+            body, take.start, rollout, targets, cues, frames, self.background, varies, over_all, self.misfit,
+            take.frame_dt, own.views, with_flow=weights.get("flow", 0.0) != 0, extra=Extra(own.extra),
+        )  # fmt: skip
         terms = evaluate_terms(weights, step)
         if over_all is not None:
             self.last["mean_abs_C"] = float(over_all.mean_abs_C.detach())

@@ -104,14 +104,9 @@ class Identification:
         compared = self.takes[0].cues.positions.shape[1] if marked else len(body.rest)
         self.chosen = residuals.sampled(compared, body.rest.device)
         blocks = blocks_of(
-            body,
-            adapter=self.adapter,
-            heterogeneity=self.heterogeneity,
-            settings=settings,
-            ground=world.ground,
-            free=not any(self.gains),
-            calibrating=self.calibrating,
-        )
+            body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings, ground=world.ground,
+            free=not any(self.gains), calibrating=self.calibrating,
+        )  # fmt: skip
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
         bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
         self.iteration, self.noise, self.substeps = 0, None, None
@@ -122,12 +117,9 @@ class Identification:
         if self.two_grids:
             sd = torch.full((1,), float(settings.grid_error))
             blocks.append(Block("grid", torch.zeros(1), sd, 0.2, nuisance=True))
-        self.newton = GaussNewton(
-            blocks,
-            [self._seat(each) for each in bodies],
-            progress=progress,
-            many=self._many if body.rest.is_cuda and not body.settings.adaptive else None,
-        )
+        many = self._many if body.rest.is_cuda and not body.settings.adaptive else None
+        own = [self._seat(each) for each in bodies]
+        self.newton = GaussNewton(blocks, own, progress=progress, many=many)
         if known is not None and (shared := known.only(self.newton.names())).names:
             self.newton.known = shared
         self.converged = False
@@ -186,26 +178,18 @@ class Identification:
         """The body at the start of a take, with what is learned here."""
         take = self.takes[index]
         model = body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter)
-        return body.ready(
-            take.start,
-            self.world,
-            len(take.cues.positions),
-            take.frame_dt,
-            model=model,
-            substeps=substeps,
-        )
+        frames, frame_dt = len(take.cues.positions), take.frame_dt
+        return body.ready(take.start, self.world, frames, frame_dt, model=model, substeps=substeps)
 
     @torch.no_grad()
     def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
-        take = self.takes[index]
-        seen = take.cues.positions
-        return self.ready(body, index, substeps).simulate(
-            len(seen), self.world.solids, observed=seen if gain else None, gain=gain,
-            unseen=self.unseen(take),
-        )  # fmt: skip
+        return self._simulated(self.ready(body, index, substeps), self.takes[index], gain)
 
-    def unseen(self, take) -> Callable[[Tensor, int], Tensor] | None:
-        return None if take.response is None else take.response.unseen
+    def _simulated(self, ready: Ready, take, gain: float) -> Rollout:
+        seen, solids = take.cues.positions, self.world.solids
+        unseen = None if take.response is None else take.response.unseen
+        observed = seen if gain else None
+        return ready.simulate(len(seen), solids, observed=observed, gain=gain, unseen=unseen)
 
     @torch.no_grad()
     def _many(self, rows: Tensor) -> Tensor:
@@ -219,13 +203,7 @@ class Identification:
                 for row in some:
                     seat.write(row)
                     parts.append(self.ready(self.body, i, self.substeps[i]).answered())
-                rollout = Ready.stack(parts).simulate(
-                    len(take.cues.positions),
-                    self.world.solids,
-                    observed=take.cues.positions if gain else None,
-                    gain=gain,
-                    unseen=self.unseen(take),
-                )
+                rollout = self._simulated(Ready.stack(parts), take, gain)
                 for k, own in enumerate(rollout.worlds()):
                     found[first + k].append(self._differences(own, i))
         shares = rows[:, -1].tolist() if self.two_grids else [0.0] * len(rows)
@@ -252,9 +230,8 @@ class Identification:
     def _differences(self, rollout: Rollout, index: int) -> residuals.Fields:
         """Of a rollout from what was seen of take `index`; forces are those of the first."""
         take, curves = self.takes[index], self.world.forces if index == 0 else ()
-        found = residuals.fields(
-            rollout, take.cues, take.start.rotation, self.chosen, take.response
-        )
+        turn = take.start.rotation
+        found = residuals.fields(rollout, take.cues, turn, self.chosen, take.response)
         if not curves:
             return found
         force = force_residuals(rollout, curves, self.world, take.frame_dt)
@@ -348,13 +325,11 @@ class Identification:
 
     def _hold_substeps(self) -> None:
         """Substeps are a step function of the numbers: held fixed, differences are those of a smooth function."""
-        adaptive = self.body.settings.adaptive  # then only a rollout tells how many it takes
-        asked = [
-            self.rollout(self.body, i).substeps
-            if adaptive
-            else self.ready(self.body, i).simulator.substeps
-            for i in range(len(self.takes))
-        ]
+        body, takes = self.body, range(len(self.takes))
+        if body.settings.adaptive:  # then only a rollout tells how many it takes
+            asked = [self.rollout(body, i).substeps for i in takes]
+        else:
+            asked = [self.ready(body, i).simulator.substeps for i in takes]
         self.substeps = [-(-int(1.05 * count) // ROUNDED) * ROUNDED for count in asked]
 
     @torch.no_grad()
@@ -372,17 +347,12 @@ class Identification:
         if self._residuals is None:
             self.prepare()
         r, self._residuals = self._residuals, None
-        report = self.newton.iterate(
-            learn=1 <= self.iteration < EVIDENCE_ITERATIONS,
-            r=r,
-            settled=self.iteration >= NOISE_ITERATIONS and not self.calibrating,
-        )
-        self.report = report
+        learn = 1 <= self.iteration < EVIDENCE_ITERATIONS
+        settled = self.iteration >= NOISE_ITERATIONS and not self.calibrating
+        report = self.report = self.newton.iterate(learn=learn, r=r, settled=settled)
         self.iteration += 1
-        small = (
-            self.iteration > NOISE_ITERATIONS
-            and report["length"] * report["share"] < self.settings.tolerance
-        )
+        step = report["length"] * report["share"]
+        small = self.iteration > NOISE_ITERATIONS and step < self.settings.tolerance
         gained = report["before"] - report["after"]
         flat = self.iteration > EVIDENCE_ITERATIONS and not self.calibrating and gained < FLAT
         whole = not self.softly or self.iteration > len(self.softly) + 1

@@ -76,18 +76,11 @@ class SegmentSolver:
         shared: bool = False,
     ) -> Workspace:
         """Of a pool that is this thread's alone (`Buffers.take`)."""
-        key = (
-            len(self.volume),
-            substeps,
-            adapted,
-            plastic_adapted,
-            with_adjoint,
-            self.worlds,
-            shared,
-        )
+        n = len(self.volume)
+        key = n, substeps, adapted, plastic_adapted, with_adjoint, self.worlds, shared
         if key not in pool:
             pool[key] = Workspace(
-                self.numerics, len(self.volume), substeps, adapted=adapted, plastic_adapted=plastic_adapted,
+                self.numerics, n, substeps, adapted=adapted, plastic_adapted=plastic_adapted,
                 with_adjoint=with_adjoint, worlds=self.worlds, shared=shared,
             )  # fmt: skip
         return pool[key]
@@ -101,10 +94,8 @@ class SegmentSolver:
         try:
             yield
             with torch.no_grad():
-                fine = (
-                    min(self.look(torch.stack(self._shared.flags).amin(0), self._shared.final))
-                    == NO_EVENT
-                )
+                flags = torch.stack(self._shared.flags).amin(0)
+                fine = min(self.look(flags, self._shared.final)) == NO_EVENT
         finally:
             self._shared = None
         if not fine:
@@ -131,18 +122,15 @@ class SegmentSolver:
         bounds = self.bounds(state)
         if not np.isfinite(bounds).all():
             return 1
-        while frames > 1 and not self._serves(
-            bounds, frames * frame_dt, min(frame_dt, WIDENED * dt), margin
-        ):
+        least = min(frame_dt, WIDENED * dt)
+        while frames > 1 and not self._serves(bounds, frames * frame_dt, least, margin):
             frames //= 2
         return frames
 
     def _serves(self, bounds: np.ndarray, time: float, least: float, margin: int) -> bool:
         """Whether the windows for `time` [s] are about as small as those for the time `least`."""
-        reach = fallen(bounds, self._pull, time)
-        long, short = window_of(
-            reach, self.numerics.dx, np.array([time, least])[:, None, None], margin
-        )[1].prod(-1)
+        reach, times = fallen(bounds, self._pull, time), np.array([time, least])[:, None, None]
+        long, short = window_of(reach, self.numerics.dx, times, margin)[1].prod(-1)
         return bool(long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES)
 
     def windows(self, state: State, time: float, margin: int, falls: bool) -> Windows:
@@ -162,9 +150,8 @@ class SegmentSolver:
     def look(self, flags: Tensor, final: State) -> list[int]:
         """The events of a segment; the same transfer tells the host where the next one starts."""
         bounds = extent(*(self._apart(t) for t in final[:2]))
-        numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(
-            force=True
-        )  # float64 holds the flags exactly
+        # float64 holds the flags exactly
+        numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(force=True)
         self._know(final, numbers[4:].reshape(-1, 12))
         return [int(n) for n in numbers[:4]]
 
@@ -179,9 +166,8 @@ class SegmentSolver:
     def bounds(self, state: State) -> np.ndarray:
         """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""
         if self._known is None or not same_memory(self._known[0], state[:2]):
-            self._know(
-                state, extent(*(self._apart(t) for t in state[:2])).double().numpy(force=True)
-            )
+            bounds = extent(*(self._apart(t) for t in state[:2]))
+            self._know(state, bounds.double().numpy(force=True))
         return self._known[1]
 
     def _know(self, state: State, bounds: np.ndarray) -> None:
@@ -210,16 +196,14 @@ class SegmentSolver:
         substep, particle = first + flag // len(self.volume), flag % len(self.volume)
         world, particle = divmod(particle, len(self.volume) // self.worlds)
         law, numerics = self.numerics.law, self.numerics
+        inverted = "on_inversion=error forbids"
+        if law.needs_positive_J:
+            inverted = f"law {law.name} has no value for"
         what = {
             WINDOW: "moved by more than half a cell per substep",
             NONFINITE: "position, velocity or deformation is no longer finite",
             OUTSIDE: f"position is outside the box {list(numerics.box[0])} to {list(numerics.box[1])} m",
-            INVERTED: "det F <= 0, which "
-            + (
-                f"law {law.name} has no value for"
-                if law.needs_positive_J
-                else "on_inversion=error forbids"
-            ),
+            INVERTED: f"det F <= 0, which {inverted}",
         }[event]
         remedy = "use more substeps, or parameters nearer to the calibrated ones"
         if event == OUTSIDE:
