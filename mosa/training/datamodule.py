@@ -188,15 +188,11 @@ class SceneDataModule(L.LightningDataModule):
             return float(dx / grid_spacing(1.0, per_cell))
         if self.scene.markers is not None:
             return marker_spacing(self.scene, None if particles == "auto" else int(particles))
+        device = self.device or "cpu"
         return spacing_for(
-            self.scene,
-            None if particles == "auto" else particles,
-            self.reconstruction_settings,
-            per_cell=per_cell,
-            most=most_particles(self.device or "cpu"),
-            cache_dir=self.cache,
-            device=self.device or "cpu",
-        )
+            self.scene, None if particles == "auto" else particles, self.reconstruction_settings, per_cell=per_cell,
+            most=most_particles(device), cache_dir=self.cache, device=device,
+        )  # fmt: skip
 
     @property
     def dx(self) -> float:
@@ -206,26 +202,21 @@ class SceneDataModule(L.LightningDataModule):
     def reconstructed(self) -> bool:
         """Whether the training sequence's reconstruction lies in the cache."""
         return stored(
-            self.scene,
-            lambda: self.spacing,
-            self.reconstruction_settings,
-            cache_dir=self.cache,
-            seed=self.settings.seed,
-        )
+            self.scene, lambda: self.spacing, self.reconstruction_settings, cache_dir=self.cache, seed=self.settings.seed
+        )  # fmt: skip
+
+    @property
+    def _found_with(self) -> dict[str, Any]:
+        """What is the same for the reconstruction of every sequence."""
+        return {"settings": self.reconstruction_settings, "cache_dir": self.cache, "seed": self.settings.seed,
+                "device": self.device or "cpu"}  # fmt: skip
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
         """Of the training sequence."""
         if self.scene.markers is not None:
             return reconstruction_of_markers(self.scene, self.spacing)
-        return reconstruct(
-            self.scene,
-            settings=self.reconstruction_settings,
-            spacing=self.spacing,
-            cache_dir=self.cache,
-            seed=self.settings.seed,
-            device=self.device or "cpu",
-        )
+        return reconstruct(self.scene, spacing=self.spacing, **self._found_with)
 
     @cached_property
     def shape(self) -> RestShape:
@@ -239,17 +230,9 @@ class SceneDataModule(L.LightningDataModule):
             return followed_by_markers(scene, self.reconstruction)
         start = self.starts[f"train/{scene.sequence}"]
         return follow(
-            scene,
-            self.scene,
-            self.reconstruction,
-            rotation=start.rotation,
-            center=start.center,
-            rest_center=self.shape.center,
-            settings=self.reconstruction_settings,
-            cache_dir=self.cache,
-            seed=self.settings.seed,
-            device=self.device or "cpu",
-        )
+            scene, self.scene, self.reconstruction, rotation=start.rotation, center=start.center,
+            rest_center=self.shape.center, **self._found_with,
+        )  # fmt: skip
 
     # ---------------------------------------------------------------- starts
     @cached_property
@@ -318,25 +301,17 @@ class SceneDataModule(L.LightningDataModule):
 
     def batch(self, views: Sequence[int]) -> MotionBatch:
         """These views of all sequences that are learned from, in all frames that may be read."""
-        return MotionBatch(
-            sequences=tuple(
-                self.sequence_batch(i, take, views) for i, take in enumerate(self.takes)
-            )
-        )
+        own = (self.sequence_batch(i, take, views) for i, take in enumerate(self.takes))
+        return MotionBatch(sequences=tuple(own))
 
     def sequence_batch(self, index: int, take: Take, views: Sequence[int]) -> SequenceBatch:
         cameras = len(take.observations.cameras)
         chosen = [view % cameras for view in views] if cameras else []
         frames = list(range(len(take.cues.positions)))
         return SequenceBatch(
-            name=take.name,
-            index=index,
-            views=chosen,
-            frames=frames,
-            observations=take.observations.select(chosen),
-            cues=take.cues,
-            extra=dict(take.extra),
-        )
+            name=take.name, index=index, views=chosen, frames=frames, observations=take.observations.select(chosen),
+            cues=take.cues, extra=dict(take.extra),
+        )  # fmt: skip
 
     @cached_property
     def held_back(self) -> list[MotionBatch]:
@@ -350,16 +325,7 @@ class SceneDataModule(L.LightningDataModule):
     def seen_in(
         self, name: str, seen: Observations, views: Sequence[int], frames: Sequence[int]
     ) -> MotionBatch:
-        return MotionBatch(
-            sequences=(
-                SequenceBatch(
-                    name=name,
-                    index=0,
-                    views=list(views),
-                    frames=list(frames),
-                    observations=seen,
-                    cues=None,
-                    extra={},
-                ),
-            )
-        )
+        own = SequenceBatch(
+            name=name, index=0, views=list(views), frames=list(frames), observations=seen, cues=None, extra={},
+        )  # fmt: skip
+        return MotionBatch(sequences=(own,))

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -72,6 +72,25 @@ NEAR = 8
 them, with new buffers."""
 
 
+class _Asked(NamedTuple):
+    """Arguments that `Simulator.rollout` and `Simulator.stepper` share, which say what they are. frames: None for any number."""
+
+    parameters: dict[str, Any]
+    volume: Tensor
+    density: float | Tensor
+    adapter: Any
+    stride: int | None
+    motions: Sequence | None
+    gravity: Tensor | Sequence | None
+    together: int | None
+    timing: Adaptive | Replay | None
+    started: bool
+    held: Held | None
+    frames: int | None = None
+    collect: Callable[[Any], None] | None = None
+    start_time: float = 0.0
+
+
 class Simulator:
     """MLS-MPM of one law on one grid and time step. Rollouts are differentiable in state, parameters and adapter outputs.
 
@@ -111,11 +130,8 @@ class Simulator:
             )
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
-        self.substeps, self.frame_dt, self.dt = (
-            int(substeps),
-            float(frame_dt),
-            float(frame_dt) / int(substeps),
-        )
+        self.substeps, self.frame_dt = int(substeps), float(frame_dt)
+        self.dt = self.frame_dt / self.substeps
         self.dtype, self.device = dtype, torch.device(named_device(device))
         self.options = options
         gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
@@ -134,9 +150,8 @@ class Simulator:
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
         box = corners(box, float(dx) if touching else 0.0)
-        low, high = (
-            box if axes.turn is None else corners(None)
-        )  # one askew is looked at by `Stepper.through`
+        # one askew is looked at by `Stepper.through`
+        low, high = box if axes.turn is None else corners(None)
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt,
             gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes.to(self.device), plane_count=len(all_planes),
@@ -168,10 +183,8 @@ class Simulator:
         one.
         """
         shape = (particles,) if worlds is None else (worlds, particles)
-        like, factor = (
-            self.numerics.planes,
-            YIELD_CONVENTIONS[self.options.yield_convention],
-        )  # of its type and on its device
+        like = self.numerics.planes  # of its type and on its device
+        factor = YIELD_CONVENTIONS[self.options.yield_convention]
         return pack_parameters(
             self.law, parameters, shape, like, rotation=rotation, yield_factor=factor
         )
@@ -222,8 +235,9 @@ class Simulator:
         it. On a CPU each world has the bits of its own rollout, where gradients of what worlds share are summed over them.
         SimulationDiverged names the world: none of the others is returned.
         """
-        given = parameters, volume, density, adapter, stride, motions, gravity, together, timing
-        stepper, start = self._stepper(state, *given, frames, started, collect, held, start_time)
+        asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held,
+                       frames, collect, start_time)  # fmt: skip
+        stepper, start = self._stepper(state, asked)
         poses, all_known = self._poses(stepper, frames, start_time, isinstance(timing, Replay))
         prepared, moment, varies = stepper.prepared, start, stepper.clock.varies
         current, frame = stepper.enter(start, not started)
@@ -250,15 +264,11 @@ class Simulator:
         )
         inverted = int((_determinant(columns[2].detach()) <= 0).sum())
         world = stepper.axes.world
-        columns = [
-            world.points(columns[0]),
-            world.vectors(columns[1]),
-            *map(world.gradients, columns[2:]),
-        ]
+        x, v, *F = columns
+        columns = [world.points(x), world.vectors(v), *map(world.gradients, F)]
         if inverted and self.options.on_inversion == "warn":
-            warnings.warn(
-                f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2
-            )
+            found = f"{inverted} particle states with det F <= 0 in {frames} frames"
+            warnings.warn(found, stacklevel=2)
         (forces,) = stepper.apart([torch.stack(reactions) if reactions else None], 2)
         return Rollout(
             *columns[:3], columns[-1], times=self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device),
@@ -289,67 +299,73 @@ class Simulator:
         timing: choose the substeps of every frame. steps: for which there shall be memory to keep all states, where a gradient is
         wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError.
         """
-        given = parameters, volume, density, adapter, stride, motions, gravity, together, timing
-        stepper, moment = self._stepper(state, *given, None, started, None, held)
+        asked = _Asked(
+            parameters,
+            volume,
+            density,
+            adapter,
+            stride,
+            motions,
+            gravity,
+            together,
+            timing,
+            started,
+            held,
+        )
+        stepper, moment = self._stepper(state, asked)
         stepper.prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
         return stepper, moment._replace(substeps=self.substeps if started else 0)
 
-    def _stepper(
-        self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
-        motions, gravity, together: int | None, timing: Adaptive | Replay | None, frames: int | None, started: bool, collect=None,
-        held: Held | None = None, start_time: float = 0.0,
-    ) -> tuple[Stepper, Moment]:  # fmt: skip
-        """frames: None where there may be any number of them. Errors: ConfigError."""
-        worlds = None if state.x.ndim == 2 else count_of_worlds(state, together)
+    def _stepper(self, state: ParticleState, asked: _Asked) -> tuple[Stepper, Moment]:
+        """Errors: ConfigError."""
+        gravity, timing, held = asked.gravity, asked.timing, asked.held
+        worlds = None if state.x.ndim == 2 else count_of_worlds(state, asked.together)
         if worlds is not None and timing is not None:
             raise ConfigError(
                 "timing: expected None with many worlds, which take the same substeps"
             )
-        if worlds is None and (gravity is not None or together is not None):
+        if worlds is None and (gravity is not None or asked.together is not None):
             raise ConfigError(
                 "gravity and together: expected None without worlds; gravity is the simulator's"
             )
-        check_state(self.numerics, state, volume)
-        each = motions_of_worlds(motions, self.colliders, worlds)
+        check_state(self.numerics, state, asked.volume)
+        each = motions_of_worlds(asked.motions, self.colliders, worlds)
         if self.numerics.driven:
-            held = self._held(held, state.x, each, start_time)
+            held = self._held(held, state.x, each, asked.start_time)
         ends = ends_of(state.x)
         if (shift := self._origin(state.x, ends, held)) != self._axes.shift:
             self._move(shift)
         axes = self._axes
         state = axes.state(state, self.dtype)
-        if not started:
+        if not asked.started:
             check_above(self._walls, ends if axes == Axes() else ends_of(state.x), state.x)
-        gravities = (
-            None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
-        )
+        gravities = None
+        if worlds is not None:
+            gravities = gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         if gravity is not None:
-            gravities = tuple(
-                map(tuple, axes.vectors(torch.tensor(gravities, dtype=torch.float64)).tolist())
-            )
-        prepared = self._prepare(
-            state, parameters, volume, density, adapter, stride, collect, frames, worlds,
-            gravities, together, held,
-        )  # fmt: skip
+            turned = axes.vectors(torch.tensor(gravities, dtype=torch.float64))
+            gravities = tuple(map(tuple, turned.tolist()))
+        prepared = self._prepare(state, asked, worlds, gravities, held)
         choose = None
         if isinstance(timing, Replay):
-            counts = check_counts(timing.counts, frames)
+            counts = check_counts(timing.counts, asked.frames)
             choose = lambda frame, *_: counts[frame - 1]  # noqa: E731
         elif timing is not None:
             solids = max(
                 (m.max_speed(reach(c.shape)) for m, c in zip(each[0], self.colliders)), default=0.0
             )
+            density = asked.density
             density = density if isinstance(density, Tensor) and density.ndim else float(density)
             chooser = StepChooser(
-                timing.control, self.numerics, parameters, prepared.packed, density, self.frame_dt,
-                solids,
+                timing.control, self.numerics, asked.parameters, prepared.packed, density,
+                self.frame_dt, solids,
             )  # fmt: skip
             choose = chooser.choose
-        clock = Clock(self.frame_dt, self.substeps, None if frames == 1 else choose)
-        lag = 0.0 if timing is None else timing.lag
-        return Stepper(prepared, worlds, clock, each, axes, self.colliders), Moment(
-            self._begun(state, started), lag=lag
+        clock = Clock(self.frame_dt, self.substeps, None if asked.frames == 1 else choose)
+        moment = Moment(
+            self._begun(state, asked.started), lag=0.0 if timing is None else timing.lag
         )
+        return Stepper(prepared, worlds, clock, each, axes, self.colliders), moment
 
     def _move(self, shift: tuple[float, ...] | None) -> None:
         """The origin of its axes. A stepper that was made before goes on with its own numerics and buffers."""
@@ -390,30 +406,23 @@ class Simulator:
         ), found
 
     def _prepare(
-        self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
-        collect, frames: int | None, worlds: int | None, gravities: Sequence[tuple] | None, together: int | None,
-        held: Held | None = None,
+        self, state: ParticleState, asked: _Asked, worlds: int | None, gravities: Sequence[tuple] | None, held: Held | None
     ) -> Prepared:  # fmt: skip
         """What a rollout needs besides its state. Errors: ConfigError."""
-        counted(
-            "particles of all frames",
-            (frames or 1, *state.x.shape[:-1]),
-            "take fewer",
-            each=4 * (3 + 3 + 9 + 9),
-        )
-        volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
+        every, each = (asked.frames or 1, *state.x.shape[:-1]), 4 * (3 + 3 + 9 + 9)
+        counted("particles of all frames", every, "take fewer", each=each)
+        volume, adapter, stride = asked.volume.detach().contiguous(), asked.adapter, asked.stride
         F = state.F if worlds is None else state.F.flatten(0, 1)
-        packed = self.pack(
-            parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds
-        )
-        density, mean_mass = checked_density(density, volume, self.law, packed)
+        rotation = polar_rotation(F) if self.law.reference is not None else None
+        packed = self.pack(asked.parameters, len(volume), rotation, worlds)
+        density, mean_mass = checked_density(asked.density, volume, self.law, packed)
         cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         if worlds is None:
             solvers = [SegmentSolver(self.numerics, volume, density, cutoff, None, None, held)]
         else:
-            size = together or (worlds if self.device.type == "cuda" else 1)
+            size = asked.together or (worlds if self.device.type == "cuda" else 1)
             volume, density = (
                 t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density)
             )
@@ -423,7 +432,7 @@ class Simulator:
                 for i in range(0, worlds, size)
             ]  # fmt: skip
         if isinstance(adapter, Sequence):
-            adapter = Several(adapter, count)
+            adapter = Several(adapter, worlds or 1)
         if adapter is not None and stride is not None and self.numerics.moduli is not None:
             raise ConfigError(
                 "prior.options.mean_volume: expected an adapter whose operator does not depend on the state "
@@ -431,7 +440,7 @@ class Simulator:
             )
         lanes = Lanes(solvers, self.buffers)
         return Prepared(
-            self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers
+            self.numerics, self._ask, lanes, packed, adapter, stride, asked.collect, self.gathers
         )
 
     def _origin(self, x: Tensor, ends: np.ndarray, held: Held | None) -> tuple[float, ...] | None:
