@@ -236,24 +236,18 @@ def speed_of_pictures(count: int, side: int, device: str) -> float:
     )
     w2c = torch.eye(4)
     w2c[2, 3] = 6.0
-    cameras = Cameras(torch.stack([K, K]), torch.stack([w2c, w2c]), side, side, ("a", "b")).to(
-        device
-    )
+    pair = torch.stack([K, K]), torch.stack([w2c, w2c])
+    cameras = Cameras(*pair, side, side, ("a", "b")).to(device)
     points = ball(min(count, MEASURED), 1.0).to(device)
     n, background = len(points), torch.ones(3, device=device)
-    covariances = (
-        (torch.eye(3, device=device) * (0.35 * (4.19 / n) ** (1 / 3)) ** 2)
-        .expand(n, 3, 3)
-        .contiguous()
-    )
+    covariance = torch.eye(3, device=device) * (0.35 * (4.19 / n) ** (1 / 3)) ** 2
+    covariances = covariance.expand(n, 3, 3).contiguous()
     state = torch.zeros(2, dtype=torch.long, device=device)
     took = []
     for _ in range(3):
         means = points.clone().requires_grad_(True)
-        opacities, colors = (
-            torch.full((n,), 0.8, device=device),
-            torch.full((1, n, 3), 0.5, device=device).requires_grad_(True),
-        )
+        opacities = torch.full((n,), 0.8, device=device)
+        colors = torch.full((1, n, 3), 0.5, device=device).requires_grad_(True)
         began = time.perf_counter()
         image, alpha = rasterize(
             means[None], covariances[None], opacities, colors, cameras, state, background
@@ -313,18 +307,14 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     )
     columns = sum(b.size for b in planned.newton.blocks)
     together = SIDE_BY_SIDE if module.body.rest.is_cuda else planned.threads(columns)
-    each = (
-        columns / together + 5
-    )  # the residuals, the noise, one or two steps that are tried, the distance
+    # the residuals, the noise, one or two steps that are tried, the distance
+    each = columns / together + 5
     begun = planned.calibrating and not stage.looks_again
-    contacts = (
-        (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3)
-        if begun and module.ground_is_sought
-        else 0
-    )
-    contacts += (
-        ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
-    )
+    contacts, sought = 0.0, module.ground_is_sought
+    if begun and sought:
+        contacts += (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3)
+    if stage.learns_adapter and sought:
+        contacts += ASKED * RIVAL_ITERATIONS * each
     learned = module.body.material.learned
     searched = rollouts_of_search(learned, len(planned.offsets), each) if begun else 0
     return len(planned.pairs) * (stage.iterations * each + contacts + searched)
@@ -342,20 +332,16 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int) -> float:
     pictures = len(module.takes) * (frames - 1) * speeds.picture
     each = 0.7 * again.iterations * again.views * pictures
     total = KERNELS + looks * each
-    if (
-        each
-        and again.response
-        and any(stage.newton and not stage.calibrates for stage in module.stages)
-    ):
+    later = any(stage.newton and not stage.calibrates for stage in module.stages)
+    if each and again.response and later:
         total += each + 0.15 * 3 * MODES * again.response * pictures
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0
-        total += (
-            newton_rollouts(module, stage) * rollout * stiff
-            if stage.newton
-            else stage.iterations * step * adapted
-        )
+        if stage.newton:
+            total += newton_rollouts(module, stage) * rollout * stiff
+        else:
+            total += stage.iterations * step * adapted
     return total
 
 
@@ -365,29 +351,21 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
     lies in the cache."""
     settings, slow, picture = cfg["reconstruction"], speeds.relative, speeds.picture
     moving, dynamic = size.frames - 1, settings["dynamic"]
-    tracked = (
-        dynamic["track_iterations"] * moving * dynamic["track_views"]
-        if dynamic["model"] == "modes"
-        else 0
-    )
-    motion = (
-        0.7 * picture * (tracked + dynamic["iterations"] * moving) + 1.2e-3 * slow * size.particles
-    )
+    tracked = dynamic["track_iterations"] * moving * dynamic["track_views"]
+    tracked *= dynamic["model"] == "modes"
+    motion = 0.7 * picture * (tracked + dynamic["iterations"] * moving)
+    motion += 1.2e-3 * slow * size.particles
     pictures = sum(
         settings[part]["iterations"] * settings[part]["views"] for part in ("static", "appearance")
     )
     free = min(settings["geometry"]["frames"], size.frames // 2)
     still = slow * (5 + 4e-5 * size.cameras * free * window) + picture * pictures
     reconstruction = (1.0 if stored else still + motion) + (size.taught - 1) * motion
-    poses = (size.sequences - 1) * (
-        0.5 + 3e-4 * size.cameras * window
-    ) + size.sequences * 4e-5 * size.cameras * window
+    poses = (size.sequences - 1) * (0.5 + 3e-4 * size.cameras * window)
+    poses += size.sequences * 4e-5 * size.cameras * window
     rollout = moving * speeds.frame
-    draws = (
-        DRAWS + len(RIVALS)
-        if any(stage.newton and stage.learns_adapter for stage in module.stages)
-        else 0
-    )
+    adapted = any(stage.newton and stage.learns_adapter for stage in module.stages)
+    draws = DRAWS + len(RIVALS) if adapted else 0
     count = min(size.particles, cfg["evaluation"]["assignment"])
     distances = 0.6 * size.frames * 0.02 + 4 * 0.4 * (count / 2048) ** 2.4
     shown = 3 * size.sequences * size.cameras * size.frames
@@ -398,12 +376,8 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
         + 0.4 * picture * shown
     )
     fit = seconds_of_fit(module, speeds, size.frames)
-    return {
-        "reconstruction": reconstruction,
-        "starts": slow * poses,
-        "fit": fit,
-        "evaluation": evaluation,
-    }
+    starts = slow * poses
+    return dict(reconstruction=reconstruction, starts=starts, fit=fit, evaluation=evaluation)
 
 
 def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, device: str, *, stored: bool = False,
@@ -413,12 +387,8 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
     most: particles where their number is left open. Errors: ConfigError where this machine's memory does not hold the run."""
     size, radius = size_of(cfg, scene, others, taught, most)
     memory = check_memory(cfg, size)
-    windows = object_windows(
-        scene,
-        scene.training_cameras,
-        scene.training_frames[:1],
-        margin=cfg["reconstruction"]["margin"],
-    )
+    margin, first = cfg["reconstruction"]["margin"], scene.training_frames[:1]
+    windows = object_windows(scene, scene.training_cameras, first, margin=margin)
     window = windows.images.shape[1] * windows.images.shape[2]
     with torch.random.fork_rng(devices=[]):
         body = body_like(cfg, scene, min(size.particles, MEASURED), radius)

@@ -131,11 +131,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     ) -> None:
         """first, overrides: a whole configuration (`mosa.compose`), or overrides as on the command line. Errors: ConfigError."""
         super().__init__()
-        whole = (
-            dict(first)
-            if isinstance(first, dict) and not overrides
-            else plain(composed(first, overrides))
-        )
+        alone = isinstance(first, dict) and not overrides
+        whole = dict(first) if alone else plain(composed(first, overrides))
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
         if self.cfg:
             settings = TrainSettings.read(self.cfg)
@@ -278,6 +275,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
+        cues = responses = None
+        if self.informed:
+            cues = [take.cues.positions.cpu() for take in self.takes]
+            responses = [take.response and take.response.written() for take in self.takes]
         fit = FitRecord(
             stage=self.stage_index,
             steps_done=self.steps_done,
@@ -292,10 +293,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             parts=self.parts,
             identification=self.identification.state() if self.identification else None,
             retreat=self.retreat.written(),
-            cues=[take.cues.positions.cpu() for take in self.takes] if self.informed else None,
-            responses=[take.response and take.response.written() for take in self.takes]
-            if self.informed
-            else None,
+            cues=cues,
+            responses=responses,
         )
         record = RunRecord(
             **dict(self.record),
@@ -399,11 +398,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.running_optimizer = found["optimizer"]
             return found
         body = self.body
-        numbers = tensors_of(
-            body,
-            adapter=stage.learns_adapter and is_learned(body.adapter),
-            heterogeneity=stage.learns_heterogeneity and is_learned(body.heterogeneity),
-        )
+        adapter = stage.learns_adapter and is_learned(body.adapter)
+        varies = stage.learns_heterogeneity and is_learned(body.heterogeneity)
+        numbers = tensors_of(body, adapter=adapter, heterogeneity=varies)
         self.running_optimizer = GaussNewtonOptimizer(numbers, lambda: self.identification)
         return self.running_optimizer
 
@@ -415,11 +412,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """The loss before the step. By Gauss-Newton: minus the logarithm of the posterior; by Adam: the weighted terms of the views
         of `batch`, None where the step before was taken back."""
         stage, iteration = self.stage, len(self.losses)
-        return (
-            self.newton_loss(stage, iteration)
-            if stage.newton
-            else self.gradient_loss(stage, iteration, batch)
-        )
+        if stage.newton:
+            return self.newton_loss(stage, iteration)
+        return self.gradient_loss(stage, iteration, batch)
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
         if loss.requires_grad:  # Gauss-Newton's has none
@@ -476,22 +471,15 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def test_dataloader(self) -> DataLoader:
         """Without a data module: the sequences that the run was evaluated on, from the configuration in its checkpoint. Errors:
         DataError, ConfigError."""
-        return DataLoader(
-            run_sequences(
-                self.record.settings["scene"],
-                {prefix: start.plain() for prefix, start in self.record.starts.items()},
-                self.body,
-            ),
-            batch_size=None,
-            collate_fn=lambda sequence: sequence,
-        )
+        starts = {prefix: start.plain() for prefix, start in self.record.starts.items()}
+        found = run_sequences(self.record.settings["scene"], starts, self.body)
+        return DataLoader(found, batch_size=None, collate_fn=lambda sequence: sequence)
 
     def test_step(self, batch, batch_idx: int) -> None:
         """Logs the figures of docs/figures.md of one sequence, of every model. batch: `evaluation.Sequence`."""
         here = replace(batch, start=type(batch.start).read(batch.start.written(), self.body.rest))
-        figures, _ = evaluate(
-            self.body, [here], self.world, TrainSettings.part(self.cfg).evaluation
-        )
+        settings = TrainSettings.part(self.cfg).evaluation
+        figures, _ = evaluate(self.body, [here], self.world, settings)
         figures.pop("time/particle_substeps_per_s")
         self.log_dict(figures, batch_size=1)  # `test/<metric>` of several sequences is averaged
 
@@ -541,9 +529,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if stage.learns_adapter and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
             parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
-            adapter.prepare(
-                material.law, material_states(material.law, parameters, self.body.law_options)
-            )
+            states = material_states(material.law, parameters, self.body.law_options)
+            adapter.prepare(material.law, states)
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
 
@@ -600,11 +587,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             values[f"id/{name}"] = value.detach()
         height = self.body.contact.height(self.world.ground, self.body.settings.dx)
         values["id/contact_offset"] = height.detach()
-        self.log_dict(
-            {k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()},
-            on_step=True,
-            on_epoch=False,
-        )
+        tensors = {k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}
+        self.log_dict(tensors, on_step=True, on_epoch=False)
         self.last |= {k: float(v) for k, v in values.items()}
 
     @torch.no_grad()

@@ -59,21 +59,11 @@ class GradientSteps:
         learned = [] if replaced else [p for p in body.material.parameters() if p.requires_grad]
         groups = [{"params": learned, "lr": stage.lr, "name": "material"}]
         if body.contact.enabled:
-            groups.append(
-                {
-                    "params": list(body.contact.parameters()),
-                    "lr": stage.lr_contact,
-                    "name": "contact",
-                }
-            )
+            params = list(body.contact.parameters())
+            groups.append({"params": params, "lr": stage.lr_contact, "name": "contact"})
         if stage.learns_heterogeneity and body.heterogeneity is not None:
-            groups.append(
-                {
-                    "params": list(body.heterogeneity.parameters()),
-                    "lr": stage.lr_networks,
-                    "name": "heterogeneity",
-                }
-            )
+            params = list(body.heterogeneity.parameters())
+            groups.append({"params": params, "lr": stage.lr_networks, "name": "heterogeneity"})
         if stage.learns_adapter and body.adapter is not None:
             params = [p for p in body.adapter.parameters() if p.requires_grad]
             groups.append({"params": params, "lr": stage.lr_adapter, "name": "adapter"})

@@ -15,7 +15,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -92,14 +92,7 @@ class Posterior:
 
     def written(self) -> dict:
         """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
-        return {
-            "names": list(self.names),
-            "mean": self.mean,
-            "covariance": self.covariance,
-            "determined": self.determined,
-            "model_error": self.model_error,
-            "rivals": dict(self.rivals),
-        }
+        return vars(self) | {"names": list(self.names), "rivals": dict(self.rivals)}
 
     @classmethod
     def read(cls, written: dict) -> Posterior:
@@ -110,14 +103,9 @@ class Posterior:
     def only(self, names: Sequence[str]) -> Posterior:
         """Of those of its numbers that are among `names`, whatever the others are."""
         kept = [i for i, name in enumerate(self.names) if name in names]
-        return replace(
-            self,
-            names=[self.names[i] for i in kept],
-            mean=self.mean[kept],
-            covariance=self.covariance[kept][:, kept],
-            determined=self.determined[kept],
-            rivals={},
-        )
+        names, covariance = [self.names[i] for i in kept], self.covariance[kept][:, kept]
+        mean, determined = self.mean[kept], self.determined[kept]
+        return Posterior(names, mean, covariance, determined, self.model_error)
 
     def among(self, names: Sequence[str]) -> Posterior:
         """The same numbers among `names`, of which the others are 0 and not learned."""
@@ -131,14 +119,8 @@ class Posterior:
         covariance = torch.diag(torch.full((len(names),), KNOWN**2, dtype=torch.float64))
         covariance[torch.tensor(place)[:, None], torch.tensor(place)] = self.covariance
         rivals = {name: spread(numbers) for name, numbers in self.rivals.items()}
-        return Posterior(
-            list(names),
-            spread(self.mean),
-            covariance,
-            spread(self.determined),
-            self.model_error,
-            rivals,
-        )
+        mean, determined = spread(self.mean), spread(self.determined)
+        return Posterior(list(names), mean, covariance, determined, self.model_error, rivals)
 
     def draws(self, count: int, generator: torch.Generator | None = None) -> Tensor:
         """(count, D) float64. generator: of the random numbers; None: one with seed 0, so that the same draws come every time."""

@@ -37,11 +37,9 @@ def few_numbers(module: torch.nn.Module | None) -> bool:
 def limits_of(name: str) -> tuple[float, float]:
     """Of a global parameter's unconstrained number, within which it is learned: beyond those of nu a rollout no longer tells
     another one."""
-    return (
-        (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX))
-        if name == "nu"
-        else (-math.inf, math.inf)
-    )
+    if name == "nu":
+        return FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX)
+    return -math.inf, math.inf
 
 
 def warn_of_ends(material: Material) -> None:
@@ -81,35 +79,20 @@ def blocks_of(
     for name in body.material.learned:
         start = body.material.begins[name]
         wider = 2.5 if name == "nu" else 1.0
-        blocks.append(
-            Block(
-                name,
-                torch.tensor([start]),
-                torch.tensor([1.5]),
-                wider * step,
-                bounds=limits_of(name),
-            )
-        )
+        mean, sd = torch.tensor([start]), torch.tensor([1.5])
+        blocks.append(Block(name, mean, sd, wider * step, bounds=limits_of(name)))
     if body.contact.enabled:
         sd, bounds = body.contact.prior(ground, body.settings.dx, free)
         mean = torch.tensor([ContactOffset.START])
         blocks.append(Block("contact", mean, torch.tensor([sd]), step, bounds=bounds))
     if adapter:
         zero = torch.zeros(body.adapter.numbers.numel())
-        blocks.append(
-            Block("operator", zero, zero + settings.operator_sd, step, learned=settings.evidence)
-        )
+        sd = zero + settings.operator_sd
+        blocks.append(Block("operator", zero, sd, step, learned=settings.evidence))
     if heterogeneity:
         falls = (1 + (body.heterogeneity.size / 2) ** 2) ** (-settings.smoothness / 2)
-        blocks.append(
-            Block(
-                "stiffness",
-                0 * falls,
-                settings.stiffness_sd * falls,
-                step / body.heterogeneity.settings.amplitude,
-                learned=settings.evidence,
-            )
-        )
+        sd, step = settings.stiffness_sd * falls, step / body.heterogeneity.settings.amplitude
+        blocks.append(Block("stiffness", 0 * falls, sd, step, learned=settings.evidence))
     return blocks
 
 

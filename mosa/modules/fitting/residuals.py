@@ -65,20 +65,11 @@ def fields(
         x, F = response.seen(x, F, start_rotation)
     U, S, V = singular_value_decomposition(F[1:, chosen])
     relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
-    vector = 0.5 * torch.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        -1,
-    )
+    twice = relative - relative.mT
+    vector = 0.5 * torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1)
     weight = cues.weight[1:frames, chosen, None]
-    return Fields(
-        x[1:, chosen] - cues.positions[1:frames, chosen],
-        vector * weight,
-        (S - cues.stretch[1:frames, chosen]) * weight,
-    )
+    away = x[1:, chosen] - cues.positions[1:frames, chosen]
+    return Fields(away, vector * weight, (S - cues.stretch[1:frames, chosen]) * weight)
 
 
 def floors(dx: float, cells: float) -> tuple[float, float, float]:

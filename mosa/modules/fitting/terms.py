@@ -59,15 +59,11 @@ class Step:
     def seen(self) -> Views:
         """Images, mattes and flow of the rollout, from the cameras of `targets`; rendered once, for all terms that ask."""
         body, rollout = self.body, self.rollout
+        covariances = deformed_covariances(rollout.F_tot, body.covariances)
         return observe(
-            rollout.x,
-            deformed_covariances(rollout.F_tot, body.covariances),
-            body.opacities,
-            body.colors,
-            self.targets.cameras,
-            self.background,
+            rollout.x, covariances, body.opacities, body.colors, self.targets.cameras, self.background,
             flow=self.with_flow,
-        )
+        )  # fmt: skip
 
 
 Term = Callable[[Step], Tensor | None]

@@ -47,40 +47,29 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
     response: whether it shall be found what the cues keep of the prediction."""
     if take.again is None:
         return take
-    model = body.model().only(heterogeneity=False, adapter=False)
+    model, seen = body.model().only(heterogeneity=False, adapter=False), take.cues.positions
 
     @torch.no_grad()
     def predicted(gain: float = 0.0) -> Tensor:
         return body.simulate(
-            take.start,
-            world,
-            len(take.cues.positions),
-            take.frame_dt,
-            model=model,
-            observed=take.cues.positions if gain else None,
-            gain=gain,
-        ).x
+            take.start, world, len(seen), take.frame_dt, model=model, observed=seen if gain else None, gain=gain
+        ).x  # fmt: skip
 
-    free, other, found = predicted(), None, None
-    if (
-        response and not body.settings.adaptive
-    ):  # substeps that vary cannot be corrected frame by frame
+    free, other, found, name = predicted(), None, None, take.again.scene.sequence
+    # substeps that vary cannot be corrected frame by frame
+    if response and not body.settings.adaptive:
         try:
             other = predicted(CORRECTING)
         except MosaError as error:
-            log.info(
-                "motion of %s: the corrected prediction cannot be simulated: %s",
-                take.again.scene.sequence,
-                error,
-            )
+            log.info("motion of %s: the corrected prediction cannot be simulated: %s", name, error)
     if other is None:
-        cues = take.again.about(free, take.cues.positions)
+        cues = take.again.about(free, seen)
     else:
-        cues, found = take.again.with_response(free, other, take.cues.positions, take.first_contact)
-    moved = float((cues.positions - take.cues.positions).square().sum(-1).mean().sqrt())
+        cues, found = take.again.with_response(free, other, seen, take.first_contact)
+    moved = float((cues.positions - seen).square().sum(-1).mean().sqrt())
     log.info(
         "motion of %s fitted again, from the calibrated law's prediction: changed by %.2g mm (root mean square)",
-        take.again.scene.sequence,
+        name,
         1e3 * moved,
     )
     return replace(take, cues=cues, response=found)
