@@ -65,10 +65,8 @@ class InteractionNetwork(Adapter):
         )
 
     def __getstate__(self) -> dict:
-        return {
-            **super().__getstate__(),
-            "_dynamics": None,
-        }  # it holds graphs, which can be neither copied nor pickled
+        # it holds graphs, which can be neither copied nor pickled
+        return {**super().__getstate__(), "_dynamics": None}
 
     def settle(self, rest: Tensor, volume: Tensor) -> None:
         """Choose nodes and bonds of a body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError for too few particles."""
@@ -90,9 +88,8 @@ class InteractionNetwork(Adapter):
         total = np.bincount(i, weights=L, minlength=count) + np.bincount(
             j, weights=L, minlength=count
         )
-        share = (
-            6 * V_nodes / total
-        )  # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
+        # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
+        share = 6 * V_nodes / total
         area = share[i] + share[j]
         bond = area / L
         rate = (
@@ -121,9 +118,8 @@ class InteractionNetwork(Adapter):
         for name, value in self.named_buffers():
             if value.is_floating_point() and name not in ("E_ref", "poisson"):
                 setattr(self, name, value.to(rest.dtype))
-        self.fastest = float(
-            np.sqrt(2 * rate.max())
-        )  # bound of the nodes' frequencies, times sqrt(E_ref/density)
+        # bound of the nodes' frequencies, times sqrt(E_ref/density)
+        self.fastest = float(np.sqrt(2 * rate.max()))
         self.radius = 0.5 * float(V.mean()) ** (1 / 3)
 
     def tension(

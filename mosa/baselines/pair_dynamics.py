@@ -34,9 +34,8 @@ class Interactions:
             * math.sqrt(float(network.E_ref) / density)
             * math.exp(0.5 * network.stiffer)
         )
-        self.substeps = math.ceil(
-            frame_dt * fastest
-        )  # half of the limit of stability, 2/fastest, for bonds at their stiffest
+        # half of the limit of stability, 2/fastest, for bonds at their stiffest
+        self.substeps = math.ceil(frame_dt * fastest)
         self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt
         self._passes: FramePasses | None = None
 
@@ -203,9 +202,8 @@ class Frame(torch.autograd.Function):
     @staticmethod
     def forward(ctx, passes: FramePasses, x: Tensor, v: Tensor, *weights: Tensor):
         ctx.passes = passes
-        ctx.save_for_backward(
-            x, v, *weights
-        )  # the weights too: a change of them before the adjoint is then an error
+        # the weights too: a change of them before the adjoint is then an error
+        ctx.save_for_backward(x, v, *weights)
         return passes.advance(x, v)
 
     @staticmethod

@@ -44,9 +44,8 @@ class Impact(Problem):
             [[first] * 3, np.linspace(first, end, round(AFTER / STEP) + 1), [end] * 3]
         )
         count = len(self.knots) - 4
-        self.bend = np.diff(np.eye(count), 3, axis=0)[
-            :, 3:
-        ]  # the first three vanish: the curve joins the parabola smoothly
+        # the first three vanish: the curve joins the parabola smoothly
+        self.bend = np.diff(np.eye(count), 3, axis=0)[:, 3:]
         focal = float(np.mean([phone.camera.K[0, 0] for phone in phones]))
         self.size = self.radius / focal  # of the object, in units of depth
         self.base = 8 + 4 * len(phones)

@@ -59,9 +59,8 @@ def hull_in_flight(
         ):
             own = times[k] + fall.readouts[v] * row_share(phone, track.centres[k], knowledge)
             pixels = phone.camera.project(points + fall.at(own))
-            when = times[k] + fall.readouts[v] * row_share(
-                phone, pixels, knowledge
-            )  # each point when its row is read
+            # each point when its row is read
+            when = times[k] + fall.readouts[v] * row_share(phone, pixels, knowledge)
             pixels = phone.camera.project(points + fall.at(when))
             points = points[track.shows(k, pixels)]
     return points
@@ -92,9 +91,8 @@ def corrected(
     if len(points) * (PITCH * radius) ** 3 < 0.3 * radius**3:  # of a ball it is 4.2
         return None
     times = np.linspace(*fall.window, SAMPLES)
-    middle = points.mean(
-        0
-    )  # a place of the body's own, or the centre would wander from one correction to the next
+    # a place of the body's own, or the centre would wander from one correction to the next
+    middle = points.mean(0)
     found = []
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         places = fall.at(times)

@@ -92,9 +92,8 @@ def arguments(words: list[str]) -> argparse.Namespace:
 def main(words: list[str] | None = None) -> None:
     say_version(words)
     settle_threads()
-    signal.signal(
-        signal.SIGTERM, interrupt
-    )  # or the jobs would go on without anyone who waits for them
+    # or the jobs would go on without anyone who waits for them
+    signal.signal(signal.SIGTERM, interrupt)
     with tolerant_output():  # hours of jobs do not end with whoever read their lines
         code = code_of(words)
     sys.exit(code)

@@ -62,9 +62,8 @@ def build_world(config: Mapping[str, Any]) -> World:
     """walls: {mode, friction} of the box's six sides, or None; colliders, driven: lists, see
     `colliders_from_config` and `driven_from_config`; all may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
-    if (
-        ground is not None and ground.mode == AUTO
-    ):  # where it is found, it is written down; until then the body sticks
+    # where it is found, it is written down; until then the body sticks
+    if ground is not None and ground.mode == AUTO:
         ground = replace(ground, mode="sticky")
     gravity, up, box = (
         torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box")

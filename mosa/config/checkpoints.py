@@ -104,9 +104,8 @@ def check_archive(path: Path) -> None:
             raise DataError(
                 f"ckpt_path: {path} is not a readable checkpoint (an entry of its archive is there twice)"
             )
-        if (
-            damaged := archive.testzip()
-        ) is not None:  # torch does not compare the sums: a flipped bit would be another number
+        # torch does not compare the sums: a flipped bit would be another number
+        if (damaged := archive.testzip()) is not None:
             raise DataError(
                 f"ckpt_path: {path} is damaged: its part {damaged} is not what was written (another sum)"
             )
@@ -114,9 +113,8 @@ def check_archive(path: Path) -> None:
             if not entry.endswith(".pkl"):
                 continue
             for code, named, _ in pickletools.genops(archive.read(entry)):
-                if (
-                    "GLOBAL" in code.name and named not in NAMED
-                ):  # STACK_GLOBAL names nothing here, and is not written
+                # STACK_GLOBAL names nothing here, and is not written
+                if "GLOBAL" in code.name and named not in NAMED:
                     raise DataError(
                         f"ckpt_path: {path} refers to {named or 'a function or class'}; a run's checkpoint holds "
                         "numbers, texts and tensors only, and nothing else is loaded"
@@ -294,9 +292,8 @@ def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
             raise DataError(
                 f"ckpt_path: {path}: body.{name}: expected a tensor, found {type(value).__name__}"
             )
-        unset = (
-            name.startswith("adapter.") and value.ndim == 0
-        )  # an adapter that was not switched on yet has no unit
+        # an adapter that was not switched on yet has no unit
+        unset = name.startswith("adapter.") and value.ndim == 0
         if value.is_floating_point() and not unset and not bool(torch.isfinite(value).all()):
             raise DataError(f"ckpt_path: {path}: body.{name}: expected finite numbers")
     opacities, colors, covariances = (

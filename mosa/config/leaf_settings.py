@@ -208,8 +208,7 @@ class CaptureSettings(Settings):
         ]
         | None
     ) = Field(
-        None,
-        description="upwards in the poses' world; null: against the acceleration of the fall",
+        None, description="upwards in the poses' world; null: against the acceleration of the fall"
     )
     ground: Three | None = Field(
         None,
@@ -255,20 +254,15 @@ class SearchSection(Settings):
         0.02, gt=0, le=10, description="gradient: Adam's learning rate, falling to a tenth"
     )
     clip: Positive = Field(
-        0.5,
-        description="gradient: largest norm of one trial's gradient with respect to one action",
+        0.5, description="gradient: largest norm of one trial's gradient with respect to one action"
     )
     every: Count = Field(10, description="iterations between validations")
     validation: Count = Field(32, description="validation trials, in the training simulator")
     candidates: int = Field(
-        32,
-        ge=4,
-        le=10**9,
-        description="model: candidate batches per iteration",
+        32, ge=4, le=10**9, description="model: candidate batches per iteration"
     )
     spread: Positive = Field(
-        0.4,
-        description="model: initial standard deviation of actions about those of the policy",
+        0.4, description="model: initial standard deviation of actions about those of the policy"
     )
 
 
@@ -303,10 +297,7 @@ class EnvironmentsSettings(Settings):
     seeds: Annotated[list[Seed], Expected("a list of whole numbers"), such(bool)] = Field(
         [0, 1, 2], description="seeds of the table"
     )
-    policy: Text = Field(
-        "gradient",
-        description="gradient or model",
-    )
+    policy: Text = Field("gradient", description="gradient or model")
     trials: Count = Field(
         100, description="number of tests, in the truth and in the training simulator"
     )

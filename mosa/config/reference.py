@@ -49,11 +49,7 @@ Keys under `adapter` and `scene` depend on the option that you choose: [Adapters
 The settings models generate this page (`python -m mosa.config.reference`), and a test compares both. The models are in
 `mosa/config/command_settings.py`, `mosa/config/leaf_settings.py` and in the package of each section.
 """
-SCENES = {
-    "transforms": "films in files",
-    "markers": "`scene=markers`",
-    "rabbit": "built-in bodies",
-}
+SCENES = {"transforms": "films in files", "markers": "`scene=markers`", "rabbit": "built-in bodies"}
 """File in conf/scene -> the options whose keys it shows."""
 IN_SCENES = """The column *Expected* names the options that take a key. Defaults are those of `conf/scene/transforms.yaml`,
 `markers.yaml` and `rabbit.yaml`; the file of your option may have others."""

@@ -68,9 +68,8 @@ def train_and_test(cfg: DictConfig) -> None:
     if values["films"]:
         ffmpeg("films")
     folder = Path(values["out"] or HydraConfig.get().runtime.output_dir)
-    folder.mkdir(
-        parents=True, exist_ok=True
-    )  # what cannot be written is said before hours are spent
+    # what cannot be written is said before hours are spent
+    folder.mkdir(parents=True, exist_ok=True)
     bench = Bench(setting)
     if values["jobs_only"]:
         make_jobs(bench, [(name, seed) for seed in values["seeds"] for name in names], folder)

@@ -25,9 +25,8 @@ def assigned(cost: np.ndarray) -> np.ndarray:
     columns = potentials(coarse, assigned(coarse))
     reduced = cost - (cost[:, :half] - columns).min(1, keepdims=True)
     reduced -= reduced.min(0)
-    reduced -= reduced.min(
-        1, keepdims=True
-    )  # no cost is negative, and most partners of the end are near zero
+    # no cost is negative, and most partners of the end are near zero
+    reduced -= reduced.min(1, keepdims=True)
     return linear_sum_assignment(reduced)[1]
 
 

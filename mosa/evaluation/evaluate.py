@@ -232,9 +232,8 @@ def evaluate(
             "evaluation: neither the law nor its prior can be simulated on any of these sequences: "
             f"{', '.join(s.prefix for s in sequences)}; the warnings above say why"
         )
-    of_pictures = {
-        name for name in measured if name.endswith(("_crop", "_full"))
-    }  # all that held-out cameras tell
+    # all that held-out cameras tell
+    of_pictures = {name for name in measured if name.endswith(("_crop", "_full"))}
     figures |= {f"{model}{part}/{name}": worst(name) for model, part in missing
                 for name in (of_pictures if part == "camera" else measured - {"mean_abs_C"})}  # fmt: skip
     figures |= test_means(figures)

@@ -150,9 +150,8 @@ def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
     """
     points = cloud.detach().cpu().double().numpy()
     generator = np.random.default_rng(seed)
-    k = min(
-        12, len(points) - 1
-    )  # at 12 a lattice gives its own spacing to 2 %, and so does a random cloud
+    # at 12 a lattice gives its own spacing to 2 %, and so does a random cloud
+    k = min(12, len(points) - 1)
     reach = np.median(cKDTree(points).query(points, k=[k + 1])[0])
     spacing = reach * (4 / 3 * np.pi / (k + 0.5)) ** (1 / 3)
     chosen = points[generator.integers(len(points), size=count)]

@@ -117,10 +117,7 @@ def model_card(
         f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."
     )
     unsure = "This fit keeps no posterior: how sure the law is, is not known."
-    errors = (
-        results_table(figures),
-        columns_text(figures, name),
-    )
+    errors = (results_table(figures), columns_text(figures, name))
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),
         "What was learned": f"{learned}\n\n{parameter_table(figures, law)}",

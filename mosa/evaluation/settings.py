@@ -15,8 +15,7 @@ class EvaluationSettings(Settings):
     where: ClassVar[str] = "evaluation"
 
     floor: bool = Field(
-        True,
-        description="built-in scenes: simulate the true law on the learner's grid (row floor)",
+        True, description="built-in scenes: simulate the true law on the learner's grid (row floor)"
     )
     samples: Count = Field(8192, description="points of the chamfer distance")
     assignment: Count = Field(

@@ -188,10 +188,7 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
     if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
         return sd * float(slope.abs())
     low, high = limits_of(name)
-    middle, sd = (
-        raw.detach().clamp(low, high),
-        min(max(sd, 1e-9), 1e9),
-    )
+    middle, sd = (raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9))
     below, within = torch.special.ndtr(
         (torch.tensor([low, high], dtype=torch.float64) - middle) / sd
     ).tolist()

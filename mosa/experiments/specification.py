@@ -348,9 +348,8 @@ def folder_name(overrides: Sequence[str]) -> str:
 
 def figures_of(job: Job) -> dict[str, float | str]:
     """metrics.json of a complete job. Errors: DataError for a damaged one."""
-    from mosa.training.run_folder import (
-        read_figures,
-    )  # which imports the simulator: a list of jobs does not wait for it
+    # which imports the simulator: a list of jobs does not wait for it
+    from mosa.training.run_folder import read_figures
 
     return read_figures(job.folder / "metrics.json")
 

@@ -69,10 +69,8 @@ def plane(name: str) -> tuple[list[float], Tensor]:
     """(degrees, unit vectors (K, 3)) in the plane of x and the vertical in which a built-in body is pressed: evenly over half a
     turn, and along its fibres where these lie in the plane."""
     angles, n = directions_in_plane((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), ANGLES + 1)
-    degrees, vectors = (
-        torch.rad2deg(angles)[:-1].tolist(),
-        list(n[:-1]),
-    )  # the last one is the first, turned over
+    # the last one is the first, turned over
+    degrees, vectors = (torch.rad2deg(angles)[:-1].tolist(), list(n[:-1]))
     fibre = getattr(OBJECTS[name].material, "fibre", None)
     if fibre is not None:
         fibre = torch.tensor(fibre, dtype=n.dtype) / torch.tensor(fibre, dtype=n.dtype).norm()

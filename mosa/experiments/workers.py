@@ -35,9 +35,8 @@ class Worker:
         """Run `program`, a "module:function", with `words` as its command line and its output in the file `screen`.
 
         Returns: the exit code, once the job has ended. Errors of the Future: of loky, where the process was killed."""
-        screen.write_bytes(
-            b""
-        )  # the output of an earlier run in this folder is not read as this one's
+        # the output of an earlier run in this folder is not read as this one's
+        screen.write_bytes(b"")
         try:
             pool = self.started()
         except BrokenProcessPool:  # the process was killed since its last job

@@ -29,9 +29,8 @@ def use(wanted: bool = True) -> None:
 
     Sums of Warp's kernels are exact, and torch takes its algorithms of fixed order. To be called before the first one."""
     if wanted:
-        os.environ.setdefault(
-            "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
-        )  # read when torch first multiplies matrices there
+        # read when torch first multiplies matrices there
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         # of what has no such algorithm only the gradient of grid_sample is used, and of it only that of the places, which is one
         # thread's each
         warnings.filterwarnings("ignore", message=".*grid_sampler.*deterministic.*")

@@ -69,9 +69,8 @@ class StageCache:
             )
             self.folder.mkdir(parents=True, exist_ok=True)
             file, text = self.folder / "key.json", json.dumps(key, indent=1, sort_keys=True)
-            if (
-                not file.is_file() or file.read_bytes() != text.encode()
-            ):  # a cache that has all may be one that is only read
+            # a cache that has all may be one that is only read
+            if not file.is_file() or file.read_bytes() != text.encode():
                 with written_whole(file) as partial:
                     partial.write_text(text)
 

@@ -52,9 +52,8 @@ def resolution(rest: Tensor, spacing: float, dx: float) -> Resolution:
     index = np.floor((points - points.min(0)) / spacing + 0.5).astype(int) + 1
     solid = np.zeros(index.max(0) + 2, bool)
     solid[tuple(index.T)] = True
-    solid = ndimage.binary_closing(
-        solid
-    )  # particles sit at the centroids of their voxels, up to half a spacing off the lattice
+    # particles sit at the centroids of their voxels, up to half a spacing off the lattice
+    solid = ndimage.binary_closing(solid)
     # two half cells for each: a ball is then centred between layers, whether their number is even or odd
     fine = solid.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     inside = ndimage.distance_transform_edt(fine)

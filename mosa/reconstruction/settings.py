@@ -29,8 +29,7 @@ class GeometrySection(Settings):
         ),
     )
     frames: Count = Field(
-        6,
-        description="frames of free flight whose outlines and colours are used, at most",
+        6, description="frames of free flight whose outlines and colours are used, at most"
     )
 
 
@@ -47,10 +46,7 @@ class FitSettings(Settings):
     lr_scales: Weight = Field(0.02, description="learning rate of the logarithms of scales")
     ssim: Share = Field(0.2, description="weight of 1 - SSIM; the rest is L1")
     matte: Weight = Field(1.0, description="weight of the matte's error")
-    keep: Weight = Field(
-        0.0,
-        description="weight of the initial colour, in pixels of an image",
-    )
+    keep: Weight = Field(0.0, description="weight of the initial colour, in pixels of an image")
     largest: AtLeastOne = Field(
         2.0, description="largest scale of a Gaussian, over its initial scale"
     )
@@ -69,8 +65,7 @@ class StaticSettings(FitSettings):
     where: ClassVar[str] = "reconstruction.static"
 
     relocate_every: Whole = Field(
-        100,
-        description="steps between relocations of vanished Gaussians to opaque ones; 0: never",
+        100, description="steps between relocations of vanished Gaussians to opaque ones; 0: never"
     )
 
 
@@ -106,17 +101,12 @@ class InformedSettings(Settings):
 
     iterations: Whole = Field(80, description="steps; 0: no second fit")
     views: Count = Field(1, description="images of every frame in a step")
-    lr: Positive = Field(
-        0.02,
-        description="learning rate, in units of the object's radius",
-    )
+    lr: Positive = Field(0.02, description="learning rate, in units of the object's radius")
     elastic: Weight = Field(
-        0.3,
-        description="weight of the elastic energy of the difference from the prediction",
+        0.3, description="weight of the elastic energy of the difference from the prediction"
     )
     bending: Weight = Field(
-        1.0,
-        description="weight of the curvature of the difference from the prediction",
+        1.0, description="weight of the curvature of the difference from the prediction"
     )
     response: Whole = Field(
         4,
@@ -186,10 +176,7 @@ class DynamicSettings(Settings):
     bases: Width = Field(10, description="network: motion bases")
     hidden: Width = Field(256, description="network: width")
     basis_layers: Layers = Field(8, description="network: layers of the bases")
-    coefficient_layers: Layers = Field(
-        3,
-        description="network: layers of the coefficients",
-    )
+    coefficient_layers: Layers = Field(3, description="network: layers of the coefficients")
     space_frequencies: int = Field(
         4, ge=0, le=16, description="network: sines and cosines of a position; GIC: 10"
     )
@@ -232,10 +219,7 @@ class ReconstructionSettings(Settings):
         ),
     )
     margin: int = Field(
-        6,
-        ge=0,
-        le=256,
-        description="px around the mattes in the windows that are kept in memory",
+        6, ge=0, le=256, description="px around the mattes in the windows that are kept in memory"
     )
     splats: Text | None = Field(
         None,

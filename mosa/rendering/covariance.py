@@ -114,6 +114,7 @@ def matrix_to_quaternion(R: Tensor) -> Tensor:
     that no rotation is near a singularity (Shepperd 1978). Not meant to be differentiated.
     """
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
+    # 4 w^2, 4 x^2, 4 y^2, 4 z^2
     squares = torch.stack(
         (
             1 + m[0][0] + m[1][1] + m[2][2],
@@ -122,7 +123,7 @@ def matrix_to_quaternion(R: Tensor) -> Tensor:
             1 - m[0][0] - m[1][1] + m[2][2],
         ),
         -1,
-    )  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    )
     wx, wy, wz = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     rows = (

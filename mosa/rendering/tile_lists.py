@@ -83,12 +83,13 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     images, gaussians, _ = records.shape
     number, columns, rows = images * gaussians, -(-width // TILE), -(-height // TILE)
     last = images * rows * columns
+    # int32
     counted(
         "rasterize: Gaussians, or tiles, of all images",
         [max(number, last)],
         "render fewer at once",
         most=ENTRIES_MAX,
-    )  # int32
+    )
     device = wp.device_from_torch(records.device)
     scalar = wp.dtype_from_torch(records.dtype)
     count, emit = list_kernels(scalar)

@@ -30,9 +30,8 @@ class TolerantStream:
             return act()
         except OSError:
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(
-                nowhere, self.stream.fileno()
-            )  # also for what runs below this process, and for what is still in the buffer
+            # also for what runs below this process, and for what is still in the buffer
+            os.dup2(nowhere, self.stream.fileno())
             os.close(nowhere)
             return otherwise
 

@@ -40,9 +40,8 @@ def written_whole(path: str | Path) -> Iterator[Path]:
             os.fsync(written.fileno())
         os.replace(partial, path)
     except OSError as error:
-        if (
-            error.errno is not None and error.filename is None
-        ):  # a disk that fills up meanwhile names no file
+        # a disk that fills up meanwhile names no file
+        if error.errno is not None and error.filename is None:
             error.filename = str(path)
         raise
     finally:

@@ -144,9 +144,8 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
     ) as error:
         if begun or ckpt_path is None or lacks_memory(error):
             raise
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[
-            :300
-        ]  # Lightning takes its own entries as they are
+        # Lightning takes its own entries as they are
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         raise DataError(
             f"ckpt_path: {ckpt_path}: the fit cannot go on from it ({reason})"
         ) from error

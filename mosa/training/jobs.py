@@ -250,9 +250,8 @@ class Failures(Callback):
     """Of the sweep that ended last in this process."""
 
     def on_multirun_start(self, config: DictConfig, **_) -> None:
-        shutil.rmtree(
-            Path(config.hydra.sweep.dir) / FAILED, ignore_errors=True
-        )  # of an earlier sweep in this folder
+        # of an earlier sweep in this folder
+        shutil.rmtree(Path(config.hydra.sweep.dir) / FAILED, ignore_errors=True)
         Failures.count = 0
         begun.append(True)
 
@@ -349,9 +348,8 @@ def held_back() -> Iterator[None]:
         if len(waiting) > 1:
             before[number](number, frame)
 
-    replaced = {
-        number: handler for number, handler in before.items() if callable(handler)
-    }  # not what is ignored, or ends at once
+    # not what is ignored, or ends at once
+    replaced = {number: handler for number, handler in before.items() if callable(handler)}
     for number in replaced:
         signal.signal(number, wait)
     try:

@@ -85,9 +85,8 @@ def log_outcome(
     }
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
-            (Path(logger.log_dir) / "hparams.yaml").unlink(
-                missing_ok=True
-            )  # the fit left an empty one, which would be kept
+            # the fit left an empty one, which would be kept
+            (Path(logger.log_dir) / "hparams.yaml").unlink(missing_ok=True)
             logger.log_hyperparams(parameters, final)
             logger.finalize("success")
         elif isinstance(logger, WandbLogger):

@@ -39,9 +39,8 @@ def quiet() -> None:
     """Keep library chatter off the screen; errors and our own output stay."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    logging.getLogger("lightning.pytorch.profilers").setLevel(
-        logging.INFO
-    )  # its table was asked for
+    # its table was asked for
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)
     warnings.filterwarnings("ignore", module="lightning.*")
 
 

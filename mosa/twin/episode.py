@@ -134,9 +134,8 @@ class Episode:
                 ready, self._begin = _worlds(body, world, starts, laws, gravity, options)
                 more = {"gravity": gravity, "together": together}
             self._lifts, motions = ready.lift, ready.motions(self.colliders)
-            self._raised = (
-                ready.lift.double().cpu()
-            )  # once: a step shall not wait for a GPU to say it
+            # once: a step shall not wait for a GPU to say it
+            self._raised = ready.lift.double().cpu()
             self._motions = motions if ready.lift.ndim > 1 else [motions]
             self._stepper, moment = ready.simulator.stepper(
                 ready.state, **ready.arguments, motions=motions, steps=frames, **more
@@ -187,9 +186,8 @@ class Episode:
         if self.colliders:
             rotation_matrices(state.rotation, state.rotation.ndim - 2)
         for name in ("frames", "substeps"):
-            if (
-                not 0 <= int(found := getattr(state, name)) <= 2**53
-            ):  # as far as times have them exactly
+            # as far as times have them exactly
+            if not 0 <= int(found := getattr(state, name)) <= 2**53:
                 raise ConfigError(
                     f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}"
                 )

@@ -142,9 +142,8 @@ def start_in(
         if height < 0 and world.ground is not None:
             raise ConfigError(f"height: expected metres above the ground, >= 0, found {height:g}")
         ground, low = world.ground.height if world.ground is not None else 0.0, arms @ up
-        if (
-            world.ground is not None and world.ground.mode == "touch"
-        ):  # it is met by balls, where it was found to be
+        # it is met by balls, where it was found to be
+        if world.ground is not None and world.ground.mode == "touch":
             low = (
                 low
                 - 0.5 * body.volume.to(low) ** (1 / 3)

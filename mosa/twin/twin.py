@@ -20,13 +20,7 @@ from pydantic import InstanceOf
 from torch import Tensor
 
 from mosa.config.build import build_body, world_of
-from mosa.config.checkpoints import (
-    TENSORS,
-    check_kinds,
-    check_numbers,
-    checked,
-    read_checkpoint,
-)
+from mosa.config.checkpoints import TENSORS, check_kinds, check_numbers, checked, read_checkpoint
 from mosa.config.record import BodyRecord
 from mosa.data.io.splat_formats import Formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
@@ -61,13 +55,7 @@ from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
 from mosa.twin.shown_solids import with_solids
-from mosa.twin.start import (
-    Seconds,
-    Variant,
-    check_frames,
-    check_wants_no_gradients,
-    start_in,
-)
+from mosa.twin.start import Seconds, Variant, check_frames, check_wants_no_gradients, start_in
 from mosa.types import Cameras, Rollout
 
 Draws = Annotated[int, Ge(2), Le(10_000)]
@@ -353,9 +341,8 @@ class Twin:
             if met and colliders is None
             else colliders_from_config(colliders or (), "colliders")
         )
-        if colliders is not None and met > len(
-            solids
-        ):  # driven sets have reactions, and nothing to draw
+        # driven sets have reactions, and nothing to draw
+        if colliders is not None and met > len(solids):
             solids += self.world.solids[len(self.world.colliders) :]
         if met != len(solids):
             raise ConfigError(

@@ -81,9 +81,8 @@ class LiveViewer:
         self.gizmo = scene.add_transform_controls("/push", 2.5 * live.radius, disable_rotations=True, depth_test=False,
                                                   position=ball)  # fmt: skip
         self.gizmo.on_update(lambda _: self.pushed(self.gizmo.position))
-        self.draggable = hasattr(
-            self.ball, "on_drag"
-        )  # newer viser: the ball itself follows the mouse, in the screen's plane
+        # newer viser: the ball itself follows the mouse, in the screen's plane
+        self.draggable = hasattr(self.ball, "on_drag")
         if self.draggable:
             self.ball.on_drag("left")(self.dragged)
         self.buttons["drop"].on_click(lambda _: self.drop())

@@ -98,12 +98,10 @@ def view_of(
         low[1] = min(low[1], ground)
     corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
     toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
-    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(
-        0
-    )  # to the right, and up
-    distance = (
-        corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)
-    ).max()  # all in a square window, and a margin
+    # to the right, and up
+    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)
+    # all in a square window, and a margin
+    distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()
     target = 0.5 * (low + high) @ axes
     return target + distance * toward @ axes, target
 
@@ -150,9 +148,8 @@ def add_ground(
     """A grid at `height` along `up` [m] in cells for a body of `size` [m], about `target` (3,), `far` [m] to each side."""
     axes = np.stack([across, np.cross(up, across), up], axis=1)  # the grid's x, y and normal
     at, width = target + (height - target @ up) * up, cell(size)
-    at = axes @ np.array(
-        [*(width * np.round(axes.T[:2] @ at / width)), at @ up]
-    )  # lines at multiples of the width
+    # lines at multiples of the width
+    at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ up])
     extent = 2 * width * math.ceil(far / width)
     scene.add_grid(
         "/ground",

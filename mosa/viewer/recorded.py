@@ -265,9 +265,8 @@ class Viewer:
             try:
                 pause = 1 / offered(self.rate)
                 if self.play.value:
-                    self.frame.value = (int(offered(self.frame)) + 1) % len(
-                        self.clip.times
-                    )  # draws
+                    # draws
+                    self.frame.value = (int(offered(self.frame)) + 1) % len(self.clip.times)
             except Exception:  # the page outlives whatever a message, or a picture, meets
                 logging.getLogger(__name__).exception("the viewer: a picture is left out")
 

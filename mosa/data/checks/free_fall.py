@@ -167,9 +167,8 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
         sides = [k for k in (first - 1, last) if 0 <= k < len(change) and float(change[k]) > level]
         if last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
             continue  # where it turns round it may look the same before and after
-        moved = max(
-            (float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0
-        )  # what is let go starts to fall
+        # what is let go starts to fall
+        moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)
         said = (
             f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, and an object moving "
             f"by {moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "

@@ -141,9 +141,8 @@ def check_outlines(scene: Scene, label: str) -> None:
             continue  # thinner than a voxel
         shares, islands = uncovered_and_islands(points, pitch, mattes, cameras)
         worst = max(worst, worst_uncovered(shares, cameras.names, frame, label))
-        if (
-            frame == 0 and max(islands) >= ISLAND
-        ):  # later it may splash, and drops are thinner than a voxel
+        # later it may splash, and drops are thinner than a voxel
+        if frame == 0 and max(islands) >= ISLAND:
             v = islands.index(max(islands))
             many = sum(pixels >= ISLAND for pixels in islands)
             warnings.warn(f"{label}: the matte of camera {cameras.names[v]}, frame 0, has {islands[v]} pixels apart from the "

@@ -41,9 +41,8 @@ class Tangents:
         self.K, self.rotation = scene.cameras.K.double(), scene.cameras.w2c[:, :3, :3].double()
         place = -(self.rotation.transpose(1, 2) @ scene.cameras.w2c[:, :3, 3:].double())[..., 0]
         axis = normalize(place - place[:, None], dim=2)
-        axis = torch.where(
-            torch.ones(V, V).triu()[..., None] > 0, axis, -axis
-        )  # one direction for both cameras of a pair
+        # one direction for both cameras of a pair
+        axis = torch.where(torch.ones(V, V).triu()[..., None] > 0, axis, -axis)
         self.outlines = [[outline_of(matte) for matte in mattes] for mattes in scene.mattes]
         self.angles, self.reach = (
             torch.full((V, V, T, 2), torch.nan).double(),
@@ -89,9 +88,8 @@ class Tangents:
             1
         ) * self.reach[camera, :, frame]
         known = sorted(off[off.isfinite()].tolist())
-        return (
-            known[len(known) // 2] if known else torch.inf
-        )  # of two the larger: either may fit by chance
+        # of two the larger: either may fit by chance
+        return known[len(known) // 2] if known else torch.inf
 
     def explanation(
         self, camera: int, frames: list[int], others: list[int], names: tuple[str, ...]
@@ -179,9 +177,8 @@ def check_pictures(scene: Scene, label: str) -> None:
                 + f"; or leave out the camera (scene.holdout_cameras=[{names[v]}]) or the frames (scene.frames)")  # fmt: skip
         if sure and float(row.max()) > SUSPECT:
             raise DataError(said)
-        worst = max(
-            worst, (float(row.max()) + sure, said)
-        )  # one that is explained is said first, however small
+        # one that is explained is said first, however small
+        worst = max(worst, (float(row.max()) + sure, said))
     if worst[0] > SUSPECT:
         many = int((off.amax(1) > limit).sum())
         warnings.warn(worst[1] + f" ({many} cameras have such frames)" * (many > 1), stacklevel=4)

@@ -180,9 +180,8 @@ def check_cameras(scene: Scene, label: str) -> None:
     for v, name in enumerate(cameras.names):
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
             raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
-        if (
-            (far := float(places[v].norm())) > FARTHEST and far > MAX_ORIGIN_RATIO * spread
-        ):  # else the unit is wrong, which is said below
+        # else the unit is wrong, which is said below
+        if (far := float(places[v].norm())) > FARTHEST and far > MAX_ORIGIN_RATIO * spread:
             raise DataError(
                 f"{label}: camera {name}: expected within {FARTHEST:g} m of the origin, where float32 has digits for "
                 f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids"

@@ -79,9 +79,7 @@ def load_phystwin(
         holdout_frames=holdout_frames, **world)  # fmt: skip
 
 
-def read_cameras(
-    folder: Path,
-) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[str, Path]]:
+def read_cameras(folder: Path) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[str, Path]]:
     """(calibration, folder of the body's masks) of each camera 0, 1, ..."""
     listing, poses = folder / "metadata.json", numbers_of(folder / "calibrate.pkl")
     document = read_json(listing)

@@ -131,9 +131,8 @@ def assembled(
             )
         K, coefficients, fisheye, size = cameras[number]
         w2c = np.eye(4)
-        w2c[:3, :3] = Rotation.from_quat(
-            np.roll(quaternion, -1)
-        ).as_matrix()  # COLMAP writes w first, scipy last
+        # COLMAP writes w first, scipy last
+        w2c[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
         w2c[:3, 3] = shift
         found[name] = Camera(K, w2c, size, where, coefficients, fisheye)
     if not found:

@@ -30,9 +30,8 @@ def save_glb(path: str | Path, shown: Appearance) -> Path:
     """Write Gaussians whose vertical is y, glTF's; folders are made."""
     path, splats, harmonics = Path(path), shown.splats, shown.harmonics
     shown_as = splats.colors.clamp(0, 1)
-    linear = torch.where(
-        shown_as <= 0.04045, shown_as / 12.92, ((shown_as + 0.055) / 1.055) ** 2.4
-    )  # IEC 61966-2-1
+    # IEC 61966-2-1
+    linear = torch.where(shown_as <= 0.04045, shown_as / 12.92, ((shown_as + 0.055) / 1.055) ** 2.4)
     opacities = splats.opacities.clamp(0, 1)[:, None]
     values = {
         "POSITION": splats.means,

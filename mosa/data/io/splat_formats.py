@@ -112,9 +112,8 @@ def save_usd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(
-        f"{path.stem}.{os.getpid()}.partial{path.suffix}"
-    )  # USD tells its format by the name
+    # USD tells its format by the name
+    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
     unfinished.unlink(missing_ok=True)
     stage = Usd.Stage.CreateNew(str(unfinished))
     UsdGeom.SetStageUpAxis(

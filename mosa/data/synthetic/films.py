@@ -141,11 +141,12 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
             progress=lambda frame: bar.update(),
         )  # fmt: skip
     cameras = cameras_of(body, seed)
+    # as the surface's
     paint = (
         SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1]))
         if body.remesh
         else None
-    )  # as the surface's
+    )
 
     def film_at(x: np.ndarray) -> np.ndarray:
         if not body.remesh:

@@ -160,9 +160,8 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
         K, K.new_tensor([cameras.width / 2, cameras.height, 1.0])
     )
     fall = float(ray @ up)
-    if (
-        fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height
-    ):  # a camera below the ground, or looking up
+    # a camera below the ground, or looking up
+    if fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height:
         return []
     middle = eye + (scene.ground.height - float(eye @ up)) / fall * ray
     across = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
@@ -225,9 +224,8 @@ def on_ground(
     if not lines:
         return image
     ink = np.zeros(image.shape[:2], np.uint8)
-    fixed = [
-        np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines
-    ]  # of 1/16 px
+    # of 1/16 px
+    fixed = [np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines]
     cv2.polylines(ink, fixed, False, 255, 1, cv2.LINE_AA, shift=4)
     far = np.abs(image - 255.0 * background.numpy()).max(-1)
     behind = far <= NEAR_BACKGROUND

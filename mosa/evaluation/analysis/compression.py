@@ -104,9 +104,8 @@ def press(
     stretch = (found.F_tot[:, middle] @ Q.T)[..., 2, 2].mean(1)
     strain = 1 - 0.5 * (stretch[1:] + stretch[:-1])
     area = float(volume.sum()) / HEIGHT
-    late = slice(
-        FRAMES // 4, None
-    )  # before, the plates have not reached the body: a grid contact is felt half a cell off
+    # before, the plates have not reached the body: a grid contact is felt half a cell off
+    late = slice(FRAMES // 4, None)
     powers = torch.stack([strain, strain**2], 1)[late]
     fitted = torch.linalg.lstsq(powers, (force / area)[late][:, None]).solution
     return Pressed(strain, force, float(fitted[0]))

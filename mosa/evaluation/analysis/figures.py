@@ -117,9 +117,10 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
             raise OSError(errno.EIO, "ffmpeg has ended while it wrote", str(path)) from error
         finally:
             writer.close()
+        # ffmpeg says nothing of it
         if (found := int(cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT))) != len(
             frames
-        ):  # ffmpeg says nothing of it
+        ):
             raise OSError(
                 errno.EIO,
                 f"{found} of {len(frames)} pictures are in it: is the disk full?",

@@ -136,9 +136,8 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     motion does not tell. gains: of other contacts, about the learned law, where those were asked."""
     taken = taken_of(distances)
     touches, said = (learned_on(taken, gains), [_asked(gains)]) if gains else (taken, [])
-    if touches != "sticky" and (
-        taken == "sticky" or not gains
-    ):  # only the isotropic law was asked for its friction
+    # only the isotropic law was asked for its friction
+    if touches != "sticky" and (taken == "sticky" or not gains):
         said.append(_guessed(distances, contact(touches)[0]))
     listed = ", ".join(
         f"{_words(name)} {distances[name] * 1e3:.2f} mm"

@@ -78,9 +78,8 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         parts.append(f"## {experiment.title}")
         found = read_tables(results / f"{name}.json")
         tables, provenance = found if found is not None else ({}, [])
-        known = {
-            option.name for option in experiment.axes[experiment.rows]
-        }  # results of before may have other rows
+        # results of before may have other rows
+        known = {option.name for option in experiment.axes[experiment.rows]}
         tables = {
             label: {row: cells for row, cells in rows.items() if row in known}
             for label, rows in tables.items()
@@ -282,9 +281,8 @@ def ahead_in_each(
         if not math.isfinite(mine[column].mean):
             known[column] = f"{column}: {mine[column].text(figure.decimals)}"
             continue
-        found = {
-            row: compared(mine, rows[row], column, sign) for row in others
-        }  # None: the other one diverged
+        # None: the other one diverged
+        found = {row: compared(mine, rows[row], column, sign) for row in others}
         bad = [
             row
             for row, each in found.items()

@@ -82,10 +82,8 @@ class Adapter(nn.Module, AdapterProtocol):
         return None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "_last": None,
-        }  # it holds a graph, which can be neither copied nor pickled
+        # it holds a graph, which can be neither copied nor pickled
+        return {**self.__dict__, "_last": None}
 
     def switch_on(self, reference_modulus: Tensor | float, poisson: Tensor | float = 0.3) -> None:
         """They never change afterwards: a moving unit would make dL/dE wrong and the law irreproducible from its weights."""

@@ -37,9 +37,8 @@ def _placement(dtype: torch.dtype, device: torch.device) -> Tensor:
     result = torch.zeros(3, 3, 3, 6, 6, dtype=dtype)
     for plane, components in enumerate(PLANES):
         for row, target in enumerate(components):
-            weight = (
-                1.0 if target in (XX, YY, ZZ) else 0.5
-            )  # each shear appears on two planes and is their mean
+            # each shear appears on two planes and is their mean
+            weight = 1.0 if target in (XX, YY, ZZ) else 0.5
             for column, source in enumerate(components):
                 result[plane, row, column, target, source] += weight
     return result.reshape(27, 36).to(device)
@@ -92,9 +91,8 @@ def redistribution(planes: Tensor, normal: Tensor) -> Tensor:
 
 def with_normal(T: Tensor, normal: Tensor) -> Tensor:
     """`redistribution` of a plane operator T - I (N, 6, 6)."""
-    block = torch.nn.functional.pad(
-        normal, (0, 3)
-    )  # C_xyz I, in the columns of the normal components
+    # C_xyz I, in the columns of the normal components
+    block = torch.nn.functional.pad(normal, (0, 3))
     return torch.cat([T[..., :3, :] + block + normal @ T[..., :3, :], T[..., 3:, :]], -2)
 
 

@@ -71,9 +71,8 @@ class StressAdapter(Adapter):
             "no_pre": no_pre,
             "no_post": no_post,
         }
-        bound = (
-            None if no_prior_stress else l_max
-        )  # without the prior the residuals have to carry the whole stress
+        # without the prior the residuals have to carry the whole stress
+        bound = None if no_prior_stress else l_max
         self.operator = ProgressiveOperator(
             l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape
         )

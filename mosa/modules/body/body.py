@@ -79,9 +79,8 @@ class Body(nn.Module):
         self.frozen = nn.ModuleDict(
             {"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)}
         )
-        if (
-            heterogeneity is not None
-        ):  # the prior's is what a stage that starts from it goes back to; it is never simulated
+        # the prior's is what a stage that starts from it goes back to; it is never simulated
+        if heterogeneity is not None:
             for variant in self.frozen.values():
                 variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
@@ -153,9 +152,8 @@ class Body(nn.Module):
         v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
         n = len(arm)
         F = Q.expand(n, 3, 3).contiguous()
-        far = (
-            float(start.center.detach().abs().max()) > PERIOD * self.settings.dx
-        )  # where float32 has few digits for a particle
+        # where float32 has few digits for a particle
+        far = float(start.center.detach().abs().max()) > PERIOD * self.settings.dx
         center = start.center.double() if far else start.center
         return ParticleState(
             arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F

@@ -21,10 +21,7 @@ class HeterogeneitySettings(Settings):
 
     enabled: bool = Field(True, description="learn how the stiffness varies over the body")
     amplitude: float = Field(
-        0.5,
-        gt=0,
-        lt=1,
-        description="largest relative deviation; the paper's network: 0.2",
+        0.5, gt=0, lt=1, description="largest relative deviation; the paper's network: 0.2"
     )
     kind: Literal["modes", "network"] = Field(
         "modes",
@@ -34,24 +31,12 @@ class HeterogeneitySettings(Settings):
         ),
     )
     wavelength: float = Field(
-        0.33,
-        ge=0.02,
-        le=2,
-        description="modes: the shortest wave, over the body's longest side",
+        0.33, ge=0.02, le=2, description="modes: the shortest wave, over the body's longest side"
     )
-    most: Width = Field(
-        50,
-        description="modes: number of waves, at most, the longest first",
-    )
-    hidden: Width = Field(
-        32,
-        description="network: width of its layers",
-    )
+    most: Width = Field(50, description="modes: number of waves, at most, the longest first")
+    hidden: Width = Field(32, description="network: width of its layers")
     frequencies: int = Field(
-        2,
-        ge=0,
-        le=32,
-        description="network: sines and cosines of pi 2^k x that it reads beside x",
+        2, ge=0, le=32, description="network: sines and cosines of pi 2^k x that it reads beside x"
     )
 
 

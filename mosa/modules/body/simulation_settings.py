@@ -45,8 +45,7 @@ class TimeStepping(Settings):
         Field(32, description="bits of the simulation's numbers")
     )
     contact_offset: bool = Field(
-        True,
-        description="learn the height [m] above the ground at which the grid stops the body",
+        True, description="learn the height [m] above the ground at which the grid stops the body"
     )
 
     def strides(self, least: int) -> int:

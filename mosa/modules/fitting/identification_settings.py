@@ -77,8 +77,7 @@ class IdentificationSettings(Settings):
     )
     smoothness: Weight = Field(1.0, description="exponent of this fall")
     evidence: bool = Field(
-        True,
-        description="find both prior standard deviations from the data (MacKay)",
+        True, description="find both prior standard deviations from the data (MacKay)"
     )
     known: Text | None = Field(
         None,
@@ -136,8 +135,7 @@ class LossWeights(Settings):
         ),
     )
     operator_variance: Weight = Field(
-        0.0,
-        description="not in the paper: variance of the operator over particles and states",
+        0.0, description="not in the paper: variance of the operator over particles and states"
     )
 
     def weights(self) -> dict[str, Any]:

@@ -75,9 +75,8 @@ class _Polar(torch.autograd.Function):
         M = trace * torch.eye(3, dtype=F.dtype, device=F.device) - 0.5 * (W + W.mT)
         cofactor = cofactors(M)
         det = (M[..., 0, :] * cofactor[..., 0, :]).sum(-1)
-        omega = (cofactor @ axial(R.mT @ seed)[..., None])[..., 0] / det[
-            ..., None
-        ]  # M is symmetric
+        # M is symmetric
+        omega = (cofactor @ axial(R.mT @ seed)[..., None])[..., 0] / det[..., None]
         return R @ skew(omega)
 
 
@@ -97,13 +96,11 @@ def rotation_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, start: Tensor) -> 
     F_tot, cue: (T, N, 3, 3), frame 0 first; weight: (T, N); start: Q (3, 3), the rotation the sequence started with.
     Frame 0 and inverted particles have no weight.
     """
-    positive = ~(
-        torch.linalg.det(F_tot.detach()) <= FLAT
-    )  # a NaN stays in, so that the loss shows it
+    # a NaN stays in, so that the loss shows it
+    positive = ~(torch.linalg.det(F_tot.detach()) <= FLAT)
     eye = torch.eye(3, dtype=F_tot.dtype, device=F_tot.device)
-    R = polar_rotation(
-        torch.where(positive[..., None, None], F_tot, eye)
-    )  # replaced before, or 0 x NaN would pass through
+    # replaced before, or 0 x NaN would pass through
+    R = polar_rotation(torch.where(positive[..., None, None], F_tot, eye))
     squared = (cue - R @ start.mT.to(R)).square().sum((-1, -2))
     return weighted_mean(squared[1:], (weight * positive)[1:])
 

@@ -87,9 +87,8 @@ def patterns(found: list[Fields]) -> float:
     counts = []
     for each in found:
         field = each.position.flatten(1).double()
-        field = field / field.norm(dim=1, keepdim=True).clamp(
-            min=1e-12
-        )  # as the noise weighs the frames
+        # as the noise weighs the frames
+        field = field / field.norm(dim=1, keepdim=True).clamp(min=1e-12)
         gram = field @ field.T
         counts.append(float(gram.trace() ** 2 / gram.square().sum()))
     return sum(counts) / len(counts)

@@ -39,14 +39,11 @@ class StageSettings(Settings):
     )
     iterations: Whole = Field(description="steps of Adam; 0 leaves the stage out")
     lr: Weight = Field(
-        description="Adam's rate, on the logarithms and logits of the global parameters",
+        description="Adam's rate, on the logarithms and logits of the global parameters"
     )
     lr_networks: Weight = Field(0.0, description="Adam's rate of the heterogeneity field")
     lr_adapter: Weight = Field(0.0, description="Adam's rate of the adapter")
-    lr_contact: Weight = Field(
-        0.0,
-        description="Adam's rate of the contact offset [cells]",
-    )
+    lr_contact: Weight = Field(0.0, description="Adam's rate of the contact offset [cells]")
     converged: Weight = Field(
         0.0,
         description=(
@@ -162,10 +159,7 @@ class FitSection(Settings):
     needs: ClassVar[dict[str, str]] = {"views clip": "adam"}
 
     views: Count = Field(2, description="Adam: cameras that a step renders")
-    clip: Positive = Field(
-        1.0,
-        description="Adam: bound of the gradient norm of the networks",
-    )
+    clip: Positive = Field(1.0, description="Adam: bound of the gradient norm of the networks")
     prior: StageSettings = Field(
         StageSettings(
             newton_iterations=8, looks=3, iterations=40, lr=0.1, lr_contact=0.03, converged=1e-3

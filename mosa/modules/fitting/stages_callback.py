@@ -37,9 +37,8 @@ class Stages(Checkpoint):
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int
     ) -> None:
-        if (
-            pl_module.stage_over and batch_idx == 0
-        ):  # of a checkpoint that was written before the stage was ended
+        # of a checkpoint that was written before the stage was ended
+        if pl_module.stage_over and batch_idx == 0:
             self.advance(trainer, pl_module)
         if (
             pl_module.stage is not None

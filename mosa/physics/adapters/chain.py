@@ -93,9 +93,8 @@ class Chain:
         }  # fmt: skip
         self.light: Workspace | None = None
         self.full: Workspace | None = None
-        self.statistics: dict[
-            bool, tuple[Tensor, ...]
-        ] = {}  # in light and in full buffers: each graph has its own
+        # in light and in full buffers: each graph has its own
+        self.statistics: dict[bool, tuple[Tensor, ...]] = {}
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
         failing = f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured"
@@ -229,9 +228,8 @@ class Chain:
 
         learned: of the adapter as it is now."""
         for each in (self.light, self.full):
-            if (
-                each is not None
-            ):  # this pass uses one, the other may have had those of an earlier one
+            # this pass uses one, the other may have had those of an earlier one
+            if each is not None:
                 each.cutoff, each.steps = work.cutoff, work.steps
         self.learned = learned
         # not their sizes: buffers may come back to an earlier one
@@ -240,10 +238,8 @@ class Chain:
         )
         held, read = (buffers, work.cutoff), (*learned.tensors, *learned.weights)
         if held != self._held or not same_memory(self._read, read):
-            self._held, self._read = (
-                held,
-                [t.detach() for t in read],
-            )  # aliases, which belong to no graph
+            # aliases, which belong to no graph
+            self._held, self._read = (held, [t.detach() for t in read])
             self._graphs.drop()
 
     def play(self, steps: Steps, name: str, *arguments) -> None:
@@ -306,9 +302,8 @@ class ChainOfSegments(Stretch):
         self, work: Workspace, acting: Sequence[Tensor], again: bool, penalised: bool
     ) -> None:
         weights, tensors = tuple(acting[1:]), tensors_of(self.chain.adapter)
-        self.chain.follow(
-            work, Learned(self.learned.names, weights, tensors)
-        )  # another rollout may have gone forward since
+        # another rollout may have gone forward since
+        self.chain.follow(work, Learned(self.learned.names, weights, tensors))
         self.chain.play(work.steps, "adjoint", self.chain.again if again else "tape", penalised)
 
     def adjoint_of(self, work: Workspace, acting: Sequence[Tensor]) -> list[Tensor | None]:

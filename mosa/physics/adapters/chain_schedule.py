@@ -111,15 +111,7 @@ class Chains:
         self, lengths: tuple[int, ...], state: State, graphs: bool, learned: Learned
     ) -> Chain:
         chains, n, worlds = self.lanes.buffers.chains, len(self.packed), self.lanes.worlds
-        key = (
-            self.adapter,
-            n,
-            worlds,
-            lengths,
-            self.collects,
-            graphs,
-            learned.names,
-        )
+        key = (self.adapter, n, worlds, lengths, self.collects, graphs, learned.names)
         chain = chains.pop(key, None)
         if chain is None:
             while len(chains) >= MAX_CHAINS:
@@ -143,9 +135,8 @@ class Chains:
                     t.detach().requires_grad_() for t in (state.F, state.C_affine, self.packed)
                 ]
                 answer, held = self.ask(self.adapter, *leaves), 0
-                if (
-                    device.type == "cuda"
-                ):  # the second one's: an adapter may hold its last graph, and frees it with the next
+                # the second one's: an adapter may hold its last graph, and frees it with the next
+                if device.type == "cuda":
                     held = torch.cuda.memory_allocated(device)
                     second = self.ask(self.adapter, *leaves)
                     held = torch.cuda.memory_allocated(device) - held

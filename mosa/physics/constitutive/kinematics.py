@@ -179,9 +179,8 @@ def polar_value(F: wp.mat33d):
                 x = wp.sqrt(wp.ddot(X, X))
                 y = wp.sqrt(wp.dot(bc, bc) + wp.dot(ca, ca) + wp.dot(ab, ab))
                 if y > wp.float64(1.0e-5) * x * x and d * x * x * x > -wp.float64(0.1) * y * y * y:
-                    e = (
-                        _ONE / x
-                    )  # all singular values are positive after the step: y/x is about the second one
+                    # all singular values are positive after the step: y/x is about the second one
+                    e = _ONE / x
                     f = _ONE / y
                 else:
                     step = 20

@@ -76,9 +76,8 @@ class Lanes:
                 self.buffers.give_back(pool)
 
         count = len(self.solvers)
-        if (
-            count == 1 or self.solvers[0].volume.is_cuda
-        ):  # in turns: while one captures a graph no other may touch the stream
+        # in turns: while one captures a graph no other may touch the stream
+        if count == 1 or self.solvers[0].volume.is_cuda:
             return [run(index) for index in range(count)]
         if kind in self.buffers.ran:
             return list(threaded(run, range(count)))

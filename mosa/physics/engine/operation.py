@@ -226,9 +226,8 @@ class _Advance(torch.autograd.Function):
         state, others = _detached(inputs[:STATES]), inputs[STATES:]
         final, more, ctx.kept = stretch.forward(state, others, True)
         ctx.stretch, ctx.own = stretch, STATES if stretch.plastic else STATES - 1
-        ctx.save_for_backward(
-            *state, *others
-        )  # weights too: autograd tells if one is changed before the backward pass
+        # weights too: autograd tells if one is changed before the backward pass
+        ctx.save_for_backward(*state, *others)
         return *final[: ctx.own], *more
 
     @staticmethod

@@ -216,9 +216,8 @@ class Workspace:
         if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
             self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL)))
         if self._placed is None or not np.array_equal(rows, self._placed):
-            self.window.copy_(
-                torch.from_numpy(rows).flatten(0, 1), non_blocking=True
-            )  # CUDA stages it before it returns
+            # CUDA stages it before it returns
+            self.window.copy_(torch.from_numpy(rows).flatten(0, 1), non_blocking=True)
             self._placed, self.nodes = rows, nodes
         self._given = origins, dims
 

@@ -50,9 +50,8 @@ def grid_window(
     x, v: (..., N, 3); bounds: their extent, where the host has it already; name: of a world, for messages. Errors:
     SimulationDiverged for non-finite input or particles of a world spread over more than 2^23 nodes.
     """
-    bounds = (
-        extent(x, v).numpy(force=True) if bounds is None else bounds
-    )  # the only transfer to the host
+    # the only transfer to the host
+    bounds = extent(x, v).numpy(force=True) if bounds is None else bounds
     rows = np.reshape(bounds, (-1, 12))
     if not np.isfinite(rows).all():
         world = int((~np.isfinite(rows)).any(1).nonzero()[0][0])
@@ -81,9 +80,8 @@ def window_of(
     """As `grid_window`, of extents (..., 12) and of any size, in float64; time: one, or some that broadcast with (..., 1)."""
     bounds = np.asarray(bounds, dtype=np.float64)
     speeds = _OUTWARDS * bounds[..., 6:]
-    turned = TURNED * np.abs(speeds).max(
-        -1, keepdims=True
-    )  # by the largest component of a velocity
+    # by the largest component of a velocity
+    turned = TURNED * np.abs(speeds).max(-1, keepdims=True)
     ahead = np.ceil(np.maximum(GAINED * speeds, turned) * time / dx) + margin
     cells = np.floor(bounds[..., :6] / dx - 0.5)
     low, high = cells[..., :3] - ahead[..., :3], cells[..., 3:] + 2 + ahead[..., 3:]

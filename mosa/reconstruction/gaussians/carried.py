@@ -141,9 +141,8 @@ def fit_carried(
         batch = windows.select(chosen.to(windows.frame.device))
         A, turn = carried.gradients[batch.frame], carried.rotations[batch.frame]
         means = carried.means[batch.frame] + (A @ gaussians.shift[..., None])[..., 0]
-        directions = (means.detach() - eyes[chosen][:, None])[
-            ..., None, :
-        ] @ turn  # seen from the body: R^T d
+        # seen from the body: R^T d
+        directions = (means.detach() - eyes[chosen][:, None])[..., None, :] @ turn
         colors = (
             colors_in(gaussians.harmonics, directions[..., 0, :])
             * (turns[batch.frame] @ gaussians.light).exp()[..., None]

@@ -274,10 +274,8 @@ def surface_information(
     where."""
     width, total = pixel_width(distance, frames[0]), torch.zeros_like(distance.values)
     _, radius = span(distance)
-    patch, shape = (
-        0.5 * settings.patch,
-        tuple(distance.values.shape),
-    )  # half: nothing is said of what lies far from a rim
+    # half: nothing is said of what lies far from a rim
+    patch, shape = (0.5 * settings.patch, tuple(distance.values.shape))
     area = 2 * math.pi * patch**2
     for views in frames:
         group = _group(views)

@@ -127,9 +127,8 @@ def solid_of(
             "solid: expected Gaussians that enclose something, found none opaque enough; is the object cut out of its "
             "surroundings, and what is its opacity?"
         )
-    depth = (
-        ndimage.distance_transform_edt(inside) - 0.5
-    ) * pitch  # the surface lies half a voxel outside of the outermost centres
+    # the surface lies half a voxel outside of the outermost centres
+    depth = (ndimage.distance_transform_edt(inside) - 0.5) * pitch
     centres = ndimage.map_coordinates(
         depth, ((splats.means - origin) / pitch).T.double().numpy(), order=1
     )

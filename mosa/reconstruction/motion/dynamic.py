@@ -131,9 +131,8 @@ class Objective:
                 c if self.predicted is None else c - self.predicted.coefficients[frames]
             ) / self.motion.reach
             curvature = (self.scaffold.modes.energy[:, None] * c**2).sum((-2, -1))
-            if (
-                self.refining and settings.bending_scale > 0
-            ):  # what a frame shows sets its own weight
+            # what a frame shows sets its own weight
+            if self.refining and settings.bending_scale > 0:
                 curvature = settings.bending_scale * torch.log1p(curvature / settings.bending_scale)
             loss = loss + settings.bending * curvature.mean()
         return loss

@@ -17,12 +17,7 @@ from torch import Tensor
 
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
 from mosa.reconstruction.motion.cues import polar
-from mosa.reconstruction.motion.dynamic import (
-    Objective,
-    Predicted,
-    Scaffold,
-    minimise,
-)
+from mosa.reconstruction.motion.dynamic import Objective, Predicted, Scaffold, minimise
 from mosa.reconstruction.motion.modes import coefficients_of
 from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.motion.observed import Windows

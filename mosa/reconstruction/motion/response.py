@@ -124,9 +124,8 @@ def image_matrices(
 
     def some_of(colour: Tensor, alpha: Tensor) -> Tensor:
         values = torch.cat([colour, alpha[..., None]], -1).flatten(1)
-        return values[
-            :, :: 2 * (values.shape[1] // (2 * VALUES)) + 1
-        ]  # an odd step meets all four channels
+        # an odd step meets all four channels
+        return values[:, :: 2 * (values.shape[1] // (2 * VALUES)) + 1]
 
     for frame in range(1, len(offsets)):
         at = torch.tensor([frame], device=device)

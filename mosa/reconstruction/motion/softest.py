@@ -99,9 +99,8 @@ def softest_vectors(
         return None
     A = _on(matrix, known, torch.float64)
     high = 1.1 * largest_eigenvalue(A)
-    limit = (
-        count + 2 * (last - count) // 3
-    )  # the very last ones converge slowest: what lies above is suppressed
+    # the very last ones converge slowest: what lies above is suppressed
+    limit = count + 2 * (last - count) // 3
     X = cosines(points.double(), last)
     for _ in range(MOST_FILTERS):
         X, _ = torch.linalg.qr(X - known @ (known.T @ X))

@@ -101,9 +101,8 @@ def follow_rigidly(
             residual = found[:, :4] - wanted
             slope = torch.stack([found[:, 4:8] * K[0, 0], found[:, 8:12] * K[1, 1]], -1)
             depth = -(slope * flat[:, None]).sum(-1, keepdim=True)
-            pull = (
-                torch.cat([slope, depth], -1) / seen[:, 2:, None] @ w2c[:3, :3]
-            )  # (N, 4, 3) by a shift of the point
+            # (N, 4, 3) by a shift of the point
+            pull = torch.cat([slope, depth], -1) / seen[:, 2:, None] @ w2c[:3, :3]
             arm = moved - motion.centre - motion.shift
             turned = torch.linalg.cross(arm[:, None].expand_as(pull), pull) / radius
             J = torch.cat([pull, turned], -1)

@@ -206,9 +206,7 @@ def searched(
             center = matte_centres(mattes[:, None], cameras, size * area**0.5)[0]
         begin = size
     found = Similarities(
-        spread_rotations(ROTATIONS),
-        center.expand(ROTATIONS, 3),
-        torch.full((ROTATIONS,), begin),
+        spread_rotations(ROTATIONS), center.expand(ROTATIONS, 3), torch.full((ROTATIONS,), begin)
     )
     for count, iterations, keep in ((24, 3, 96), (40, 6, 32), (80, 10, 12)):
         found, cost = fitted(solid, found, rays.some(count), iterations, sized=sized)

@@ -238,9 +238,8 @@ def register_pose(
     at about 56 px, the best at full resolution with all views. Errors: DataError where fewer than two views see the
     object.
     """
-    middle = splats.means.detach().mean(
-        0
-    )  # about which the body turns while searching, wherever X_c is
+    # about which the body turns while searching, wherever X_c is
+    middle = splats.means.detach().mean(0)
     body = RigidBody.of(splats, middle, normals)
     background = background.to(body.arm)
     images, mattes = images[:, None].to(body.arm), mattes[:, None].to(body.arm)

@@ -61,9 +61,8 @@ def first_contact(body: RestShape, start: Start, scene: Scene) -> int:
     """Index of the first frame after first contact: given by the scene, or where free flight would have touched the ground."""
     if scene.last_free_frame is not None:
         return min(scene.last_free_frame + 1, scene.frames - 1)
-    surface = 0.5 * float(body.volume.mean()) ** (
-        1 / 3
-    )  # particles lie half a spacing below the surface
+    # particles lie half a spacing below the surface
+    surface = 0.5 * float(body.volume.mean()) ** (1 / 3)
     for t, time in enumerate((scene.times - scene.times[0]).tolist()):
         if t > 0 and lowest(body, start, scene, time) < surface:
             return t

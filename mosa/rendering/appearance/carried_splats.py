@@ -117,9 +117,10 @@ class Seen:
                 colors = colors_in(self.harmonics, torch.ones_like(self.means[:1]))
             else:
                 lines = self.means - camera_centers(camera).to(self.means)
+                # R^T d
                 colors = colors_in(
                     self.harmonics, (lines[..., None, :] @ self.rotations)[..., 0, :]
-                )  # R^T d
+                )
             if self.shades is not None:
                 colors = colors * self.shades[..., None]
             found.append(

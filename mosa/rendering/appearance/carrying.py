@@ -80,9 +80,8 @@ class Binding:
         means, gradients = map(torch.stack, zip(*bound.states(positions)))
         with torch.no_grad():
             U, s, Vh = torch.linalg.svd(gradients)
-            proper = torch.linalg.det(
-                U @ Vh
-            ).sign()  # the smallest axis is the one that an inverted neighbourhood turned over
+            # the smallest axis is the one that an inverted neighbourhood turned over
+            proper = torch.linalg.det(U @ Vh).sign()
             rotations = torch.cat((U[..., :2], U[..., 2:] * proper[..., None, None]), -1) @ Vh
             far = s[..., 0] > STRETCH_LIMIT
         if bool(far.any()):

@@ -81,11 +81,7 @@ def adjoint(gt, extra, r, N, M, row: tl.constexpr, EXTRA: tl.constexpr, value):
 
 @triton.jit
 def components(v, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
-    return (
-        tl.load(v + plane * M + r),
-        tl.load(v + c1 * M + r),
-        tl.load(v + c2 * M + r),
-    )
+    return (tl.load(v + plane * M + r), tl.load(v + c1 * M + r), tl.load(v + c2 * M + r))
 
 
 @triton.jit

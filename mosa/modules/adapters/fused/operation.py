@@ -77,9 +77,8 @@ class _Launch:
 
     def __init__(self, settings: Settings, n: int, hidden: int, device: torch.device) -> None:
         self.n, self.hidden, self.device = n, hidden, device
-        self.rows = (
-            -(-(n + 1) // LANES) * LANES
-        )  # the particles, the state at rest, and as many more of these as fill the last one
+        # the particles, the state at rest, and as many more of these as fill the last one
+        self.rows = -(-(n + 1) // LANES) * LANES
         self.lanes = (self.rows // LANES,)
         precision = settings.precision
         # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
@@ -250,9 +249,8 @@ def _backward(
     n, m, hidden = launch.n, launch.rows, launch.hidden
     grid, size = launch.backward(wanted)
     inside = size["SUMS"] == "inside"
-    h1, h2, g1, g2 = (
-        w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4)
-    )  # of one network after the other
+    # of one network after the other
+    h1, h2, g1, g2 = (w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4))
     scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
     flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
     programs = grid[0] if inside else launch.programs(BLOCK, 1)
