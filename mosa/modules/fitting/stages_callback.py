@@ -77,10 +77,8 @@ class Stages(Checkpoint):
     @staticmethod
     def announce(trainer: L.Trainer, pl_module: Any) -> None:
         """Tells the training data what the next epoch is."""
-        epochs, stage = (
-            getattr(getattr(trainer, "datamodule", None), "epochs", None),
-            pl_module.stage,
-        )
+        epochs = getattr(getattr(trainer, "datamodule", None), "epochs", None)
+        stage = pl_module.stage
         if isinstance(epochs, Epochs) and stage is not None:
             done = len(pl_module.losses)
             epochs.begin(

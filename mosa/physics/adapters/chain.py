@@ -78,13 +78,11 @@ class Chain:
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int, worlds: int,
         lengths: Sequence[int], *, learned: Learned, plastic_adapted: bool, collects: bool, graphs: bool,
     ) -> None:  # fmt: skip
-        self.numerics, self.adapter, self.ask, self.lengths, self.collects = (
-            numerics,
-            adapter,
-            ask,
-            tuple(lengths),
-            collects,
-        )
+        self.numerics = numerics
+        self.adapter = adapter
+        self.ask = ask
+        self.lengths = tuple(lengths)
+        self.collects = collects
         self.substeps = sum(lengths)
         self.learned = learned
         self._shape = {

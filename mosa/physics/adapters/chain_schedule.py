@@ -47,13 +47,11 @@ class Chains:
         packed: Tensor,
         collects: bool,
     ) -> None:
-        self.lanes, self.adapter, self.ask, self.packed, self.collects = (
-            lanes,
-            adapter,
-            ask,
-            packed,
-            collects,
-        )
+        self.lanes = lanes
+        self.adapter = adapter
+        self.ask = ask
+        self.packed = packed
+        self.collects = collects
         self.numerics = lanes.numerics
 
     def plan(self, state: State, substeps: int, stride: int, wanted: bool) -> Plan:

@@ -82,10 +82,8 @@ def stress_kernel(
     """
     field33, field6, field66, fieldp = field_types(scalar)
     energetic = adapted and strain is not None
-    own, needs_rotation = (
-        particle_access(scalar, SLOTS),
-        uses_rotation or (adapted and not energetic),
-    )
+    own = particle_access(scalar, SLOTS)
+    needs_rotation = uses_rotation or (adapted and not energetic)
     factorised, measure = strain in FACTORISED, STRAINS.index(strain) if energetic else 0
 
     @wp.kernel(module="unique")

@@ -21,13 +21,11 @@ def update_kernels(scalar) -> SimpleNamespace:
     collide, adj_collide = make_plane_functions(scalar)
     fade, slowness = make_fade(scalar), make_slowness(scalar)
     memory, nodes = node_access(scalar), node_functions(scalar)
-    load3, load4, store3, store4, clear = (
-        memory.load3,
-        memory.load4,
-        memory.store3,
-        memory.store4,
-        memory.clear,
-    )
+    load3 = memory.load3
+    load4 = memory.load4
+    store3 = memory.store3
+    store4 = memory.store4
+    clear = memory.clear
     node_position, nodes_of = nodes.node_position, nodes.nodes_of
     module = f"mosa.physics.grid_update_{scalar.__name__}"
 

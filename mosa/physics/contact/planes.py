@@ -73,10 +73,8 @@ def pack_planes(
 
     Errors: ConfigError naming the plane and the field.
     """
-    values, modes = (
-        torch.zeros(max(len(planes), 1), 6, dtype=torch.float64),
-        torch.zeros(max(len(planes), 1)).int(),
-    )
+    values = torch.zeros(max(len(planes), 1), 6, dtype=torch.float64)
+    modes = torch.zeros(max(len(planes), 1)).int()
     for i, plane in enumerate(planes):
         if plane.mode not in MODES:
             raise ConfigError(

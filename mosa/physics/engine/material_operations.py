@@ -78,10 +78,8 @@ class _MaterialState(torch.autograd.Function):
     def backward(ctx, *seeds):
         # the adjoint leaves the outputs alone and only reads the seeds: Warp clears only those that are the grad of an array
         inputs, seeds = list(ctx.saved_tensors), [*seeds] + [None] * (not ctx.plastic)
-        gradients, blank = (
-            _zeros(inputs) if ctx.into is None else ctx.into,
-            inputs[0].new_empty(1, 6),
-        )
+        gradients = _zeros(inputs) if ctx.into is None else ctx.into
+        blank = inputs[0].new_empty(1, 6)
         with warp_stream(blank.device):
             arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
             adjoints = [*_targets(gradients, ctx.kinds), *_arrays(seeds, ctx.kinds[3:])]

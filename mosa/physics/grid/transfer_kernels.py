@@ -35,26 +35,20 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
-    memory, stencil, nodes_of = (
-        node_access(scalar),
-        stencil_functions(scalar),
-        node_functions(scalar).nodes_of,
-    )
+    memory = node_access(scalar)
+    stencil = stencil_functions(scalar)
+    nodes_of = node_functions(scalar).nodes_of
     load3, load4, clear_node = memory.load3, memory.load4, memory.clear
     adding = exact_node_access(scalar) if exact else memory
-    pair, add3, add4, settle_node = (
-        adding.pair,
-        adding.add3,
-        adding.add4,
-        exact_node_access(scalar).settle_node,
-    )
+    pair = adding.pair
+    add3 = adding.add3
+    add4 = adding.add4
+    settle_node = exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
-    spline, spline_slope, cell, local_cell = (
-        stencil.spline,
-        stencil.spline_slope,
-        stencil.cell,
-        stencil.local_cell,
-    )
+    spline = stencil.spline
+    spline_slope = stencil.spline_slope
+    cell = stencil.cell
+    local_cell = stencil.local_cell
     window_row = stencil.window_row
     module = f"mosa.physics.{'exact_' if exact else ''}transfers_{scalar.__name__}"
 

@@ -31,10 +31,8 @@ def extent(x: Tensor, v: Tensor) -> Tensor:
 
 def fallen(bounds: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
     """`extent` (..., 12) with the velocities of bodies that gravity (..., 3) [m/s^2] pulls on for `time` seconds."""
-    bounds, gained = (
-        np.array(bounds, dtype=np.float64),
-        np.asarray(gravity, dtype=np.float64) * time,
-    )
+    bounds = np.array(bounds, dtype=np.float64)
+    gained = np.asarray(gravity, dtype=np.float64) * time
     bounds[..., 6:9] += np.minimum(gained, 0.0)
     bounds[..., 9:] += np.maximum(gained, 0.0)
     return bounds

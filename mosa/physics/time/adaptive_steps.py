@@ -100,10 +100,8 @@ class StepChooser:
         self.rest_modulus = law.wave_modulus(values).expand(n)
         self.viscosity = law.explicit_viscosity(values).expand(n)
         # what the frame itself can add to the speeds at its start
-        self.fall, self.collider_speed = (
-            math.hypot(*numerics.gravity) * self.frame_dt,
-            collider_speed,
-        )
+        self.fall = math.hypot(*numerics.gravity) * self.frame_dt
+        self.collider_speed = collider_speed
 
     @torch.no_grad()
     def choose(self, frame: int, state: State, collider_speed: float | None = None) -> int:
