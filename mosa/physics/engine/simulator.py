@@ -25,7 +25,7 @@ from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, reach
 from mosa.physics.contact.driven import Held, hold, stack_held
-from mosa.physics.contact.motion import Points, sample_frame, sample_poses
+from mosa.physics.contact.motion import Points
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.axes import Axes, ends_of, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
@@ -49,7 +49,7 @@ from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.engine.stepping import Prepared, Stepper
 from mosa.physics.launching import SCALARS
 from mosa.physics.time.adaptive_steps import StepChooser, check_counts
-from mosa.physics.time.clock import Adaptive, Clock, Frame, Moment, Replay
+from mosa.physics.time.clock import Adaptive, Clock, Moment, Replay
 from mosa.physics.time.time_step import MOST_SUBSTEPS
 from mosa.settings import Count, Expected, Number, Positive, Text, shown, such, typed
 from mosa.system.limits import counted, named_device
@@ -238,7 +238,7 @@ class Simulator:
         asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held,
                        frames, collect, start_time)  # fmt: skip
         stepper, start = self._stepper(state, asked)
-        poses, all_known = self._poses(stepper, frames, start_time, isinstance(timing, Replay))
+        poses, all_known = stepper.poses_of(frames, start_time, isinstance(timing, Replay))
         prepared, moment, varies = stepper.prepared, start, stepper.clock.varies
         current, frame = stepper.enter(start, not started)
         recorded = [flat(start.state)]
@@ -378,32 +378,6 @@ class Simulator:
             self.numerics, planes=planes.to(self.device, self.dtype), low=low, high=high
         )
         self._axes, self.buffers = replace(self._axes, shift=shift), Buffers()
-
-    def _poses(
-        self, stepper: Stepper, frames: int, start_time: float, replayed: bool
-    ) -> tuple[Callable[[int, Frame], tuple[Tensor, ...]], tuple[Tensor, ...]]:
-        """(what tells those of the colliders in a frame interval, all of them where these are known beforehand)."""
-        each = stepper.motions
-        if not self.colliders:
-            return lambda *_: (), ()
-        if stepper.clock.varies:
-
-            def chosen(number: int, frame: Frame) -> tuple[Tensor, ...]:
-                sampled = sample_frame(each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time,
-                                       replayed)  # fmt: skip
-                led = stepper.led(frame.count, frame.dt, start_time + number * self.frame_dt)
-                return (*stepper.taken(sampled, frame.dt), *led)
-
-            return chosen, ()
-        found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time) for own in each]
-        found = stepper.taken(
-            tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)),
-            self.dt,
-        )
-        found = (*found, *stepper.led((frames - 1) * self.substeps, self.dt, start_time))
-        return lambda _, frame: tuple(
-            part[frame.first : frame.first + frame.count] for part in found
-        ), found
 
     def _prepare(
         self, state: ParticleState, asked: _Asked, worlds: int | None, gravities: Sequence[tuple] | None, held: Held | None

@@ -20,7 +20,7 @@ from mosa.physics.adapters.chain_schedule import SEGMENT, Chains
 from mosa.physics.adapters.interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.driven import sample_paths
-from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
+from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_frame, sample_poses
 from mosa.physics.engine.axes import Axes
 from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.lanes import Lanes
@@ -338,6 +338,35 @@ class Stepper:
         poses = self.taken(poses, frame.dt)
         poses = poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
         return (*poses, *self._paths(moment, frame))
+
+    def poses_of(
+        self, frames: int, start: float, replayed: bool
+    ) -> tuple[Callable[[int, Frame], tuple[Tensor, ...]], tuple[Tensor, ...]]:
+        """(what tells those of a rollout's frame intervals, all of them where these are known beforehand). start [s]: of the
+        motions; replayed: whether counts of substeps were given."""
+        clock, each = self.clock, self.motions
+        if not self.solids:
+            return lambda *_: (), ()
+        if clock.varies:
+
+            def chosen(number: int, frame: Frame) -> tuple[Tensor, ...]:
+                sampled = sample_frame(each[0], number, frames - 1, frame.first, frame.count, clock.frame_dt, start,
+                                       replayed)  # fmt: skip
+                led = self.led(frame.count, frame.dt, start + number * clock.frame_dt)
+                return (*self.taken(sampled, frame.dt), *led)
+
+            return chosen, ()
+        sampled = [sample_poses(own, frames - 1, clock.count, clock.dt, start) for own in each]
+        joined = tuple(
+            torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*sampled)
+        )
+        found = (
+            *self.taken(joined, clock.dt),
+            *self.led((frames - 1) * clock.count, clock.dt, start),
+        )
+        return lambda _, frame: tuple(
+            t[frame.first : frame.first + frame.count] for t in found
+        ), found
 
     def _paths(self, moment: Moment, frame: Frame) -> tuple[Tensor, ...]:
         """(S, W P, 3) each: paths and rates of the points that lead driven particles, () where
