@@ -15,7 +15,7 @@ from pydantic_core import PydanticUndefined
 
 from mosa.config.composition import configuration
 from mosa.config.leaf_settings import COMMANDS
-from mosa.settings import Settings, annotation_of, described, model_in
+from mosa.settings import Settings, annotation_of, described, model_in, nearest
 
 HEAD = """# Configuration
 
@@ -140,11 +140,19 @@ def main(words: list[str]) -> None:
         sys.exit(2)
     beside = (*arguments(), *of_scenes()) if words[0] == "train" else ()
     found = [*rows(COMMANDS[words[0]], None), *beside]
-    for key, default, kind, about in found:
-        if len(words) == 1 or f"{key}.".startswith(f"{words[1]}."):
-            print(
-                f"{key}{f' = {default}' if default else ''}\n    {about}{f' ({kind})' if kind else ''}"
-            )
+    asked = [row for row in found if len(words) == 1 or f"{row[0]}.".startswith(f"{words[1]}.")]
+    for key, default, kind, about in asked:
+        print(
+            f"{key}{f' = {default}' if default else ''}\n    {about}{f' ({kind})' if kind else ''}"
+        )
+    if not asked:
+        known = [row[0] for row in found]
+        print(
+            f"{words[1]}: no key of {words[0]} by itself{nearest(words[1], known, '')}; "
+            f"python -m mosa.config.reference {words[0]} lists all",
+            file=sys.stderr,
+        )
+        sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from mosa.errors import ConfigError, DataError
+from mosa.training.sweep_table import seconds
 
 PLOTS = ("bars", "lines", "map", None)
 SPECIFICATIONS = Path(__file__).with_name("specifications")
@@ -364,9 +365,7 @@ def minutes_taken(job: Job) -> float | None:
             return float(measured.read_text())
         except ValueError:  # killed while it was written
             pass
-    figures = figures_of(job)
-    return sum(value for key, value in figures.items() if key.startswith("time/") and key.endswith("_s") and key.count("_") == 1
-               and isinstance(value, (int, float))) / 60  # fmt: skip
+    return seconds(figures_of(job)) / 60
 
 
 def commit_of(job: Job) -> str | None:

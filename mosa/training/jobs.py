@@ -233,6 +233,11 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
             run()
         except SystemExit as ended:
             if ended.code == 1 and not begun:
+                print(
+                    "`+` adds parameters of laws and options of adapters alone; all keys: "
+                    "python -m mosa.config.reference <command> [KEY]",
+                    file=sys.stderr,
+                )
                 sys.exit(2)
             raise
         except KeyboardInterrupt:  # between jobs, or before the first

@@ -12,7 +12,13 @@ from torch import Tensor
 from mosa import __version__
 from mosa.data.io.gaussian_ply import save_ply
 from mosa.data.synthetic.true_geometry import geometry_figures
-from mosa.evaluation.analysis.comparison import TITLES, compare, write_comparisons
+from mosa.evaluation.analysis.comparison import (
+    TITLES,
+    compare,
+    distances,
+    error_limit,
+    write_comparisons,
+)
 from mosa.evaluation.analysis.marker_figures import write_markers
 from mosa.evaluation.analysis.tables import (
     columns_text,
@@ -128,7 +134,11 @@ def write_outputs(
         simulated = [s for s in evaluated if TITLES.keys() & kept[s.prefix].keys()]
         shown = [s for s in simulated if s.prefix.startswith("test")] or simulated[:1]
         if shown:
-            write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
+            far = (distances(body, s.scene, kept[s.prefix]).values() for s in shown)
+            limit = error_limit(d for each in far for d in each)
+            write_comparisons(
+                folder, {s.prefix: compare(body, s, kept[s.prefix], limit=limit) for s in shown}
+            )
     law = body.material.law
     parts = (note, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
              determined_text(figures, law), geometry_lines(figures))  # fmt: skip

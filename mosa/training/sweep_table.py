@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -51,12 +51,21 @@ def sweep_table(folder: str | Path) -> list[Row]:
                 row |= {"state": "failed", "message": " ".join(reason.read_text().split())}
         except (OSError, ValueError, yaml.YAMLError) as error:
             raise DataError(f"{job}: a damaged file ({error}); remove the job's folder") from error
-        spent = [v for k, v in figures.items() if k.startswith("time/") and k.endswith("_s")]
-        row["time_s"] = sum(map(float, spent)) if spent else ""  # type: ignore[arg-type]
+        row["time_s"] = seconds(figures) or ""
         rows.append(row | figures)
     if not rows:
         raise DataError(f"{folder}: expected the folder of a sweep with 0_..., 1_..., found no job")
     return rows
+
+
+def seconds(figures: Mapping[str, object]) -> float:
+    """All stages of a run together [s]; 0 where none was measured."""
+    return sum(
+        value
+        for key, value in figures.items()
+        if key.startswith("time/") and key.endswith("_s") and "_per_" not in key
+        if isinstance(value, int | float)
+    )
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:

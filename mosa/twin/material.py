@@ -13,6 +13,7 @@ from mosa.errors import ConfigError
 from mosa.evaluation.analysis.anisotropy import mandel_matrix, mandel_scale
 from mosa.evaluation.analysis.law_stress import in_double, tangent, values_of
 from mosa.evaluation.analysis.stiffness import stiffest
+from mosa.evaluation.analysis.tables import NOTICEABLE
 from mosa.evaluation.uncertainty import determined
 from mosa.modules.adapters.microplane import PAIRS
 from mosa.modules.body.body import Body
@@ -245,8 +246,10 @@ def summary(twin: Any) -> str:
         if (stiffness := adapter.stiffness()) is not None:
             axis, ratio = stiffest(stiffness.cpu())
             where = ", ".join(f"{v:.2f}" for v in axis.tolist())
-            lines.append(f"          largest over smallest Young's modulus {float(ratio):.3g}")
-            lines.append(f"          stiffest along ({where})")
+            along = f", stiffest along ({where})" if ratio >= NOTICEABLE else ""
+            lines.append(
+                f"          largest over smallest Young's modulus {float(ratio):.3g}{along}"
+            )
     low, high = float(material.field.min()), float(material.field.max())
     if high - low > 1e-6:
         lines.append(f"field     {low:.3g} to {high:.3g} times this stiffness over the body")

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-from mosa.config.reference import page
+import pytest
+
+from mosa.config.reference import main, page
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
 
@@ -10,3 +12,16 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
 def test_the_page_of_all_settings_is_true():
     """python -m mosa.config.reference > docs/reference/configuration.md"""
     assert PAGE.read_text() == page()
+
+
+def test_a_key_that_is_not_there_is_named_with_the_nearest(capsys):
+    main(["eval", "simulate.height"])
+    assert capsys.readouterr().out.startswith("simulate.height = null\n    m, lowest point")
+    with pytest.raises(SystemExit, match="2"):
+        main(["eval", "simulate.hight"])
+    found = capsys.readouterr()
+    assert (
+        not found.out
+        and "simulate.hight" in found.err
+        and "nearest is simulate.height" in found.err
+    )

@@ -20,6 +20,7 @@ def folder(tmp_path):
         (job / ".hydra").mkdir(parents=True)
         (job / ".hydra" / "overrides.yaml").write_text(f"- prior={law}\n- scene=rabbit\n")
     figures = {"test/rms_m": 0.012345, "id/E": 3e4, "time/fit_s": 2.5, "time/data_s": 1.0, "time/device": "a CPU",
+               "time/particle_substeps_per_s": 4e5,
                "posterior/E_relative_sd": 0.03}  # fmt: skip
     (tmp_path / "0_prior-stvk" / "metrics.json").write_text(json.dumps(figures))
     (tmp_path / "failed").mkdir()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,11 +61,17 @@ class Comparison:
 
 @torch.no_grad()
 def compare(
-    body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, width: int = 320
+    body: Body,
+    shown: Sequence,
+    variants: Mapping[str, Rollout],
+    *,
+    width: int = 320,
+    limit: float | None = None,
 ) -> Comparison:
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
+    limit [m]: the distance that has the last colour (`error_limit` of this sequence).
     """
     scene = shown.scene
     camera = (scene.training_cameras or [0])[0]
@@ -74,8 +80,7 @@ def compare(
     times = max(1, round(width / max(w, h)))
     lines = ground_lines(scene, cameras, body.size)
     real = crop_images(scene.images[[camera]], x0, y0, w, h, axis=2)[0]
-    known = [variant for variant in TITLES if variant in variants]
-    seen = {variant: drawn(body, variants[variant], cameras, scene) for variant in known}
+    seen = {v: drawn(body, variants[v], cameras, scene) for v in TITLES if v in variants}
 
     def finished(images: Tensor) -> np.ndarray:
         return np.stack(
@@ -85,18 +90,15 @@ def compare(
             ]
         )
 
-    target = true_motion(body, scene)
-    if target is None:
+    far = distances(body, scene, variants)
+    if not far:
         label, high, colors = "difference of the images", f"{DIFFERENCE:g}", "Reds"
         errors = {
             v: paint((images - real).abs().mean(-1) / DIFFERENCE, colors)
             for v, images in seen.items()
         }
     else:
-        far = {v: (variants[v].x.cpu() - target.cpu()).norm(dim=-1) for v in known}
-        limit = round_up(
-            max(float(torch.quantile(d.flatten()[: 2**24], 0.99)) for d in far.values())
-        )
+        limit = limit or error_limit(far.values())
         label, high, colors = "distance to the true motion", f"{1e3 * limit:g} mm", "viridis"
         errors = {
             v: drawn(body, variants[v], cameras, scene, paint(d / limit, colors))
@@ -110,6 +112,19 @@ def compare(
         colors,
         scene.times.tolist(),
     )
+
+
+def distances(body: Body, scene: Scene, variants: Mapping[str, Rollout]) -> dict[str, Tensor]:
+    """(T, N) [m] of each model's particles to the true motion; none where that is not known."""
+    if (target := true_motion(body, scene)) is None:
+        return {}
+    return {v: (variants[v].x - target).norm(dim=-1).cpu() for v in TITLES if v in variants}
+
+
+def error_limit(far: Iterable[Tensor]) -> float:
+    """End [m] of a scale that 99 % of each of these distances are within."""
+    most = (float(torch.quantile(d.flatten()[: 2**24], 0.99)) for d in far)
+    return round_up(max(most, default=0.0))
 
 
 def drawn(
@@ -271,4 +286,8 @@ def write_comparisons(folder: Path, shown: Mapping[str, Comparison]) -> None:
             f"{prefix}: {title}, {each.label}, 0 to {each.high}": images
             for title, images in each.errors.items()
         }
+    for each in shown.values():  # the scale once, under the first frame
+        scale = np.full_like(each.images["real"], 255)
+        scale[0] = legend(each)
+        rows[each.label] = scale
     write_strip(folder / "strip.png", rows, notes=notes)

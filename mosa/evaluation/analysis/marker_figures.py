@@ -72,7 +72,12 @@ def write_markers(
                 times, 1e3 * (predicted[:, m, along] - rest), lw=1, color=f"C{k}", label=names[m]
             )
         axis.set(title=s.prefix, ylabel=f"{'xyz'[along]} displacement [mm]")
-        axis.legend(loc="upper right", fontsize=8, title="dots measured, lines predicted")
+        axis.legend(
+            loc="center left",
+            bbox_to_anchor=(1, 0.5),
+            fontsize=8,
+            title="dots measured,\nlines predicted",
+        )
     axes[-1, 0].set_xlabel("time [s]")
     figure.savefig(folder / "markers.png", dpi=110)
     pyplot.close(figure)

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from mosa.errors import MosaError, SimulationDiverged
 from mosa.system.limits import counted
+from mosa.types import in_brief
 
 SHORTER, SHORTEST = 0.4, 0.05
 """A step that does not improve is tried again so much shorter; one of fewer standard deviations of the posterior is not tried."""
@@ -82,6 +83,8 @@ class Posterior:
     precision that comes from the data and not from its prior; model_error [m]: distance of the identified model from what was seen;
     rivals: numbers (D,) at which laws of another form explain the data too, by name.
     """
+
+    __repr__ = in_brief
 
     names: list[str]
     mean: Tensor
@@ -150,6 +153,9 @@ class GaussNewton:
     progress: Callable[[], None] | None = None
     many: Callable[[Tensor], Tensor] | None = None
     known: Posterior | None = None
+    borne: float = 1.0
+    """Share of the data's precision that a posterior will count. The known numbers weigh more by its
+    inverse while they are fitted, so that what is found is the mean of that posterior."""
     matrix: Tensor | None = field(default=None, init=False)
     data: Tensor | None = field(default=None, init=False)
     columns: Tensor | None = field(default=None, init=False)
@@ -167,12 +173,13 @@ class GaussNewton:
             mean[self._places()] = self.known.mean.double()
         return mean
 
-    def precision(self) -> Tensor:
-        """(D, D) of the prior."""
+    def precision(self, borne: float | None = None) -> Tensor:
+        """(D, D) of the prior. borne: 1.0 as it is, None beside all data."""
         precision = torch.diag(1 / self._vector(lambda b: b.sd * b.factor).square())
         if self.known is not None:
             at = self._places()
-            precision[at[:, None], at] = torch.linalg.inv(self.known.covariance.double())
+            known = torch.linalg.inv(self.known.covariance.double())
+            precision[at[:, None], at] = known / (self.borne if borne is None else borne)
         return precision
 
     def _places(self) -> Tensor:
@@ -361,9 +368,10 @@ class GaussNewton:
         it would have moved them is one more standard deviation along that way. Errors: ValueError before the first iteration."""
         if self.matrix is None or self.data is None or self.columns is None:
             raise ValueError("posterior: expected an iteration before it is asked for")
-        covariance = torch.linalg.inv(self.matrix - (1 - share) * self.data)
+        precision = self.precision(1.0)
+        covariance = torch.linalg.inv(share * self.data + precision)
         covariance = 0.5 * (covariance + covariance.T)
-        determined = (1 - (covariance @ self.precision()).diagonal()).clamp(0, 1)
+        determined = (1 - (covariance @ precision).diagonal()).clamp(0, 1)
         if wrong is not None:
             moved = covariance @ (share * (self.columns.T @ wrong.to(self.columns)).double().cpu())
             covariance = covariance + torch.outer(moved, moved)

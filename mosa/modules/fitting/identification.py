@@ -338,6 +338,8 @@ class Identification:
         self._hold_substeps()
         if self.iteration < NOISE_ITERATIONS or self.noise is None:
             self._measure_noise()
+        if self.calibrating and self.newton.known is not None:
+            self.newton.borne = self.independent()
         seat = self.newton.seats[0]
         self._residuals = seat.residuals()
         return self.newton.cost(seat.read(), self._residuals)

@@ -13,6 +13,8 @@ import torch
 from mosa.evaluation.analysis.comparison import (
     Comparison,
     compare,
+    distances,
+    error_limit,
     ground_lines,
     legend,
     on_ground,
@@ -172,6 +174,15 @@ def test_the_distance_to_the_truth_is_painted(body):
     )
 
 
+def test_all_recordings_of_a_run_share_the_scale_of_the_farthest(body):
+    near = Sequence("test/drop", scene(), Start(torch.eye(3), *torch.zeros(3, 3)), 2)
+    far = distances(body, near.scene, {"prior": rollout(SHIFT), "adapted": rollout(0.0)})
+    assert list(far) == ["prior", "adapted"] and error_limit(far.values()) == pytest.approx(0.05)
+    limit = error_limit([*far.values(), torch.full((T, 3), 0.15)])
+    assert compare(body, near, {"adapted": rollout(0.0)}, limit=limit).high == "200 mm"
+    assert distances(body, scene(truth=False), {"prior": rollout(SHIFT)}) == {}
+
+
 def test_without_truth_the_difference_of_the_images_is_painted(body):
     found = shown(body, truth=False)
     assert (found.label, found.high) == ("difference of the images", "0.5")
@@ -196,7 +207,11 @@ def test_legend_video_and_strip(body, tmp_path):
     rows = 2 * (height + 26) + 26
     assert video.shape == (T, rows + rows % 2, 3 * width + (3 * width) % 2, 3)
     strip = iio.imread(tmp_path / "strip.png")
-    assert strip.shape == (2 * (5 * (height + 26) + 22), T * width, 3)
+    assert strip.shape == (
+        2 * (5 * (height + 26) + 22) + height + 26,
+        T * width,
+        3,
+    )  # the scale once
 
 
 def test_every_frame_has_its_own_caption(tmp_path):

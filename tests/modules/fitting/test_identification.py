@@ -13,7 +13,7 @@ from mosa.evaluation.analysis.anisotropy import dyads
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.modules.adapters.hyperelastic import anisotropic_basis
 from mosa.modules.fitting import identification as identification_module
-from mosa.modules.fitting.gauss_newton import Seat
+from mosa.modules.fitting.gauss_newton import Posterior, Seat
 from mosa.modules.fitting.identification import COARSER, EVIDENCE_ITERATIONS, SOFTLY, Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.parameters import as_rival, read_numbers, write_numbers
@@ -34,10 +34,10 @@ def fibres(strength: float, axis: torch.Tensor = AXIS) -> torch.Tensor:
 
 
 def identification(
-    body, takes, stage="joint", criterion=None, seats=1, kinds=(True, True, True), **settings
-) -> Identification:
+    body, takes, stage="joint", criterion=None, seats=1, kinds=(True, True, True), known=None, **settings
+) -> Identification:  # fmt: skip
     return Identification(body, takes, WORLD, Stage(name=stage, iterations=40, lr=0.1), criterion or Criterion(name="corrected"),
-                          IdentificationSettings(**settings), kinds, seats=seats)  # fmt: skip
+                          IdentificationSettings(**settings), kinds, seats=seats, known=known)  # fmt: skip
 
 
 def run(found: Identification, most: int = 12) -> int:
@@ -586,3 +586,21 @@ def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
     # the bend is one pattern in all frames, and not one in each
     counted = 100 / 30 * found.settings.count * (FRAMES - bent.first_contact)
     assert 1 <= sure[1][0] * counted < 3
+
+
+def test_a_calibration_weighs_another_experiment_as_its_posterior_says():
+    """Cues with one smooth error say little of E, though they are many: a prior that is 30 % off moves
+    by a part of its standard deviation, as the posterior has it almost to itself."""
+    truth = small_body(adapter=False)
+    take = take_and_turn(truth, 0.5)
+    late = torch.linspace(0, 1, FRAMES, dtype=torch.float64)[:, None]
+    take.cues.positions[..., 0] += 0.02 * late * truth.rest[:, 1] / truth.rest[:, 1].abs().max()
+    mean, sd = math.log(1.3 * E), 0.05
+    known = Posterior(["E"], torch.tensor([mean]).double(), torch.tensor([[sd**2]]).double(), torch.ones(1))  # fmt: skip
+    body = small_body(adapter=False)
+    found = identification(body, [take], "prior", known=known, grid_error=0)
+    found.iterate_until_converged(6)
+    posterior = found.posterior()
+    at = posterior.names.index("E")
+    assert posterior.covariance[at, at].sqrt() == pytest.approx(sd, rel=0.1)
+    assert 0 < mean - float(posterior.mean[at]) < 0.3 * sd  # 4 sd where all data count
