@@ -140,7 +140,10 @@ def main(words: list[str]) -> None:
         sys.exit(2)
     beside = (*arguments(), *of_scenes()) if words[0] == "train" else ()
     found = [*rows(COMMANDS[words[0]], None), *beside]
-    asked = [row for row in found if len(words) == 1 or f"{row[0]}.".startswith(f"{words[1]}.")]
+    key = f"{words[1]}." if words[1:] else ""
+    asked = [row for row in found if f"{row[0]}.".startswith(key)]
+    # an entry of a mapping has no row of its own
+    asked = asked or [row for row in found if row[1] and key.startswith(f"{row[0]}.")]
     for key, default, kind, about in asked:
         print(
             f"{key}{f' = {default}' if default else ''}\n    {about}{f' ({kind})' if kind else ''}"
@@ -148,7 +151,7 @@ def main(words: list[str]) -> None:
     if not asked:
         known = [row[0] for row in found]
         print(
-            f"{words[1]}: no key of {words[0]} by itself{nearest(words[1], known, '')}; "
+            f"{words[1]}: unknown key of {words[0]}{nearest(words[1], known, '')}; "
             f"python -m mosa.config.reference {words[0]} lists all",
             file=sys.stderr,
         )

@@ -17,6 +17,8 @@ def test_the_page_of_all_settings_is_true():
 def test_a_key_that_is_not_there_is_named_with_the_nearest(capsys):
     main(["eval", "simulate.height"])
     assert capsys.readouterr().out.startswith("simulate.height = null\n    m, lowest point")
+    main(["eval", "simulate.velocity.x"])
+    assert capsys.readouterr().out.startswith("simulate.velocity = ")
     with pytest.raises(SystemExit, match="2"):
         main(["eval", "simulate.hight"])
     found = capsys.readouterr()
