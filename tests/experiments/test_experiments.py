@@ -127,6 +127,14 @@ def test_ones_own_folder_has_the_paper_s_axes_and_its_own(tmp_path, capsys):
         run(arguments(["mine", "--specifications", str(tmp_path / "none")]))
 
 
+def test_an_estimate_says_that_it_is_without_what_is_set(tmp_path, capsys):
+    words = ["table_time", "--quick", "--dry-run", "--runs", str(tmp_path)]
+    for more in ([], ["--set", "fit=paper"]):
+        assert run(arguments([*words, *more])) == 0
+        said = capsys.readouterr().out.splitlines()[-1]
+        assert said.endswith("--set fit=paper" if more else "side by side")
+
+
 def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
     for words, message in (
         (["nothing"], "experiment: expected one of .* or all, found 'nothing'"),
