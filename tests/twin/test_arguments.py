@@ -28,7 +28,7 @@ def begun(made):
     ("folder", (5, None, True, [], 1.5), lambda v: TWIN().export(MOTION(), v)),
     ("formats", (5, "ply", ["obj"], [1], None), lambda v: TWIN().export(MOTION(), "nowhere", formats=v)),
     ("folder", (5, None, True, [], 1.5), lambda v: TWIN().export_material(v)),
-    ("formats", (5, "npz", ["obj"], [1], None), lambda v: TWIN().export_material("nowhere", v)),
+    ("formats", (5, "npz", ["fbx"], [1], None), lambda v: TWIN().export_material("nowhere", v)),
     ("export", ("/proc/nowhere", "/dev/null/a", "a\0b"), lambda v: TWIN().export(MOTION(), v)),
     ("export", ("/proc/nowhere", "/dev/null/a", "a\0b"), lambda v: TWIN().export_material(v)),
     ("action", (5, 0, "a", torch.zeros(3), [{}], {"a"}), lambda v: begun(TWIN()).step(v)),
