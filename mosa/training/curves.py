@@ -84,7 +84,7 @@ CURVES = (
     Curve(
         "final/<figure>",
         "as above",
-        "figure of `metrics.json`, once, beside the configuration (TensorBoard: HPARAMS)",
+        "figure of `metrics.json` (its `id/E` includes eta), once, beside the configuration (TensorBoard: HPARAMS)",
     ),
 )
 
