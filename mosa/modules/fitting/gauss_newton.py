@@ -174,7 +174,8 @@ class GaussNewton:
         return mean
 
     def precision(self, borne: float | None = None) -> Tensor:
-        """(D, D) of the prior. borne: 1.0 as it is, None beside all data."""
+        """(D, D) of the prior. borne: share that the known numbers are weighed for, None for the fit's;
+        1.0: as the other experiment has them."""
         precision = torch.diag(1 / self._vector(lambda b: b.sd * b.factor).square())
         if self.known is not None:
             at = self._places()

@@ -588,17 +588,19 @@ def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
     assert 1 <= sure[1][0] * counted < 3
 
 
-def test_a_calibration_weighs_another_experiment_as_its_posterior_says():
+@pytest.mark.parametrize("turns", [(0.5,), (0.5, 1.2)])
+def test_a_calibration_weighs_another_experiment_as_its_posterior_says(turns):
     """Cues with one smooth error say little of E, though they are many: a prior that is 30 % off moves
     by a part of its standard deviation, as the posterior has it almost to itself."""
     truth = small_body(adapter=False)
-    take = take_and_turn(truth, 0.5)
+    takes = [take_and_turn(truth, turn) for turn in turns]
     late = torch.linspace(0, 1, FRAMES, dtype=torch.float64)[:, None]
-    take.cues.positions[..., 0] += 0.02 * late * truth.rest[:, 1] / truth.rest[:, 1].abs().max()
+    for take in takes:
+        take.cues.positions[..., 0] += 0.02 * late * truth.rest[:, 1] / truth.rest[:, 1].abs().max()
     mean, sd = math.log(1.3 * E), 0.05
     known = Posterior(["E"], torch.tensor([mean]).double(), torch.tensor([[sd**2]]).double(), torch.ones(1))  # fmt: skip
     body = small_body(adapter=False)
-    found = identification(body, [take], "prior", known=known, grid_error=0)
+    found = identification(body, takes, "prior", known=known, grid_error=0)
     found.iterate_until_converged(6)
     posterior = found.posterior()
     at = posterior.names.index("E")
