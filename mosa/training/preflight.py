@@ -136,12 +136,7 @@ def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
     """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
     for prefix, start in found.items():
         x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(
-            world.colliders,
-            x,
-            f"the body of {prefix}",
-            spacing=float(body.volume.mean()) ** (1 / 3),
-        )
+        check_clear(world.colliders, x, f"the body of {prefix}", spacing=body.spacing)
 
 
 def warn_of_little(

@@ -72,7 +72,7 @@ def press(
     up = world.up.double().cpu()
     heights = body.rest.double().cpu() @ rotation_matrix(rotation).double().T @ up
     tall = float(heights.max() - heights.min())
-    gap = AWAY * float(body.volume.mean()) ** (1 / 3)
+    gap = AWAY * body.spacing
     speed = (SQUEEZED * tall + gap) / ((frames - 1) * twin.frame_dt)
     top, motion = up * (world.ground.height + tall + gap), {"velocity": (-speed * up).tolist()}
     plate = {"type": "plane", "normal": (-up).tolist(), "position": top.tolist(), "motion": motion}

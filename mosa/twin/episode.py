@@ -18,10 +18,11 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Ready, Start, World
 from mosa.modules.fitting.parameters import each_law
-from mosa.physics.contact.colliders import reach
+from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.driven import held_in, stack_held
 from mosa.physics.contact.motion import (
     Poses,
+    Trajectory,
     exponential,
     rotation_matrices,
     rotation_vector,
@@ -34,7 +35,7 @@ from mosa.physics.engine.numerics import State, flat
 from mosa.physics.time.clock import Moment
 from mosa.settings import shown
 from mosa.twin.start import check_wants_no_gradients
-from mosa.types import ParticleState, dense, in_brief
+from mosa.types import ParticleState, Rollout, dense, in_brief
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
 
@@ -84,6 +85,37 @@ class TwinState:
                 f"state: expected {', '.join(sorted(names))}, found {', '.join(sorted(tensors))}"
             )
         return cls(**tensors)
+
+
+def in_order(states: Sequence[TwinState]) -> bool:
+    """Whether they are states of one body and world, in the order of time, equally far apart."""
+    times = torch.tensor([float(each.time) for each in states], dtype=torch.float64)
+    apart = times.diff()
+    return (
+        len(states) > 0
+        and all(each.x.ndim == 2 and each.x.shape == states[0].x.shape for each in states)
+        and bool((apart > 0).all() and ((apart - apart[:1]).abs() < 1e-6 * apart).all())
+    )
+
+
+def rollout_of(states: Sequence[TwinState]) -> Rollout:
+    """The motion through T states as a rollout without reactions, whose times begin at 0 s."""
+    x, v, F, F_tot, times = (
+        torch.stack([getattr(each, name).detach() for each in states])
+        for name in ("positions", "v", "F", "F_tot", "time")
+    )
+    last = ParticleState(*(getattr(states[-1], name).detach() for name in State._fields))
+    counts = torch.stack([each.substeps for each in states]).diff().tolist()
+    return Rollout(x.to(v), v, F, F_tot, (times - times[0]).to(v), last, counts=tuple(counts))
+
+
+def placed_as(states: Sequence[TwinState], solids: Sequence[Collider]) -> tuple[Collider, ...]:
+    """K solids where they are in the states."""
+    x, R = (torch.stack([getattr(s, n).detach() for s in states]) for n in ("position", "rotation"))
+    return tuple(
+        replace(solid, motion=Trajectory(x[:, k], R[:, k], 0 * x[:, k], 0 * x[:, k]))
+        for k, solid in enumerate(solids)
+    )
 
 
 class Stepped(NamedTuple):

@@ -167,7 +167,11 @@ class TwinMaterial:
         if not any(given.get(name) for name in DAMPING):
             given = {name: value for name, value in given.items() if name not in DAMPING}
         modulated = self._body.material.modulated if same else None
-        self._take(Material(law or self.law, given, modulated=modulated), density, new=not same)
+        try:
+            material = Material(law or self.law, given, modulated=modulated)
+        except ConfigError as error:  # which names them as a configuration does
+            raise ConfigError(str(error).replace("prior.parameters.", "", 1)) from error
+        self._take(material, density, new=not same)
 
     def preset(self, name: str) -> None:
         """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the
@@ -229,7 +233,8 @@ def summary(twin: Any) -> str:
     volume = float(body.volume.sum())
     sure: Mapping[str, float] = {} if twin.posterior is None else determined(body, twin.posterior)
     lines = [
-        f"body      {len(body.rest)} particles, {1e3 * body.size:.4g} mm long, "
+        f"body      {len(body.rest)} particles {1e3 * body.spacing:.3g} mm apart, "
+        f"{1e3 * body.size:.4g} mm long, "
         f"{1e6 * volume:.4g} cm^3, {1e3 * volume * body.density:.4g} g at {body.density:.4g} kg/m^3",
         f"law       {body.material.law}",
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Annotated, Any
@@ -16,9 +17,16 @@ from torch import Tensor
 from mosa.config.record import is_rotation
 from mosa.errors import ConfigError
 from mosa.modules.body.body import VARIANTS, Body, Start, World
-from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.colliders import (
+    HOLD,
+    HalfSpace,
+    axis_degrees,
+    colliders_from_config,
+)
 from mosa.physics.contact.driven import driven_from_config
+from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.overlap import check_clear
+from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.inputs import FASTEST, numbers, vector
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
@@ -27,6 +35,10 @@ UNDER = 0.25
 """Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
 """Of a particle in a frame of a rollout: x, v, F, F_tot."""
+LARGE = 50.0
+"""Length of a mesh over the body's from which its unit is doubted."""
+CREEP = 5e-3
+"""[m/s] of a held body from which the number of substeps is doubted."""
 
 
 Variant = Annotated[str, Expected(f"one of {', '.join(VARIANTS)}"), such(lambda v: v in VARIANTS)]
@@ -101,12 +113,10 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
                 "what was learned"
             )
         return value
-    if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:
+    if value.shape != (4,) or not value[:3].any():
         raise ConfigError(f"rotation: expected {expected}, found {value.tolist()}")
-    axis = (value[:3].double() / value[:3].double().norm()).cpu().numpy()
-    return torch.tensor(
-        Rotation.from_rotvec(axis * math.radians(float(value[3]))).as_matrix(), dtype=torch.float32
-    )
+    turn = axis_degrees(value.cpu()).numpy()
+    return torch.tensor(Rotation.from_rotvec(turn).as_matrix(), dtype=torch.float32)
 
 
 def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
@@ -164,14 +174,30 @@ def start_in(
                 f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
                 f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m"
             )
-    field, spacing = (
-        "world.colliders" if colliders is None else "colliders",
-        float(body.volume.mean()) ** (1 / 3),
-    )
-    check_clear(world.colliders, center + arms, "the body", field, spacing)
+    field = "world.colliders" if colliders is None else "colliders"
+    pressed = check_clear(world.colliders, center + arms, "the body", field, body.spacing)
+    if pressed > 0.25 * body.spacing:
+        warnings.warn(
+            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} mm "
+            "deep in a contact, which throws it off at once: contact begins "
+            f"{500 * body.spacing:.3g} mm, half the particles' spacing, outside of a solid",
+            stacklevel=4,
+        )
+    for i, each in enumerate(world.colliders):
+        if (
+            isinstance(each.shape, SignedDistanceField)
+            and (size := each.shape.extent) > LARGE * body.size
+        ):
+            warnings.warn(
+                f"{field}[{i}]: expected a mesh about as large as the body of {body.size:.3g} m, "
+                f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
+                stacklevel=4,
+            )
     if world.ground is not None:
         below = float(
-            (((center + arms) @ up).detach() < world.ground.height - 0.25 * spacing).double().mean()
+            (((center + arms) @ up).detach() < world.ground.height - 0.25 * body.spacing)
+            .double()
+            .mean()
         )
         if below > UNDER:
             raise ConfigError(
@@ -179,6 +205,28 @@ def start_in(
                 f"found {below:.0%} of it below (height is that of its lowest point above the ground)"
             )
     return start, world
+
+
+def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | None) -> None:
+    """Warn where two or more solids may hold the body by friction, and it would slide down faster
+    than `CREEP`. Contact takes a share of a particle's sliding velocity in a substep: the speed
+    grows with the substep (docs/verification.md). substeps: None where they are chosen."""
+    holds = [
+        HOLD if each.mode == "sticky" else GRIP
+        for each in world.colliders
+        if (each.mode == "sticky" or each.friction > 0) and not isinstance(each.shape, HalfSpace)
+    ]
+    if len(holds) < 2 or substeps is None:
+        return
+    pull = float(world.gravity.norm()) * body.size / (min(holds) * body.spacing)
+    speed, enough = pull * frame_dt / substeps, math.ceil(pull * frame_dt / CREEP)
+    if speed > CREEP:
+        warnings.warn(
+            f"substeps: solids that hold the body by friction let it slide at about "
+            f"{1e3 * speed:.2g} mm/s with {substeps} substeps; substeps={enough} give "
+            f"{1e3 * CREEP:.2g} mm/s",
+            stacklevel=4,
+        )
 
 
 @torch.no_grad()

@@ -42,12 +42,12 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
-from mosa.settings import Count, Expected, Number, Seed, typed
+from mosa.settings import Count, Expected, Number, Seed, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
-from mosa.twin.episode import Episode, Stepped, TwinState
+from mosa.twin.episode import Episode, Stepped, TwinState, in_order, placed_as, rollout_of
 from mosa.twin.material import TwinMaterial, summary
 from mosa.twin.material_files import Formats as MaterialFormats
 from mosa.twin.material_files import export_material
@@ -55,12 +55,23 @@ from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
 from mosa.twin.shown_solids import with_solids
-from mosa.twin.start import Seconds, Variant, check_frames, check_wants_no_gradients, start_in
+from mosa.twin.start import (
+    Seconds,
+    Variant,
+    check_frames,
+    check_wants_no_gradients,
+    start_in,
+    warn_of_creep,
+)
 from mosa.types import Cameras, Rollout
 
 Draws = Annotated[int, Ge(2), Le(10_000)]
 Pixels = Annotated[int, Ge(8), Le(8192)]
-Motion = Annotated[Rollout, InstanceOf, Expected("a Rollout, as simulate returns it")]
+Motion = Annotated[
+    InstanceOf[Rollout] | Sequence[InstanceOf[TwinState]],
+    Expected("a Rollout, as simulate returns it, or a list of the states of steps, in their order"),
+    such(lambda v: isinstance(v, Rollout) or in_order(v)),
+]
 
 
 class Twin:
@@ -119,7 +130,8 @@ class Twin:
         """
         if self.posterior is None:
             raise ConfigError(
-                "predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)"
+                "predict: this twin has no posterior: its material was set (load the checkpoint "
+                "again), or its run kept none (a fit by Gauss-Newton does: fit.joint.optimizer=auto)"
             )
         rollout, laws = (
             self.simulate(**start),
@@ -151,6 +163,7 @@ class Twin:
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         box: Sequence[Sequence[float]] | Tensor | None = None,
         driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+        substeps: Substeps | None = None,
     ) -> Rollout:
         """Roll the learned law out from a new start.
 
@@ -162,7 +175,8 @@ class Twin:
         driven: sets of particles that are held, moved or loaded, instead of the world's
         (docs/driven.md); their reactions come after those of the colliders. box: (2, 3) [m] the
         lower and the upper corner of what no particle may leave, None for the scene's; walls of
-        the world stay where they are. No gradients: `reset(differentiable=True)` and `step` have
+        the world stay where they are. substeps: of a frame, as `reset` takes them.
+        No gradients: `reset(differentiable=True)` and `step` have
         them, and a tensor that requires them is refused. Errors: ConfigError naming the argument
         (also a solid that the body starts in), SimulationDiverged (the body leaves the box).
         """
@@ -176,10 +190,12 @@ class Twin:
             tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar,
         ):
             start, world = start_in(self.body, self.world, self.training_start, **given)
-            model = self.body.model(variant)
-            return self.body.simulate(
-                start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update()
-            )
+            ready = self.body.ready(
+                start, world, frames, self.frame_dt, model=self.body.model(variant), substeps=substeps, enough=True,
+            )  # fmt: skip
+            fixed = ready.simulator.substeps if ready.timing is None else None
+            warn_of_creep(self.body, world, self.frame_dt, fixed)
+            return ready.simulate(frames, world.solids, progress=lambda _: bar.update())
 
     @typed
     def reset(
@@ -219,6 +235,7 @@ class Twin:
             self.body, world, control_dt or self.frame_dt, start, variant=variant, frames=frames,
             substeps=substeps, differentiable=differentiable,
         )  # fmt: skip
+        warn_of_creep(self.body, world, self._episode.frame_dt, self._episode.substeps)
         return self._episode.state
 
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
@@ -267,10 +284,16 @@ class Twin:
         view: Sequence[float] | None = None,
     ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
-        rollout was simulated with (None: the world's). Half spaces are not drawn. view: (3,) from the body to the
-        camera, None for a view from the side and a little above."""
+        rollout was simulated with (None: the world's). rollout: or a list of the states of T steps,
+        whose solids are drawn where they were then (None: those of `reset`). Half spaces are not
+        drawn. view: (3,) from the body to the camera, None for a view from the side and a little
+        above."""
+        return self._pictures(*self._met(rollout, colliders), size, view)
+
+    def _pictures(
+        self, rollout: Rollout, solids: Sequence[Collider], size: int, view: Sequence[float] | None
+    ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
-        solids = self._met(rollout, colliders)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
         # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
         for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
@@ -332,24 +355,30 @@ class Twin:
         return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
 
     def _met(
-        self, rollout: Rollout, colliders: Sequence[Collider | Mapping[str, Any]] | None
-    ) -> tuple[Collider, ...]:
-        """The solids of a rollout, None for the world's. Errors: ConfigError where they are not as many as it has reactions of."""
-        met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
-        solids = (
-            self.world.solids
-            if met and colliders is None
-            else colliders_from_config(colliders or (), "colliders")
-        )
+        self,
+        motion: Rollout | Sequence[TwinState],
+        colliders: Sequence[Collider | Mapping[str, Any]] | None,
+    ) -> tuple[Rollout, tuple[Collider, ...]]:
+        """(rollout, its solids), both as `render` takes them. Errors: ConfigError where it was not
+        simulated with as many."""
+        if isinstance(motion, Rollout):
+            rollout, world = motion, self.world
+            met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
+        else:
+            rollout, world, met = rollout_of(motion), self.episode.world, len(motion[0].position)
+        if met and colliders is None:
+            solids = world.solids
+        else:
+            solids = colliders_from_config(colliders or (), "colliders")
         # driven sets have reactions, and nothing to draw
         if colliders is not None and met > len(solids):
-            solids += self.world.solids[len(self.world.colliders) :]
+            solids += world.solids[len(world.colliders) :]
         if met != len(solids):
             raise ConfigError(
                 f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
                 f"{len(solids)}"
             )
-        return tuple(solids)
+        return rollout, solids if isinstance(motion, Rollout) else placed_as(motion, solids)
 
     @typed
     def export(
@@ -360,9 +389,10 @@ class Twin:
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
-        the rollout was simulated with, None for the world's. Of the video: size [px] and view, as
-        `render` takes them; fps, None for 0.3 of real time. Errors: ConfigError where they are not."""
-        solids = self._met(rollout, colliders)
+        the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px] and view, as
+        there; fps, None for 0.3 of real time. Errors: ConfigError where they are not."""
+        rollout, solids = self._met(rollout, colliders)
+        apart = float(rollout.times[1]) if len(rollout.times) > 1 else self.frame_dt
         folder = made_folder(Path(folder) / "ply").parent
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
@@ -371,14 +401,14 @@ class Twin:
             seen(self.body, rollout.x, rollout.F_tot),
             folder / "splats",
             formats,
-            rate=1 / self.frame_dt,
+            rate=1 / apart,
             up=self.world.up,
         )
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            images = self.render(rollout, size, solids, view)
+            images = self._pictures(rollout, solids, size, view)
             frames = side_by_side({title: images}, footer=moments)
-            write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / self.frame_dt))
+            write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))
         return folder
 
     @property

@@ -62,5 +62,7 @@ def test_every_shape_of_a_link_is_a_collider(tmp_path):
     assert mesh["position"] == [0, 0, 0]
     assert solid["position"] == pytest.approx([0, -0.1, 0]) and solid["length"] == 0.2
     assert solid["rotation"] == pytest.approx([1, 0, 0, 90])
+    with pytest.raises(ValueError, match=r"^j: expected -3.0 to 3.0 rad or m, found 45"):
+        robot.action({"j": 45})
     pose = robot.action({"j": np.pi / 2})["b"]
     assert np.allclose(pose["rotation"], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])

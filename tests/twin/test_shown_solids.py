@@ -16,6 +16,7 @@ from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
 from mosa.twin.shown_solids import SOLID, surface, with_solids
 from mosa.types import Cameras
+from mosa.viewer.clips import read_run
 from tests.modules.body.test_world import PLATE, twin
 
 UP = torch.tensor([0.0, 1.0, 0.0])
@@ -126,6 +127,29 @@ def test_an_exported_motion_has_its_solids_and_the_ground(tmp_path):
     images = one.render(alone, size=96)
     lines = ((images - 120 / 255).abs().amax(-1) < 0.3) & (images.amax(-1) - images.amin(-1) < 0.02)
     assert lines[0].float().mean() > 0.01
+
+
+def test_the_states_of_steps_are_shown_as_the_rollout_is(tmp_path):
+    """With a plate that moves on its own, and where actions have moved it."""
+    one, plate = twin(), {**PLATE, "name": "plate"}
+    rollout = one.simulate(frames=4, colliders=[plate])
+    states = [one.reset(colliders=[plate], frames=4), *(one.step().state for _ in range(3))]
+    assert torch.equal(one.render(states, size=64), one.render(rollout, size=64, colliders=[plate]))
+    moved = [one.reset(colliders=[plate], control_dt=0.01)]
+    moved += [one.step({"plate": {"velocity": (0, 0, 0.5)}}).state for _ in range(3)]
+    one.export(moved, tmp_path, video=False)
+    saved = np.load(tmp_path / "rollout.npz")
+    at = saved["simulation/collider_position"][:, 0] - np.array([0, 0.36, 0])
+    assert at == pytest.approx(np.array([[0, 0, 0.005 * k] for k in range(4)]), abs=1e-9)
+    assert saved["simulation/times"] == pytest.approx([0, 0.01, 0.02, 0.03])
+    assert np.array_equal(saved["simulation/x"][-1], moved[-1].positions)
+    (clip,) = read_run(tmp_path)
+    assert len(clip.times) == 4 and clip.solids == (Box((0.6, 0.1, 0.6)),)
+    with pytest.raises(ConfigError, match="expected the 1 that"):
+        one.export(moved, tmp_path, colliders=[])
+    for wrong in (moved[::-1], [moved[0], moved[0]], [], [moved[0], rollout]):
+        with pytest.raises(ConfigError, match=r"^rollout: expected a Rollout, .* or a list of the"):
+            one.render(wrong)
 
 
 def test_a_shadow_lies_below_the_body_and_sharpens_as_it_lands():

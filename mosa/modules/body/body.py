@@ -104,6 +104,11 @@ class Body(nn.Module):
         """Largest extent of the rest shape [m]."""
         return float((self.rest.amax(0) - self.rest.amin(0)).max())
 
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring particles [m]. Solids are met at half of it from their surface."""
+        return float(self.volume.mean()) ** (1 / 3)
+
     def factor(self, heterogeneity: StiffnessField | None) -> Tensor:
         """(N,) stiffness factor 1 + amplitude tanh eta(X)."""
         if heterogeneity is None:

@@ -290,7 +290,7 @@ def _motion(item: dict) -> Motion:
             raise ConfigError("normal and rotation: expected one of them")
         rotation = _turn_to(item["normal"])
     else:
-        rotation = _axis_degrees(rotation)
+        rotation = axis_degrees(rotation)
     if "waypoints" in motion:
         points = motion.pop("waypoints")
         if motion or item.get("position") is not None:
@@ -300,7 +300,7 @@ def _motion(item: dict) -> Motion:
         if len(points) < 2:
             raise ConfigError(f"motion.waypoints: expected at least two poses, found {len(points)}")
         turns = [
-            _axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation
+            axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation
             for p in points
         ]
         return Motion.waypoints(
@@ -316,14 +316,20 @@ def _motion(item: dict) -> Motion:
     return Motion(position, rotation, **motion)
 
 
-def _axis_degrees(value: Sequence[float] | None) -> Tensor:
-    """Rotation vector (3,) [rad] of (ax, ay, az, degrees)."""
+def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
+    """Rotation vector (3,) [rad] of (ax, ay, az, degrees). Errors: ConfigError, also for a
+    quaternion: four numbers of norm 1 whose first three are no unit axis (0.05 to 0.99)."""
     if value is None:
         return torch.zeros(3, dtype=torch.float64)
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.shape != (4,) or not float(value[:3].norm()) > 0:
         raise ConfigError(
             f"rotation: expected (ax, ay, az, degrees) with a non-zero axis, found {value.tolist()}"
+        )
+    if abs(float(value.norm()) - 1) < 1e-3 and 0.05 < float(value[:3].norm()) < 0.99:
+        raise ConfigError(
+            f"rotation: expected (ax, ay, az, degrees), found {value.tolist()}, a quaternion by "
+            "its norm of 1"
         )
     return value[:3] / value[:3].norm() * torch.deg2rad(value[3])
 

@@ -30,6 +30,11 @@ class SignedDistanceField:
     spacing: float
     margin: float
 
+    @property
+    def extent(self) -> float:
+        """Longest extent of the mesh [m], to a spacing or two."""
+        return self.spacing * (max(self.values.shape) - 1) - 2 * self.margin
+
 
 @wp.kernel(module="mosa.physics.contact.mesh", enable_backward=False)
 def _nearest(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import Collider, Particles, half_width
+from mosa.physics.contact.colliders import Collider, HalfSpace, Particles, half_width
+from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.reference import signed_distance
 
@@ -20,10 +22,13 @@ are half a spacing outside."""
 @torch.no_grad()
 def check_clear(
     colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0, poses: tuple = (),
-) -> None:  # fmt: skip
-    """x: (N, 3) [m] of particles where the body starts, and their spacing [m]; where: what starts, for the message; poses: position
+) -> float:  # fmt: skip
+    """How deep [m] the body starts in the contact of a solid, which begins half a spacing outside of
+    it; below 0 where it is clear.
+
+    x: (N, 3) [m] of particles where the body starts, and their spacing [m]; where: what starts, for the message; poses: position
     (K, 3) [m] and rotation (K, 3, 3) of the colliders now, () for theirs at t = 0. Errors: ConfigError naming the colliders."""
-    deep, places = [], []
+    deep, places, pressed = [], [], -math.inf
     colliders = [each for each in colliders if not isinstance(each.shape, Particles)]
     for k, collider in enumerate(colliders):
         motion = (
@@ -37,16 +42,28 @@ def check_clear(
         distance = signed_distance(
             collider.shape, (x.detach().cpu().double() - position) @ rotation
         )
+        pressed = max(pressed, 0.5 * spacing - float(distance.min()))
         deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
         places.append(str([round(p, 4) for p in position.tolist()]))
     share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:
         inside = [i for i, each in enumerate(deep) if bool(each.any())]
+        hints = dict.fromkeys(_hint(colliders[i]) for i in inside)
         named = " and ".join(
             f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside
         )
         raise ConfigError(
             f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside "
             f"of {'them' if inside[1:] else 'it'} {'now' if poses else 'at t = 0'}, where its position is "
-            f"{' and '.join(places[i] for i in inside)} m"
+            f"{' and '.join(places[i] for i in inside)} m{'; '.join(['', *filter(None, hints)])}"
         )
+    return pressed
+
+
+def _hint(collider: Collider) -> str:
+    """What may be wrong with a solid that the body is in."""
+    if isinstance(collider.shape, HalfSpace):
+        return "a plane fills all below its xy plane (normal: towards the free side)"
+    if isinstance(collider.shape, SignedDistanceField):
+        return f"its mesh is {collider.shape.extent:.3g} m long (scale: 0.001 for a file in mm)"
+    return ""

@@ -404,7 +404,8 @@ class Stepper:
             k = int(fastest.argmax())
             raise ConfigError(
                 f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
-                f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))"
+                f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps "
+                "(reset(substeps=)), and radians for the turns of actions"
             )
         (x, R, v, w), axes = poses, self.axes
         turned = axes.points(x), axes.gradients(R), axes.vectors(v), axes.vectors(w)

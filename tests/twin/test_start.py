@@ -1,0 +1,131 @@
+"""Starts of a twin among solids: what is refused, and what is warned of."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from small_bodies import FRAME_DT, WORLD, small_body, start
+
+from mosa.errors import ConfigError
+from mosa.twin.twin import Twin
+
+STILL = {"velocity": (0, 0, 0), "angular_velocity": (0, 0, 0)}
+FLOOR = {"type": "box", "size": [1, 0.1, 1], "position": [0, 0.05, 0], "mode": "separate"}
+
+
+def twin(E=3e4) -> Twin:
+    """A block of 0.12 x 0.1 x 0.08 m of particles 20 mm apart."""
+    body = small_body(adapter=False, precision=32, E=E)
+    return Twin(body, WORLD, FRAME_DT, None, start(height=0.3, speed=0.0, dtype=torch.float32))
+
+
+@pytest.mark.parametrize(
+    "turn", [(0.7071, 0, 0, 0.7071), (0, 0, 0.383, 0.924), (0.1, 0.7, 0.1, -0.7)]
+)
+def test_a_quaternion_is_no_axis_with_an_angle_in_degrees(turn):
+    waypoints = [{"time": t, "position": [0, 0, 0], "rotation": turn} for t in (0, 1)]
+    for given in (
+        {"rotation": turn},
+        {"rotation": torch.tensor(turn)},
+        {"colliders": [{**FLOOR, "rotation": turn}]},
+        {"colliders": [{"type": "sphere", "radius": 1, "motion": {"waypoints": waypoints}}]},
+    ):
+        with pytest.raises(
+            ConfigError, match=r"rotation: expected \(ax, ay, az, deg.*a quaternion"
+        ):
+            twin().reset(**given)
+
+
+@pytest.mark.parametrize("turn", [(1, 0, 0, 0), (0, 1, 0, 0.05), (0, 0.02, 0, 1), (0.6, 0, 0, 0.9)])
+def test_a_small_angle_about_any_axis_is_one(turn):
+    found = twin().reset(rotation=turn, **STILL).F[0].double()
+    axis = np.array(turn[:3]) / np.linalg.norm(turn[:3])
+    skew = [[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]]
+    turned = torch.matrix_exp(np.deg2rad(turn[3]) * torch.tensor(skew, dtype=torch.float64))
+    assert torch.allclose(found, turned, atol=1e-6)
+
+
+def test_a_body_that_starts_in_the_contact_of_a_floor_is_warned_of_and_half_a_spacing_higher_is_calm():
+    made, forces = twin(), []
+    assert made.body.spacing == pytest.approx(0.02)
+    for above in (0.0, 0.5 * made.body.spacing):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            made.reset(height=0.1 + above, **STILL, colliders=[FLOOR], control_dt=0.01)
+        forces.append(-float(made.step().reactions[0, 0, 1]))
+        said = [str(each.message) for each in told]
+        assert ["found it 10 mm deep in a contact" in each for each in said] == [True] * (not above)
+    weight = 9.8 * 1000 * float(made.body.volume.sum())
+    assert forces[0] > 20 * weight and abs(forces[1]) < 0.1 * weight
+
+
+def test_a_plane_that_faces_another_way_and_a_mesh_in_millimetres_are_named(tmp_path):
+    made, box = twin(), tmp_path / "box.obj"
+    with pytest.raises(ConfigError, match=r"inside of it .*; a plane fills all below its xy plane"):
+        made.reset(
+            colliders=[{"type": "plane", "position": [0, 0.1, 0], "rotation": [1, 0, 0, 90]}]
+        )
+    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    faces = [(1, 2, 4), (1, 4, 3), (5, 7, 8), (5, 8, 6), (1, 5, 6), (1, 6, 2), (3, 4, 8), (3, 8, 7), (1, 3, 7), (1, 7, 5),
+             (2, 6, 8), (2, 8, 4)]  # fmt: skip
+    rows = ["v %g %g %g" % tuple(30 * c for c in corner) for corner in corners]  # noqa: UP031
+    box.write_text("\n".join(rows + ["f {} {} {}".format(*face) for face in faces]))
+    solid = {"type": "mesh", "path": str(box), "spacing": 10}
+    with pytest.raises(ConfigError, match=r"its mesh is 6\d m long \(scale: 0.001"):
+        made.reset(colliders=[solid])
+    with pytest.warns(
+        UserWarning, match=r"^colliders\[0\]: expected a mesh about as large as .* 6\d m"
+    ):
+        made.reset(colliders=[{**solid, "position": [100, 0, 0]}])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        made.reset(
+            colliders=[{**solid, "position": [0.2, 0.3, 0], "scale": 0.001, "spacing": 0.01}]
+        )
+
+
+@pytest.mark.parametrize("mode, speed", [("separate", 20), ("sticky", 35)])
+def test_a_grip_slides_about_as_fast_as_it_is_warned_of(mode, speed):
+    """g dt H/(3 s) of friction, g dt H/(1.75 s) of sticky, with dt = 1/800 s."""
+    made = twin(E=6e4)
+    jaws = [{"type": "box", "name": str(side), "size": [0.06, 0.12, 0.16], "position": [0.1 * side, 0.3, 0], "mode": mode,
+             "friction": 0.8 * (mode == "separate")} for side in (-1, 1)]  # fmt: skip
+
+    def slides(substeps) -> float:
+        made.reset(**STILL, colliders=jaws, control_dt=0.01, substeps=substeps)
+        heights = []
+        for k in range(45):
+            at = 0.1 - 0.017 * min(1, (k + 1) / 10)
+            action = {str(side): {"position": (at * side, 0.3, 0)} for side in (-1, 1)}
+            heights.append(float(made.step(action).state.positions[:, 1].mean()))
+        return 1e3 * (heights[20] - heights[44]) / 0.24
+
+    with pytest.warns(
+        UserWarning, match=rf"about {speed}\.?\d* mm/s with 8 substeps; subs.*=\d+ giv"
+    ):
+        found = slides(8)
+    assert 0.6 * speed < found < 1.2 * speed
+    if mode == "separate":
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert slides(33) < 6
+
+
+def test_a_turn_in_degrees_is_asked_about():
+    made = twin()
+    made.reset(**STILL, colliders=[{**FLOOR, "name": "floor"}], control_dt=0.01)
+    with pytest.raises(ConfigError, match=r"use more substeps .*radians"):
+        made.step({"floor": {"rotation": (0, 0, 90)}})
+
+
+def test_a_rollout_takes_as_many_substeps_as_it_is_told():
+    made = twin()
+    assert made.simulate(frames=3, substeps=64, **STILL).counts == (64, 64)
+    with pytest.raises(ConfigError, match="substeps"):
+        made.simulate(frames=3, substeps=1, **STILL)
+
+
+def test_a_value_of_the_material_is_named_as_it_was_set():
+    with pytest.raises(ConfigError, match=r"^E: expected a number, found"):
+        twin().material.E = "2e4"
