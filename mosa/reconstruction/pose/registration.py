@@ -3,8 +3,9 @@ compare.
 
 The body is a set of splats that moves rigidly: x = Q (X - X_c) + x_c. Colour and matte of its rendering are
 compared with the images by robust least squares over poses (Levenberg-Marquardt), from many rotations at first,
-coarse to fine; geometry alone would not fix a ball. Its colours are those of another pose, in a light that stayed while it turned:
-the eight numbers of that light are found along with the pose at the end, so that a bright side does not turn the body.
+coarse to fine; geometry alone would not fix a ball. Its colours are those of another pose, in a light that stayed while it turned.
+The search therefore compares brightness less than hue, and the eight numbers of that light are found along with the pose at the
+end, so that a bright side does not turn the body.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ from mosa.rendering.appearance.lighting import LIGHT
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Cameras, Splats
 
+BRIGHTNESS = 0.3
+"""Share of brightness in the search over rotations. A disc that had turned by 60 and 120 degrees about its axis was found at 13
+and 29 degrees by whole colours, since its bright rim turned with it."""
 SILHOUETTE = 2.29
 """Side of a square as large as a ball's silhouette, over the root mean square distance of its points from the middle."""
 
@@ -142,9 +146,8 @@ def coarse_poses(
     seen = body.render(poses, level.cameras, background)
     centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras, SILHOUETTE * body.radius)
     poses = Poses(R, center + center - centres)
-    cost = (
-        huber(body.render(poses, level.cameras, background) - level.target)[0].flatten(1).mean(-1)
-    )
+    seen = level.weighed(body.render(poses, level.cameras, background))
+    cost = huber(seen - level.target)[0].flatten(1).mean(-1)
     return poses.take(cost.argsort()[:keep])
 
 
@@ -249,12 +252,13 @@ def register_pose(
         torch.linspace(0, len(cameras) - 1, min(coarse_views, len(cameras))).round().long().tolist()
     )
     thin = body.thinned(400, seed)
-    level = make_level(images[some], mattes[some], cameras.select(some), center, 28)
+    search = images[some], mattes[some], cameras.select(some), center
+    level = make_level(*search, 28, BRIGHTNESS)
     poses = coarse_poses(thin, level, center, background, rotations, starts)
     for iterations, keep in ((4, max(3, starts // 3)), (6, 3)):
         poses, cost = refine(thin, level, poses, background, iterations=iterations)
         poses = poses.take(distinct(poses, cost, keep))
-    level = make_level(images[some], mattes[some], cameras.select(some), center, 56)
+    level = make_level(*search, 56, BRIGHTNESS)
     poses, cost = refine(body, level, poses, background, iterations=8)
     best = poses.take(cost.argsort()[:1])
     level, found = make_level(images, mattes, cameras, center, None), None

@@ -48,14 +48,22 @@ class Poses:
 
 @dataclass(frozen=True)
 class Level:
-    """Images of one resolution, cut to the object. target: (T, V, H, W, 4) colour and matte of T frames.
+    """Images of one resolution, cut to the object. target: (T, V, H, W, 4) colour and matte of T frames, as `weighed`.
 
-    pixel: what a pixel covers at the object [m].
+    pixel: what a pixel covers at the object [m]; brightness: share with which it counts beside hue and matte.
     """
 
     target: Tensor
     cameras: Cameras
     pixel: float
+    brightness: float = 1.0
+
+    def weighed(self, images: Tensor) -> Tensor:
+        """Images (..., 4) with the mean of their colour reduced to its share."""
+        if self.brightness == 1:
+            return images
+        color, matte = images[..., :3], images[..., 3:]
+        return torch.cat((color - (1 - self.brightness) * color.mean(-1, keepdim=True), matte), -1)
 
 
 @dataclass(frozen=True)
@@ -137,7 +145,12 @@ def left_jacobian(v: Tensor) -> Tensor:
 
 
 def make_level(
-    images: Tensor, mattes: Tensor, cameras: Cameras, center: Tensor, target_px: float | None
+    images: Tensor,
+    mattes: Tensor,
+    cameras: Cameras,
+    center: Tensor,
+    target_px: float | None,
+    brightness: float = 1.0,
 ) -> Level:
     """Images (V, T, H, W, 3) and mattes (V, T, H, W) cut to the object, its window reduced to about `target_px`
     (None: kept)."""
@@ -158,7 +171,8 @@ def make_level(
     cut = replace(cut, K=K, width=width // factor, height=height // factor)
     depth = project(center[None].to(cut.K), cut)[1].clamp(min=1e-3)
     pixel = float((depth[:, 0] / cut.K[:, 0, 0]).median())
-    return Level(stack.transpose(0, 1).contiguous(), cut, pixel)
+    level = Level(stack.transpose(0, 1).contiguous(), cut, pixel, brightness)
+    return replace(level, target=level.weighed(level.target))
 
 
 def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,9 +197,8 @@ def pose_columns(
         poses.rotation.repeat_interleave(len(steps), 0),
         poses.center.repeat_interleave(len(steps), 0),
     )
-    seen = body.render(around.moved(shift, angle), level.cameras, background).view(
-        count, len(steps), -1
-    )
+    seen = level.weighed(body.render(around.moved(shift, angle), level.cameras, background))
+    seen = seen.view(count, len(steps), -1)
     return seen[:, 0], (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (
         seen[:, 1:] - seen[:, :1]
     ) / h

@@ -133,6 +133,18 @@ def test_pose_of_a_ball_comes_from_its_colours():
     assert degrees(Q, truth.rotation[0]) < 0.3
 
 
+def test_a_bright_side_finds_no_other_turn():
+    """A ball of faint colours that a strong light makes bright on one side, a third of a turn later:
+    its hue says how it has turned, its brightness that it hardly has."""
+    ball, truth, cameras = lattice_body(0.03, ball=True), turned(0.0, 0.0, 2.1), ring(5, 64)
+    ball = replace(ball, colors=0.5 + 0.3 * (ball.colors - 0.5))
+    lit = replace(ball, colors=ball.colors * fixed_light(outward(ball), 0.4)[:, None])
+    images, mattes = found_pose(ball, truth, cameras, shading=0.4)
+    options = dict(background=WHITE, rest_center=REST_CENTER, rotations=300, starts=12)
+    Q, *_ = register_pose(lit, images, mattes, cameras, normals=outward(ball), **options)
+    assert degrees(Q, truth.rotation[0]) < 1  # 177 where brightness counts as hue does
+
+
 @pytest.mark.parametrize("frames", [2, 5])
 def test_velocity_of_free_flight(frames):
     """With a start pose 2 mm and 1 degree off, as a registration may leave it: that must not turn into velocity."""
