@@ -564,7 +564,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     def end(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next."""
-        if stage.calibrates and not stage.looks_again:
+        compared = any(law_named(law).plastic for law in self.compared)
+        if stage.calibrates and not stage.looks_again and not compared:
             warn_of_yielding(self.body, self.takes, self.world)
         for name in stage.keeps:
             self.body.freeze(name)

@@ -185,11 +185,12 @@ class Material(nn.Module):
                 each if each == AUTO or each.endswith(DAMPED) else each + DAMPED
                 for each in (law, *candidates)
             )
-        for each in candidates or (law,):
+        laws = tuple(candidates) or (law,)
+        for each in laws:
             own = {n: parameters[n] for n in taken(each, parameters)} if candidates else parameters
             self._check_names(each, own, parameters, frozen, modulated)
         if unused := sorted(
-            set(parameters).difference(*(taken(each, parameters) for each in candidates or (law,)))
+            set(parameters).difference(*(taken(each, parameters) for each in laws))
         ):
             raise ConfigError(
                 f"prior.parameters: expected parameters of the candidates {', '.join(candidates)}, "
@@ -197,7 +198,7 @@ class Material(nn.Module):
                 "candidate that has it"
             )
         self.candidates, self.friction_cone = tuple(candidates), friction_cone
-        self.law, self.given = candidates[0] if candidates else law, tuple(parameters)
+        self.law, self.given = laws[0], tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
         self.modulated = (
             tuple(modulated)
