@@ -163,13 +163,15 @@ def build_prior(
     section = PriorSection.read(config)
     options = LawOptions.read(section.options or {})
     material = Material(
-        law or section.law,
+        section.law,
         section.parameters,
         names(section.frozen),
         None if section.modulated is None else names(section.modulated),
-        () if law else names(section.candidates),
+        names(section.candidates),
         options.friction_cone,
     )
+    if law:
+        material.choose(law)
     return material, options
 
 

@@ -55,6 +55,7 @@ from mosa.modules.fitting.newton_optimizer import GaussNewtonOptimizer
 from mosa.modules.fitting.newton_steps import NewtonSteps
 from mosa.modules.fitting.parameters import is_learned, tensors_of
 from mosa.modules.fitting.retreat import Retreat
+from mosa.modules.fitting.search.yielding import warn_of_yielding
 from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.stages_callback import Stages
 from mosa.modules.fitting.terms import check_terms
@@ -563,6 +564,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     def end(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next."""
+        compared = any(law_named(law).plastic for law in self.compared)
+        if stage.calibrates and not stage.looks_again and not compared:
+            warn_of_yielding(self.body, self.takes, self.world)
         for name in stage.keeps:
             self.body.freeze(name)
         self.stage_index, self.losses, self.identification = self.stage_index + 1, [], None

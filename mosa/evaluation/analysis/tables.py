@@ -16,6 +16,7 @@ from mosa.modules.fitting.search.ground import (
     taken_of,
 )
 from mosa.modules.fitting.search.parts import WORTH, chosen, named
+from mosa.physics.constitutive.laws import law_named
 from mosa.types import RUBBING
 
 ROWS = {
@@ -215,9 +216,13 @@ def _backbones(compared: Mapping[str, float], gained: Mapping[str, float]) -> st
         for name, error in sorted(compared.items(), key=lambda e: e[1])
     )
     said = f"Error of the isotropic laws after calibration: {listed}."
+    yielding = {name for name in compared if law_named(name).plastic}
+    if yielding and yielding != set(compared):
+        said += " The body stays deformed, which no elastic law predicts: laws that yield were compared."
     if gained:
         each = ", ".join(f"{name} {gain:+.1f}" for name, gain in gained.items())
-        nearest = min(compared, key=compared.get)
+        alike = yielding if yielding & set(gained) else set(compared) - yielding
+        nearest = min(alike, key=compared.get)
         said += f" With what was learned about {nearest}, the logarithm of the likelihood changes by: {each}."
     return said
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -145,6 +145,12 @@ def unit_of(law: str, name: str) -> str:
     return UNITS.get(name, "")
 
 
+def taken(law: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Those of the parameters `names` that a law has. Errors: ConfigError for an unknown law."""
+    known = set(law_named(law).parameters)
+    return tuple(name for name in names if known.issuperset(GIVES.get(name, (name,))))
+
+
 class Material(nn.Module):
     """Parameters of one prior law.
 
@@ -153,7 +159,8 @@ class Material(nn.Module):
     names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa
     together). damping, bulk_damping among the parameters: with a viscous branch of the law
     (`constitutive.damping`). friction_cone: of `friction_alpha`. candidates: laws among which a calibration chooses, with law=auto;
-    until then it is the first. A parameter that starts on a bound of its range is held there.
+    until then it is the first. Each reads those of `parameters` that it has. A parameter that starts on
+    a bound of its range is held there.
     Errors: ConfigError naming the parameter, what was expected and what was found.
     """
 
@@ -178,10 +185,20 @@ class Material(nn.Module):
                 each if each == AUTO or each.endswith(DAMPED) else each + DAMPED
                 for each in (law, *candidates)
             )
-        for each in candidates or (law,):
-            self._check_names(each, parameters, frozen, modulated)
+        laws = tuple(candidates) or (law,)
+        for each in laws:
+            own = {n: parameters[n] for n in taken(each, parameters)} if candidates else parameters
+            self._check_names(each, own, parameters, frozen, modulated)
+        if unused := sorted(
+            set(parameters).difference(*(taken(each, parameters) for each in laws))
+        ):
+            raise ConfigError(
+                f"prior.parameters: expected parameters of the candidates {', '.join(candidates)}, "
+                f"found {', '.join(unused)}: leave it out (~prior.parameters.{unused[0]}), or add a "
+                "candidate that has it"
+            )
         self.candidates, self.friction_cone = tuple(candidates), friction_cone
-        self.law, self.names = candidates[0] if candidates else law, tuple(parameters)
+        self.law, self.given = laws[0], tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
         self.modulated = (
             tuple(modulated)
@@ -208,7 +225,7 @@ class Material(nn.Module):
             )
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
-    def _check_names(self, law: str, parameters, frozen, modulated) -> None:
+    def _check_names(self, law: str, parameters, given, frozen, modulated) -> None:
         known = law_named(law)
         if unknown := sorted(set(parameters) - set(FORMS)):
             own = [name for name in unknown if name in known.parameters]
@@ -221,9 +238,10 @@ class Material(nn.Module):
                 f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}{hint}"
             )
         for key, names in (("frozen", frozen), ("modulated", modulated or ())):
-            if strange := sorted(set(names) - set(parameters)):
+            if strange := sorted(set(names) - set(given)):
                 raise ConfigError(
-                    f"prior.{key}: expected names among {', '.join(parameters)}, found {', '.join(strange)}"
+                    f"prior.{key}: expected names among {', '.join(given)}, "
+                    f"found {', '.join(strange)}"
                 )
         if ("E" in parameters) != ("nu" in parameters):
             raise ConfigError(
@@ -279,9 +297,17 @@ class Material(nn.Module):
             self.raw[coordinate] = nn.Parameter(torch.tensor(0.0), requires_grad=learned)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters of the law in use."""
+        return taken(self.law, self.given)
+
+    @property
     def learned(self) -> list[str]:
         """Names of the unconstrained numbers that are learned, of a direction its two angles."""
-        return [name for name, raw in self.raw.items() if raw.requires_grad]
+        own = set(self.names)
+        for name in own.intersection(self.directions):
+            own.update(Direction.coordinates(name))
+        return [name for name, raw in self.raw.items() if name in own and raw.requires_grad]
 
     def direction(self, name: str) -> Tensor:
         """(3,) unit vector of a parameter that is one, in the rest shape."""
@@ -321,7 +347,7 @@ class Material(nn.Module):
         parts = {f"{name}_{axis}" for name in self.directions for axis in Direction.AXES}
         values = {n: v * factor if n in self.modulated else v for n, v in self.physical().items()}
         result = {n: v for n, v in values.items() if n not in GIVES and n not in parts}
-        result |= {name: self.direction(name) for name in self.directions}
+        result |= {name: self.direction(name) for name in self.directions if name in self.names}
         if "E" in values:
             result["mu"], result["lam"] = lame(values["E"], values["nu"])
         if "friction_angle" in values:

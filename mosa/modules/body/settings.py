@@ -56,7 +56,11 @@ class PriorSection(Settings):
         None, description="parameters that the heterogeneity multiplies; null: the stiffness"
     )
     candidates: Names | None = Field(
-        None, description="with law=auto: the laws that are calibrated and compared"
+        None,
+        description=(
+            "with law=auto: the laws that are calibrated and compared; those that yield only "
+            "where the body stays deformed"
+        ),
     )
     options: Section | None = Field(None, description="options of the law (below)")
 

@@ -7,6 +7,7 @@ asks for (`Ready.simulate`).
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import os
 import threading
@@ -302,17 +303,19 @@ class Identification:
         return search(self)
 
     @torch.no_grad()
-    def score(self) -> float:
-        """Error of the criterion's predictions [m]: the geometric mean over the frames after the
-        first of the root mean square distance over particles, above the floor of the noise.
+    def score(self, gains: Sequence[float] | None = None) -> float:
+        """Error of the predictions [m] with these gains, by default the stage's own: the geometric
+        mean over the frames after the first of the root mean square distance over particles, above
+        the floor of the noise.
 
         This is the likelihood of the positions where each frame has an unknown noise of its own,
         so that frames which no law predicts do not decide. Of free rollouts it is `distance`."""
-        if not any(self.gains):
+        gains = gains or self.gains
+        if not any(gains):
             return self.distance()
         least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
         logarithms = []
-        for i, gain in self.pairs:
+        for i, gain in itertools.product(range(len(self.takes)), gains):
             away = self.takes[i].cues.away(self.rollout(self.body, i, gain).x)
             square = away[1:].square().sum(-1).mean(-1).double() + least
             logarithms.append(0.5 * float(square.log().mean()))

@@ -27,7 +27,9 @@ from mosa.modules.fitting.search.ground import (
 )  # fmt: skip
 from mosa.modules.fitting.search.parts import PARTS, chosen
 from mosa.modules.fitting.search.parts import named as named_parts
+from mosa.modules.fitting.search.yielding import lasting
 from mosa.modules.fitting.stages import Stage
+from mosa.physics.constitutive.laws import law_named
 from mosa.system.progress import tqdm
 from mosa.types import Ground
 
@@ -59,11 +61,16 @@ class NewtonSteps:
             self.find_ground(stage)
             searched = True
         if self.body.material.candidates:
-            searched = True
+            again, searched = searched, True
             self.compared = choose_law(
-                self.body, self.body.material.candidates, lambda: self.identifying(stage)
+                self.body,
+                self.body.material.candidates,
+                lambda: self.identifying(stage),
+                lambda: lasting(self.body, self.takes, self.world),
             )
             self.choose(self.body.material.law)
+            if again and law_named(self.body.material.law).plastic:
+                self.find_ground(stage)  # what was found before was found with an elastic law
         identification = self.identifying(stage)
         if saved is not None:
             self.go_on(identification, saved)
@@ -107,7 +114,12 @@ class NewtonSteps:
         if not stage.learns_adapter or not self.compared or self.law_gains:
             return None
         own = self.identification.cost()
-        others = [law for law in self.compared if law != self.body.material.law]
+        law = law_named(self.body.material.law)
+        others = [
+            each
+            for each in self.compared
+            if each != law.name and law_named(each).plastic == law.plastic
+        ]
         gains = {law: own - self.fitted_on(self.world.ground, stage, law)[0] for law in others}
         self.law_gains = {law: gain for law, gain in gains.items() if math.isfinite(gain)}
         best = max(self.law_gains, key=self.law_gains.get, default=None)

@@ -92,3 +92,14 @@ def test_the_recording_that_no_column_names_is_said():
     assert (
         columns_text({"test/a/psnr_crop": 30.0}, "a") == ""
     )  # of another scene than the one that was learned from
+
+
+def test_a_report_says_which_backbones_were_compared_and_why():
+    errors = {"corotated": 12e-3, "stvk": 13e-3}
+    found = {f"id_prior/compared/{law}_m": error for law, error in errors.items()}
+    text = determined_text(found | {"id_prior/gain/stvk": 7.2}, "stvk")
+    assert "Backbone: stvk." in text and "yield" not in text
+    assert "corotated 12.00 mm, stvk 13.00 mm." in text and "about corotated" in text
+    yields = found | {"id_prior/compared/von_mises_m": 11e-3}  # too little to be taken
+    text = determined_text(yields | {"id_prior/gain/stvk": -3.0}, "corotated")
+    assert "laws that yield were compared" in text and "about corotated" in text

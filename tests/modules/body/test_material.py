@@ -38,7 +38,9 @@ def test_every_prior_starts_at_the_values_of_its_file(file):
     material = Material(**keys)
     laws = keys["candidates"] if file.stem == "auto" else [keys["law"]]
     assert file.stem.startswith(keys["law"]) and material.law == laws[0]
-    given, found = keys["parameters"], material.physical()
+    given, found = keys["parameters"], {}
+    for material.law in laws:
+        found |= material.physical()
     for name in given:
         if name in material.directions:
             given[name] = torch.nn.functional.normalize(
@@ -51,6 +53,20 @@ def test_every_prior_starts_at_the_values_of_its_file(file):
         assert set(material.per_particle(torch.ones(4))) == {
             n for n in law.parameters if n != law.reference
         }
+
+
+def test_each_candidate_has_its_own_parameters():
+    laws, given = ("corotated", "von_mises"), {**ELASTIC, "yield_stress": 5e3}
+    material = Material("auto", given, candidates=laws)
+    assert material.names == ("E", "nu") and material.learned == ["E", "nu"]
+    assert set(material.per_particle()) == {"mu", "lam"}
+    material.choose("von_mises")
+    assert material.learned == ["E", "nu", "yield_stress"]
+    assert float(material.per_particle()["yield_stress"].detach()) == pytest.approx(5e3)
+    with pytest.raises(ConfigError, match=r"candidates corotated, von_mises, found cohesion"):
+        Material("auto", {**given, "cohesion": 0.1}, candidates=laws)
+    with pytest.raises(ConfigError, match="von_mises takes lam, mu, yield_stress"):
+        Material("auto", ELASTIC, candidates=laws)
 
 
 def test_lame_parameters_and_friction_follow_from_the_physical_ones():

@@ -13,6 +13,9 @@ import torch
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.body.body import Body
 from mosa.modules.body.material import FORMS, STIFFNESS
+from mosa.modules.fitting.search.parts import WORTH
+from mosa.modules.fitting.search.yielding import LASTS
+from mosa.physics.constitutive.laws import law_named
 from mosa.system.progress import tqdm
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
@@ -59,6 +62,7 @@ class Calibration(Protocol):
 
     body: Body
     offsets: tuple[float | None, ...]
+    gains: tuple[float, ...]
 
     def search(self) -> float:
         """`search` of it."""
@@ -66,8 +70,8 @@ class Calibration(Protocol):
     def iterate(self) -> dict[str, float]:
         """One iteration of Gauss-Newton."""
 
-    def score(self) -> float:
-        """How far the predictions are from the cues [m]."""
+    def score(self, gains: Sequence[float] | None = None) -> float:
+        """How far the predictions are from the cues [m]; gains: those of another criterion."""
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues."""
@@ -299,31 +303,58 @@ TRIED = 4
 
 
 def choose_law(
-    body: Body, candidates: Sequence[str], build: Callable[[], Calibration]
+    body: Body,
+    candidates: Sequence[str],
+    build: Callable[[], Calibration],
+    lasts: Callable[[], float],
 ) -> dict[str, float]:
-    """Calibrate every candidate and leave `body` at the one with the smallest score, which is returned for
-    each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
-    """
-    found: dict[str, float] = {}
-    best: tuple[float, dict, str] | None = None
-    for law in candidates:
-        body.material.law = law
-        calibration = build()
-        try:
-            calibration.search()
-            for _ in range(TRIED):
-                calibration.iterate()
-            found[law] = calibration.score()
-        except SimulationDiverged:
-            found[law] = math.inf
-            continue
-        if best is None or found[law] < best[0]:
-            best = (found[law], calibrated(body), law)
+    """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction
+    [m], all by the elastic laws' criterion; infinite where a law cannot be simulated.
+
+    The elastic law with the smallest error is chosen. Where it leaves a lasting change of shape
+    unexplained, or none can be simulated, laws that yield are calibrated too, and the best of them
+    is chosen if its error is below `WORTH` of the elastic one's: with a yield stress that the
+    motion does not reach it is an elastic law.
+
+    build: a calibration of `body`; lasts: the share that `body` leaves unexplained (`yielding`).
+    Errors: SimulationDiverged where no law can be simulated."""
+    errors: dict[str, float] = {}
+    ends: dict[str, dict[str, dict]] = {}
+    begun, gains = calibrated(body), None
+    yielding = [law for law in candidates if law_named(law).plastic]
+
+    def best_of(laws: Sequence[str]) -> str | None:
+        """Calibrates these; the best one, which `body` then is."""
+        nonlocal gains
+        for law in laws:
+            body.material.law = law
+            calibrate_as(body, begun)
+            calibration, errors[law] = build(), math.inf
+            try:
+                calibration.search()
+                for _ in range(TRIED):
+                    calibration.iterate()
+                gains = gains or calibration.gains
+                errors[law] = calibration.score(gains)
+            except SimulationDiverged:
+                continue
+            ends[law] = calibrated(body)
+        best = min((law for law in laws if law in ends), key=errors.__getitem__, default=None)
+        if best is not None:
+            body.material.law = best
+            calibrate_as(body, ends[best])
+        return best
+
+    best = best_of([law for law in candidates if law not in yielding])
+    if yielding and (best is None or lasts() > LASTS):
+        other = best_of(yielding)
+        if best is None or (other is not None and errors[other] < WORTH * errors[best]):
+            best = other
     if best is None:
         raise SimulationDiverged(
             f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
             "to the body's"
         )
-    calibrate_as(body, best[1])
-    body.choose(best[2])
-    return found
+    body.choose(best)
+    calibrate_as(body, ends[best])
+    return errors

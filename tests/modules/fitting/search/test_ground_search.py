@@ -20,6 +20,7 @@ from mosa.evaluation.analysis.tables import (
 )
 from mosa.modules.body.body import World
 from mosa.modules.body.contact import ContactOffset
+from mosa.modules.body.material import Material
 from mosa.modules.fitting import newton_steps
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
@@ -314,6 +315,26 @@ def test_a_run_goes_on_with_the_ground_that_it_found():
         and again.record.ground.plain() == asdict(truth)
         and again.grounds == module.grounds
     )
+
+
+@pytest.mark.parametrize("chosen", ["corotated", "von_mises"])
+def test_the_ground_is_sought_again_with_a_law_that_yields(monkeypatch, chosen):
+    """An elastic law of a body that yields is far off on every ground."""
+    begins, asked = start(turn=0.5, speed=-2.0), []
+    module = fit_of(take_of(small_body(adapter=False), begins, 2))
+    laws = ("corotated", "von_mises")
+    given = {"E": E, "nu": NU, "yield_stress": 1e4}
+    module.body.material = Material(AUTO, given, candidates=laws).double()
+
+    def choose_ground(body, known, calibration):
+        asked.append(body.material.law)
+        return replace(known, friction=float(len(asked)), mode="touch"), {"sticky": 1e-3}
+
+    monkeypatch.setattr(newton_steps, "choose_ground", choose_ground)
+    monkeypatch.setattr(newton_steps, "choose_law", lambda body, *_: body.choose(chosen) or {})
+    module.begun(module.stages[0])
+    assert asked == ["corotated", "von_mises"][: 1 + (chosen == "von_mises")]
+    assert module.world.ground == Ground(0.0, "touch", float(len(asked)))
 
 
 def learning(truth: Ground) -> LitMosa:

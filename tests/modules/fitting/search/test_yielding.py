@@ -1,0 +1,144 @@
+"""Bodies that stay deformed, and the laws that are then compared."""
+
+import math
+import warnings
+from types import SimpleNamespace
+
+import pytest
+import torch
+from small_bodies import NU, WORLD, E, small_body, start, take_of
+
+from mosa.errors import SimulationDiverged
+from mosa.modules.body.material import Material
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
+from mosa.modules.fitting.search import backbone
+from mosa.modules.fitting.search.backbone import choose_law
+from mosa.modules.fitting.search.parts import WORTH
+from mosa.modules.fitting.search.yielding import LASTS, lasting, warn_of_yielding
+from mosa.modules.fitting.stages import Stage
+from mosa.types import MarkerCues
+
+BEGINS = start(turn=0.5, speed=-3.0)
+YIELDS = 2500.0
+LAWS = ("corotated", "stvk", "von_mises")
+
+
+def body_of(law, yield_stress=YIELDS, scale=1.0):
+    body = small_body(adapter=False)
+    given = {"E": scale * E, "nu": NU} | (
+        {"yield_stress": yield_stress} if law == "von_mises" else {}
+    )
+    body.material = Material(law, given).double()
+    return body
+
+
+def film(law, frames=12, **changes):
+    return take_of(body_of(law, **changes), BEGINS, frames)
+
+
+def test_a_body_that_yields_keeps_a_shape_that_no_elastic_law_has():
+    yielded, elastic = film("von_mises"), film("stvk")
+    for E_of in (0.3, 1.0):  # a calibration of an elastic law takes such a body for a soft one
+        assert lasting(body_of("stvk", scale=E_of), [yielded], WORLD) > LASTS
+    assert lasting(body_of("von_mises"), [yielded], WORLD) == 0.0
+    # a law that is wrong, of an elastic body
+    assert lasting(body_of("corotated", scale=1.3), [elastic], WORLD) < 0.5 * LASTS
+    assert lasting(body_of("corotated"), [elastic, yielded], WORLD) > LASTS
+    # films that end as the body is squashed, and of a body that flows to the end
+    assert lasting(body_of("corotated"), [film("stvk", frames=3)], WORLD) == 0.0
+    assert lasting(body_of("stvk"), [film("von_mises", yield_stress=800.0)], WORLD) > LASTS
+
+
+def test_tracked_points_tell_it_too():
+    take, body = film("von_mises"), body_of("stvk")
+    few = torch.arange(0, len(body.rest), 5)
+    seen = take.cues.positions[:, few].clone()
+    seen[3, 0] = torch.nan
+    take.cues = MarkerCues(seen, few[:, None], torch.ones(len(few), 1).double())
+    assert lasting(body, [take], WORLD) > LASTS
+
+
+def test_an_elastic_prior_of_such_a_body_is_warned_of():
+    take = film("von_mises")
+    with pytest.warns(UserWarning, match=r"keeps \d+% of its largest change.*prior=von_mises"):
+        warn_of_yielding(body_of("stvk"), [take], WORLD)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_yielding(body_of("von_mises"), [take], WORLD)
+        warn_of_yielding(body_of("stvk"), [film("stvk")], WORLD)
+
+
+def made(errors, tried):
+    """Calibrations of a body whose laws have these errors [m], None where it diverges."""
+    given = {"E": E, "nu": NU, "yield_stress": YIELDS}
+    body = small_body(adapter=False)
+    body.material = Material("auto", given, candidates=LAWS).double()
+
+    def build():
+        law = body.material.law
+        tried.append(law)
+
+        def search():
+            if errors[law] is None:
+                raise SimulationDiverged("")
+            with torch.no_grad():
+                body.material.raw["E"].fill_(float(LAWS.index(law)))
+
+        gains = (0.0,) if law == "von_mises" else (0.5,)
+        return SimpleNamespace(search=search, iterate=dict, gains=gains,
+                               score=lambda asked: errors[law] if asked == (0.5,) else 1e3)  # fmt: skip
+
+    return body, build
+
+
+@pytest.mark.parametrize(("share", "yielding", "law"), [
+    (0.9 * LASTS, 1e-3, "stvk"), (0.9, 1e-3, "von_mises"), (0.9, 1.1 * WORTH * 8e-3, "stvk"), (0.9, None, "stvk"),
+])  # fmt: skip
+def test_laws_that_yield_are_asked_where_the_body_stays_deformed_and_taken_where_they_predict_it(
+    share, yielding, law
+):
+    tried: list[str] = []
+    errors = {"corotated": 9e-3, "stvk": 8e-3, "von_mises": yielding}
+    body, build = made(errors, tried)
+    laws_at = []
+
+    def lasts():
+        laws_at.append((body.material.law, body.material.raw["E"].item()))
+        return share
+
+    found = choose_law(body, LAWS, build, lasts)
+    assert laws_at == [("stvk", 1.0)]  # asked of the best elastic law
+    assert tried == list(LAWS[: 3 if share > LASTS else 2]) and set(found) == set(tried)
+    assert found.get("von_mises", 1e-3) == (math.inf if yielding is None else yielding)
+    assert body.material.law == law and body.material.candidates == ()
+    assert body.material.raw["E"].item() == LAWS.index(law)
+
+
+def test_a_law_that_yields_is_left_where_no_elastic_one_can_be_simulated():
+    tried: list[str] = []
+    body, build = made({"corotated": None, "stvk": None, "von_mises": 1e-3}, tried)
+    choose_law(body, LAWS, build, lambda: pytest.fail("no elastic law is there to be asked"))
+    assert body.material.law == "von_mises" and tried == list(LAWS)
+
+
+@pytest.mark.parametrize(("truth", "yield_stress"), [("von_mises", YIELDS), ("stvk", 1e6)])
+def test_both_kinds_of_law_are_compared_by_one_prediction(monkeypatch, truth, yield_stress):
+    """With a yield stress that the motion does not reach von Mises is the elastic law."""
+    monkeypatch.setattr(Identification, "search", lambda self: 0.0)
+    monkeypatch.setattr(backbone, "TRIED", 1)
+    take = film(truth)
+    body = small_body(adapter=False)
+    given = {"E": 1.1 * E, "nu": NU, "yield_stress": 1.1 * yield_stress}
+    body.material = Material("auto", given, candidates=LAWS[1:]).double()
+    stage = Stage(name="prior", iterations=3, lr=0.1, optimizer="gauss_newton")
+    errors = choose_law(
+        body, LAWS[1:],
+        lambda: Identification(body, [take], WORLD, stage, Criterion(name="corrected"), IdentificationSettings()),
+        lambda: 1.0,
+    )  # fmt: skip
+    if truth == "stvk":
+        assert errors["von_mises"] == pytest.approx(errors["stvk"], rel=0.1)
+    else:
+        assert errors["von_mises"] < 0.5 * errors["stvk"]
+    assert body.material.law == truth
