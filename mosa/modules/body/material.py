@@ -189,14 +189,14 @@ class Material(nn.Module):
         for each in laws:
             own = {n: parameters[n] for n in taken(each, parameters)} if candidates else parameters
             self._check_names(each, own, parameters, frozen, modulated)
-        if unused := sorted(
-            set(parameters).difference(*(taken(each, parameters) for each in laws))
-        ):
+        used = {name for each in laws for name in taken(each, parameters)}
+        if unknown := sorted(set(parameters) - used - set(FORMS)):
             raise ConfigError(
                 f"prior.parameters: expected parameters of the candidates {', '.join(candidates)}, "
-                f"found {', '.join(unused)}: leave it out (~prior.parameters.{unused[0]}), or add a "
-                "candidate that has it"
+                f"found {', '.join(unknown)}"
             )
+        # a choice of candidates on the command line leaves the file's parameters of the others
+        parameters = {name: value for name, value in parameters.items() if name in used}
         self.candidates, self.friction_cone = tuple(candidates), friction_cone
         self.law, self.given = laws[0], tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"

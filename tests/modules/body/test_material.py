@@ -63,8 +63,9 @@ def test_each_candidate_has_its_own_parameters():
     material.choose("von_mises")
     assert material.learned == ["E", "nu", "yield_stress"]
     assert float(material.per_particle()["yield_stress"].detach()) == pytest.approx(5e3)
-    with pytest.raises(ConfigError, match=r"candidates corotated, von_mises, found cohesion"):
-        Material("auto", {**given, "cohesion": 0.1}, candidates=laws)
+    assert Material("auto", {**given, "cohesion": 0.1}, candidates=laws).given == tuple(given)
+    with pytest.raises(ConfigError, match=r"candidates corotated, von_mises, found cohesoin"):
+        Material("auto", {**given, "cohesoin": 0.1}, candidates=laws)
     with pytest.raises(ConfigError, match="von_mises takes lam, mu, yield_stress"):
         Material("auto", ELASTIC, candidates=laws)
 
