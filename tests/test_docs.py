@@ -46,17 +46,23 @@ def test_what_a_page_names_is_there(page):
 
 
 def test_figures_of_the_readme_are_those_of_the_files_that_it_names():
-    """A comment above a table names its sources; every figure of the table stands in one of them."""
-    tables = re.findall(
-        r"<!-- figures: ([^>]+?) -->\n((?:\|.*\n)+)", (ROOT / "README.md").read_text()
+    """A comment names the sources of all figures from it to the next heading, in tables and sentences."""
+    readme = (ROOT / "README.md").read_text()
+    assert len(readme.splitlines()) <= 120
+    parts = re.findall(
+        r"<!-- figures: ([^>]+?) -->\n(.+?)(?=\n## |<!-- figures|\Z)", readme, re.DOTALL
     )
-    assert len(tables) == 3
-    for sources, table in tables:
+    assert len(parts) == 3
+    number = r"\d+\.\d+(?:e\d+)?(?: ± \d+\.\d+)?"
+    for sources, said in parts:
         text = "".join((ROOT / name).read_text() for name in sources.split())
-        figures = re.findall(r"\d+\.\d+(?:e\d+)?(?: ± \d+\.\d+)?", table)
+        figures = re.findall(number, re.sub(r"[Vv]ersion [\d.]+", "", said))
         assert figures and not [
             each for each in figures if not re.search(rf"(?<![\d.]){re.escape(each)}(?!\d)", text)
         ], sources
+    rest = re.sub(r"<!-- figures.+?(?=\n## |<!-- figures|\Z)", "", readme, flags=re.DOTALL)
+    untraced = re.findall(rf"{number}(?= ?(?:mm|dB|degrees|%|s\b|GB))", rest)
+    assert not untraced
 
 
 @pytest.fixture(scope="module")
