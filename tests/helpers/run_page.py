@@ -50,23 +50,23 @@ class Block(NamedTuple):
     text: str
     line: int
     """Lines above it."""
-    named: str | None
+    named: str | None = None
     """Path of the file that it is."""
+    left_out: bool = False
 
 
 def blocks(page: Path) -> list[Block]:
-    """All that run here."""
     if page.suffix == ".ipynb":
         cells = json.loads(page.read_text())["cells"]
-        return [Block("python", "".join(cell["source"]), 0, None) for cell in cells if cell["cell_type"] == "code"]  # fmt: skip
+        return [Block("python", "".join(cell["source"]), 0) for cell in cells if cell["cell_type"] == "code"]  # fmt: skip
     found, above = [], ""
     for token in MarkdownIt("commonmark").parse(page.read_text()):
         if token.type in ("fence", "code_block"):
             named = re.match(r"# ([\w/]+\.(?:py|yaml))\n", token.content)
-            left_out = re.match(r"<!-- not run(?: without (\w+))?: .+ -->", above)
-            if left_out is None or (left_out[1] and find_spec(left_out[1])):
-                text = token.content[named.end() if named else 0 :]
-                found.append(Block(token.info, text, token.map[0] + 1, named and named[1]))
+            reason = re.match(r"<!-- not run(?: without (\w+))?: .+ -->", above)
+            left_out = reason is not None and not (reason[1] and find_spec(reason[1]))
+            text = token.content[named.end() if named else 0 :]
+            found.append(Block(token.info, text, token.map[0] + 1, named and named[1], left_out))
         above = token.content if token.type == "html_block" else ""
     return found
 
@@ -133,7 +133,7 @@ def run(page: Path, before: str, after: str) -> None:
     exec(before, names)
     written(page, Path())
     for block in blocks(page):
-        if block.named or block.language in NO_CODE:
+        if block.named or block.left_out or block.language in NO_CODE:
             continue
         if block.language == "python":  # lines of its traceback are those of the page
             exec(compile("\n" * block.line + block.text, str(page), "exec"), names)
@@ -142,7 +142,8 @@ def run(page: Path, before: str, after: str) -> None:
         for line in block.text.replace("\\\n", " ").splitlines():
             for each in line.split(" && "):
                 command(shlex.split(each, comments=True))
-    exec(after, names)
+    if not any(block.left_out for block in blocks(page)):
+        exec(after, names)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ FIRST, NOTEBOOK = "docs/tutorial.md", "docs/notebook.ipynb"
 PAGES = [
     path.relative_to(ROOT).as_posix()
     for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md")), ROOT / "docs" / "notebook.ipynb")
-    if path.name != "CHANGELOG.md" and run_page.blocks(path)
+    if path.name != "CHANGELOG.md" and any(block.language not in run_page.NO_CODE for block in run_page.blocks(path))
 ]  # fmt: skip
 
 ROUGHLY = """
