@@ -3,36 +3,23 @@ the baseline."""
 
 import json
 import os
-import re
 from pathlib import Path
 
 import forked
 import numpy as np
 import pytest
-import torch
 import yaml
+from run_page import written
 
 from mosa.data.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
-BLOCK = re.compile(r"```(?:python|yaml)\n# ([\w/]+\.(?:py|yaml))\n(.*?)```", re.DOTALL)
-"""Path and text of a file on the page; a YAML file's package, where it names one, is the line after."""
+PAGE = ROOT / "docs" / "extending.md"
 QUICK = ["debug=default", "scene.holdout_frames=0", "fit=adam", "fit.prior.iterations=2", "fit.joint.iterations=2",
          "fit.prior_eta.iterations=0", "heterogeneity.enabled=false", "simulation.particles=100", "reconstruction.resolution=40",
          "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30", "reconstruction.carried.iterations=10",
          "reconstruction.dynamic.iterations=10", "reconstruction.dynamic.track_iterations=10", "logger=csv",
          "evaluation.video=false", "evaluation.samples=64", "evaluation.assignment=32"]  # fmt: skip
-
-
-def written(folder: Path) -> list[str]:
-    """The files of the page, below `folder`."""
-    names = []
-    for name, text in BLOCK.findall((ROOT / "docs" / "extending.md").read_text()):
-        file = folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
-        names.append(name)
-    return names
 
 
 def recorded(folder: Path, cache: Path) -> Path:
@@ -60,7 +47,7 @@ if __name__ == "__main__":
 def run(tmp_path_factory, cache):
     """The package as a row of a table of its own: a specification in a folder, whose job is the run."""
     folder = tmp_path_factory.mktemp("extending")
-    assert len(written(folder)) == 11
+    assert len(written(PAGE, folder)) == 11
     row = ["extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "prior=fibres", "adapter=softer",
            "+losses.volume=0.5"]  # fmt: skip
     scene = [
@@ -159,26 +146,6 @@ def test_a_checkpoint_needs_the_package_and_does_not_import_it(run):
     )
 
 
-def test_the_simulator_alone():
-    section = (ROOT / "docs" / "extending.md").read_text().partition("## The simulator alone")[2]
-    (block,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-    names = {}
-    exec(block, names)
-    rollout = names["rollout"]
-    assert rollout.x.shape == (26, 13**3, 3) and len(block.strip().splitlines()) <= 12
-    height = rollout.x[:, :, 1].mean(1)
-    fall = 0.165 - 0.5 * 9.8 * rollout.times[:7].square()
-    torch.testing.assert_close(
-        height[:7], fall, rtol=0, atol=1.5e-3
-    )  # half a substep of gravity early, 0.3 mm in 0.12 s
-    low = int(height.argmin())
-    assert (
-        6 < low < 25
-        and rollout.x[:, :, 1].min() > -names["dx"] / 2
-        and height[low:].max() > 1.5 * height[low]
-    )
-
-
 BASELINE = """
 import my_mosa, torch
 from small_bodies import FRAME_DT, WORLD, small_body, start
@@ -197,7 +164,7 @@ print(float((one - other).abs().max()), float((one - softer).abs().max()), slope
 
 
 def test_the_baseline_stands_in_for_the_law(tmp_path):
-    written(tmp_path)
+    written(PAGE, tmp_path)
     path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "helpers")))
     (tmp_path / "baseline.py").write_text(BASELINE)
     result = forked.call(

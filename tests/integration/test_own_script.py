@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 from pathlib import Path
 
 import forked
@@ -12,6 +11,7 @@ import torch
 from assembled import ROUGHLY
 from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
+from run_page import written
 
 from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
@@ -91,10 +91,7 @@ def test_the_data_stand_alone(cache):
 
 def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
     _, _, module, trainer = fitted
-    page = (ROOT / "docs" / "own_training_script.md").read_text()
-    for name, text in re.findall(r"```\w+\n# ([\w/]+\.(?:py|yaml))\n(.*?)```", page, re.S):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
+    written(ROOT / "docs" / "own_training_script.md", tmp_path)
     words = ["train.py", "--config-dir", f"{tmp_path}/my_conf", f"hydra.run.dir={tmp_path}", "debug=default",
              f"scene.cache={cache}", "adapter=mosa", "fit.views=1", "fit.joint.iterations=5", *HELD, "evaluation.video=false",
              "evaluation.floor=false", "evaluation.samples=64", "evaluation.assignment=16", "logger=none",

@@ -1,11 +1,8 @@
 """A twin that is stepped: the bits of one long simulation, state saved and branched, driven colliders, gradients, many worlds."""
 
 import math
-import re
-import warnings
 from dataclasses import replace
 from io import BytesIO
-from pathlib import Path
 
 import pytest
 import torch
@@ -538,28 +535,6 @@ def test_errors_of_starts_and_states():
             )
     with pytest.raises(DataError, match=r"state: expected .* found x"):
         TwinState.read({"x": torch.zeros(3)})
-
-
-def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
-    """Every block of docs/twin.md, one after another, with a small body in place of the checkpoint's."""
-    page = (Path(__file__).parents[2] / "docs" / "twin.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(blocks) == 5
-    monkeypatch.setattr(Twin, "load", lambda path: twin(32))
-    monkeypatch.chdir(tmp_path)
-    names = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # of gradients that are far off
-        for block in blocks:
-            exec(block, names)
-    assert names["outcomes"][0].shape == (120, 3) and not torch.equal(*names["outcomes"])
-    assert names["by_push"].abs().max() > 0 and names["by_modulus"].abs() > 0
-    assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (
-        4,
-        1,
-        6,
-    )
-    assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
 
 
 def test_worlds_begin_again_outside_of_where_solids_are_by_then():

@@ -5,40 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from small_bodies import FRAME_DT, WORLD, small_body, start
 
 from mosa.physics.contact.mesh import read_mesh
-from mosa.twin.twin import Twin
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robots.md").read_text()
-JAW = """<link name="{name}"><collision>
-<geometry><box size="0.06 0.12 0.16"/></geometry></collision></link>
-<joint name="{name}_slide" type="prismatic"><parent link="lift"/><child link="{name}"/>
-<origin xyz="{x} 0 0"/><axis xyz="{side} 0 0"/>
-<limit lower="0" upper="1" effort="1" velocity="1"/></joint>"""
-GRIPPER = """<robot name="gripper"><link name="root"/><link name="lift"/>
-<joint name="up" type="prismatic"><parent link="root"/><child link="lift"/><axis xyz="0 1 0"/>
-<limit lower="0" upper="1" effort="1" velocity="1"/></joint>{jaws}</robot>"""
-
-
-def test_a_gripper_lifts_a_body_and_carries_its_weight(tmp_path, monkeypatch):
-    pytest.importorskip("yourdfpy")
-    jaws = JAW.format(name="left", x=-0.1, side=1) + JAW.format(name="right", x=0.1, side=-1)
-    (tmp_path / "gripper.urdf").write_text(GRIPPER.format(jaws=jaws))
-    monkeypatch.chdir(tmp_path)
-    body = small_body(adapter=False, precision=32, E=6e4)
-    begun = start(height=0.04, speed=0.0, dtype=torch.float32)
-    made = Twin(body, WORLD, FRAME_DT, None, begun)
-    monkeypatch.setattr(Twin, "load", lambda path: made)
-    links, use = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    carried = []
-    use += "    carried.append(float(forces[:, 1].sum()))\n"
-    names = {"carried": carried}
-    exec(links + use, names)
-    assert float(names["state"].positions[:, 1].mean()) > 0.12
-    weight = 9.8 * 1000 * float(body.volume.sum())
-    assert -np.mean(carried[-20:]) == pytest.approx(weight, rel=0.03)
 
 
 def test_every_shape_of_a_link_is_a_collider(tmp_path):
