@@ -102,7 +102,7 @@ def response_of(states: States, adapter: AdapterProtocol | None) -> Callable[[Te
     """Corrected stress (M, 6) [Pa] as a function of the Hencky strain (M, 6): both Mandel, in the material frame.
 
     Errors: ConfigError for the default adapter, whose operator is a stiffness."""
-    if adapter is not None and adapter.strain is not None:
+    if adapter is not None and adapter.energetic:
         raise ConfigError(
             "anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its in "
             "mosa.evaluation.analysis.stiffness"

@@ -87,7 +87,7 @@ def press(
     steady = adapter is None or adapter.steady
     simulator = Simulator(
         law, dx=dx, substeps=substeps if steady else -(-substeps // stride) * stride, frame_dt=duration / FRAMES, gravity=(0, 0, 0),
-        colliders=plates, dtype=torch.float64, strain=None if adapter is None else adapter.strain, options=law_options,
+        colliders=plates, dtype=torch.float64, energetic=adapter is not None and adapter.energetic, options=law_options,
     )  # fmt: skip
     F = Q.expand(n, 3, 3).contiguous()
     state = ParticleState(x, (x @ shear).contiguous(), shear.expand(n, 3, 3).contiguous(), F, F)

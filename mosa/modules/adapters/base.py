@@ -29,7 +29,7 @@ class Adapter(nn.Module, AdapterProtocol):
     """What every adapter has; what an adapter answers is documented in `AdapterProtocol`. One that derives from this writes
     `forward`, which notes what it departs from the prior by, and what else is different about it."""
 
-    strain: str | None = None
+    energetic = False
     few_numbers = False
     replaces_law = False
     own_dynamics = False

@@ -1,7 +1,7 @@
 """The default adapter: an anisotropic stiffness added to the prior's energy, so that the learned law has an energy at every strain.
 
-psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E a strain in the material frame (`strain.py`), mu the shear
-modulus at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
+psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E Green's strain, mu the shear modulus
+at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
 
     C0 + S = C0^(1/2) exp(A) C0^(1/2),      A symmetric, orthogonal to the two isotropic tensors,
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -81,15 +80,14 @@ def root_stiffness(poisson: Tensor) -> Tensor:
 class HyperelasticAdapter(Adapter):
     """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
 
-    strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one. Fluids have no shear modulus that it could
-    be a multiple of: it is left out there.
+    Fluids have no shear modulus that it could be a multiple of: it is left out there.
     """
 
+    energetic = True
     few_numbers = True
 
-    def __init__(self, *, strain: Literal["hencky", "biot", "green"] = "green") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.strain = strain
         self.numbers = nn.Parameter(torch.zeros(NUMBERS))
         self._live: Tensor | None = None
 

@@ -28,9 +28,8 @@ class AdapterProtocol(Protocol):
     """() [Pa], the unit of its stress, fixed by `switch_on`; not a number before."""
     poisson: Tensor
     """() Poisson number of the prior at that moment."""
-    strain: str | None
-    """Strain measure (`mosa.physics.constitutive.strain`) that G multiplies where the operator is a stiffness; None where it acts
-    on the prior's stress."""
+    energetic: bool
+    """Whether G is a stiffness, of an energy in Green's strain; else it acts on the prior's stress."""
     few_numbers: bool
     """Whether all that it learns is one parameter, `numbers`, of so few numbers that Gauss-Newton can learn them."""
     replaces_law: bool

@@ -61,7 +61,7 @@ class Workspace:
         self.kernels = transfer_kernels(self.scalar, self.exact)
         self.update = update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(
-            numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain
+            numerics.law, self.scalar, adapted, plastic_adapted, numerics.energetic
         )
         self.plastic = numerics.law.plastic
         n = particles
