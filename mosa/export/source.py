@@ -49,7 +49,9 @@ def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
         adapter = None
         if (stiffness := found["stiffness"]) is not None:
             if stiffness["strain"] != "green":
-                raise ValueError(f"expected a stiffness in Green's strain, found {stiffness['strain']}")
+                raise ValueError(
+                    f"expected a stiffness in Green's strain, found {stiffness['strain']}"
+                )
             adapter = HyperelasticAdapter().double()
             with torch.no_grad():
                 adapter.numbers.copy_(torch.tensor(stiffness["numbers"], dtype=torch.float64))

@@ -8,7 +8,7 @@ import math
 import torch
 
 from mosa.errors import SimulationDiverged
-from mosa.modules.adapters.protocol import AdapterProtocol
+from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.modules.body.material import Material
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
@@ -37,7 +37,7 @@ def longitudinal_modulus(material: Material) -> float:
 @torch.no_grad()
 def vibration_growth(
     material: Material,
-    adapter: AdapterProtocol | None,
+    adapter: Adapter | None,
     *,
     density: float,
     stride: int,

@@ -194,9 +194,7 @@ def test_moduli_of_the_stiffness_are_those_of_a_uniaxial_test():
     """A bar along n is pulled by 1e-6: Newton's method on the strain until nothing but the axial stress is left."""
     young, nu = 2.0, 0.35
     mu, lam = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
-    adapter = adapter_of(
-        0.4 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(3)), nu
-    )
+    adapter = adapter_of(0.4 * torch.randn(NUMBERS, generator=torch.Generator().manual_seed(3)), nu)
     S = adapter.correction()
     n = torch.nn.functional.normalize(
         torch.randn(20, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
@@ -206,9 +204,7 @@ def test_moduli_of_the_stiffness_are_those_of_a_uniaxial_test():
 
     def response(e):
         return (
-            reference.vech(
-                stress(torch.eye(3).double() + reference.unvech(e / SCALE), mu, lam, S)
-            )
+            reference.vech(stress(torch.eye(3).double() + reference.unvech(e / SCALE), mu, lam, S))
             * SCALE
         )
 
@@ -316,17 +312,13 @@ def free_energy(body, rollout):
         body.material.poisson().double()
     )
     stored = share * law.energy(F, p["mu"], p["lam"])
-    stored = stored + reference.stiffness_energy(
-        F, p["mu"], added.expand(len(F), 6, 6)
-    )
+    stored = stored + reference.stiffness_energy(F, p["mu"], added.expand(len(F), 6, 6))
     kinetic = 0.5 * body.density * rollout.v.square().sum(-1)
     return ((kinetic + stored.reshape(kinetic.shape)) * body.volume).sum(1)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(
-    "size", [0.3, 1.0]
-)
+@pytest.mark.parametrize("size", [0.3, 1.0])
 def test_a_free_block_never_gains_energy(size):
     """Spinning without gravity or contact: the sum of kinetic and stored energy. Numbers are up to ten times what a fit expects."""
     generator = torch.Generator().manual_seed(12)

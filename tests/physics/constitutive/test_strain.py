@@ -1,7 +1,6 @@
 """Stiffnesses with an energy: the stress is the energy's derivative, at equal stretches too, and a closed loop gains
 nothing."""
 
-
 import mpmath
 import pytest
 import substep_reference as reference
@@ -165,9 +164,7 @@ def test_the_adjoint_is_that_of_differences():
     for direction in ((dF, 0, 0), (0, dp, 0), (0, 0, dS)):
 
         def at(t, d=direction):
-            return (launch(F + t * d[0], parameters + t * d[1], S + t * d[2]) * seed).sum(
-                (1, 2)
-            )
+            return (launch(F + t * d[0], parameters + t * d[1], S + t * d[2]) * seed).sum((1, 2))
 
         h = 2e-4
         difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
@@ -190,9 +187,7 @@ def test_objectivity(rotations):
     Q = rotations[: len(F)]
     parameters, S = inputs(F)
     tau = launch(F, parameters, S)
-    assert (
-        launch(Q @ F, parameters, S) - Q @ tau @ Q.mT
-    ).abs().max() < 1e-12 * tau.abs().max()
+    assert (launch(Q @ F, parameters, S) - Q @ tau @ Q.mT).abs().max() < 1e-12 * tau.abs().max()
     frame = mandel_rotation(Q)
     inward = launch(F @ Q.mT, parameters, frame @ S @ frame.mT)
     assert (inward - tau).abs().max() < 1e-12 * tau.abs().max()

@@ -1,4 +1,4 @@
-"""Every adapter that a configuration may name answers `AdapterProtocol`, and nothing else of the program asks which one it is."""
+"""Every adapter that a configuration may name answers what `Adapter` lists, and nobody asks which one it is."""
 
 import copy
 import pickle
@@ -13,8 +13,8 @@ from small_bodies import FRAME_DT, WORLD, lattice, small_body, start
 import mosa
 from mosa.config.build import fitting
 from mosa.errors import ConfigError
+from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.penalties import PENALTIES
-from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.modules.adapters.registry import ADAPTERS, adapter_class
 from mosa.modules.adapters.warm_start import drawn_stretches
 from mosa.modules.body.material import Material, material_states
@@ -59,11 +59,7 @@ def state():
 @pytest.mark.parametrize("name", NAMES)
 def test_it_has_all_that_is_asked(name):
     adapter = made(name)
-    asked = [
-        *AdapterProtocol.__annotations__,
-        *(key for key in vars(AdapterProtocol) if not key.startswith("_")),
-    ]
-    assert len(asked) > 20 and not [key for key in asked if not hasattr(adapter, key)]
+    assert isinstance(adapter, Adapter)
     assert all(callable(penalty) for penalty in adapter.penalties.values()) and set(
         PENALTIES
     ) <= set(adapter.penalties)
@@ -220,9 +216,7 @@ def test_only_what_has_nothing_to_correct_is_left_out():
     for name in NAMES:
         adapter = made(name)
         assert adapter.unsuited(law_named("corotated")) is None
-        assert (adapter.unsuited(law_named("newtonian")) is not None) == (
-            adapter.energetic
-        )
+        assert (adapter.unsuited(law_named("newtonian")) is not None) == (adapter.energetic)
     with pytest.warns(UserWarning, match="newtonian has no shear stiffness"):
         assert fitting(made("hyperelastic"), "newtonian") is None
     assert fitting(None, "newtonian") is None
