@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.rotations import axial, skew
 from mosa.system.limits import counted
 
 
@@ -29,10 +30,7 @@ class Poses(NamedTuple):
 
 def exponential(vectors: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable."""
-    zero = torch.zeros_like(vectors[..., 0])
-    x, y, z = vectors.unbind(-1)
-    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-    return torch.matrix_exp(rows.unflatten(-1, (3, 3)))
+    return torch.matrix_exp(skew(vectors))
 
 
 def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
@@ -59,9 +57,7 @@ def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
 
 def rotation_vector(R: Tensor) -> Tensor:
     """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) by at most pi, differentiable."""
-    sine = 0.5 * torch.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
-    )
+    sine = 0.5 * axial(R)
     cosine = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
     square = (sine**2).sum(-1)
     small = square < 1e-8
