@@ -298,19 +298,7 @@ class Simulator:
         timing: choose the substeps of every frame. steps: for which there shall be memory to keep all states, where a gradient is
         wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError.
         """
-        asked = _Asked(
-            parameters,
-            volume,
-            density,
-            adapter,
-            stride,
-            motions,
-            gravity,
-            together,
-            timing,
-            started,
-            held,
-        )
+        asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held)  # fmt: skip
         stepper, moment = self._stepper(state, asked)
         stepper.prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
         return stepper, moment._replace(substeps=self.substeps if started else 0)
