@@ -148,13 +148,14 @@ def layer(
     x, V, b, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
 ):  # fmt: skip
     """x V + b, padded as `tile_of`."""
+    y = times(x, V, OUT, IN, STRIDE, KEEP, P)
     if OUT == 6 or OUT == 12:
         bias = vector(b, tl.arange(0, 16), OUT)
     elif OUT == 36:
         bias = vector(b, tl.arange(0, 64), OUT)
     else:
         bias = tl.load(b + tl.arange(0, OUT))
-    return times(x, V, OUT, IN, STRIDE, KEEP, P) + bias[None, :]
+    return y + bias[None, :]
 
 
 @triton.jit(do_not_specialize=["N"])
