@@ -77,9 +77,11 @@ def filled(kind, *values):
 def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None
-    adjoint = {} if adj_inputs is None else {"adj_inputs": adj_inputs, "adjoint": True}
     with NOTHING if device.is_cuda else ON_CPU.launching():
-        wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block, **adjoint)
+        wp.launch(
+            kernel, dim, inputs=inputs, adj_inputs=adj_inputs or [], adjoint=adj_inputs is not None, device=device,
+            block_dim=block,
+        )  # fmt: skip
 
 
 def warp_stream(device: torch.device):

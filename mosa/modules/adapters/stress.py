@@ -69,12 +69,8 @@ class StressAdapter(Adapter):
     @property
     def steady(self) -> bool:
         part = self.operator  # the plastic one has the same switches
-        return (
-            (part.constant or part.no_C)
-            and part.no_pre
-            and part.no_post
-            and not part.no_prior_stress
-        )
+        networks = not (part.no_pre and part.no_post) or part.no_prior_stress
+        return (part.constant or part.no_C) and not networks
 
     def stiffening(self, poisson: Tensor | float) -> float:
         """That of the operator itself where there is only one, else the bound of all that alpha allows; `ADAPTER_MARGIN` at least.

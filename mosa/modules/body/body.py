@@ -124,11 +124,8 @@ class Body(nn.Module):
         if variant not in self.frozen:
             raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         frozen = self.frozen[variant]
-        heterogeneity = (
-            frozen["heterogeneity"]
-            if variant == "prior_eta" and "heterogeneity" in frozen
-            else None
-        )
+        varies = variant == "prior_eta" and "heterogeneity" in frozen
+        heterogeneity = frozen["heterogeneity"] if varies else None
         return Model(frozen["material"], frozen["contact"], heterogeneity)
 
     def choose(self, law: str) -> None:

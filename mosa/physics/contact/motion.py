@@ -357,6 +357,12 @@ class Points:
         return float((steps / self.times.diff()).max())
 
 
+def pose_at(motion: Motion | Trajectory | Points, start: float = 0.0) -> tuple[Tensor, ...]:
+    """(position (3,), rotation (3, 3)) float64 at a time [s], without gradient."""
+    motion = motion.timed(None, 1.0) if isinstance(motion, Motion) else motion
+    return tuple(part[0].detach() for part in motion.sample(1, 1, 1e-9, start)[:2])
+
+
 def sample_frame(
     motions: Sequence[Motion | Trajectory], frame: int, frames: int, first: int, count: int, frame_dt: float, start: float,
     replayed: bool,

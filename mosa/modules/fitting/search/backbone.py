@@ -33,18 +33,9 @@ CONTACT = "contact"
 FURTHER, FURTHEST = 1.5, 100.0
 """Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
 STRIDES = {
-    "E": 1.1,
-    "mu": 1.1,
-    "kappa": 1.1,
-    "yield_stress": 1.1,
-    "viscosity": 1.6,
-    "damping": 1.6,
-    "bulk_damping": 1.6,
-    "cohesion": 0.5,
-    "nu": 0.8,
-    "friction_angle": 0.8,
-    CONTACT: 0.15,
-}
+    **dict.fromkeys((*STIFFNESS, "yield_stress"), 1.1), **dict.fromkeys(("viscosity", "damping", "bulk_damping"), 1.6),
+    "cohesion": 0.5, "nu": 0.8, "friction_angle": 0.8, CONTACT: 0.15,
+}  # fmt: skip
 """First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
 range and 17 degrees in that of the angle's."""
 FINEST = 0.2
