@@ -67,7 +67,7 @@ class Case:
         solids = [Collider(Sphere(3 * DX), "separate", 0.2)] if more else []
         self.simulator = Simulator(
             "corotated", dx=DX, substeps=substeps, frame_dt=STEP, ground=GROUND, dtype=dtype, device=device, colliders=solids,
-            strain="green", up=(0, 1, 0), options=LawOptions(on_inversion="ignore"),
+            energetic=True, up=(0, 1, 0), options=LawOptions(on_inversion="ignore"),
         )  # fmt: skip
         state = ParticleState(*(t.to(device) for t in block(particles, DX, dtype)))
         self.states = ParticleState.stack([state] * worlds)

@@ -204,8 +204,9 @@ def mistake(
     if first["type"] in ("extra_forbidden", "invalid_key"):
         section, key = model_in(wanted) if wanted is not None else owner, str(first["loc"][-1])
         known = [name for name, f in (section or owner).model_fields.items()]
+        expected = f"one of {', '.join(known)}" if known else "none"
         return ConfigError(
-            f"{'.'.join([*path, key])}: unknown key; expected one of {', '.join(known)}{nearest(key, known, '.'.join(path))}"
+            f"{'.'.join([*path, key])}: unknown key; expected {expected}{nearest(key, known, '.'.join(path))}"
         )
     if first["type"] == "missing":
         return ConfigError(f"{name}: expected this key, found none")

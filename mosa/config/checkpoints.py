@@ -217,8 +217,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
     if os.path.isfile(path) and Path(path).suffix == ".json":
         try:
             found = read_json(Path(path))
-            law, stiffness = str(found["law"]), dict(found["stiffness"] or {})
-            own = found["posterior"]
+            law, own = str(found["law"]), found["posterior"]
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             check("posterior.names", own["names"], Names)
             named = [_as_operator(name) for name in own["names"]]
@@ -233,7 +232,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
         inflation = 1.0
     else:
         run = record_of(read_checkpoint(path), path)
-        law, stiffness, record = run.law or run.sections.prior.law, run.sections.adapter.plain(), run.posterior  # fmt: skip
+        law, record = run.law or run.sections.prior.law, run.posterior
         inflation = INFLATION
     if record is None:
         raise DataError(f"{where}: {path}: expected the checkpoint of an ended fit, found none")
@@ -244,13 +243,6 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
         raise ConfigError(
             f"{where}: expected numbers of {material.law} that are learned "
             f"({', '.join(learned)}), found {', '.join(record.names)} of {law}: {path}"
-        )
-    strain = None if adapter is None else adapter.strain
-    if len(posterior.names) > sum(name in material.learned for name in posterior.names) and (
-        stiffness.get("strain", strain) != strain
-    ):
-        raise ConfigError(
-            f"{where}: expected a stiffness in the strain {strain}, found {stiffness['strain']}"
         )
     return replace(posterior, covariance=inflation**2 * posterior.covariance)
 

@@ -78,18 +78,10 @@ def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = Non
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None
     with NOTHING if device.is_cuda else ON_CPU.launching():
-        if adj_inputs is None:
-            wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
-        else:
-            wp.launch(
-                kernel,
-                dim,
-                inputs=inputs,
-                adj_inputs=adj_inputs,
-                adjoint=True,
-                device=device,
-                block_dim=block,
-            )
+        wp.launch(
+            kernel, dim, inputs=inputs, adj_inputs=adj_inputs or [], adjoint=adj_inputs is not None, device=device,
+            block_dim=block,
+        )  # fmt: skip
 
 
 def warp_stream(device: torch.device):

@@ -517,7 +517,7 @@ def _worlds(
         found = [body.ready(quick, hardest, **fixed).answered() for _ in each_law(body, laws)]
     first = found[0].simulator
     simulator = body.simulator(
-        first.law.name, first.substeps, first.frame_dt, world, first.numerics.strain
+        first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic
     )
 
     def begin(b: int, start: Start) -> ParticleState:

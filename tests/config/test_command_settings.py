@@ -42,7 +42,7 @@ def test_what_is_known_passes(overrides):
     ("sed", "seed"), ("world.wals", "world.walls"), ("simulation.particels", "simulation.particles"), ("fit.view", "fit.views"),
     ("rendering.magrin", "rendering.margin"), ("evaluation.sample", "evaluation.samples"), ("fit.joint.lrr", "fit.joint.lr"),
     ("heterogeneity.amplitud", "heterogeneity.amplitude"), ("reconstruction.static.vews", "reconstruction.static.views"),
-    ("losses.imag", "losses.image"), ("adapter.strian", "adapter.strain"), ("prior.options.norm_ep", "prior.options.norm_eps"),
+    ("losses.imag", "losses.image"), ("prior.options.norm_ep", "prior.options.norm_eps"),
 ])  # fmt: skip
 def test_an_unknown_key_is_refused_with_the_nearest(key, nearest):
     values = copy.deepcopy(composed())

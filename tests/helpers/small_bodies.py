@@ -25,12 +25,12 @@ def lattice(counts=(6, 5, 4), spacing=DX / 2) -> torch.Tensor:
     return torch.cartesian_prod(*axes)
 
 
-def small_body(*, numbers=None, strain="green", adapter=True, modes=False, law="corotated", E=E, nu=NU, contact=False,
+def small_body(*, numbers=None, adapter=True, modes=False, law="corotated", E=E, nu=NU, contact=False,
                counts=(6, 5, 4), precision=64, on=True) -> Body:  # fmt: skip
     """numbers: (19,) of the hyperelastic adapter, 0 where None; on: whether it is switched on, at E and nu."""
     rest = lattice(counts)
     n = len(rest)
-    module = HyperelasticAdapter(strain=strain) if adapter else None
+    module = HyperelasticAdapter() if adapter else None
     field = (
         StiffnessModes(
             rest.amin(0) - DX / 4, rest.amax(0) + DX / 4, HeterogeneitySettings(wavelength=1.0)

@@ -177,31 +177,19 @@ def adapted_stress(
     return tau + R @ unvech((operator[0] @ s[..., None])[..., 0] + operator[1]) @ R.mT
 
 
-def strain(measure: str, F: Tensor) -> Tensor:
-    """Strain (N, 3, 3) in the material frame: hencky, biot or green, as functions of the eigenvalues of F^T F (N, 3, 3)."""
-    C = F.mT @ F
-    if measure == "green":
-        return 0.5 * (C - EYE)
-    values, V = torch.linalg.eigh(C)
-    stretches = {"hencky": 0.5 * torch.log(values), "biot": values.sqrt() - 1}
-    return V @ torch.diag_embed(stretches[measure]) @ V.mT
-
-
-def stiffness_energy(measure: str, F: Tensor, mu: Tensor, S: Tensor) -> Tensor:
-    """mu E : S : E (N,) of the strain E of F (N, 3, 3); S: (N, 6, 6) on Mandel components, mu: (N,) or ()."""
-    e = vech(strain(measure, F)) * torch.tensor(
+def stiffness_energy(F: Tensor, mu: Tensor, S: Tensor) -> Tensor:
+    """mu E : S : E (N,) of Green's strain E of F (N, 3, 3); S: (N, 6, 6) on Mandel components, mu: (N,) or ()."""
+    e = vech(0.5 * (F.mT @ F - EYE)) * torch.tensor(
         [1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64
     )
     return mu * torch.einsum("ni,nij,nj->n", e, S, e)
 
 
-def stiffened_stress(law: str, measure: str, F: Tensor, p: dict[str, Tensor], S: Tensor) -> Tensor:
-    """The law's Kirchhoff stress and (dpsi/dF) F^T of `stiffness_energy`; F (N, 3, 3) with three different stretches."""
+def stiffened_stress(law: str, F: Tensor, p: dict[str, Tensor], S: Tensor) -> Tensor:
+    """The law's Kirchhoff stress and (dpsi/dF) F^T of `stiffness_energy`; F (N, 3, 3)."""
     F = F if F.requires_grad else F.clone().requires_grad_()
-    slope = torch.autograd.grad(
-        stiffness_energy(measure, F, p["mu"], S).sum(), F, create_graph=True
-    )[0]
-    return stress(law, F, p) + slope @ F.mT
+    energy = stiffness_energy(F, p["mu"], S).sum()
+    return stress(law, F, p) + torch.autograd.grad(energy, F, create_graph=True)[0] @ F.mT
 
 
 def meet(

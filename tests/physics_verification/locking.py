@@ -66,10 +66,9 @@ class StaticBeam:
         work = self.work
         work.over_nodes(work.kernels.clear, [work.grid_wp[0]])
         work.run(work.stress, work.particles, work._stress_arguments(0, 0))
-        geometry = work._geometry(1.0)
         work.run(work.kernels.p2g, work.particles, [
-            work.x_wp[0], work.v_wp[0], work.C_affine_wp[0], work.F_wp[0], work.tau_wp[0], work.mass_wp, work.volume_wp,
-            *geometry, 0, 0, work.flags_wp, work.grid_wp[0],
+            work.states_wp[0], work.states_wp[0].v, work.tau_wp[0], work.mass_wp, work.volume_wp, work.grids, 1.0, 0, 0,
+            work.flags_wp, work.grid_wp[0],
         ])  # fmt: skip
         return work.grid_slots()[0, 0].clone()
 
@@ -80,8 +79,7 @@ class StaticBeam:
         field[self.free, :3] = u
         far = work.kernels.vec3(*[1e9] * 3)
         work.run(work.kernels.g2p, work.particles, [
-            work.x_wp[0], work.F_tot_wp[0], work.velocity_wp[0], *work._geometry(0.0), -far, far, 0, work.flags_wp,
-            work.x_wp[1], work.v_wp[1], work.C_affine_wp[1], work.F_tot_wp[1],
+            work.states_wp[0], work.velocity_wp[0], work.grids, 0.0, -far, far, 0, work.flags_wp, work.states_wp[1],
         ])  # fmt: skip
         work.F[0].copy_(self.eye + work.C_affine[1])
         return work.v[1].clone()

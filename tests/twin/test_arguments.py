@@ -71,7 +71,7 @@ GRID = {"dx": 0.05, "substeps": 40, "frame_dt": 1 / 30}
 
 @pytest.mark.parametrize("name, wrong", [
     ("law", (5, None, True, [], 1.0)), ("dx", (0, -1, math.nan, "a", True)), ("substeps", (0, 2.5, "a", True, 10**9)),
-    ("frame_dt", (0, -1, math.inf, "a", None)), ("strain", ("foo", 5, True, [], "")),
+    ("frame_dt", (0, -1, math.inf, "a", None)), ("energetic", ("foo", 5, None, [], "")),
     ("gravity", ("abc", (0, 1), (0, math.nan, 0), 5, None, (0, 1e9, 0))),
     ("up", ("abc", (0, 1), (0, math.nan, 0), 5, [[0, 1, 0]])), ("ground", (5, "sticky", {}, True, [0.0])),
     (r"ground\.height", (Ground("a"), Ground(math.nan), Ground(True), Ground(10**400), Ground(None))),

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.microplane import MANDEL, PAIRS
-from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.physics.adapters.interface import MaterialState
 
 States = Callable[[Tensor], MaterialState]
@@ -75,7 +75,7 @@ def directions_on_sphere(count: int = 200) -> Tensor:
     return torch.stack([r * torch.cos(turn), r * torch.sin(turn), z], -1)
 
 
-def stress_jacobian(adapter: AdapterProtocol, w: Tensor, s: Tensor) -> Tensor:
+def stress_jacobian(adapter: Adapter, w: Tensor, s: Tensor) -> Tensor:
     """d tau_hat/d tau_iso at held stretch, (N, 6, 6) on vech components, I where the law is the prior.
 
     w, s: (N, 6) dimensionless states vech(W - I) and vech(R^T tau R)/E_ref. The networks' dependence on the stress is included.
@@ -98,11 +98,11 @@ def redistribution_response(jacobian: Tensor, directions: Tensor) -> Tensor:
     return (change @ dyads(directions).to(jacobian).T).norm(dim=-2)
 
 
-def response_of(states: States, adapter: AdapterProtocol | None) -> Callable[[Tensor], Tensor]:
+def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], Tensor]:
     """Corrected stress (M, 6) [Pa] as a function of the Hencky strain (M, 6): both Mandel, in the material frame.
 
     Errors: ConfigError for the default adapter, whose operator is a stiffness."""
-    if adapter is not None and adapter.strain is not None:
+    if adapter is not None and adapter.energetic:
         raise ConfigError(
             "anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its in "
             "mosa.evaluation.analysis.stiffness"
@@ -166,7 +166,7 @@ def uniaxial_stress(
 
 
 def directional_modulus(
-    states: States, adapter: AdapterProtocol | None, directions: Tensor, strain: float = 5e-3
+    states: States, adapter: Adapter | None, directions: Tensor, strain: float = 5e-3
 ) -> Tensor:
     """E(n) (K,) [Pa] along (K, 3): central difference of the uniaxial stress at +-strain, lateral stress free.
 
@@ -191,7 +191,7 @@ def directions_about(axis: Tensor, radius: float, count: int) -> Tensor:
 
 
 def stiffest_axis(
-    states: States, adapter: AdapterProtocol | None, count: int = 200, strain: float = 5e-3
+    states: States, adapter: Adapter | None, count: int = 200, strain: float = 5e-3
 ) -> tuple[Tensor, float]:
     """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of `count` directions, and as many about the best of
     them: which way a learned law is stiff, to be compared with a known fibre. 200: to 1.2 degrees, where those of the half sphere

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.modules.adapters.protocol import AdapterProtocol
+from mosa.modules.adapters.base import Adapter
 from mosa.physics.constitutive.elasticity import wave_modulus
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion
@@ -54,7 +54,7 @@ def rotation_to(direction: Tensor) -> Tensor:
 @torch.no_grad()
 def press(
     law: str, parameters: Mapping[str, Tensor], direction: Tensor, *, modulus: float, poisson: float, density: float = 1000.0,
-    adapter: AdapterProtocol | None = None, stride: int = 8, stiffening: float = 1.85, cells: int = CELLS,
+    adapter: Adapter | None = None, stride: int = 8, stiffening: float = 1.85, cells: int = CELLS,
     law_options: LawOptions = AS_USUAL,
 ) -> Pressed:  # fmt: skip
     """Compress a specimen along a material direction (3,), between frictionless plates, without gravity; float64 on the CPU.
@@ -87,7 +87,7 @@ def press(
     steady = adapter is None or adapter.steady
     simulator = Simulator(
         law, dx=dx, substeps=substeps if steady else -(-substeps // stride) * stride, frame_dt=duration / FRAMES, gravity=(0, 0, 0),
-        colliders=plates, dtype=torch.float64, strain=None if adapter is None else adapter.strain, options=law_options,
+        colliders=plates, dtype=torch.float64, energetic=adapter is not None and adapter.energetic, options=law_options,
     )  # fmt: skip
     F = Q.expand(n, 3, 3).contiguous()
     state = ParticleState(x, (x @ shear).contiguous(), shear.expand(n, 3, 3).contiguous(), F, F)

@@ -69,7 +69,7 @@ def described(material: Material, adapter: HyperelasticAdapter | None) -> dict[s
     """A law as plain data, SI units: what material.json holds, and `mosa.export.source` reads."""
     parameters, stiffness = values_of(material), None
     if adapter is not None:
-        stiffness = {"strain": adapter.strain, "numbers": adapter.numbers.tolist()}
+        stiffness = {"strain": "green", "numbers": adapter.numbers.tolist()}
     return {"format": FORMAT, "law": material.law, "parameters": parameters, "stiffness": stiffness}
 
 
@@ -94,8 +94,7 @@ def evaluated(
     G, h = operator(material, adapter)
     parts = [F, torch.zeros_like(F), packed.expand(n, SLOTS), G, h, torch.zeros_like(F)]
     parts = [part.detach().contiguous() for part in parts]
-    strain = None if adapter is None else adapter.strain
-    kernel, _ = kernels_of(law, wp.float64, adapter is not None, False, strain)
+    kernel, _ = kernels_of(law, wp.float64, adapter is not None, False, energetic=True)
     launch(kernel, n, wrapped(parts), wp.get_device("cpu"))
     return kernel, parts
 

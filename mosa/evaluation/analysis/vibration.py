@@ -8,7 +8,7 @@ import math
 import torch
 
 from mosa.errors import SimulationDiverged
-from mosa.modules.adapters.protocol import AdapterProtocol
+from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.modules.body.material import Material
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
@@ -37,7 +37,7 @@ def longitudinal_modulus(material: Material) -> float:
 @torch.no_grad()
 def vibration_growth(
     material: Material,
-    adapter: AdapterProtocol | None,
+    adapter: Adapter | None,
     *,
     density: float,
     stride: int,
@@ -88,7 +88,7 @@ def vibration_growth(
         frame_dt=frame_dt,
         gravity=(0, 0, 0),
         dtype=torch.float64,
-        strain=None if adapter is None else adapter.strain,
+        energetic=adapter is not None and adapter.energetic,
         options=law_options,
     )
     parameters = {
@@ -106,7 +106,7 @@ def vibration_growth(
         return math.inf
     energy = rollout.v.square().sum((1, 2))
     maxima = [float(energy[0]), *energy[1:].reshape(periods, FRAMES).amax(1).tolist()]
-    if adapter is None or adapter.strain is not None:
+    if adapter is None or adapter.energetic:
         # modes that meet lend kinetic energy to strain for a period and give it back: that is no growth where the law has an
         # energy. What it had before, the start's, is a bound. A law without one has to be caught while it grows from little
         return max(

@@ -1,7 +1,7 @@
 """The default adapter: an anisotropic stiffness added to the prior's energy, so that the learned law has an energy at every strain.
 
-psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E a strain in the material frame (`strain.py`), mu the shear
-modulus at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
+psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E Green's strain, mu the shear modulus
+at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
 
     C0 + S = C0^(1/2) exp(A) C0^(1/2),      A symmetric, orthogonal to the two isotropic tensors,
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -53,14 +53,10 @@ def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
             E[i, j] = E[j, i] = value if i == j else half * value
         return E
 
-    normal, shear, coupled = (
-        [(0, 0), (1, 1), (2, 2)],
-        [(3, 3), (4, 4), (5, 5)],
-        [(1, 2), (0, 2), (0, 1)],
-    )
-    parts = [
-        dict(zip(three, weights)) for three in (normal, shear, coupled) for weights in CONTRASTS
-    ]
+    normal, shear = [(0, 0), (1, 1), (2, 2)], [(3, 3), (4, 4), (5, 5)]
+    coupled = [(1, 2), (0, 2), (0, 1)]
+    threes = (normal, shear, coupled)
+    parts = [dict(zip(three, weights)) for three in threes for weights in CONTRASTS]
     means = {**dict.fromkeys(normal, math.sqrt(2 / 15)), **dict.fromkeys(shear, -math.sqrt(2 / 15)),
              **dict.fromkeys(coupled, -math.sqrt(1 / 15))}  # fmt: skip
     others = [{(i, j): 1.0} for i in range(6) for j in range(max(i + 1, 3), 6)]
@@ -69,35 +65,29 @@ def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def root_stiffness(poisson: Tensor) -> Tensor:
     """(6, 6) C0^(1/2) in Mandel scaling and units of sqrt(2 mu); poisson: () below 1/2."""
-    one = torch.tensor(
-        [1.0, 1, 1, 0, 0, 0], dtype=poisson.dtype, device=poisson.device
-    ) / math.sqrt(3)
+    like: dict[str, Any] = {"dtype": poisson.dtype, "device": poisson.device}
+    one = torch.tensor([1.0, 1, 1, 0, 0, 0], **like) / math.sqrt(3)
     bulk = ((1 + poisson) / (1 - 2 * poisson)).sqrt()
-    return torch.eye(6, dtype=poisson.dtype, device=poisson.device) + (bulk - 1) * torch.outer(
-        one, one
-    )
+    return torch.eye(6, **like) + (bulk - 1) * torch.outer(one, one)
 
 
 class HyperelasticAdapter(Adapter):
     """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
 
-    strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one. Fluids have no shear modulus that it could
-    be a multiple of: it is left out there.
+    Fluids have no shear modulus that it could be a multiple of: it is left out there.
     """
 
+    energetic = True
     few_numbers = True
 
-    def __init__(self, *, strain: Literal["hencky", "biot", "green"] = "green") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.strain = strain
         self.numbers = nn.Parameter(torch.zeros(NUMBERS))
         self._live: Tensor | None = None
 
     def __getstate__(self) -> dict:
-        return {
-            **super().__getstate__(),
-            "_live": None if self._live is None else self._live.detach(),
-        }
+        live = None if self._live is None else self._live.detach()
+        return super().__getstate__() | {"_live": live}
 
     @property
     def steady(self) -> bool:
@@ -130,11 +120,8 @@ class HyperelasticAdapter(Adapter):
 
     def _matrix(self) -> Tensor:
         """A (6, 6) float64."""
-        return torch.einsum(
-            "k,kij->ij",
-            self.numbers.double(),
-            anisotropic_basis(torch.float64, self.numbers.device),
-        )
+        basis = anisotropic_basis(torch.float64, self.numbers.device)
+        return torch.einsum("k,kij->ij", self.numbers.double(), basis)
 
     def _exponential(self) -> Tensor:
         """exp(A) (6, 6) float64."""

@@ -46,25 +46,17 @@ class ProgressiveOperator(nn.Module):
         self.alpha, self.l_max, self.scale = alpha, l_max, input_scale
         self.factors, self.correction = factors, microplane.CORRECTIONS[factors]
         self.alpha_normal = alpha if alpha_normal is None else alpha_normal
-        self.no_C, self.no_pre, self.no_post, self.no_prior_stress = (
-            no_C,
-            no_pre,
-            no_post,
-            no_prior_stress,
-        )
+        self.no_C, self.no_prior_stress = no_C, no_prior_stress
+        self.no_pre, self.no_post = no_pre, no_post
         self.constant, self.major_symmetry = state_dependence == "constant", major_symmetry
         self.phi = TwoHiddenLayers(12, 6, hidden)
         self.psi1 = TwoHiddenLayers(12, hidden, hidden)
         self.planes = nn.Linear(hidden, 36)
         self.psi2 = TwoHiddenLayers(hidden + 3, 12 + hidden, hidden)
         self.theta = TwoHiddenLayers(hidden + 12, 6, hidden)
-        for layer, rows in (
-            (self.phi[-1], None),
-            (self.planes, None),
-            (self.psi2[-1], 12),
-            (self.theta[-1], None),
-        ):
-            zero_outputs(layer, rows)
+        for layer in (self.phi[-1], self.planes, self.theta[-1]):
+            zero_outputs(layer)
+        zero_outputs(self.psi2[-1], 12)
         self.free = nn.Parameter(torch.zeros(4, 12)) if self.constant and not no_C else None
         self.adaptive = not (no_C or self.constant)
         for module, used in (
@@ -99,10 +91,9 @@ class ProgressiveOperator(nn.Module):
     def constant_corrections(self, like: Tensor) -> Tensor:
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
         # filled where they are used: a copy from the host would wait for all that a GPU has still to do
-        bounds = ((3, self.alpha), (1, self.alpha_normal))
-        bound = torch.cat(
-            [torch.full((rows, 1), value, device=like.device) for rows, value in bounds]
-        ).to(like)
+        bound = torch.full((4, 1), self.alpha, device=like.device)
+        bound[3:].fill_(self.alpha_normal)
+        bound = bound.to(like)
         return self.correction(bound * torch.tanh(self.scale * self.free).to(like))
 
     def constant_operator(self) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -52,25 +52,12 @@ class StressAdapter(Adapter):
             raise ConfigError(
                 "adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone"
             )
-        self.rest_free, self.recompute, self.fused, self.precision = (
-            rest_free,
-            recompute,
-            fused,
-            precision,
-        )
-        shape = {
-            "alpha": alpha,
-            "alpha_normal": alpha_normal,
-            "input_scale": input_scale,
-            "hidden": hidden,
-        }
-        shape |= {
-            "factors": factors,
-            "state_dependence": state_dependence,
-            "no_C": no_C,
-            "no_pre": no_pre,
-            "no_post": no_post,
-        }
+        self.rest_free, self.recompute = rest_free, recompute
+        self.fused, self.precision = fused, precision
+        shape: dict[str, Any] = {
+            "alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden,
+            "factors": factors, "state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post,
+        }  # fmt: skip
         # without the prior the residuals have to carry the whole stress
         bound = None if no_prior_stress else l_max
         self.operator = ProgressiveOperator(
@@ -82,12 +69,8 @@ class StressAdapter(Adapter):
     @property
     def steady(self) -> bool:
         part = self.operator  # the plastic one has the same switches
-        return (
-            (part.constant or part.no_C)
-            and part.no_pre
-            and part.no_post
-            and not part.no_prior_stress
-        )
+        networks = not (part.no_pre and part.no_post) or part.no_prior_stress
+        return (part.constant or part.no_C) and not networks
 
     def stiffening(self, poisson: Tensor | float) -> float:
         """That of the operator itself where there is only one, else the bound of all that alpha allows; `ADAPTER_MARGIN` at least.
@@ -138,9 +121,8 @@ class StressAdapter(Adapter):
             G, b, _ = self.affine(self.operator, w, s)
             return apply(G, s) + b
         zero = torch.zeros_like(w[:1])
-        d = self.operator.stepwise(torch.cat([w, zero]), torch.cat([s, zero])) - torch.cat(
-            [s, zero]
-        )
+        s = torch.cat([s, zero])
+        d = self.operator.stepwise(torch.cat([w, zero]), s) - s
         return d[:-1] - d[-1:] if self.rest_free else d[:-1]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
@@ -155,12 +137,8 @@ class StressAdapter(Adapter):
         self._last = (parts.C, parts.pre, parts.post)
         plastic_G = plastic_h = None
         if self.plastic_operator is not None and state.plastic_strain is not None:
-            plastic_G, plastic_h, _ = self._evaluate(
-                self.plastic_operator,
-                w,
-                state.plastic_strain.to(inner),
-                torch.ones_like(self.E_ref),
-            )
+            strain, one = state.plastic_strain.to(inner), torch.ones_like(self.E_ref)
+            plastic_G, plastic_h, _ = self._evaluate(self.plastic_operator, w, strain, one)
             plastic_G, plastic_h = plastic_G.to(outer), plastic_h.to(outer)
         return AdapterOperator(G.to(outer), h.to(outer), plastic_G, plastic_h)
 
@@ -171,16 +149,10 @@ class StressAdapter(Adapter):
         if chosen(self.fused, operator, w):
             from mosa.modules.adapters.fused.operation import Settings, fused_operator
 
-            settings = Settings(
-                operator.alpha,
-                operator.l_max,
-                float(operator.scale),
-                self.rest_free,
-                PRECISIONS[self.precision],
-            )
-            G, h, numbers, pre, post = fused_operator(
-                w, s, unit.reshape(1), settings, weights_of(operator)
-            )
+            scale, precision = float(operator.scale), PRECISIONS[self.precision]
+            settings = Settings(operator.alpha, operator.l_max, scale, self.rest_free, precision)
+            found = fused_operator(w, s, unit.reshape(1), settings, weights_of(operator))
+            G, h, numbers, pre, post = found
             return G, h, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))
         if self.recompute and torch.is_grad_enabled() and not backward_at_hand():
             G, b, parts = checkpoint(

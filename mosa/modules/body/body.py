@@ -124,11 +124,8 @@ class Body(nn.Module):
         if variant not in self.frozen:
             raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         frozen = self.frozen[variant]
-        heterogeneity = (
-            frozen["heterogeneity"]
-            if variant == "prior_eta" and "heterogeneity" in frozen
-            else None
-        )
+        varies = variant == "prior_eta" and "heterogeneity" in frozen
+        heterogeneity = frozen["heterogeneity"] if varies else None
         return Model(frozen["material"], frozen["contact"], heterogeneity)
 
     def choose(self, law: str) -> None:
@@ -260,9 +257,8 @@ class Body(nn.Module):
             state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
         else:
             simulator = self.simulator(
-                material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else
-                None,
-            )  # fmt: skip
+                material.law, substeps, frame_dt, world, adapter is not None and adapter.energetic
+            )
         state = replace(state, x=state.x + lift)
         state = state.to(dtype)
         arguments = {
@@ -284,20 +280,20 @@ class Body(nn.Module):
         return given if added is None else given | {"density": self.density + added}
 
     def simulator(
-        self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None
+        self, law: str, substeps: int, frame_dt: float, world: World, energetic: bool = False
     ) -> Simulator:
         """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).
 
-        strain: of an adapter whose operator is a stiffness (`Simulator`)."""
+        energetic: as `Simulator`."""
         device, settings, options = self.rest.device, self.settings, self.law_options
-        key = (law, substeps, frame_dt, str(device), strain, settings, options)
+        key = (law, substeps, frame_dt, str(device), energetic, settings, options)
         if self._made is None or self._made[0] is not world or self._made[1] != key:
             dtype = torch.float64 if settings.precision == 64 else torch.float32
             simulator = Simulator(
                 law, dx=settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity,
                 up=world.up, ground=self.contact.at_nodes(world.ground, settings.dx),
                 planes=world.planes, colliders=world.solids, box=world.box, dtype=dtype,
-                device=device, strain=strain, options=options,
+                device=device, energetic=energetic, options=options,
             )  # fmt: skip
             self._made = world, key, simulator
         return self._made[2]

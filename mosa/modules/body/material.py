@@ -100,17 +100,9 @@ FORMS: dict[str, Form | Direction] = {
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain. Exponents of `ogden` stay where
 each term is polyconvex: at least 3/2, or at most -3 (Hartmann and Neff 2003)."""
 UNITS = {
-    "E": "Pa",
-    "mu": "Pa",
-    "kappa": "Pa",
-    "yield_stress": "Pa",
-    "viscosity": "Pa s",
-    "damping": "Pa s",
-    "bulk_damping": "Pa s",
-    "friction_angle": "degrees",
-    "fibre_stiffness": "Pa",
-    "second_fibre_stiffness": "Pa",
-}
+    **dict.fromkeys(("E", "mu", "kappa", "yield_stress", "fibre_stiffness", "second_fibre_stiffness"), "Pa"),
+    **dict.fromkeys(("viscosity", "damping", "bulk_damping"), "Pa s"), "friction_angle": "degrees",
+}  # fmt: skip
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
 RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity", "fibre_stiffness", "second_fibre_stiffness",
             "fibre_exponent", *DAMPING)  # fmt: skip
@@ -212,18 +204,6 @@ class Material(nn.Module):
         self.directions = tuple(name for name in parameters if isinstance(FORMS[name], Direction))
         for name, value in parameters.items():
             self._add(name, value, name not in frozen)
-        if "viscosity" in self.raw:
-            self.register_buffer("viscosity_is_a_logarithm", torch.tensor(True))
-
-    def _load_from_state_dict(self, state_dict, prefix: str, *rest) -> None:
-        """Of checkpoints without the mark, the viscosity is the inverse of a softplus."""
-        name, mark = f"{prefix}raw.viscosity", f"{prefix}viscosity_is_a_logarithm"
-        if "viscosity" in self.raw and name in state_dict and mark not in state_dict:
-            state_dict[name], state_dict[mark] = (
-                SOFTPLUS.physical(state_dict[name]).log(),
-                torch.tensor(True),
-            )
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _check_names(self, law: str, parameters, given, frozen, modulated) -> None:
         known = law_named(law)

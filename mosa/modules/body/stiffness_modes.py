@@ -6,6 +6,8 @@ mean 0 and variance 1 over the particles. P(X) = P_global (1 + amplitude tanh et
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor, nn
 
@@ -27,13 +29,9 @@ class StiffnessModes(StiffnessField):
         sides = (extent / extent.max()).tolist()
         limit = 2 / wavelength  # in half waves per longest side
         counts = [range(int(limit * side) + 1) for side in sides]
-        found = []
-        for a in counts[0]:
-            for b in counts[1]:
-                for c in counts[2]:
-                    size = sum((n / s) ** 2 for n, s in zip((a, b, c), sides)) ** 0.5
-                    if 0 < size <= limit:
-                        found.append((size, a, b, c))
+        waves = itertools.product(*counts)
+        sizes = ((sum((n / s) ** 2 for n, s in zip(wave, sides)) ** 0.5, *wave) for wave in waves)
+        found = [(size, *wave) for size, *wave in sizes if 0 < size <= limit]
         found = sorted(found)[: self.settings.most]
         if not found:
             raise ConfigError(

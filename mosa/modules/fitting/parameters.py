@@ -104,20 +104,19 @@ def tensors_of(body: Body, *, adapter: bool, heterogeneity: bool) -> list[Tensor
     return tensors + ([body.heterogeneity.coefficients] if heterogeneity else [])
 
 
+def _seat(body: Body) -> Seat:
+    learned = {"adapter": is_learned(body.adapter), "heterogeneity": is_learned(body.heterogeneity)}
+    return Seat(tensors_of(body, **learned), torch.empty)
+
+
 def write_numbers(body: Body, numbers: Tensor) -> None:
     """Set a learned body to numbers (D,) of its joint stage's posterior, a draw of it for instance."""
-    tensors = tensors_of(
-        body, adapter=is_learned(body.adapter), heterogeneity=is_learned(body.heterogeneity)
-    )
-    Seat(tensors, lambda: numbers).write(numbers)
+    _seat(body).write(numbers)
 
 
 def read_numbers(body: Body) -> Tensor:
     """What `write_numbers` sets, (D,)."""
-    tensors = tensors_of(
-        body, adapter=is_learned(body.adapter), heterogeneity=is_learned(body.heterogeneity)
-    )
-    return Seat(tensors, torch.empty).read()
+    return _seat(body).read()
 
 
 def each_law(body: Body, numbers: Tensor) -> Iterator[Tensor]:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
+from mosa.physics.rotations import axial
 from mosa.reconstruction.motion.response import Response
 from mosa.types import MarkerCues, MotionCues, Rollout
 
@@ -65,11 +66,11 @@ def fields(
         x, F = response.seen(x, F, start_rotation)
     U, S, V = singular_value_decomposition(F[1:, chosen])
     relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
-    twice = relative - relative.mT
-    vector = 0.5 * torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1)
     weight = cues.weight[1:frames, chosen, None]
     away = x[1:, chosen] - cues.positions[1:frames, chosen]
-    return Fields(away, vector * weight, (S - cues.stretch[1:frames, chosen]) * weight)
+    return Fields(
+        away, 0.5 * axial(relative) * weight, (S - cues.stretch[1:frames, chosen]) * weight
+    )
 
 
 def floors(dx: float, cells: float) -> tuple[float, float, float]:

@@ -106,11 +106,9 @@ class Stage(StageSettings):
                 "heterogeneity.kind=modes), not networks; expected adam or auto"
             )
         chosen = "adam" if self.optimizer == "adam" or not few else "gauss_newton"
-        iterations = (
-            min(self.iterations, self.newton_iterations)
-            if chosen == "gauss_newton"
-            else self.iterations
-        )
+        iterations = self.iterations
+        if chosen == "gauss_newton":
+            iterations = min(iterations, self.newton_iterations)
         return self.but(optimizer=chosen, iterations=iterations)
 
     def decay(self, iteration: int) -> float:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from mosa.data.observations import Observations
 from mosa.errors import ConfigError
+from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.penalties import PENALTIES, OperatorStatistics
-from mosa.modules.adapters.protocol import AdapterProtocol
 from mosa.modules.body.body import Body, Start
 from mosa.modules.fitting import losses
 from mosa.rendering.observer import Views, deformed_covariances, observe
@@ -122,12 +122,12 @@ def register_term(name: str, term: Term) -> None:
         raise ConfigError(f"losses.{name}: there is such a term already; choose another name")
 
 
-def term_names(adapter: AdapterProtocol | type[AdapterProtocol] | None) -> list[str]:
+def term_names(adapter: Adapter | type[Adapter] | None) -> list[str]:
     """The names that a weight may have beside this adapter. Those of `PENALTIES` are known without one: a run may leave it out."""
     return [*TERMS, *(PENALTIES if adapter is None else {**PENALTIES, **adapter.penalties})]
 
 
-def check_terms(weights: Mapping[str, float], adapter: AdapterProtocol | None) -> None:
+def check_terms(weights: Mapping[str, float], adapter: Adapter | None) -> None:
     """Errors: ConfigError naming weights of no term."""
     if unknown := sorted(set(weights) - set(known := term_names(adapter))):
         raise ConfigError(

@@ -201,12 +201,8 @@ class Chain:
             work.point(answer)
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index], more=True)
-            pairs = [
-                (answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None
-            ]
-            pairs += [
-                (t, all_seeds[index]) for t, all_seeds in zip(statistics, self.statistics_seeds)
-            ]
+            pairs = [(answer[k], work.adj_held[k]) for k in ANSWER if answer[k] is not None]
+            pairs += [(t, each[index]) for t, each in zip(statistics, self.statistics_seeds)]
             pairs = [(output, seed) for output, seed in pairs if output.requires_grad]
             if not pairs:
                 continue
@@ -314,14 +310,8 @@ def advance_chain(
 ) -> tuple[State, tuple[Tensor, ...], list]:  # fmt: skip
     """(the state after the chain, reactions, statistics of each evaluation), differentiable in state, parameters, poses and the
     adapter's weights. Arguments: as `ChainOfSegments` and `advance_segment`. Errors: SimulationDiverged; LeftWindow."""
-    stretch = ChainOfSegments(
-        lanes,
-        first,
-        steps or Steps(lanes.numerics.dt, lanes.numerics.dt),
-        chain.substeps,
-        chain,
-        learned,
-    )
+    steps = steps or Steps(lanes.numerics.dt, lanes.numerics.dt)
+    stretch = ChainOfSegments(lanes, first, steps, chain.substeps, chain, learned)
     final, left = advance(stretch, state, (packed, *learned.weights, *poses))
     reactions = 2 if poses else 0
     return final, left[:reactions], chain.named(left[reactions:])

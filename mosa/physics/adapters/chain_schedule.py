@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from mosa.physics.adapters.chain import Chain, Learned, advance_chain
 from mosa.physics.adapters.network_evaluation import at_hand
 from mosa.physics.engine.budget import free_memory, substep_bytes
 from mosa.physics.engine.lanes import Lanes
-from mosa.physics.engine.numerics import State, Steps
+from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.engine.solver import LeftWindow
 
 SEGMENT = 32
@@ -34,25 +35,21 @@ class Plan(NamedTuple):
     graphs: bool = False
 
 
+@dataclass
 class Chains:
     """What asks an adapter inside of the stretches of one motion. The chains are its simulator's, among the buffers.
 
     ask, collects: as `Chain`."""
 
-    def __init__(
-        self,
-        lanes: Lanes,
-        adapter: nn.Module,
-        ask: Callable[..., dict[str, Tensor | None]],
-        packed: Tensor,
-        collects: bool,
-    ) -> None:
-        self.lanes = lanes
-        self.adapter = adapter
-        self.ask = ask
-        self.packed = packed
-        self.collects = collects
-        self.numerics = lanes.numerics
+    lanes: Lanes
+    adapter: nn.Module
+    ask: Callable[..., dict[str, Tensor | None]]
+    packed: Tensor
+    collects: bool
+
+    @property
+    def numerics(self) -> Numerics:
+        return self.lanes.numerics
 
     def plan(self, state: State, substeps: int, stride: int, wanted: bool) -> Plan:
         """How to run a motion of `substeps` substeps from `state`, by memory. wanted: whether a
@@ -72,15 +69,9 @@ class Chains:
         return Plan(limit if graphs else chain_length(substeps, start, each)[0], graphs)
 
     def frame(
-        self,
-        state: State,
-        lengths: Sequence[int],
-        first: int,
-        poses: tuple[Tensor, ...],
-        steps: Steps | None,
-        plan: Plan,
+        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None, plan: Plan,
         learned: Learned,
-    ) -> tuple[State, Tensor | None, list]:
+    ) -> tuple[State, Tensor | None, list]:  # fmt: skip
         """(as `Prepared.frame`, statistics of the evaluations). A chain that fails is cut. learned:
         of the adapter as it is now."""
         groups, done, forces, collected = grouped(lengths, plan.limit), 0, [], []

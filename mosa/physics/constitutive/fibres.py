@@ -90,18 +90,9 @@ _TWO_FAMILIES = dict.fromkeys(
     ("mu", "lam", "fibre_stiffness", "second_fibre_stiffness", "fibre_exponent", "dispersion"), 1
 )
 register_law(
-    "hgo",
-    hgo,
-    _ONE_FAMILY | {"fibre": 3},
-    needs_positive_J=True,
-    energy=hgo_energy,
-    modulus=stretched_modulus,
-)
+    "hgo", hgo, _ONE_FAMILY | {"fibre": 3}, needs_positive_J=True, energy=hgo_energy, modulus=stretched_modulus
+)  # fmt: skip
 register_law(
-    "hgo_two",
-    hgo_two,
-    _TWO_FAMILIES | {"fibre": 3, "second_fibre": 3},
-    needs_positive_J=True,
-    energy=hgo_two_energy,
-    modulus=stretched_modulus,
-)
+    "hgo_two", hgo_two, _TWO_FAMILIES | {"fibre": 3, "second_fibre": 3}, needs_positive_J=True,
+    energy=hgo_two_energy, modulus=stretched_modulus,
+)  # fmt: skip

@@ -55,6 +55,40 @@ def jacobi_angle(a: wp.vec3d, b: wp.vec3d):
 
 
 @wp.func
+def made_orthogonal(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d):
+    """Columns a, b of F V and p, q of V after the turn that makes a and b orthogonal, and whether there was one."""
+    co, si = jacobi_angle(a, b)
+    turning = int(0)
+    a1 = a
+    b1 = b
+    p1 = p
+    q1 = q
+    if si != _ZERO:
+        if wp.abs(si) > _TURN:
+            turning = int(1)
+        a1 = co * a - si * b
+        b1 = si * a + co * b
+        p1 = co * p - si * q
+        q1 = si * p + co * q
+    return a1, b1, p1, q1, turning
+
+
+@wp.func
+def in_order(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d):
+    """The longer one of a and b first, by a swap that keeps det V."""
+    a1 = a
+    b1 = b
+    p1 = p
+    q1 = q
+    if wp.dot(a, a) < wp.dot(b, b):
+        a1 = b
+        b1 = -a
+        p1 = q
+        q1 = -p
+    return a1, b1, p1, q1
+
+
+@wp.func
 def svd_value(F: wp.mat33d):
     """One-sided Jacobi: accurate to rounding also for close and for small singular values, one sweep near rest."""
     a = column(F, 0)
@@ -65,61 +99,15 @@ def svd_value(F: wp.mat33d):
     r = wp.vec3d(_ZERO, _ZERO, _ONE)
     sweep = int(0)
     turning = int(1)
-    while sweep < 12 and turning == 1:
-        turning = int(0)
-        co, si = jacobi_angle(a, b)
-        if si != _ZERO:
-            if wp.abs(si) > _TURN:
-                turning = int(1)
-            t = co * a - si * b
-            b = si * a + co * b
-            a = t
-            t = co * p - si * q
-            q = si * p + co * q
-            p = t
-        co, si = jacobi_angle(a, c)
-        if si != _ZERO:
-            if wp.abs(si) > _TURN:
-                turning = int(1)
-            t = co * a - si * c
-            c = si * a + co * c
-            a = t
-            t = co * p - si * r
-            r = si * p + co * r
-            p = t
-        co, si = jacobi_angle(b, c)
-        if si != _ZERO:
-            if wp.abs(si) > _TURN:
-                turning = int(1)
-            t = co * b - si * c
-            c = si * b + co * c
-            b = t
-            t = co * q - si * r
-            r = si * q + co * r
-            q = t
+    while sweep < 12 and turning > 0:
+        a, b, p, q, first = made_orthogonal(a, b, p, q)
+        a, c, p, r, second = made_orthogonal(a, c, p, r)
+        b, c, q, r, third = made_orthogonal(b, c, q, r)
+        turning = first + second + third
         sweep = sweep + 1
-    # descending order by swaps that keep det V = +1
-    if wp.dot(a, a) < wp.dot(b, b):
-        t = a
-        a = b
-        b = -t
-        t = p
-        p = q
-        q = -t
-    if wp.dot(b, b) < wp.dot(c, c):
-        t = b
-        b = c
-        c = -t
-        t = q
-        q = r
-        r = -t
-    if wp.dot(a, a) < wp.dot(b, b):
-        t = a
-        a = b
-        b = -t
-        t = p
-        p = q
-        q = -t
+    a, b, p, q = in_order(a, b, p, q)
+    b, c, q, r = in_order(b, c, q, r)
+    a, b, p, q = in_order(a, b, p, q)
     s0 = wp.length(a)
     u0 = wp.vec3d(_ONE, _ZERO, _ZERO)
     if s0 > _ZERO:

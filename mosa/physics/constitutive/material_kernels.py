@@ -4,7 +4,6 @@ Fields may be float32; everything between load and store is float64 (see `kinema
 vech order: xx, yy, zz, yz, zx, xy, plain components.
 """
 
-# ruff: noqa: RUF059
 # (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
 
 from functools import cache
@@ -20,14 +19,6 @@ from mosa.physics.constitutive.kinematics import (
 )
 from mosa.physics.constitutive.laws import SLOTS, Law
 from mosa.physics.constitutive.particle_access import particle_access
-from mosa.physics.constitutive.strain import (
-    FACTORISED,
-    STRAINS,
-    conjugate_stress,
-    green_strain,
-    green_stress,
-    material_strain,
-)
 
 vec6 = wp.types.vector(length=6, dtype=wp.float64)
 
@@ -60,6 +51,18 @@ def deviator(A: wp.mat33d):
     return A - (wp.trace(A) / wp.float64(3.0)) * wp.identity(n=3, dtype=wp.float64)
 
 
+@wp.func
+def green_strain(F: wp.mat33d):
+    """(F^T F - I)/2."""
+    return wp.float64(0.5) * (wp.transpose(F) * F - wp.identity(n=3, dtype=wp.float64))
+
+
+@wp.func
+def green_stress(F: wp.mat33d, T: wp.mat33d):
+    """Kirchhoff stress F T F^T of T = dpsi/dE, E the strain of Green (Ogden, Non-linear Elastic Deformations, section 4.2)."""
+    return F * T * wp.transpose(F)
+
+
 def field_types(scalar):
     """(mat33, vec6, mat66, parameter vector) of a field precision."""
     return (
@@ -72,19 +75,18 @@ def field_types(scalar):
 
 @cache
 def stress_kernel(
-    stress, uses_rotation: bool, scalar, adapted: bool, strain: str | None = None, shear: int = 0
+    stress, uses_rotation: bool, scalar, adapted: bool, energetic: bool = False, shear: int = 0
 ):
     """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame.
 
-    strain: a name of `STRAINS`; the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is
-    added is the stress of the energy mu E : G : E, to 1 + h[0] times the prior's. shear: place of mu among the law's parameters.
+    energetic: the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is added is the stress of the energy
+    mu E : G : E, E Green's strain, to 1 + h[0] times the prior's. shear: place of mu among the law's parameters.
     G and h of one row are those of all particles, each of which adds to a row of its own of their gradients.
     """
     field33, field6, field66, fieldp = field_types(scalar)
-    energetic = adapted and strain is not None
+    energetic = adapted and energetic
     own = particle_access(scalar, SLOTS)
     needs_rotation = uses_rotation or (adapted and not energetic)
-    factorised, measure = strain in FACTORISED, STRAINS.index(strain) if energetic else 0
 
     @wp.kernel(module="unique")
     def stress_of_particles(
@@ -102,16 +104,8 @@ def stress_kernel(
         if wp.static(energetic):
             modulus = wp.float64(2.0) * p[wp.static(shear)]
             T = (wp.float64(1.0) + own.vector6(h, i, place)[0]) * T
-            if wp.static(factorised):
-                U, S, V = svd(Fi)
-                E = mandel(material_strain(wp.static(measure), Fi, S, V))
-                T = T + conjugate_stress(
-                    wp.static(measure), Fi, S, V, unmandel(modulus * own.times66(G, i, place, E))
-                )
-            else:
-                T = T + green_stress(
-                    Fi, unmandel(modulus * own.times66(G, i, place, mandel(green_strain(Fi))))
-                )
+            E = mandel(green_strain(Fi))
+            T = T + green_stress(Fi, unmandel(modulus * own.times66(G, i, place, E)))
         elif wp.static(adapted):
             s = vech(wp.transpose(R) * T * R)
             T = T + R * unvech(
@@ -183,10 +177,10 @@ def state_kernel(stress, uses_rotation: bool, scalar, plastic: bool):
     return material_state
 
 
-def kernels_of(law: Law, scalar, adapted: bool, plastic_adapted: bool, strain: str | None = None):
-    """(stress kernel, return-mapping kernel or None) of a law. strain: of an operator that is a stiffness, see `stress_kernel`."""
-    shear = law.offsets["mu"] if adapted and strain is not None else 0
+def kernels_of(law: Law, scalar, adapted: bool, plastic_adapted: bool, energetic: bool = False):
+    """(stress kernel, return-mapping kernel or None) of a law. energetic: as `stress_kernel`."""
+    shear = law.offsets["mu"] if adapted and energetic else 0
     stress = stress_kernel(
-        law.stress, law.uses_rotation, scalar, adapted, strain if adapted else None, shear
+        law.stress, law.uses_rotation, scalar, adapted, adapted and energetic, shear
     )
     return stress, return_kernel(law.return_map, scalar, plastic_adapted) if law.plastic else None

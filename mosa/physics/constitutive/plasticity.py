@@ -85,12 +85,8 @@ def drucker_prager_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d, 
 
 
 register_law(
-    "von_mises",
-    stvk,
-    {"mu": 1, "lam": 1, "yield_stress": 1},
-    return_map=von_mises_return,
-    energy=stvk_energy,
-)
+    "von_mises", stvk, {"mu": 1, "lam": 1, "yield_stress": 1}, return_map=von_mises_return, energy=stvk_energy
+)  # fmt: skip
 register_law(
     "drucker_prager", stvk, {"mu": 1, "lam": 1, "friction_alpha": 1, "cohesion": 1}, return_map=drucker_prager_return,
     energy=stvk_energy,

@@ -122,12 +122,8 @@ def ogden_energy(F: Tensor, mu: Tensor, lam: Tensor, alpha_1: Tensor, share_2: T
 _LAME = {"mu": 1, "lam": 1}
 _POWERS = dict.fromkeys(("alpha_1", "share_2", "alpha_2", "share_3", "alpha_3"), 1)
 register_law(
-    "mooney_rivlin",
-    mooney_rivlin,
-    _LAME | {"second_share": 1},
-    needs_positive_J=True,
-    energy=mooney_rivlin_energy,
-)
+    "mooney_rivlin", mooney_rivlin, _LAME | {"second_share": 1}, needs_positive_J=True, energy=mooney_rivlin_energy
+)  # fmt: skip
 register_law(
     "yeoh", yeoh, _LAME | {"yeoh_2": 1, "yeoh_3": 1}, needs_positive_J=True, energy=yeoh_energy
 )

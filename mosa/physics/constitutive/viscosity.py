@@ -48,12 +48,8 @@ def root(x: wp.float64):
 
 @wp.func
 def flow_fraction(
-    n: wp.float64,
-    yield_stress: wp.float64,
-    viscosity: wp.float64,
-    modulus: wp.float64,
-    dt: wp.float64,
-):
+    n: wp.float64, yield_stress: wp.float64, viscosity: wp.float64, modulus: wp.float64, dt: wp.float64
+):  # fmt: skip
     """|s|/|s_trial| after a step of flow: |s| = n - y/(1 + viscosity/(2 modulus dt)), y = n - sqrt(2/3) yield_stress > 0."""
     y = n - _SQRT23 * yield_stress
     return _ONE - y / (n * (_ONE + viscosity / (_TWO * modulus * dt)))

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,10 +19,8 @@ from mosa.physics.contact import shapes as packing
 from mosa.physics.contact.keys import check_keys
 from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.contact.motion import Motion, Points, Trajectory
-from mosa.physics.contact.planes import MODES, Plane
+from mosa.physics.contact.planes import Plane, check_contact
 from mosa.physics.contact.touch import GRIP
-from mosa.settings import Weight, check
-from mosa.types import RUBBING
 
 
 @dataclass(frozen=True)
@@ -125,18 +123,7 @@ def pack_colliders(
             raise ConfigError(
                 f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}"
             )
-        if collider.mode not in MODES:
-            raise ConfigError(
-                f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}"
-            )
-        if isinstance(collider.friction, bool) or not 0 <= collider.friction < math.inf:
-            raise ConfigError(
-                f"{where}: friction: expected a finite number >= 0, found {collider.friction}"
-            )
-        if collider.friction > 0 and collider.mode not in RUBBING:
-            raise ConfigError(
-                f"{where}: friction acts on modes {' and '.join(RUBBING)} only, found mode {collider.mode!r}"
-            )
+        check_contact(f"{where}: ", collider.mode, collider.friction)
         if isinstance(shape, Particles):
             shapes[i, packing.SIZE] = NOWHERE
         for j, value in enumerate(_sizes(shape)):
@@ -206,12 +193,7 @@ def reach(shape: Shape) -> float:
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
     """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
-    check("world.walls.mode", mode, Literal[tuple(MODES)])
-    check("world.walls.friction", friction, Weight)
-    if friction > 0 and mode not in RUBBING:
-        raise ConfigError(
-            f"world.walls.friction: acts with modes {' and '.join(RUBBING)} only, found mode {mode!r}"
-        )
+    check_contact("world.walls.", mode, friction)
     low, high = torch.as_tensor(box).double().tolist()
     planes = []
     for axis in range(3):
@@ -262,11 +244,8 @@ def collider_of(item: Mapping, where: str) -> Collider:
         raise ConfigError(f"{where}: a {kind} needs {', '.join(missing)}")
     check_keys(item, where)
     item = {key: value for key, value in item.items() if value is not None}
-    mode = item.get("mode", "sticky")
-    if item.get("friction", 0) > 0 and mode not in RUBBING:
-        raise ConfigError(
-            f"{where}.friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}"
-        )
+    mode, friction = item.get("mode", "sticky"), float(item.get("friction", 0.0))
+    check_contact(f"{where}.", mode, friction)
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
@@ -276,7 +255,6 @@ def collider_of(item: Mapping, where: str) -> Collider:
                 *(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed)
             )
         motion = _motion(item)
-        friction = float(item.get("friction", 0.0))
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     return Collider(shape, mode, friction, motion, str(item.get("name", "")))
@@ -310,10 +288,7 @@ def _motion(item: dict) -> Motion:
         raise ConfigError(
             f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints"
         )
-    position = torch.as_tensor(item.get("position", (0.0, 0.0, 0.0)), dtype=torch.float64)
-    if position.shape != (3,):
-        raise ConfigError(f"position: expected three numbers, found {item['position']!r}")
-    return Motion(position, rotation, **motion)
+    return Motion(item.get("position", (0.0, 0.0, 0.0)), rotation, **motion)
 
 
 def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
@@ -337,8 +312,6 @@ def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
 def _turn_to(normal: Sequence[float]) -> Tensor:
     """Rotation vector (3,) that turns z to `normal`, the shortest way."""
     n = torch.as_tensor(normal, dtype=torch.float64)
-    if n.shape != (3,) or not float(n.norm()) > 0:
-        raise ConfigError(f"normal: expected a non-zero vector, found {normal}")
     n = n / n.norm()
     z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     axis, cosine = torch.linalg.cross(z, n), z @ n

@@ -19,7 +19,7 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider, Particles, Shape, collider_of
 from mosa.physics.contact.keys import fits, rows, three, told
-from mosa.physics.contact.motion import Motion, Points, Trajectory, ends
+from mosa.physics.contact.motion import Motion, Points, Trajectory, ends, pose_at
 from mosa.physics.contact.reference import signed_distance
 from mosa.settings import Expected, Section, Text, Weight, Whole
 from mosa.system.npz import read_npz
@@ -76,7 +76,7 @@ class Driven:
                     f"{where}: indices: expected numbers of particles below {len(x)}, found {int(found[-1])}"
                 )
         else:
-            position, rotation = _pose(self.motion if self.place is None else self.place)
+            position, rotation = pose_at(self.motion if self.place is None else self.place)
             inside = signed_distance(region, (place - position) @ rotation) <= 0
             found = inside.nonzero()[:, 0]
         if not len(found):
@@ -118,12 +118,6 @@ def stack_held(each: Sequence[Held]) -> Held:
     return Held(*map(torch.stack, zip(*each)))
 
 
-def _pose(motion, start: float = 0.0) -> tuple[Tensor, ...]:
-    """(position (3,), rotation (3, 3)) float64 at a time [s], without gradient."""
-    motion = motion.timed(None, 1.0) if isinstance(motion, Motion) else motion
-    return tuple(part[0].detach() for part in motion.sample(1, 1, 1e-9, start)[:2])
-
-
 def hold(
     indices: Sequence[Tensor], motions: Sequence, x: Tensor, solids: int = 0, start: float = 0.0
 ) -> Held:
@@ -139,7 +133,7 @@ def hold(
                 f"driven sets: expected sets without a common particle, found particle "
                 f"{int(chosen[sets[chosen] >= 0][0])} in two of them"
             )
-        position, rotation = _pose(motion, start)
+        position, rotation = pose_at(motion, start)
         sets[chosen], local[chosen] = solids + k, (place[chosen] - position) @ rotation
         if isinstance(motion, Points):
             first = motion.at(torch.zeros(1, dtype=torch.float64))[0].detach()

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.rotations import axial, skew
 from mosa.system.limits import counted
 
 
@@ -29,10 +30,7 @@ class Poses(NamedTuple):
 
 def exponential(vectors: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable."""
-    zero = torch.zeros_like(vectors[..., 0])
-    x, y, z = vectors.unbind(-1)
-    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-    return torch.matrix_exp(rows.unflatten(-1, (3, 3)))
+    return torch.matrix_exp(skew(vectors))
 
 
 def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
@@ -59,9 +57,7 @@ def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
 
 def rotation_vector(R: Tensor) -> Tensor:
     """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) by at most pi, differentiable."""
-    sine = 0.5 * torch.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
-    )
+    sine = 0.5 * axial(R)
     cosine = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
     square = (sine**2).sum(-1)
     small = square < 1e-8
@@ -359,6 +355,12 @@ class Points:
     def max_speed(self, reach: float) -> float:
         steps = self.points.detach().diff(dim=0).norm(dim=-1).amax(1)
         return float((steps / self.times.diff()).max())
+
+
+def pose_at(motion: Motion | Trajectory | Points, start: float = 0.0) -> tuple[Tensor, ...]:
+    """(position (3,), rotation (3, 3)) float64 at a time [s], without gradient."""
+    motion = motion.timed(None, 1.0) if isinstance(motion, Motion) else motion
+    return tuple(part[0].detach() for part in motion.sample(1, 1, 1e-9, start)[:2])
 
 
 def sample_frame(

@@ -11,7 +11,7 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import Collider, HalfSpace, Particles, half_width
 from mosa.physics.contact.mesh import SignedDistanceField
-from mosa.physics.contact.motion import Motion
+from mosa.physics.contact.motion import pose_at
 from mosa.physics.contact.reference import signed_distance
 
 MOST = 0.01
@@ -31,17 +31,12 @@ def check_clear(
     deep, places, pressed = [], [], -math.inf
     colliders = [each for each in colliders if not isinstance(each.shape, Particles)]
     for k, collider in enumerate(colliders):
-        motion = (
-            collider.motion.timed(None, 1.0)
-            if isinstance(collider.motion, Motion)
-            else collider.motion
-        )
-        position, rotation = [part[k].detach() for part in poses] or [
-            part[0] for part in motion.sample(1, 1, 1e-9)[:2]
-        ]
-        distance = signed_distance(
-            collider.shape, (x.detach().cpu().double() - position) @ rotation
-        )
+        if poses:
+            position, rotation = (part[k].detach() for part in poses)
+        else:
+            position, rotation = pose_at(collider.motion)
+        at = (x.detach().cpu().double() - position) @ rotation
+        distance = signed_distance(collider.shape, at)
         pressed = max(pressed, 0.5 * spacing - float(distance.min()))
         deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
         places.append(str([round(p, 4) for p in position.tolist()]))

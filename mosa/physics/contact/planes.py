@@ -66,6 +66,18 @@ def ground_plane(ground: Ground, up: Tensor) -> Plane:
     )
 
 
+def check_contact(where: str, mode: str, friction: float) -> None:
+    """Of a plane or a solid; where: it, as the message begins. Errors: ConfigError."""
+    if mode not in MODES:
+        raise ConfigError(f"{where}mode: expected one of {', '.join(MODES)}, found {mode!r}")
+    if not (is_number(friction) and friction >= 0):
+        raise ConfigError(f"{where}friction: expected a finite number >= 0, found {friction}")
+    if friction > 0 and mode not in RUBBING:
+        raise ConfigError(
+            f"{where}friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}"
+        )
+
+
 def pack_planes(
     planes: list[Plane], dtype: torch.dtype, device: torch.device, dx: float
 ) -> tuple[Tensor, Tensor]:
@@ -76,18 +88,7 @@ def pack_planes(
     values = torch.zeros(max(len(planes), 1), 6, dtype=torch.float64)
     modes = torch.zeros(max(len(planes), 1)).int()
     for i, plane in enumerate(planes):
-        if plane.mode not in MODES:
-            raise ConfigError(
-                f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}"
-            )
-        if not (is_number(plane.friction) and plane.friction >= 0):
-            raise ConfigError(
-                f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}"
-            )
-        if plane.friction > 0 and plane.mode not in RUBBING:
-            raise ConfigError(
-                f"plane {i}: friction acts on modes {' and '.join(RUBBING)} only, found mode {plane.mode!r}"
-            )
+        check_contact(f"plane {i}: ", plane.mode, plane.friction)
         thickness = plane.thickness
         if thickness is None:
             thickness = THICKNESS * dx if plane.friction > 0 and plane.mode != "touch" else 0.0

@@ -13,7 +13,7 @@ grid swallows what goes to single particles. The grip is greater than one becaus
 Solids are met in the same way (`collider_kernels`).
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import warp as wp
@@ -93,61 +93,67 @@ def touch_functions(scalar) -> SimpleNamespace:
 
 
 @cache
+def planes_struct(scalar):
+    """What kernels read of planes: `pack_planes` in wp.float32 or wp.float64, and how many there are."""
+
+    @partial(wp.struct, module=f"mosa.physics.planes_{scalar.__name__}")
+    class Planes:
+        values: wp.array2d(dtype=scalar)
+        modes: wp.array(dtype=int)
+        count: int
+
+    return Planes
+
+
+@cache
 def touch_kernels(scalar) -> SimpleNamespace:
     """Kernels meet and adj_meet for wp.float32 or wp.float64 fields."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
-    functions = touch_functions(scalar)
+    functions, Planes = touch_functions(scalar), planes_struct(scalar)
     depth, pushed, adj_pushed = functions.depth, functions.pushed, functions.adj_pushed
     module, grip = f"mosa.physics.touch_{scalar.__name__}", scalar(GRIP)
 
     @wp.func
-    def met(
-        v: vec3,
-        x: vec3,
-        volume: scalar,
-        planes: wp.array2d(dtype=scalar),
-        modes: wp.array(dtype=int),
-        count: int,
-        kick: scalar,
-    ):
+    def met(v: vec3, x: vec3, volume: scalar, planes: Planes, count: int, kick: scalar):
         """Velocity after the first `count` planes."""
+        values = planes.values
         u = v
         for i in range(count):
-            if modes[i] == TOUCH:
-                n = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                inside = depth(wp.dot(x, n) - planes[i, 3], volume)
+            if planes.modes[i] == TOUCH:
+                n = vec3(values[i, 0], values[i, 1], values[i, 2])
+                inside = depth(wp.dot(x, n) - values[i, 3], volume)
                 if inside > scalar(0.0):
-                    u = u + pushed(u, n, kick * inside, planes[i, 4], grip)
+                    u = u + pushed(u, n, kick * inside, values[i, 4], grip)
         return u
 
     @wp.kernel(module=module, enable_backward=False)
     def meet(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), volume: wp.array(dtype=scalar), springs: wp.array(dtype=scalar),
-        planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, dt: scalar, v_met: wp.array(dtype=vec3),
+        planes: Planes, dt: scalar, v_met: wp.array(dtype=vec3),
     ):  # fmt: skip
         p = wp.tid()
-        v_met[p] = met(v[p], x[p], volume[p], planes, modes, count, dt * springs[p])
+        v_met[p] = met(v[p], x[p], volume[p], planes, planes.count, dt * springs[p])
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_meet(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), volume: wp.array(dtype=scalar), springs: wp.array(dtype=scalar),
-        planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, dt: scalar,
-        adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3), adj_springs: wp.array(dtype=scalar),
+        planes: Planes, dt: scalar, adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3), adj_springs: wp.array(dtype=scalar),
     ):  # fmt: skip
         """Turns adj_v from that of the velocities after it to that of those before, and adds to adj_x and adj_springs."""
         p = wp.tid()
+        values = planes.values
         kick = dt * springs[p]
         a = adj_v[p]
         ax = adj_x[p]
         spring = scalar(0.0)
-        for reverse in range(count):
-            i = count - 1 - reverse
-            if modes[i] == TOUCH:
-                n = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                inside = depth(wp.dot(x[p], n) - planes[i, 3], volume[p])
+        for reverse in range(planes.count):
+            i = planes.count - 1 - reverse
+            if planes.modes[i] == TOUCH:
+                n = vec3(values[i, 0], values[i, 1], values[i, 2])
+                inside = depth(wp.dot(x[p], n) - values[i, 3], volume[p])
                 if inside > scalar(0.0):
-                    u = met(v[p], x[p], volume[p], planes, modes, i, kick)
-                    au, _an, aj = adj_pushed(u, n, kick * inside, planes[i, 4], grip, a)
+                    u = met(v[p], x[p], volume[p], planes, i, kick)
+                    au, _an, aj = adj_pushed(u, n, kick * inside, values[i, 4], grip, a)
                     a = a + au
                     ax = ax - (kick * aj) * n
                     spring = spring + dt * inside * aj

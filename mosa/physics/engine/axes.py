@@ -34,29 +34,22 @@ class Axes:
     def world(self) -> "Axes":
         """The way back."""
         turn = None if self.turn is None else self.turn.mT
-        return Axes(
-            turn,
-            self.shift
-            and tuple(
-                (-Axes(turn).vectors(torch.tensor(self.shift, dtype=torch.float64))).tolist()
-            ),
-        )
+        if self.shift is None:
+            return Axes(turn)
+        back = -Axes(turn).vectors(torch.tensor(self.shift, dtype=torch.float64))
+        return Axes(turn, tuple(back.tolist()))
 
     def vectors(self, v: Tensor | None) -> Tensor | None:
         """(..., 3), or forces and torques (..., 6)."""
-        return (
-            v
-            if v is None or self.turn is None
-            else (v.unflatten(-1, (-1, 3)) @ self.turn.mT.to(v)).flatten(-2)
-        )
+        if v is None or self.turn is None:
+            return v
+        return (v.unflatten(-1, (-1, 3)) @ self.turn.mT.to(v)).flatten(-2)
 
     def points(self, x: Tensor) -> Tensor:
         """(..., 3) [m]: float64 where the origin moves."""
-        return (
-            self.vectors(x)
-            if self.shift is None
-            else self.vectors(x.double()) - x.double().new_tensor(self.shift)
-        )
+        if self.shift is None:
+            return self.vectors(x)
+        return self.vectors(x.double()) - x.double().new_tensor(self.shift)
 
     def gradients(self, F: Tensor) -> Tensor:
         """Deformation gradients (..., 3, 3), or rotations of bodies."""
@@ -64,15 +57,11 @@ class Axes:
 
     def state(self, state: ParticleState, dtype: torch.dtype | None = None) -> ParticleState:
         """dtype: of positions, None for what `points` gives."""
-        x, F, C = (
-            self.points(state.x),
-            self.gradients(state.F),
-            self.vectors(self.gradients(state.C_affine)),
-        )
+        x, F = self.points(state.x), self.gradients(state.F)
+        x = x if dtype is None else x.to(dtype)
+        C = self.vectors(self.gradients(state.C_affine))
         F_tot = F if state.F_tot is state.F else self.gradients(state.F_tot)
-        return ParticleState(
-            x if dtype is None else x.to(dtype), self.vectors(state.v), C, F, F_tot
-        )
+        return ParticleState(x, self.vectors(state.v), C, F, F_tot)
 
 
 def entered(state: ParticleState, axes: Axes, dtype: torch.dtype, dx: float) -> ParticleState:

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any
 
 from mosa.physics.engine.workspace import Workspace
-
-
-class HasWorkspaces(Protocol):
-    """A chain (`adapter_chain`), as its owner sees it. light, full: without and with buffers for the adjoint, None until made."""
-
-    light: Workspace | None
-    full: Workspace | None
 
 
 class Buffers:
     """Workspaces and chains, with the graphs that are captured on them: scratch only, nothing in them outlives a stretch of motion.
     They go when this object goes, and nothing else holds them.
 
-    probes: what is known of adapters, by adapter and number of particles (`Chains`);
+    chains: those of `Chains`; probes: what is known of adapters, by adapter and number of particles (`Chains`);
     ran: kinds of passes that have run; the first of its kind compiles and loads kernels, which threads must not do at once."""
 
     def __init__(self) -> None:
         self.ran: set[tuple] = set()
-        self.chains: dict[tuple, HasWorkspaces] = {}
+        self.chains: dict[tuple, Any] = {}
         self.probes: dict[tuple, tuple[bool, int]] = {}
         self._pools: list[dict[tuple, Workspace]] = [{}]
 

@@ -2,7 +2,6 @@
 
 import gc
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 
@@ -31,20 +30,8 @@ def uninterrupted() -> Iterator[None]:
             gc.enable()
 
 
-class Strategy(ABC):
-    """How passes are run, and how they are captured."""
-
-    @abstractmethod
-    def run(self, body: Body) -> None:
-        """The launches of `body`, one by one."""
-
-    @abstractmethod
-    def capture(self, body: Body) -> Body:
-        """What launches them all at once. Errors: RuntimeError where they cannot be captured."""
-
-
-class WarpCapture(Strategy):
-    """Of Warp's launches alone, on a CPU too. device: torch's; of_warp: the same as Warp's."""
+class WarpCapture:
+    """Runs and captures Warp's launches alone, on a CPU too. device: torch's; of_warp: the same as Warp's."""
 
     def __init__(self, device: torch.device, of_warp) -> None:
         self.device, self.of_warp, self.cuda = device, of_warp, device.type == "cuda"
@@ -60,11 +47,13 @@ class WarpCapture(Strategy):
         return self._last[1]
 
     def run(self, body: Body) -> None:
+        """The launches of `body`, one by one."""
         stream = self._stream()
         with NOTHING if stream is None else wp.ScopedStream(stream):
             body()
 
     def capture(self, body: Body) -> Body:
+        """What launches them all at once. Errors: RuntimeError where they cannot be captured."""
         # on Warp's own stream: torch's default one cannot be captured
         captured = wp.ScopedCapture(device=self.of_warp, force_module_load=False)
         with NOTHING if self.cuda else ON_CPU.capturing(), uninterrupted(), captured:
@@ -79,8 +68,8 @@ class WarpCapture(Strategy):
         return replay
 
 
-class TorchCapture(Strategy):
-    """Of everything that torch and Warp do on torch's current CUDA stream."""
+class TorchCapture:
+    """As `WarpCapture`, of everything that torch and Warp do on torch's current CUDA stream."""
 
     def run(self, body: Body) -> None:
         body()
@@ -99,7 +88,11 @@ class Graphs:
     none at all; most: graphs, and passes that wait to become one."""
 
     def __init__(
-        self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS, most: int = MAX_GRAPHS
+        self,
+        strategy: WarpCapture | TorchCapture,
+        failing: str,
+        attempts: int = ATTEMPTS,
+        most: int = MAX_GRAPHS,
     ) -> None:
         self.strategy, self.failing, self.attempts, self.most = strategy, failing, attempts, most
         self._replays: dict[Hashable, Body] = {}

@@ -56,35 +56,38 @@ def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) 
     return tau
 
 
-class _MaterialState(torch.autograd.Function):
+class _OfParticles(torch.autograd.Function):
+    """What a kernel makes of each particle: of inputs and constants, into `outputs`; kinds: Warp types of inputs and outputs. into:
+    as `material_state`."""
+
     @staticmethod
-    def forward(ctx, law: Law, into, F, C, parameters):
-        scalar = SCALARS[F.dtype]
-        mat33, vec6, _, vecp = field_types(scalar)
-        ctx.kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
-        ctx.kinds = [mat33, mat33, vecp, vec6, vec6, vec6]
-        ctx.plastic, ctx.into = law.plastic, into
+    def forward(
+        ctx, kernel, kinds: list, constants: list, outputs: list[Tensor], into, *inputs: Tensor
+    ):
+        ctx.kernel, ctx.kinds, ctx.constants, ctx.into = kernel, kinds, constants, into
+        ctx.blanks = [t.new_empty(1, *t.shape[1:]) for t in outputs]
         ctx.set_materialize_grads(False)
-        # the kernel writes all of them; a law that does not yield has no e
-        w, s, e = (F.new_empty(rows, 6) for rows in (len(F), len(F), len(F) if law.plastic else 1))
-        ctx.save_for_backward(F, C, parameters)
-        with warp_stream(F.device):
-            arrays = _arrays([F, C, parameters, w, s, e], ctx.kinds)
-            launch(ctx.kernel, len(F), arrays, arrays[0].device)
-        return (w, s, e) if law.plastic else (w, s)
+        ctx.save_for_backward(*inputs)
+        with warp_stream(inputs[0].device):
+            arrays = _arrays([*inputs, *outputs], kinds)
+            arrays[len(inputs) : len(inputs)] = constants
+            launch(kernel, len(inputs[0]), arrays, arrays[0].device)
+        return tuple(outputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
         # the adjoint leaves the outputs alone and only reads the seeds: Warp clears only those that are the grad of an array
-        inputs, seeds = list(ctx.saved_tensors), [*seeds] + [None] * (not ctx.plastic)
+        inputs = list(ctx.saved_tensors)
+        count = len(inputs)
         gradients = _zeros(inputs) if ctx.into is None else ctx.into
-        blank = inputs[0].new_empty(1, 6)
-        with warp_stream(blank.device):
-            arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
-            adjoints = [*_targets(gradients, ctx.kinds), *_arrays(seeds, ctx.kinds[3:])]
+        with warp_stream(inputs[0].device):
+            arrays = _arrays([*inputs, *ctx.blanks], ctx.kinds)
+            arrays[count:count] = ctx.constants
+            adjoints = [*_targets(gradients, ctx.kinds), *(type(c)(0) for c in ctx.constants)]
+            adjoints += _arrays(list(seeds), ctx.kinds[count:])
             launch(ctx.kernel, len(inputs[0]), arrays, arrays[0].device, adjoints)
-        return None, None, *(gradients if ctx.into is None else (None, None, None))
+        return *[None] * 5, *(gradients if ctx.into is None else [None] * count)
 
 
 def material_state(
@@ -100,46 +103,14 @@ def material_state(
     into: add the gradients of F, C_affine and parameters to these contiguous tensors, and give autograd none. That of the
     parameters begins at a multiple of 16 bytes.
     """
-    result = _MaterialState.apply(law, into, F, C_affine, parameters)
-    return result if law.plastic else (*result, None)
-
-
-class _Return(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, numerics: Numerics, F, C, parameters, G, h):
-        scalar = SCALARS[F.dtype]
-        mat33, vec6, mat66, vecp = field_types(scalar)
-        adapted = G is not None
-        ctx.kernel = return_kernel(numerics.law.return_map, scalar, adapted)
-        ctx.kinds, ctx.adapted = [mat33, mat33, vecp, mat66, vec6], adapted
-        ctx.constants = [numerics.dt, numerics.norm_eps, int(numerics.rebuild)]
-        if not adapted:
-            G, h = F.new_zeros(1, 6, 6), F.new_zeros(1, 6)
-        ctx.save_for_backward(F, C, parameters, G, h)
-        mapped = torch.empty_like(F, memory_format=torch.contiguous_format)
-        with warp_stream(F.device):
-            arrays = _arrays([F, C, parameters, G, h], ctx.kinds)
-            launch(
-                ctx.kernel,
-                len(F),
-                [*arrays, *ctx.constants, *_arrays([mapped], [mat33])],
-                arrays[0].device,
-            )
-        return mapped
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, seed):
-        inputs = list(ctx.saved_tensors)
-        gradients = _zeros(inputs)
-        with warp_stream(seed.device):
-            arrays = _arrays(inputs, ctx.kinds)
-            blank, seeds = _arrays([seed.new_empty(1, 3, 3), seed], ctx.kinds[:1] * 2)
-            adjoints = [*_targets(gradients, ctx.kinds), 0.0, 0.0, 0, seeds]
-            launch(
-                ctx.kernel, len(seed), [*arrays, *ctx.constants, blank], arrays[0].device, adjoints
-            )
-        return None, *gradients[:3], *(gradients[3:] if ctx.adapted else (None, None))
+    scalar = SCALARS[F.dtype]
+    mat33, vec6, _, vecp = field_types(scalar)
+    kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
+    # the kernel writes all of them; a law that does not yield has no e
+    outputs = [F.new_empty(rows, 6) for rows in (len(F), len(F), len(F) if law.plastic else 1)]
+    kinds = [mat33, mat33, vecp, vec6, vec6, vec6]
+    w, s, e = _OfParticles.apply(kernel, kinds, [], outputs, into, F, C_affine, parameters)
+    return w, s, e if law.plastic else None
 
 
 def first_advance(numerics: Numerics, F: Tensor, C_affine: Tensor, parameters: Tensor, G: Tensor | None = None,
@@ -147,7 +118,15 @@ def first_advance(numerics: Numerics, F: Tensor, C_affine: Tensor, parameters: T
     """map((I + dt C_affine) F), (N, 3, 3): the advance of F with which a rollout starts. Differentiable."""
     if not numerics.law.plastic:
         return advanced(F, C_affine, numerics.dt)
-    return _Return.apply(numerics, F, C_affine, parameters, G, h)
+    scalar = SCALARS[F.dtype]
+    mat33, vec6, mat66, vecp = field_types(scalar)
+    kernel = return_kernel(numerics.law.return_map, scalar, G is not None)
+    operator = (F.new_zeros(1, 6, 6), F.new_zeros(1, 6)) if G is None else (G, h)
+    constants = [numerics.dt, numerics.norm_eps, int(numerics.rebuild)]
+    mapped = torch.empty_like(F, memory_format=torch.contiguous_format)
+    kinds = [mat33, mat33, vecp, mat66, vec6, mat33]
+    inputs = (F, C_affine, parameters, *operator)
+    return _OfParticles.apply(kernel, kinds, constants, [mapped], None, *inputs)[0]
 
 
 def advanced(F: Tensor, C_affine: Tensor, dt: float) -> Tensor:

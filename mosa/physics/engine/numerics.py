@@ -46,8 +46,8 @@ class Numerics:
     """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
     step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
     admissible domain, all in the simulator's axes (`axes`), box: the same corners in the world, norm_eps under the root of yield
-    norms, colliders None where there are none, strain: measure of an operator that is a stiffness (`stress_kernel`), None for one
-    that acts on the stress; touching: whether a plane is met by particles; moduli: the law's
+    norms, colliders None where there are none, energetic: whether an operator is a stiffness (`stress_kernel`) or acts on the
+    stress; touching: whether a plane is met by particles; moduli: the law's
     `moduli_slots` where the stress takes the mean change of volume (`mean_volume`), None where it takes each particle's own.
 
     driven: how many of the colliders, the last ones, are sets of driven particles; points: how many
@@ -69,7 +69,7 @@ class Numerics:
     rebuild: bool
     check_J: bool
     colliders: PackedColliders | None = None
-    strain: str | None = None
+    energetic: bool = False
     touching: bool = False
     moduli: tuple[int, int, int] | None = None
     driven: int = 0

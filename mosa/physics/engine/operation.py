@@ -26,12 +26,13 @@ STATES = len(State._fields)
 HELD = ("parameters", *ANSWER)
 
 
+@dataclass
 class Kept:
     """What a forward pass leaves for the backward pass. windows: of the grid that it used; tape: `Workspace.tape`, [] where the
     states are to be made again."""
 
-    def __init__(self, windows: Windows, tape: list[Tensor]) -> None:
-        self.windows, self.tape = windows, tape
+    windows: Windows
+    tape: list[Tensor]
 
     def take(self) -> list[Tensor]:
         """The tape, which is freed as soon as it is used: another pass makes the states again."""

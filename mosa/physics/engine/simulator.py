@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from mosa.errors import ConfigError
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState, Several, ask
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
-from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, reach
 from mosa.physics.contact.driven import Held, hold, stack_held
 from mosa.physics.contact.motion import Points
@@ -97,8 +96,8 @@ class Simulator:
     dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
     gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
     None for no limit. It computes in axes of its own (`axes`): planes that nodes meet have to be at right angles.
-    strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
-    to 1 + h[0] times the prior's; None: an operator on the prior's stress. options: how the law is taken.
+    energetic: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E of Green's strain that is added to
+    1 + h[0] times the prior's; else an operator on the prior's stress. options: how the law is taken.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
@@ -118,15 +117,15 @@ class Simulator:
         box: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
-        strain: Literal[tuple(STRAINS)] | None = None,  # type: ignore[valid-type]
+        energetic: bool = False,
         options: Annotated[LawOptions, InstanceOf, Expected("LawOptions")] = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
         vector("gravity", gravity)
         vector("up", gravity if up is None else up)
-        if strain is not None and not self.law.sheared:
+        if energetic and not self.law.sheared:
             raise ConfigError(
-                f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
+                f"energetic: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
             )
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
@@ -157,7 +156,7 @@ class Simulator:
             gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes.to(self.device), plane_count=len(all_planes),
             touching=touching, low=low, high=high, box=box, norm_eps=float(options.norm_eps), rebuild=options.rebuild,
             check_J=self.law.needs_positive_J or options.on_inversion == "error",
-            colliders=packed_colliders, strain=strain, driven=len(sets),
+            colliders=packed_colliders, energetic=energetic, driven=len(sets),
             moduli=self.law.moduli_slots if options.mean_volume else None,
             points=sum(c.motion.points.shape[1] for c in sets if isinstance(c.motion, Points)),
         )  # fmt: skip
@@ -299,19 +298,7 @@ class Simulator:
         timing: choose the substeps of every frame. steps: for which there shall be memory to keep all states, where a gradient is
         wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError.
         """
-        asked = _Asked(
-            parameters,
-            volume,
-            density,
-            adapter,
-            stride,
-            motions,
-            gravity,
-            together,
-            timing,
-            started,
-            held,
-        )
+        asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held)  # fmt: skip
         stepper, moment = self._stepper(state, asked)
         stepper.prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
         return stepper, moment._replace(substeps=self.substeps if started else 0)

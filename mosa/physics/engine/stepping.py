@@ -240,6 +240,7 @@ class Step(NamedTuple):
     count: int
 
 
+@dataclass(eq=False)
 class Stepper:
     """Advances bodies by one frame at a time, with colliders where the caller puts them. Made by `Simulator.stepper`.
 
@@ -248,12 +249,12 @@ class Stepper:
     world, as poses and reactions are here.
     """
 
-    def __init__(
-        self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]],
-        axes: Axes, solids: Sequence[Collider],
-    ) -> None:  # fmt: skip
-        self.prepared, self.worlds, self.clock, self.motions = prepared, worlds, clock, motions
-        self.axes, self.solids = axes, solids
+    prepared: Prepared
+    worlds: int | None
+    clock: Clock
+    motions: Sequence[Sequence[Motion | Trajectory]]
+    axes: Axes
+    solids: Sequence[Collider]
 
     def step(
         self,

@@ -20,14 +20,14 @@ from mosa.physics.contact.collider_buffers import ColliderBuffers
 from mosa.physics.contact.driven import Held
 from mosa.physics.contact.driven_buffers import DrivenBuffers
 from mosa.physics.contact.grid_update import update_kernels
-from mosa.physics.contact.touch import springs, touch_kernels
+from mosa.physics.contact.touch import planes_struct, springs, touch_kernels
 from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.exact_sums import COLUMNS, needed
 from mosa.physics.grid.mean_volume import mean_volume_kernels
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.grid.window import SMALL
-from mosa.physics.launching import SCALARS, aligned, copies, launch, zeros_in_one
+from mosa.physics.launching import SCALARS, aligned, copies, filled, launch, zeros_in_one
 from mosa.system.limits import counted
 
 SPARE = 8
@@ -61,25 +61,19 @@ class Workspace:
         self.kernels = transfer_kernels(self.scalar, self.exact)
         self.update = update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(
-            numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain
+            numerics.law, self.scalar, adapted, plastic_adapted, numerics.energetic
         )
         self.plastic = numerics.law.plastic
         n = particles
         states = substeps + 1 if with_adjoint else 2
         self._large = states * n * torch.finfo(numerics.dtype).bits // 8 >= LARGE
-        self.x, self.x_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
-        self.v, self.v_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
-        self.C_affine, self.C_affine_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
-        self.F, self.F_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
-        # the deformation gradient that is never mapped: F itself where the law does not yield
-        self.F_tot, self.F_tot_wp = self.F, self.F_wp
-        if self.plastic:
-            self.F_tot, self.F_tot_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
-        self.states = [self.x, self.v, self.C_affine, self.F, *([self.F_tot] * self.plastic)]
+        self.states, self.states_wp = self._slots(states)
+        self.x, self.v, self.C_affine, self.F = self.states[:4]
         stresses = substeps if with_adjoint else 1
         self.tau, self.tau_wp = self._per_slot(stresses, (n, 3, 3), self.kernels.mat33)
         if numerics.moduli is not None:
             self.mean = mean_volume_kernels(self.scalar, SLOTS, self.exact)
+            self.moduli = wp.vec3i(*numerics.moduli)
             _, self.F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
         self.mass, self.mass_wp = self.array((n,), self.scalar)
         self.volume, self.volume_wp = self.array((n,), self.scalar)
@@ -99,11 +93,13 @@ class Workspace:
         if with_adjoint:
             self._allocate_adjoint(shapes)
         self.flags, self.flags_wp = self.array((4,), wp.int64, torch.int64)
-        self.window, self.window_wp = self.array((3 * worlds, 3), wp.vec3i, torch.int32)
+        self.window, window = self.array((3 * worlds, 3), wp.vec3i, torch.int32)
+        self.grids = filled(self.kernels.Grids, window, self.size, numerics.dx, 1.0 / numerics.dx)
         # what gravity adds to node velocities in the first substep of a segment and in the others
         self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
-        self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
-        self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
+        values = wp.from_torch(numerics.planes, dtype=self.scalar)
+        modes = wp.from_torch(numerics.modes, dtype=wp.int32)
+        self.planes = filled(planes_struct(self.scalar), values, modes, numerics.plane_count)
         self._allocate_contact()
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
@@ -120,16 +116,8 @@ class Workspace:
     def _allocate_adjoint(self, shapes: dict) -> None:
         """shapes: of what is held, with Warp's types, by name."""
         numerics, n = self.numerics, self.particles
-        self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
-        self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
-        self.adj_C_affine, self.adj_C_affine_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-        self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-        self.adj_F_tot, self.adj_F_tot_wp = self.adj_F, self.adj_F_wp
-        if self.plastic:
-            self.adj_F_tot, self.adj_F_tot_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-        # both slots of each
-        self.adj_states = [self.adj_x, self.adj_v, self.adj_C_affine, self.adj_F]
-        self.adj_states += [self.adj_F_tot] * self.plastic
+        self.adj_states, self.adj_wp = self._slots(2)
+        self.adj_C_affine, self.adj_F = self.adj_states[2:4]
         self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
         if numerics.moduli is not None:
             _, self.adj_F_bar_wp = self.array((n, 3, 3), self.kernels.mat33)
@@ -180,6 +168,15 @@ class Workspace:
             (slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device
         )
         return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
+
+    def _slots(self, count: int) -> tuple[list[list[Tensor]], list]:
+        """(`count` slots of x, v, C_affine, F, and of F_tot where the law yields, the same as a kernel's `Particles` each)."""
+        n, vector, matrix = self.particles, self.kernels.vec3, self.kernels.mat33
+        kinds = [((n, 3), vector)] * 2 + [((n, 3, 3), matrix)] * (2 + self.plastic)
+        tensors, arrays = zip(*(self._per_slot(count, *kind) for kind in kinds))
+        # the deformation gradient that is never mapped is F itself where the law does not yield
+        whole = arrays if self.plastic else (*arrays, arrays[-1])
+        return list(tensors), [filled(self.kernels.Particles, *parts) for parts in zip(*whole)]
 
     def tape(self) -> list[Tensor]:
         """Copies of all that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""
@@ -342,7 +339,7 @@ class Workspace:
         """Launch for all nodes of the windows. Graphs hold the number of threads: one for all nodes of a world on a CPU, on a CUDA
         device one for each that there is room for, shared among the worlds in equal parts."""
         threads = -(-self.capacity // self.worlds) if self.flags_wp.device.is_cuda else 1
-        self.run(kernel, threads * self.worlds, [self.window_wp, threads, *inputs])
+        self.run(kernel, threads * self.worlds, [self.grids, threads, *inputs])
 
     def _added_to(self, field) -> wp.array:
         """What particles add to, of which the nodes' numbers in `field` are made."""
@@ -352,47 +349,37 @@ class Workspace:
         if self.exact:
             self.over_nodes(self.kernels.settle, [self.sums_wp, field])
 
-    def _geometry(self, dt: float) -> list:
-        return [self.window_wp, self.size, self.numerics.dx, 1.0 / self.numerics.dx, dt]
-
     def _kick(self, step: int) -> float:
         """For how long [s] the forces of a substep act."""
         return self.steps.kick if step == 0 else self.steps.dt
 
     def _grid_arguments(self, slot: int, step: int) -> list:
-        numerics = self.numerics
-        return [
-            self.grid_wp[slot], self.impulses_wp[min(step, 1)], self.cutoff, numerics.dx, self.planes_wp, self.modes_wp,
-            numerics.plane_count,
-        ]  # fmt: skip
+        return [self.grid_wp[slot], self.impulses_wp[min(step, 1)], self.cutoff, self.planes]
 
     def _touch_arguments(self, state: int, step: int) -> list:
-        return [
-            self.x_wp[state], self.v_wp[state], self.volume_wp, self.springs_wp, self.planes_wp, self.modes_wp,
-            self.numerics.plane_count, self._kick(step),
-        ]  # fmt: skip
+        now = self.states_wp[state]
+        return [now.x, now.v, self.volume_wp, self.springs_wp, self.planes, self._kick(step)]
 
     def _met(self, state: int, step: int, again: bool = False) -> wp.array:
         """Velocities of a state that go to the grid: after the planes and solids that particles meet, where there are such.
         again: in the adjoint, where reactions are known."""
-        v = self.v_wp[state]
+        now = self.states_wp[state]
+        v = now.v
         if self.numerics.touching:
-            self.run(
-                self.touch.meet,
-                self.particles,
-                [*self._touch_arguments(state, step), self.v_met_wp],
-            )
+            met = [*self._touch_arguments(state, step), self.v_met_wp]
+            self.run(self.touch.meet, self.particles, met)
             v = self.v_met_wp
         if self.struck:
             v = self.colliders.strike(step, self._struck(state), self._kick(step), again)
         if self.driven is not None:
-            v = self.driven.hold(step, self.x_wp[state], v, self._kick(step))
+            v = self.driven.hold(step, now.x, v, self._kick(step))
         return v
 
     def _struck(self, state: int) -> list:
         """What solids act on: particles after the planes that they meet."""
-        v = self.v_met_wp if self.numerics.touching else self.v_wp[state]
-        return [self.x_wp[state], v, self.volume_wp, self.springs_wp, self.mass_wp]
+        now = self.states_wp[state]
+        v = self.v_met_wp if self.numerics.touching else now.v
+        return [now.x, v, self.volume_wp, self.springs_wp, self.mass_wp]
 
     def _found(self, state: int) -> wp.array:
         """Velocities of a state as driven sets find them, once `_met` has run: after planes and
@@ -401,82 +388,80 @@ class Workspace:
 
     def _averaged(self, state: int) -> wp.array:
         """F of which the stress is taken."""
+        now = self.states_wp[state]
         if self.numerics.moduli is None:
-            return self.F_wp[state]
+            return now.F
         if not self.exact:
             self.over_nodes(self.kernels.clear, [self.volumes_wp])
-        x, F, volumes = self.x_wp[state], self.F_wp[state], self._added_to(self.volumes_wp)
-        at = [self.window_wp, self.size, 1.0 / self.numerics.dx]
-        self.run(self.mean.collect, self.particles, [x, F, self.volume_wp, *at, volumes])
+        volumes = self._added_to(self.volumes_wp)
+        self.run(
+            self.mean.collect, self.particles, [now.x, now.F, self.volume_wp, self.grids, volumes]
+        )
         self._settle(self.volumes_wp)
-        taken = [x, F, self.held_wp["parameters"], *self.numerics.moduli, *at, self.volumes_wp]
-        self.run(self.mean.average, self.particles, [*taken, self.F_bar_wp])
+        self.run(self.mean.average, self.particles, [
+            now.x, now.F, self.held_wp["parameters"], self.moduli, self.grids, self.volumes_wp, self.F_bar_wp,
+        ])  # fmt: skip
         return self.F_bar_wp
 
-    def _adj_averaged(self, step: int, adj_x: wp.array, adj_F: wp.array) -> None:
+    def _adj_averaged(self, step: int, adj) -> None:
         """Adds what `adj_F_bar` says to the gradients of x, F and parameters, after `_averaged` of
         the same step."""
         if not self.exact:
             self.over_nodes(self.kernels.clear, [self.adj_volumes_wp])
-        x, F = self.x_wp[step], self.F_wp[step]
-        at = [self.window_wp, self.size, 1.0 / self.numerics.dx]
+        now = self.states_wp[step]
         self.run(self.mean.adj_average, self.particles, [
-            x, F, self.held_wp["parameters"], *self.numerics.moduli, *at, self.volumes_wp, self.adj_F_bar_wp, adj_x, adj_F,
-            self.adj_held_wp["parameters"], self._added_to(self.adj_volumes_wp),
+            now.x, now.F, self.held_wp["parameters"], self.moduli, self.grids, self.volumes_wp, self.adj_F_bar_wp,
+            adj.x, adj.F, self.adj_held_wp["parameters"], self._added_to(self.adj_volumes_wp),
         ])  # fmt: skip
         self._settle(self.adj_volumes_wp)
-        taken = [x, F, self.volume_wp, *at, self.volumes_wp, self.adj_volumes_wp]
-        self.run(self.mean.adj_collect, self.particles, [*taken, adj_x, adj_F])
+        self.run(self.mean.adj_collect, self.particles, [
+            now.x, now.F, self.volume_wp, self.grids, self.volumes_wp, self.adj_volumes_wp, adj.x, adj.F,
+        ])  # fmt: skip
 
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
         return [
-            self._averaged(state), self.C_affine_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot],
+            self._averaged(state), self.states_wp[state].C, held["parameters"], held["G"], held["h"], self.tau_wp[slot],
         ]  # fmt: skip
 
     def _mapping_arguments(self, state: int, new: int) -> list:
         held, numerics = self.held_wp, self.numerics
         return [
-            self.F_wp[state], self.C_affine_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], self.steps.dt,
-            numerics.norm_eps, int(numerics.rebuild), self.F_wp[new],
+            self.states_wp[state].F, self.states_wp[new].C, held["parameters"], held["plastic_G"], held["plastic_h"],
+            self.steps.dt, numerics.norm_eps, int(numerics.rebuild), self.states_wp[new].F,
         ]  # fmt: skip
 
     def advance_steps(self, first: int, count: int) -> None:
         """Launch substeps `first` to `first + count` of the segment, from the states in slot `first`."""
         kernels, numerics, n = self.kernels, self.numerics, self.particles
-        states, grids = len(self.x), len(self.grid_wp)
-        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
+        states, grids, dt = len(self.x), len(self.grid_wp), self.steps.dt
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
         mass = self.mass_wp if self.driven is None else self.driven.mass_wp
         if self.colliders is not None and first == 0:
             self.colliders.reset()
         for step in range(first, first + count):
-            a, b, g, s = step % states, (step + 1) % states, step % grids, step % len(self.tau)
+            a, g, s, kick = step % states, step % grids, step % len(self.tau), self._kick(step)
+            now, then = self.states_wp[a], self.states_wp[(step + 1) % states]
             if step == 0 and not self.exact:
                 self.over_nodes(kernels.clear, [self.grid_wp[g]])
             clears = step + 1 < self.substeps and not self.exact
             cleared = self.grid_wp[(step + 1) % grids] if clears else None
             self.run(self.stress, n, self._stress_arguments(a, s))
             self.run(kernels.p2g, n, [
-                self.x_wp[a], self._met(a, step), self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], mass, self.volume_wp,
-                *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
+                now, self._met(a, step), self.tau_wp[s], mass, self.volume_wp, self.grids, kick,
+                int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
-            self.over_nodes(
-                self.update.grid_update,
-                [*self._grid_arguments(g, step), self.velocity_wp[g], cleared],
-            )
+            given = [*self._grid_arguments(g, step), self.velocity_wp[g], cleared]
+            self.over_nodes(self.update.grid_update, given)
             self.run(kernels.g2p, n, [
-                self.x_wp[a], self.F_tot_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
-                self.x_wp[b], self.v_wp[b], self.C_affine_wp[b], self.F_tot_wp[b],
+                now, self.velocity_wp[g], self.grids, dt, low, high, step, self.flags_wp, then,
             ])  # fmt: skip
             if self.plastic:
-                self.run(self.mapping, n, self._mapping_arguments(a, b))
+                self.run(self.mapping, n, self._mapping_arguments(a, (step + 1) % states))
             if self.driven is not None:
                 impulses = self.impulses_wp[min(step, 1)]
-                self.driven.feel(
-                    step, self.x_wp[a], self._found(a), self.v_wp[b], self._kick(step), impulses
-                )
+                self.driven.feel(step, now.x, self._found(a), then.v, kick, impulses)
         if self.colliders is not None and first + count == self.substeps:
             self.colliders.settle()
 
@@ -485,8 +470,7 @@ class Workspace:
 
         adj_held is of these substeps alone; more: but the parameters' part is added to what is there."""
         kernels, numerics, n, held = self.kernels, self.numerics, self.particles, self.adj_held_wp
-        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
-        mass = self.mass_wp if self.driven is None else self.driven.mass_wp
+        dt, mass = self.steps.dt, self.mass_wp if self.driven is None else self.driven.mass_wp
         (self.adj_operator_wp if more else self.all_adj_wp).zero_()
         if self.springs is not None:
             self.adj_springs_wp.zero_()
@@ -496,56 +480,47 @@ class Workspace:
                 self.driven.reset_adjoint()
         for step in reversed(range(first, first + count)):
             a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
+            now, then, kick = self.states_wp[step], self.states_wp[step + 1], self._kick(step)
+            adj, adj_then = self.adj_wp[a], self.adj_wp[b]
             if self.plastic:
-                self.adj_F_wp[a].zero_()
+                adj.F.zero_()
                 self.run(self.mapping, n, self._mapping_arguments(step, step + 1), [
-                    self.adj_F_wp[a], self.adj_C_affine_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"],
-                    0.0, 0.0, 0, self.adj_F_wp[b],
+                    adj.F, adj_then.C, held["parameters"], held["plastic_G"], held["plastic_h"], 0.0, 0.0, 0, adj_then.F,
                 ])  # fmt: skip
             if self.driven is not None:
-                self.driven.adj_feel(step, self.x_wp[step], self._kick(step), self.adj_v_wp[b])
+                self.driven.adj_feel(step, now.x, kick, adj_then.v)
             adj_velocity = self.adj_velocity_wp[a]
             if step == self.substeps - 1 and not self.exact:
                 self.over_nodes(kernels.clear, [adj_velocity])
             cleared = self.adj_velocity_wp[b] if step > 0 and not self.exact else None
             self.run(kernels.adj_g2p, n, [
-                self.x_wp[step], self.F_tot_wp[step], self.velocity_wp[step], self.C_affine_wp[step + 1], *geometry,
-                self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_affine_wp[b], self.adj_F_tot_wp[b],
-                self.adj_x_wp[a], self.adj_F_tot_wp[a], self._added_to(adj_velocity),
+                now, self.velocity_wp[step], self.grids, dt, then, adj_then, adj, self._added_to(adj_velocity),
             ])  # fmt: skip
             self._settle(adj_velocity)
-            self.over_nodes(
-                self.update.adj_grid,
-                [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared],
-            )
+            given = [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared]
+            self.over_nodes(self.update.adj_grid, given)
             self.run(kernels.adj_p2g, n, [
-                self.x_wp[step], self._met(step, step, True), self.C_affine_wp[step], self.tau_wp[step], mass,
-                self.volume_wp, *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a],
-                self.adj_C_affine_wp[a], self.adj_tau_wp,
+                now, self._met(step, step, True), self.tau_wp[step], mass, self.volume_wp, self.grids, kick,
+                self.adj_grid_wp, adj, self.adj_tau_wp,
             ])  # fmt: skip
-            of_met = (
-                self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp
-            ) if self.colliders is not None else ()  # fmt: skip
+            of_met = (adj.x, adj.v, self.adj_springs_wp) if self.springs is not None else ()
             if self.driven is not None:
                 self.driven.adjoint(
-                    step, self.x_wp[step], self._found(step), self.v_wp[step + 1], self._kick(step),
-                    self.impulses_wp[min(step, 1)], *of_met,
+                    step, now.x, self._found(step), then.v, kick, self.impulses_wp[min(step, 1)], *of_met
                 )  # fmt: skip
             if self.struck:
-                self.colliders.adjoint(step, self._struck(step), self._kick(step), *of_met)
+                self.colliders.adjoint(step, self._struck(step), kick, *of_met)
             if numerics.touching:
-                self.run(self.touch.adj_meet, n, [
-                    *self._touch_arguments(step, step), self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp,
-                ])  # fmt: skip
-            adj_F = self.adj_F_wp[a]
+                self.run(self.touch.adj_meet, n, [*self._touch_arguments(step, step), *of_met])
+            adj_F = adj.F
             if numerics.moduli is not None:
                 adj_F = self.adj_F_bar_wp
                 adj_F.zero_()
             self.run(self.stress, n, self._stress_arguments(step, step), [
-                adj_F, self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
+                adj_F, adj.C, held["parameters"], held["G"], held["h"], self.adj_tau_wp,
             ])  # fmt: skip
             if numerics.moduli is not None:
-                self._adj_averaged(step, self.adj_x_wp[a], self.adj_F_wp[a])
+                self._adj_averaged(step, adj)
         if self.springs is not None:
             self.run(self.touch.loosen, n, [self.adj_springs_wp, self.slopes_wp, self.adj_slots_wp])
         if self.colliders is not None and first == 0:

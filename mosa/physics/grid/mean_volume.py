@@ -57,7 +57,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
 
     collect: adds (V (J - 1), V) to nodes; average: F -> F_bar; adj_average: adds to the gradients of x, F and parameters, and to
     nodes those of q_I; adj_collect: from there to x and F.
-    slots: numbers a law can take per particle; mu, lam, kappa: their places, see `Law.moduli_slots`."""
+    slots: numbers a law can take per particle; moduli: places of mu, lam, kappa, see `Law.moduli_slots`."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
@@ -65,28 +65,27 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
     adding = exact_node_access(scalar) if exact else node_access(scalar)
     pair, add3, load3 = adding.pair, adding.add3, node_access(scalar).load3
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
-    stencil = stencil_functions(scalar)
-    cell, local_cell, window_row = stencil.cell, stencil.local_cell, stencil.window_row
+    Grids, located = stencil_functions(scalar).Grids, stencil_functions(scalar).located
     # numbers made here: Warp computes those made inside a kernel in float32
     zero, one, two_thirds = scalar(0.0), scalar(1.0), scalar(2.0 / 3.0)
     coarser, own_shear, own_fluid = scalar(1.0 / SPREAD), scalar(OWN), scalar(OWN_FLUID)
     module = f"mosa.physics.{'exact_' if exact else ''}mean_volume_{scalar.__name__}"
 
     @wp.func
-    def lowest(x: vec3, inv_dx: scalar, window: wp.array(dtype=wp.vec3i), place: int):
+    def lowest(x: vec3, p: int, grids: Grids):
         """(index of the lowest of a particle's 8 nodes, -1 outside of the window; rows along x; along y). A window has room for
         these nodes: it is at least 7 cells wide."""
-        low = window[place]
-        dims = window[place + 1]
+        n, _base, place = located(x, p, grids)
+        low = grids.windows[place]
+        dims = grids.windows[place + 1]
         along = int(coarser * scalar(dims[2])) + 3
         across = along * (int(coarser * scalar(dims[1])) + 3)
-        n = local_cell(cell(x, inv_dx), window, place)
         if n >= 0:
-            y = coarser * inv_dx * x
+            y = coarser * grids.inv_dx * x
             i = int(wp.floor(y[0])) - int(wp.floor(coarser * scalar(low[0])))
             j = int(wp.floor(y[1])) - int(wp.floor(coarser * scalar(low[1])))
             k = int(wp.floor(y[2])) - int(wp.floor(coarser * scalar(low[2])))
-            n = window[place + 2][0] + i * across + j * along + k
+            n = grids.windows[place + 2][0] + i * across + j * along + k
         return wp.vec3i(n, across, along)
 
     @wp.func
@@ -128,15 +127,16 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
         return vec4(gx, gy, gz, q)
 
     @wp.func
-    def own_part(parameters: numbers, mu: int, lam: int, kappa: int):
+    def own_part(parameters: numbers, moduli: wp.vec3i):
         """(1 - share, kappa, whether the share depends on the moduli)."""
         part = vec3(own_fluid, one, zero)
+        mu = moduli[0]
         if mu >= 0:
             bulk = zero
-            if kappa >= 0:
-                bulk = parameters[kappa]
+            if moduli[2] >= 0:
+                bulk = parameters[moduli[2]]
             else:
-                bulk = parameters[lam] + two_thirds * parameters[mu]
+                bulk = parameters[moduli[1]] + two_thirds * parameters[mu]
             own = own_shear * parameters[mu]
             if own < bulk:
                 part = vec3(own / bulk, bulk, one)
@@ -156,50 +156,48 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
     @wp.kernel(module=module, enable_backward=False)
     def collect(
         x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), volume: wp.array(dtype=scalar),
-        window: wp.array(dtype=wp.vec3i), size: int, inv_dx: scalar, nodes: added_to,
+        grids: Grids, nodes: added_to,
     ):  # fmt: skip
         p = wp.tid()
-        at = lowest(x[p], inv_dx, window, window_row(p, size))
+        at = lowest(x[p], p, grids)
         if at[0] < 0:
             return
         V = volume[p]
         q = vec3(V * scalar(own_ratio(wp.mat33d(F[p])) - _ONE), V, zero)
-        spread(nodes, at, hats(x[p], inv_dx), q, pair(at[0]))
+        spread(nodes, at, hats(x[p], grids.inv_dx), q, pair(at[0]))
 
     @wp.kernel(module=module, enable_backward=False)
     def average(
-        x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), parameters: wp.array(dtype=numbers), mu: int, lam: int, kappa: int,
-        window: wp.array(dtype=wp.vec3i), size: int, inv_dx: scalar, nodes: wp.array(dtype=vec4),
-        F_bar: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), parameters: wp.array(dtype=numbers), moduli: wp.vec3i,
+        grids: Grids, nodes: wp.array(dtype=vec4), F_bar: wp.array(dtype=mat33),
     ):  # fmt: skip
         p = wp.tid()
-        at = lowest(x[p], inv_dx, window, window_row(p, size))
+        at = lowest(x[p], p, grids)
         if at[0] < 0:
             return
-        q = interpolated(nodes, at, hats(x[p], inv_dx))[3]
+        q = interpolated(nodes, at, hats(x[p], grids.inv_dx))[3]
         Fp = wp.mat33d(F[p])
-        own = own_part(parameters[p], mu, lam, kappa)
+        own = own_part(parameters[p], moduli)
         exponent = _THIRD * wp.float64(one - own[0])
         F_bar[p] = mat33(wp.pow((_ONE + wp.float64(q)) / own_ratio(Fp), exponent) * Fp)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_average(
-        x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), parameters: wp.array(dtype=numbers), mu: int, lam: int, kappa: int,
-        window: wp.array(dtype=wp.vec3i), size: int, inv_dx: scalar, nodes: wp.array(dtype=vec4),
-        adj_F_bar: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), parameters: wp.array(dtype=numbers), moduli: wp.vec3i,
+        grids: Grids, nodes: wp.array(dtype=vec4), adj_F_bar: wp.array(dtype=mat33),
         adj_x: wp.array(dtype=vec3), adj_F: wp.array(dtype=mat33), adj_parameters: wp.array(dtype=numbers), adj_nodes: added_to,
     ):  # fmt: skip
         p = wp.tid()
-        at = lowest(x[p], inv_dx, window, window_row(p, size))
+        at = lowest(x[p], p, grids)
         if at[0] < 0:
             return
-        f = hats(x[p], inv_dx)
+        f = hats(x[p], grids.inv_dx)
         found = interpolated(nodes, at, f)
         Fp = wp.mat33d(F[p])
         A = wp.mat33d(adj_F_bar[p])
         J = own_ratio(Fp)
         mean = _ONE + wp.float64(found[3])
-        own = own_part(parameters[p], mu, lam, kappa)
+        own = own_part(parameters[p], moduli)
         share = wp.float64(one - own[0])
         factor = wp.pow(mean / J, _THIRD * share)
         # of log(factor)
@@ -209,17 +207,20 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
             B = B - (_THIRD * share * seed / J) * cofactor(Fp)
         adj_F[p] = adj_F[p] + mat33(B)
         of_mean = scalar(_THIRD * share * seed / mean)
-        adj_x[p] = adj_x[p] + (of_mean * coarser * inv_dx) * vec3(found[0], found[1], found[2])
+        adj_x[p] = adj_x[p] + (of_mean * coarser * grids.inv_dx) * vec3(
+            found[0], found[1], found[2]
+        )
         if own[2] > zero:
             # of own[0] = OWN mu/kappa
             of_own = -scalar(_THIRD * seed * wp.log(mean / J))
             of_bulk = -of_own * own[0] / own[1]
             more = adj_parameters[p]
+            mu = moduli[0]
             more[mu] = more[mu] + of_own * own_shear / own[1]
-            if kappa >= 0:
-                more[kappa] = more[kappa] + of_bulk
+            if moduli[2] >= 0:
+                more[moduli[2]] = more[moduli[2]] + of_bulk
             else:
-                more[lam] = more[lam] + of_bulk
+                more[moduli[1]] = more[moduli[1]] + of_bulk
                 more[mu] = more[mu] + two_thirds * of_bulk
             adj_parameters[p] = more
         spread(adj_nodes, at, f, vec3(of_mean, zero, zero), pair(at[0]))
@@ -227,14 +228,14 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
     @wp.kernel(module=module, enable_backward=False)
     def adj_collect(
         x: wp.array(dtype=vec3), F: wp.array(dtype=mat33), volume: wp.array(dtype=scalar),
-        window: wp.array(dtype=wp.vec3i), size: int, inv_dx: scalar, nodes: wp.array(dtype=vec4),
+        grids: Grids, nodes: wp.array(dtype=vec4),
         adj_nodes: wp.array(dtype=vec4), adj_x: wp.array(dtype=vec3), adj_F: wp.array(dtype=mat33),
     ):  # fmt: skip
         p = wp.tid()
-        at = lowest(x[p], inv_dx, window, window_row(p, size))
+        at = lowest(x[p], p, grids)
         if at[0] < 0:
             return
-        f = hats(x[p], inv_dx)
+        f = hats(x[p], grids.inv_dx)
         V = volume[p]
         Fp = wp.mat33d(F[p])
         change = V * scalar(own_ratio(Fp) - _ONE)
@@ -254,7 +255,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
                     gx = gx + slope(i) * hat(f[1], j) * hat(f[2], k) * e
                     gy = gy + hat(f[0], i) * slope(j) * hat(f[2], k) * e
                     gz = gz + hat(f[0], i) * hat(f[1], j) * slope(k) * e
-        adj_x[p] = adj_x[p] + (coarser * inv_dx) * vec3(gx, gy, gz)
+        adj_x[p] = adj_x[p] + (coarser * grids.inv_dx) * vec3(gx, gy, gz)
         if wp.determinant(Fp) > J_MIN:
             adj_F[p] = adj_F[p] + mat33(wp.float64(V * of_J) * cofactor(Fp))
 

@@ -129,15 +129,8 @@ def node_access(scalar) -> SimpleNamespace:
         store4(field, i, vec4(z, z, z, z))
 
     return SimpleNamespace(
-        load4=load4,
-        load3=load3,
-        store4=store4,
-        store3=store3,
-        pair=pair,
-        add4=add4,
-        add3=add3,
-        clear=clear,
-    )
+        load4=load4, load3=load3, store4=store4, store3=store3, pair=pair, add4=add4, add3=add3, clear=clear
+    )  # fmt: skip
 
 
 @cache
@@ -153,42 +146,30 @@ def exact_node_access(scalar) -> SimpleNamespace:
     def pair(x: int):
         return wp.vec2i(0, 1)
 
-    @wp.func
-    def add4(
-        sums: wp.array2d(dtype=wp.int64), node: int, a: vec4, b: vec4, c: vec4, together: wp.vec2i
-    ):
-        for k in range(4):
-            add_exactly(sums, 4 * node + k, a[k])
-        for k in range(4):
-            add_exactly(sums, 4 * node + 4 + k, b[k])
-        for k in range(4):
-            add_exactly(sums, 4 * node + 8 + k, c[k])
+    def add(numbers: int):
+        vector = vec4 if numbers == 4 else vec3
 
-    @wp.func
-    def add3(
-        sums: wp.array2d(dtype=wp.int64), node: int, a: vec3, b: vec3, c: vec3, together: wp.vec2i
-    ):
-        for k in range(3):
-            add_exactly(sums, 4 * node + k, a[k])
-        for k in range(3):
-            add_exactly(sums, 4 * node + 4 + k, b[k])
-        for k in range(3):
-            add_exactly(sums, 4 * node + 8 + k, c[k])
+        @wp.func
+        def add_row(
+            sums: wp.array2d(dtype=wp.int64), node: int, a: vector, b: vector, c: vector, together: wp.vec2i
+        ):  # fmt: skip
+            for k in range(numbers):
+                add_exactly(sums, 4 * node + k, a[k])
+            for k in range(numbers):
+                add_exactly(sums, 4 * node + 4 + k, b[k])
+            for k in range(numbers):
+                add_exactly(sums, 4 * node + 8 + k, c[k])
+
+        return add_row
 
     @wp.func
     def settle_node(sums: wp.array2d(dtype=wp.int64), field: wp.array(dtype=vec4), node: int):
         first = 4 * node
-        store4(
-            field,
-            node,
-            vec4(
-                total(sums, first),
-                total(sums, first + 1),
-                total(sums, first + 2),
-                total(sums, first + 3),
-            ),
-        )
+        x = total(sums, first)
+        y = total(sums, first + 1)
+        z = total(sums, first + 2)
+        store4(field, node, vec4(x, y, z, total(sums, first + 3)))
         for k in range(4):
             clear(sums, first + k)
 
-    return SimpleNamespace(pair=pair, add4=add4, add3=add3, settle_node=settle_node)
+    return SimpleNamespace(pair=pair, add4=add(4), add3=add(3), settle_node=settle_node)

@@ -8,13 +8,13 @@ The adjoint of P2G is a pure gather; the adjoint of G2P scatters three numbers p
 Stencils are nested static loops over 3: a single loop over 27 nodes compiles to a dynamic loop.
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import warp as wp
 
 from mosa.physics.grid.node_access import exact_node_access, node_access
-from mosa.physics.grid.stencil import node_functions, stencil_functions
+from mosa.physics.grid.stencil import stencil_functions
 
 # slots of the flag array: the first substep * N + particle at which the event happened
 WINDOW, NONFINITE, OUTSIDE, INVERTED = 0, 1, 2, 3
@@ -28,48 +28,49 @@ _FLIPPED = wp.constant(INVERTED)
 
 @cache
 def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
-    """Kernels clear, p2g, g2p, adj_g2p, adj_p2g, settle for wp.float32 or wp.float64 fields.
+    """Struct Particles and kernels clear, p2g, g2p, adj_g2p, adj_p2g, settle for wp.float32 or wp.float64 fields.
 
     clear and settle are launched with `threads` for each world and take all nodes of its window, however many threads that is.
     exact: p2g and adj_g2p add to exact sums, which `settle` turns into the nodes' numbers and clears."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
-    memory = node_access(scalar)
-    stencil = stencil_functions(scalar)
-    nodes_of = node_functions(scalar).nodes_of
+    memory, stencil = node_access(scalar), stencil_functions(scalar)
     load3, load4, clear_node = memory.load3, memory.load4, memory.clear
     adding = exact_node_access(scalar) if exact else memory
-    pair = adding.pair
-    add3 = adding.add3
-    add4 = adding.add4
+    pair, add3, add4 = adding.pair, adding.add3, adding.add4
     settle_node = exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
-    spline = stencil.spline
-    spline_slope = stencil.spline_slope
-    cell = stencil.cell
-    local_cell = stencil.local_cell
-    window_row = stencil.window_row
+    Grids, located, nodes_of = stencil.Grids, stencil.located, stencil.nodes_of
+    spline, spline_slope = stencil.spline, stencil.spline_slope
     module = f"mosa.physics.{'exact_' if exact else ''}transfers_{scalar.__name__}"
+
+    @partial(wp.struct, module=module)
+    class Particles:
+        """All particles between two substeps, or the adjoint of that. A: the deformation gradient
+        that is never return-mapped."""
+
+        x: wp.array(dtype=vec3)
+        v: wp.array(dtype=vec3)
+        C: wp.array(dtype=mat33)
+        F: wp.array(dtype=mat33)
+        A: wp.array(dtype=mat33)
 
     # `steps` in the kernels holds the node offsets as scalars: Warp 1.19 retypes a loop variable that is cast to float64
 
     @wp.kernel(module=module, enable_backward=False)
-    def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
+    def clear(grids: Grids, threads: int, grid: wp.array(dtype=vec4)):
         world = wp.tid() / threads
-        first, end = nodes_of(window, world)
+        first, end = nodes_of(grids, world)
         for node in range(first + wp.tid() - world * threads, end, threads):
             clear_node(grid, node)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(
-        window: wp.array(dtype=wp.vec3i),
-        threads: int,
-        sums: wp.array2d(dtype=wp.int64),
-        grid: wp.array(dtype=vec4),
+        grids: Grids, threads: int, sums: wp.array2d(dtype=wp.int64), grid: wp.array(dtype=vec4)
     ):
         world = wp.tid() / threads
-        first, end = nodes_of(window, world)
+        first, end = nodes_of(grids, world)
         for node in range(first + wp.tid() - world * threads, end, threads):
             settle_node(sums, grid, node)
 
@@ -80,35 +81,33 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
-        x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), F: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
-        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
-        check_J: int, substep: int, flags: wp.array(dtype=wp.int64), grid: added_to,
+        now: Particles, v: wp.array(dtype=vec3), tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar),
+        volume: wp.array(dtype=scalar), grids: Grids, dt: scalar, check_J: int, substep: int,
+        flags: wp.array(dtype=wp.int64), grid: added_to,
     ):  # fmt: skip
+        """Adds momentum and mass to the nodes. v: velocities after what particles meet themselves."""
         p = wp.tid()
-        xp = x[p]
-        base = cell(xp, inv_dx)
-        place = window_row(p, size)
-        dims = window[place + 1]
-        n = local_cell(base, window, place)
+        xp = now.x[p]
+        n, base, place = located(xp, p, grids)
+        dims = grids.windows[place + 1]
         if n < 0:
-            wp.atomic_min(flags, _LEFT, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p))
+            wp.atomic_min(flags, _LEFT, wp.int64(substep) * wp.int64(now.x.shape[0]) + wp.int64(p))
             return
         if check_J == 1:
-            if wp.determinant(F[p]) <= scalar(0.0):
+            if wp.determinant(now.F[p]) <= scalar(0.0):
                 wp.atomic_min(
-                    flags, _FLIPPED, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p)
+                    flags, _FLIPPED, wp.int64(substep) * wp.int64(now.x.shape[0]) + wp.int64(p)
                 )
         together = pair(n)
-        f = xp * inv_dx - base
+        f = xp * grids.inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
         steps = vec3(scalar(0.0), scalar(1.0), scalar(2.0))
         m = mass[p]
-        B = m * C[p] - (dt * volume[p] * scalar(4.0) * inv_dx * inv_dx) * tau[p]
-        q0 = m * v[p] - dx * (B * f)
-        B = dx * B
+        B = m * now.C[p] - (dt * volume[p] * scalar(4.0) * grids.inv_dx * grids.inv_dx) * tau[p]
+        q0 = m * v[p] - grids.dx * (B * f)
+        B = grids.dx * B
         # q is affine in the node: columns of B are its increments along the axes
         bx = vec3(B[0, 0], B[1, 0], B[2, 0])
         by = vec3(B[0, 1], B[1, 1], B[2, 1])
@@ -125,23 +124,18 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
-        x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4),
-        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
-        low: vec3, high: vec3, substep: int, flags: wp.array(dtype=wp.int64),
-        x_new: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3), C_new: wp.array(dtype=mat33),
-        A_new: wp.array(dtype=mat33),
+        now: Particles, velocity: wp.array(dtype=vec4), grids: Grids, dt: scalar, low: vec3, high: vec3,
+        substep: int, flags: wp.array(dtype=wp.int64), then: Particles,
     ):  # fmt: skip
-        """Also advances the deformation gradient that is never return-mapped: A <- (I + dt C) A."""
+        """Writes x, v, C and A <- (I + dt C) A of `then`."""
         p = wp.tid()
-        xp = x[p]
-        base = cell(xp, inv_dx)
-        place = window_row(p, size)
-        dims = window[place + 1]
-        n = local_cell(base, window, place)
+        xp = now.x[p]
+        n, base, place = located(xp, p, grids)
+        dims = grids.windows[place + 1]
         if n < 0:
-            x_new[p] = xp
+            then.x[p] = xp
             return
-        f = xp * inv_dx - base
+        f = xp * grids.inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -166,19 +160,19 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
             v = v + layer
             cx = cx + steps[i] * layer
         # sum w v (x_I - x)^T = dx (sum w v index^T - v f^T)
-        s = scalar(4.0) * inv_dx
+        s = scalar(4.0) * grids.inv_dx
         cx = s * (cx - f[0] * v)
         cy = s * (cy - f[1] * v)
         cz = s * (cz - f[2] * v)
         C = mat33(cx[0], cy[0], cz[0], cx[1], cy[1], cz[1], cx[2], cy[2], cz[2])
         y = xp + dt * v
-        Ap = A[p]
+        Ap = now.A[p]
         An = Ap + dt * (C * Ap)
-        x_new[p] = y
-        v_new[p] = v
-        C_new[p] = C
-        A_new[p] = An
-        key = wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p)
+        then.x[p] = y
+        then.v[p] = v
+        then.C[p] = C
+        then.A[p] = An
+        key = wp.int64(substep) * wp.int64(now.x.shape[0]) + wp.int64(p)
         total = y[0] + y[1] + y[2] + v[0] + v[1] + v[2] + An[0, 0] + An[1, 1] + An[2, 2]
         if not wp.isfinite(total):
             wp.atomic_min(flags, _BAD, key)
@@ -194,23 +188,18 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_g2p(
-        x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4), C_new: wp.array(dtype=mat33),
-        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
-        adj_x_new: wp.array(dtype=vec3), adj_v_new: wp.array(dtype=vec3), adj_C_new: wp.array(dtype=mat33),
-        adj_A_new: wp.array(dtype=mat33),
-        adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: added_to,
+        now: Particles, velocity: wp.array(dtype=vec4), grids: Grids, dt: scalar, then: Particles,
+        adj_then: Particles, adj: Particles, adj_velocity: added_to,
     ):  # fmt: skip
-        """Writes adj_x and adj_A, adds to adj_velocity."""
+        """Writes x and A of adj, adds to adj_velocity."""
         p = wp.tid()
-        xp = x[p]
-        base = cell(xp, inv_dx)
-        place = window_row(p, size)
-        dims = window[place + 1]
-        n = local_cell(base, window, place)
+        xp = now.x[p]
+        n, base, place = located(xp, p, grids)
+        dims = grids.windows[place + 1]
         if n < 0:
             return
         together = pair(n)
-        f = xp * inv_dx - base
+        f = xp * grids.inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -218,13 +207,13 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         sx = spline_slope(f[0])
         sy = spline_slope(f[1])
         sz = spline_slope(f[2])
-        an = adj_A_new[p]
-        Ap = A[p]
-        adj_A[p] = an + dt * (wp.transpose(C_new[p]) * an)
-        ac = (scalar(4.0) * inv_dx) * (adj_C_new[p] + dt * (an * wp.transpose(Ap)))
-        ax = adj_x_new[p]
+        an = adj_then.A[p]
+        Ap = now.A[p]
+        adj.A[p] = an + dt * (wp.transpose(then.C[p]) * an)
+        ac = (scalar(4.0) * grids.inv_dx) * (adj_then.C[p] + dt * (an * wp.transpose(Ap)))
+        ax = adj_then.x[p]
         # adjoint of a node's velocity is w r, r affine in the node
-        r0 = adj_v_new[p] + dt * ax - ac * f
+        r0 = adj_then.v[p] + dt * ax - ac * f
         rx = vec3(ac[0, 0], ac[1, 0], ac[2, 0])
         ry = vec3(ac[0, 1], ac[1, 1], ac[2, 1])
         rz = vec3(ac[0, 2], ac[1, 2], ac[2, 2])
@@ -256,27 +245,22 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
                 v = v + wa * a + wb * b + wc * c
                 gx = gx + sx[i] * wy[j] * flat
                 gy = gy + wx[i] * sy[j] * flat
-        adj_x[p] = ax + inv_dx * (vec3(gx, gy, gz) - wp.transpose(ac) * v)
+        adj.x[p] = ax + grids.inv_dx * (vec3(gx, gy, gz) - wp.transpose(ac) * v)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_p2g(
-        x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), tau: wp.array(dtype=mat33),
-        mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
-        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
-        adj_grid: wp.array(dtype=vec4),
-        adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3), adj_C: wp.array(dtype=mat33),
-        adj_tau: wp.array(dtype=mat33),
+        now: Particles, v: wp.array(dtype=vec3), tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar),
+        volume: wp.array(dtype=scalar), grids: Grids, dt: scalar, adj_grid: wp.array(dtype=vec4),
+        adj: Particles, adj_tau: wp.array(dtype=mat33),
     ):  # fmt: skip
-        """Adds to adj_x, writes adj_v, adj_C and adj_tau."""
+        """Adds to x of adj, writes its v and C, and adj_tau."""
         p = wp.tid()
-        xp = x[p]
-        base = cell(xp, inv_dx)
-        place = window_row(p, size)
-        dims = window[place + 1]
-        n = local_cell(base, window, place)
+        xp = now.x[p]
+        n, base, place = located(xp, p, grids)
+        dims = grids.windows[place + 1]
         if n < 0:
             return
-        f = xp * inv_dx - base
+        f = xp * grids.inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -285,8 +269,8 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         sy = spline_slope(f[1])
         sz = spline_slope(f[2])
         m = mass[p]
-        stiffness = dt * volume[p] * scalar(4.0) * inv_dx * inv_dx
-        B = dx * (m * C[p] - stiffness * tau[p])
+        stiffness = dt * volume[p] * scalar(4.0) * grids.inv_dx * grids.inv_dx
+        B = grids.dx * (m * now.C[p] - stiffness * tau[p])
         q0 = m * v[p] - B * f
         bx = vec3(B[0, 0], B[1, 0], B[2, 0])
         by = vec3(B[0, 1], B[1, 1], B[2, 1])
@@ -322,23 +306,16 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
             layer = wx[i] * layer
             s = s + layer
             cx = cx + steps[i] * layer
-        adj_v[p] = m * s
-        cx = dx * (cx - f[0] * s)
-        cy = dx * (cy - f[1] * s)
-        cz = dx * (cz - f[2] * s)
+        adj.v[p] = m * s
+        cx = grids.dx * (cx - f[0] * s)
+        cy = grids.dx * (cy - f[1] * s)
+        cz = grids.dx * (cz - f[2] * s)
         aB = mat33(cx[0], cy[0], cz[0], cx[1], cy[1], cz[1], cx[2], cy[2], cz[2])
-        adj_C[p] = m * aB
+        adj.C[p] = m * aB
         adj_tau[p] = -stiffness * aB
-        adj_x[p] = adj_x[p] + inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
+        adj.x[p] = adj.x[p] + grids.inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
 
     return SimpleNamespace(
-        clear=clear,
-        settle=settle,
-        p2g=p2g,
-        g2p=g2p,
-        adj_g2p=adj_g2p,
-        adj_p2g=adj_p2g,
-        vec3=vec3,
-        vec4=vec4,
-        mat33=mat33,
-    )
+        Particles=Particles, Grids=Grids, clear=clear, settle=settle, p2g=p2g, g2p=g2p, adj_g2p=adj_g2p,
+        adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33,
+    )  # fmt: skip

@@ -82,11 +82,10 @@ def same_to_first_order(size: float, nu: float) -> torch.Tensor:
     return torch.einsum("kij,ij->k", anisotropic_basis(torch.float64, torch.device("cpu")), A)
 
 
-@pytest.mark.parametrize("strain", ["green", "hencky"])
 @pytest.mark.parametrize("pattern", ["of the linear operator", 0, 1, 2])
-def test_large_numbers_of_a_law_with_an_energy_pass(strain, pattern):
+def test_large_numbers_of_a_law_with_an_energy_pass(pattern):
     """The linear operator's own pattern, which bursts in that form; and drawn signs, six standard deviations of the prior."""
-    adapter = HyperelasticAdapter(strain=strain)
+    adapter = HyperelasticAdapter()
     adapter.switch_on(YOUNG, 0.4)
     with torch.no_grad():
         if isinstance(pattern, str):

@@ -15,6 +15,9 @@ from mosa.physics.contact.planes import (
     make_plane_functions,
     pack_planes,
 )
+from mosa.physics.contact.touch import planes_struct
+from mosa.physics.grid.stencil import stencil_functions
+from mosa.physics.launching import filled
 from mosa.types import Ground
 
 collide, adj_collide = make_plane_functions(wp.float64)
@@ -92,11 +95,21 @@ def updated(momentum, planes, seed=None, dx=0.1):
     kernels, count = update_kernels(wp.float64), len(momentum)
     values, modes = pack_planes(planes, torch.float64, torch.device("cpu"), dx)
     grid = torch.cat([momentum, torch.ones(count, 1).double()], 1)
-    window = torch.tensor([[0, 0, 0], [1, count, 1], [0, 0, 0]], dtype=torch.int32)
+    windows = torch.tensor([[0, 0, 0], [1, count, 1], [0, 0, 0]], dtype=torch.int32)
     out = torch.zeros_like(grid)
     vec4 = wp.types.vector(4, wp.float64)
-    given = [wp.from_torch(window, dtype=wp.vec3i), 1, wp.from_torch(grid, dtype=vec4), wp.from_torch(torch.zeros(1, 3).double(),
-             dtype=wp.vec3d), 0.0, dx, wp.from_torch(values), wp.from_torch(modes), len(planes)]  # fmt: skip
+    grids = filled(
+        stencil_functions(wp.float64).Grids,
+        wp.from_torch(windows, dtype=wp.vec3i),
+        count,
+        dx,
+        1 / dx,
+    )
+    met = filled(
+        planes_struct(wp.float64), wp.from_torch(values), wp.from_torch(modes), len(planes)
+    )
+    still = wp.from_torch(torch.zeros(1, 3).double(), dtype=wp.vec3d)
+    given = [grids, 1, wp.from_torch(grid, dtype=vec4), still, 0.0, met]
     if seed is None:
         wp.launch(
             kernels.grid_update, 1, [*given, wp.from_torch(out, dtype=vec4), None], device="cpu"

@@ -3,6 +3,7 @@
 import pytest
 import torch
 import warp as wp
+from contact_reference import collide
 
 from mosa.physics.contact.collider_kernels import collider_kernels
 from mosa.physics.contact.colliders import (
@@ -17,7 +18,6 @@ from mosa.physics.contact.colliders import (
 )
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import exponential
-from mosa.physics.contact.reference import collide
 from mosa.physics.launching import filled
 
 DT, COUNT = 0.01, 1000

@@ -9,13 +9,13 @@ import torch
 
 import mosa.physics
 from mosa.physics.engine.budget import Budget
-from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
+from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs
 from mosa.physics.launching import same_memory
 from mosa.physics.time.adaptive_steps import StepControl
 from mosa.physics.time.clock import Adaptive, Clock, Moment, Replay
 
 
-class Counted(Strategy):
+class Counted:
     """Runs and captures are told apart by what they leave in `said`; the first `broken` captures fail."""
 
     def __init__(self, broken: int = 0) -> None:

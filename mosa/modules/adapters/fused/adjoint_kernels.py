@@ -17,12 +17,14 @@ import triton.language as tl
 from mosa.modules.adapters.fused.network_kernels import (
     by_column,
     factor,
-    forward,
+    kept,
+    layer,
     network_input,
     product,
     silu,
     store_by_column,
     tile_of,
+    times,
 )
 from mosa.modules.adapters.fused.sum_kernels import (
     ones_column,
@@ -66,24 +68,25 @@ def backward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl
 
 
 @triton.jit
+def kept_back(
+    W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
+):  # fmt: skip
+    """As `kept`, of the transposed product."""
+    return backward(W, OUT, IN, STRIDE, P) if KEEP else W
+
+
+@triton.jit
+def back(
+    g, U, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
+):  # fmt: skip
+    """Adjoint of what a layer reads from that of what it gives, g; U: its weight, `kept_back`."""
+    return product(g, U if KEEP else backward(U, OUT, IN, STRIDE, P), P)
+
+
+@triton.jit
 def hidden_adjoint(
-    g,
-    z1,
-    a1,
-    k2,
-    U2,
-    D2,
-    d2,
-    h1,
-    g1,
-    g2,
-    r,
-    M,
-    SUMS: tl.constexpr,
-    H: tl.constexpr,
-    BLOCK: tl.constexpr,
-    P: tl.constexpr,
-):
+    g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+):  # fmt: skip
     """(adjoint of z1, D2, d2) from g, that of the second layer's activations, whose slope is k2."""
     h = tl.arange(0, H)
     e2 = g * k2
@@ -94,7 +97,7 @@ def hidden_adjoint(
         store_by_column(h1, a1, r, h, M, H)
         store_by_column(g2, e2, r, h, M, H)
     _, k1 = silu(z1)
-    e1 = product(e2, U2, P) * k1
+    e1 = back(e2, U2, H, H, H, SUMS == "inside", P) * k1
     if SUMS == "outside":
         store_by_column(g1, e1, r, h, M, H)
     return e1, D2, d2
@@ -109,11 +112,11 @@ def theta_backward(
     """gl2 (H, M), gw, gs2 (6, M) from the adjoints gh (N, 6) of h and extra (N, 6) of post; gout (6, M). Outside, the scaled
     (w, s2) becomes rows H to H + 11 of l2."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    if SUMS == "inside":
-        V1, Vx = forward(W1, H, H, H + 12, P), forward(W1 + H, H, 12, H + 12, P)
-        U1, Ux = backward(W1, H, H, H + 12, P), backward(W1 + H, H, 12, H + 12, P)
-        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
-        U3 = backward(W3, 6, H, H, P)
+    KEEP: tl.constexpr = SUMS == "inside"
+    V1, Vx = kept(W1, H, H, H + 12, KEEP, P), kept(W1 + H, H, 12, H + 12, KEEP, P)
+    U1, Ux = kept_back(W1, H, H, H + 12, KEEP, P), kept_back(W1 + H, H, 12, H + 12, KEEP, P)
+    V2, U2 = kept(W2, H, H, H, KEEP, P), kept_back(W2, H, H, H, KEEP, P)
+    U3 = kept_back(W3, 6, H, H, KEEP, P)
     D1, D2 = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
     Dx, d2, D3 = (
         tl.zeros((H, 16), tl.float32),
@@ -124,16 +127,10 @@ def theta_backward(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x, of_state = by_column(l2, r, h, M, H), network_input(w, s2, w, r, N, M, scale, False)
-        z1 = (
-            product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 12, P), P)
-            + tl.load(b1 + h)[None, :]
-        )
-        z1 += product(of_state, Vx if SUMS == "inside" else forward(W1 + H, H, 12, H + 12, P), P)
+        z1 = layer(x, V1, b1, H, H, H + 12, KEEP, P)
+        z1 += times(of_state, Vx, H, 12, H + 12, KEEP, P)
         a1, _ = silu(z1)
-        a2, k2 = silu(
-            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
-            + tl.load(b2 + h)[None, :]
-        )
+        a2, k2 = silu(layer(a1, V2, b2, H, H, H, KEEP, P))
         g = seeds_of_b(gh, rest, unit, r, c, N, RESTED)
         if EXTRA:
             g += by_row(extra, r, c, N)
@@ -147,31 +144,14 @@ def theta_backward(
             store_by_column(gout, g, r, c, M, 6)
             store_by_column(h2, a2, r, h, M, H)
             store_by_column(l2 + H * M, of_state, r, c, M, 12)
-        g = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P)
-        e1, D2, d2 = hidden_adjoint(
-            g,
-            z1,
-            a1,
-            k2,
-            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
-            D2,
-            d2,
-            h1,
-            g1,
-            g2,
-            r,
-            M,
-            SUMS,
-            H,
-            BLOCK,
-            P,
-        )
+        g = back(g, U3, 6, H, H, KEEP, P)
+        e1, D2, d2 = hidden_adjoint(g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P)
         if SUMS == "inside":
             D1 += outer(e1, x, P)
             Dx += outer(e1, with_ones(of_state, 12), P)
         store_by_column(
             gl2,
-            product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 12, P), P),
+            back(e1, U1, H, H, H + 12, KEEP, P),
             r,
             h,
             M,
@@ -180,7 +160,7 @@ def theta_backward(
         store_input_adjoint(
             gw,
             gs2,
-            scale * product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 12, H + 12, P), P),
+            scale * back(e1, Ux, H, 12, H + 12, KEEP, P),
             r,
             M,
         )
@@ -200,26 +180,20 @@ def psi2_backward(
     """gl1 (H + 3, M), its last rows those of the scaled normals, from gt (48, M), its last 12 rows, and gl2 (H, M). Sums of the
     last layer are always made outside, from h2 (H, M) and gout (12 + H, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    if SUMS == "inside":
-        V1, Vx = forward(W1, H, H, H + 3, P), forward(W1 + H, H, 3, H + 3, P)
-        U1, Ux = backward(W1, H, H, H + 3, P), backward(W1 + H, H, 3, H + 3, P)
-        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
-        U3, U4 = backward(W3, 12, H, H, P), backward(W3 + 12 * H, H, H, H, P)
+    KEEP: tl.constexpr = SUMS == "inside"
+    V1, Vx = kept(W1, H, H, H + 3, KEEP, P), kept(W1 + H, H, 3, H + 3, KEEP, P)
+    U1, Ux = kept_back(W1, H, H, H + 3, KEEP, P), kept_back(W1 + H, H, 3, H + 3, KEEP, P)
+    V2, U2 = kept(W2, H, H, H, KEEP, P), kept_back(W2, H, H, H, KEEP, P)
+    U3, U4 = kept_back(W3, 12, H, H, KEEP, P), kept_back(W3 + 12 * H, H, H, H, KEEP, P)
     D1, D2 = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
     Dx, d2 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x, normals = by_column(l1, r, h, M, H), by_column(l1 + H * M, r, c, M, 3)
-        z1 = (
-            product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 3, P), P)
-            + tl.load(b1 + h)[None, :]
-        )
-        z1 += product(normals, Vx if SUMS == "inside" else forward(W1 + H, H, 3, H + 3, P), P)
+        z1 = layer(x, V1, b1, H, H, H + 3, KEEP, P)
+        z1 += times(normals, Vx, H, 3, H + 3, KEEP, P)
         a1, _ = silu(z1)
-        a2, k2 = silu(
-            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
-            + tl.load(b2 + h)[None, :]
-        )
+        a2, k2 = silu(layer(a1, V2, b2, H, H, H, KEEP, P))
         y = by_column(t + 36 * M, r, c, M, 12)
         e = by_column(gt + 36 * M, r, c, M, 12) * (alpha - y * y / alpha)
         yb = by_column(l2, r, h, M, H)
@@ -228,32 +202,15 @@ def psi2_backward(
             store_by_column(h2, a2, r, h, M, H)
             store_by_column(gout, e, r, c, M, 12)
             store_by_column(gout + 12 * M, eb, r, h, M, H)
-        g = product(e, U3 if SUMS == "inside" else backward(W3, 12, H, H, P), P)
-        g += product(eb, U4 if SUMS == "inside" else backward(W3 + 12 * H, H, H, H, P), P)
-        e1, D2, d2 = hidden_adjoint(
-            g,
-            z1,
-            a1,
-            k2,
-            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
-            D2,
-            d2,
-            h1,
-            g1,
-            g2,
-            r,
-            M,
-            SUMS,
-            H,
-            BLOCK,
-            P,
-        )
+        g = back(e, U3, 12, H, H, KEEP, P)
+        g += back(eb, U4, H, H, H, KEEP, P)
+        e1, D2, d2 = hidden_adjoint(g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P)
         if SUMS == "inside":
             D1 += outer(e1, x, P)
             Dx += outer(e1, with_ones(normals, 3), P)
         store_by_column(
             gl1,
-            product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 3, P), P),
+            back(e1, U1, H, H, H + 3, KEEP, P),
             r,
             h,
             M,
@@ -261,7 +218,7 @@ def psi2_backward(
         )
         store_by_column(
             gl1 + H * M,
-            product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 3, H + 3, P), P),
+            back(e1, Ux, H, 3, H + 3, KEEP, P),
             r,
             c,
             M,
@@ -280,10 +237,10 @@ def psi1_backward(
 ):  # fmt: skip
     """gw, gs (6, M) of w and s1 from gt (48, M), its first 36 rows, and gl1 (H, M); x (12, M), gplanes (36, M), gout (H, M)."""
     h, c, planes = tl.arange(0, H), tl.arange(0, 16), tl.arange(0, 64)
-    if SUMS == "inside":
-        V1, U1 = forward(W1, H, 12, 12, P), backward(W1, H, 12, 12, P)
-        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
-        U3, Up = backward(W3, H, H, H, P), backward(Wp, 36, H, H, P)
+    KEEP: tl.constexpr = SUMS == "inside"
+    V1, U1 = kept(W1, H, 12, 12, KEEP, P), kept_back(W1, H, 12, 12, KEEP, P)
+    V2, U2 = kept(W2, H, H, H, KEEP, P), kept_back(W2, H, H, H, KEEP, P)
+    U3, Up = kept_back(W3, H, H, H, KEEP, P), kept_back(Wp, 36, H, H, KEEP, P)
     D2, D3, Dp = (
         tl.zeros((H, H), tl.float32),
         tl.zeros((H, H), tl.float32),
@@ -299,22 +256,14 @@ def psi1_backward(
         r = tile * BLOCK + tl.arange(0, BLOCK)
         y = by_column(t, r, planes, M, 36)
         e = by_column(gt, r, planes, M, 36) * (alpha - y * y / alpha)
-        g = by_column(gl1, r, h, M, H) + product(
-            e, Up if SUMS == "inside" else backward(Wp, 36, H, H, P), P
-        )
+        g = by_column(gl1, r, h, M, H) + back(e, Up, 36, H, H, KEEP, P)
         if SUMS == "inside":
             Dp += outer(e, by_column(l1, r, h, M, H), P)
             dp += outer(e, ones_column(BLOCK), P)
         inputs = network_input(w, s1, w, r, N, M, scale, False)
-        z1 = (
-            product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P)
-            + tl.load(b1 + h)[None, :]
-        )
+        z1 = layer(inputs, V1, b1, H, 12, 12, KEEP, P)
         a1, _ = silu(z1)
-        a2, k2 = silu(
-            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
-            + tl.load(b2 + h)[None, :]
-        )
+        a2, k2 = silu(layer(a1, V2, b2, H, H, H, KEEP, P))
         if SUMS == "inside":
             D3 += outer(g, a2, P)
             d3 += outer(g, ones_column(BLOCK), P)
@@ -323,31 +272,14 @@ def psi1_backward(
             store_by_column(gout, g, r, h, M, H)
             store_by_column(x, inputs, r, c, M, 12)
             store_by_column(h2, a2, r, h, M, H)
-        g = product(g, U3 if SUMS == "inside" else backward(W3, H, H, H, P), P)
-        e1, D2, d2 = hidden_adjoint(
-            g,
-            z1,
-            a1,
-            k2,
-            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
-            D2,
-            d2,
-            h1,
-            g1,
-            g2,
-            r,
-            M,
-            SUMS,
-            H,
-            BLOCK,
-            P,
-        )
+        g = back(g, U3, H, H, H, KEEP, P)
+        e1, D2, d2 = hidden_adjoint(g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P)
         if SUMS == "inside":
             D1 += outer(e1, with_ones(inputs, 12), P)
         store_input_adjoint(
             gw,
             gs,
-            scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P),
+            scale * back(e1, U1, H, 12, 12, KEEP, P),
             r,
             M,
         )
@@ -376,10 +308,10 @@ def phi_backward(
     """gw, gs (N, 6), everything added up: gs1, gsx (6, M) reach s1 from the assembly with the normals, and from Psi1; gpre (6, M)
     and extra (N, 6) reach pre, as s1 does; gwx, gwt (6, M) reach w from Psi1 and Theta. x (12, M), gout (6, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    if SUMS == "inside":
-        V1, U1 = forward(W1, H, 12, 12, P), backward(W1, H, 12, 12, P)
-        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
-        U3 = backward(W3, 6, H, H, P)
+    KEEP: tl.constexpr = SUMS == "inside"
+    V1, U1 = kept(W1, H, 12, 12, KEEP, P), kept_back(W1, H, 12, 12, KEEP, P)
+    V2, U2 = kept(W2, H, H, H, KEEP, P), kept_back(W2, H, H, H, KEEP, P)
+    U3 = kept_back(W3, 6, H, H, KEEP, P)
     D2 = tl.zeros((H, H), tl.float32)
     D1, d2, D3 = (
         tl.zeros((H, 16), tl.float32),
@@ -398,15 +330,9 @@ def phi_backward(
         if BOUNDED:
             y = by_column(pre, r, c, M, 6)
             g *= bound - y * y / bound
-        z1 = (
-            product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P)
-            + tl.load(b1 + h)[None, :]
-        )
+        z1 = layer(inputs, V1, b1, H, 12, 12, KEEP, P)
         a1, _ = silu(z1)
-        a2, k2 = silu(
-            product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P)
-            + tl.load(b2 + h)[None, :]
-        )
+        a2, k2 = silu(layer(a1, V2, b2, H, H, H, KEEP, P))
         if SUMS == "inside":
             d3 += g
             D3 += outer(a2, g, P)
@@ -414,28 +340,11 @@ def phi_backward(
             store_by_column(gout, g, r, c, M, 6)
             store_by_column(x, inputs, r, c, M, 12)
             store_by_column(h2, a2, r, h, M, H)
-        g = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P)
-        e1, D2, d2 = hidden_adjoint(
-            g,
-            z1,
-            a1,
-            k2,
-            U2 if SUMS == "inside" else backward(W2, H, H, H, P),
-            D2,
-            d2,
-            h1,
-            g1,
-            g2,
-            r,
-            M,
-            SUMS,
-            H,
-            BLOCK,
-            P,
-        )
+        g = back(g, U3, 6, H, H, KEEP, P)
+        e1, D2, d2 = hidden_adjoint(g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P)
         if SUMS == "inside":
             D1 += outer(e1, with_ones(inputs, 12), P)
-        gx = scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P)
+        gx = scale * back(e1, U1, H, 12, 12, KEEP, P)
         direct = by_column(gwx, r, c, M, 6) + by_column(gwt, r, c, M, 6)
         tl.store(gw + row * 6 + column, gx + direct, mask=(row < N) & (column < 6))
         of_s = (row < N) & (column >= 6) & (column < 12)

@@ -38,24 +38,8 @@ def correction(t, r, M, first: tl.constexpr):
 
 @triton.jit
 def correction_adjoint(
-    t,
-    gt,
-    extra,
-    r,
-    N,
-    M,
-    first: tl.constexpr,
-    EXTRA: tl.constexpr,
-    a00,
-    a01,
-    a02,
-    a10,
-    a11,
-    a12,
-    a20,
-    a21,
-    a22,
-):
+    t, gt, extra, r, N, M, first: tl.constexpr, EXTRA: tl.constexpr, a00, a01, a02, a10, a11, a12, a20, a21, a22,
+):  # fmt: skip
     """Store the adjoints of the 12 numbers of a matrix, from those of its entries; extra: (N, 48) adjoints from elsewhere."""
     u00, u01, u02, u11, u12, u22, l00, l10, l11, l20, l21, l22 = numbers(t, r, M, first)
     adjoint(gt, extra, r, N, M, first, EXTRA, a00 * (1.0 + l00) + a10 * l10 + a20 * l20)
@@ -205,15 +189,8 @@ def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr)
     correction: row 0 of (I + L)(I + U) on its components v of s1."""
     first = t + 12 * plane * M + r
     v0, v1, v2 = components(s1, r, M, plane, c1, c2)
-    return (
-        v0,
-        v1,
-        v2,
-        tl.load(first),
-        tl.load(first + M),
-        tl.load(first + 2 * M),
-        tl.load(first + 6 * M),
-    )
+    u00, u01, u02 = tl.load(first), tl.load(first + M), tl.load(first + 2 * M)
+    return v0, v1, v2, u00, u01, u02, tl.load(first + 6 * M)
 
 
 @triton.jit
@@ -327,25 +304,9 @@ def seed_of(gG, r, N, row: tl.constexpr, column: tl.constexpr):
 
 @triton.jit
 def plane_adjoint(
-    t,
-    s1,
-    pre,
-    gG,
-    S,
-    B,
-    gt,
-    extra,
-    r,
-    N,
-    M,
-    p: tl.constexpr,
-    c1: tl.constexpr,
-    c2: tl.constexpr,
-    k0,
-    k1,
-    k2,
+    t, s1, pre, gG, S, B, gt, extra, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, k0, k1, k2,
     EXTRA: tl.constexpr,
-):
+):  # fmt: skip
     """Stores the adjoints of the plane's numbers; returns those of column p of C_xyz (3), of the plane's components of s1 (3) and
     of pre (3). S, B: adjoints of s2 and moved (6)."""
     C = correction(t, r, M, 12 * p)

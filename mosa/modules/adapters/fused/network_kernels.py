@@ -127,26 +127,52 @@ def forward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl.
     return factor(tl.trans(tile_of(W, OUT, IN, STRIDE)), P)
 
 
+@triton.jit
+def kept(
+    W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
+):  # fmt: skip
+    """A weight for `times`: the second factor itself where weights stay from tile to tile, else where it lies."""
+    return forward(W, OUT, IN, STRIDE, P) if KEEP else W
+
+
+@triton.jit
+def times(
+    x, V, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
+):  # fmt: skip
+    """x V, of a weight that is `kept`."""
+    return product(x, V if KEEP else forward(V, OUT, IN, STRIDE, P), P)
+
+
+@triton.jit
+def layer(
+    x, V, b, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
+):  # fmt: skip
+    """x V + b, padded as `tile_of`."""
+    y = times(x, V, OUT, IN, STRIDE, KEEP, P)
+    if OUT == 6 or OUT == 12:
+        bias = vector(b, tl.arange(0, 16), OUT)
+    elif OUT == 36:
+        bias = vector(b, tl.arange(0, 64), OUT)
+    else:
+        bias = tl.load(b + tl.arange(0, OUT))
+    return y + bias[None, :]
+
+
 @triton.jit(do_not_specialize=["N"])
 def phi_forward(
     w, s, unit, W1, b1, W2, b2, W3, b3, pre, s1, N, M, scale, bound,
     BOUNDED: tl.constexpr, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Step 1: pre (6, M) and s1 = s / unit + pre (6, M)."""
-    h, c = tl.arange(0, H), tl.arange(0, 16)
-    if KEEP:
-        V1, V2 = forward(W1, H, 12, 12, P), forward(W2, H, H, H, P)
-        V3 = forward(W3, 6, H, H, P)
+    c = tl.arange(0, 16)
+    V1, V2 = kept(W1, H, 12, 12, KEEP, P), kept(W2, H, H, H, KEEP, P)
+    V3 = kept(W3, 6, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s, unit, r, N, M, scale, True)
-        z, _ = silu(
-            product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
-        )
-        z, _ = silu(
-            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
-        )
-        y = product(z, V3 if KEEP else forward(W3, 6, H, H, P), P) + vector(b3, c, 6)[None, :]
+        z, _ = silu(layer(x, V1, b1, H, 12, 12, KEEP, P))
+        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
+        y = layer(z, V3, b3, 6, H, H, KEEP, P)
         if BOUNDED:
             y = bound * tanh(y)
         store_by_column(pre, y, r, c, M, 6)
@@ -163,69 +189,37 @@ def psi1_forward(
 ):  # fmt: skip
     """Step 2: l1 (H, M) and the 36 numbers of the planes, rows 0 to 35 of t (48, M)."""
     h, planes = tl.arange(0, H), tl.arange(0, 64)
-    if KEEP:
-        V1, V2 = forward(W1, H, 12, 12, P), forward(W2, H, H, H, P)
-        V3, Vp = forward(W3, H, H, H, P), forward(Wp, 36, H, H, P)
+    V1, V2 = kept(W1, H, 12, 12, KEEP, P), kept(W2, H, H, H, KEEP, P)
+    V3, Vp = kept(W3, H, H, H, KEEP, P), kept(Wp, 36, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s1, w, r, N, M, scale, False)
-        z, _ = silu(
-            product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
-        )
-        z, _ = silu(
-            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
-        )
-        y = product(z, V3 if KEEP else forward(W3, H, H, H, P), P) + tl.load(b3 + h)[None, :]
+        z, _ = silu(layer(x, V1, b1, H, 12, 12, KEEP, P))
+        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
+        y = layer(z, V3, b3, H, H, H, KEEP, P)
         store_by_column(l1, y, r, h, M, H)
-        numbers = alpha * tanh(
-            product(y, Vp if KEEP else forward(Wp, 36, H, H, P), P)
-            + vector(bp, planes, 36)[None, :]
-        )
+        numbers = alpha * tanh(layer(y, Vp, bp, 36, H, H, KEEP, P))
         store_by_column(t, numbers, r, planes, M, 36)
 
 
 @triton.jit(do_not_specialize=["N"])
 def psi2_forward(
-    l1,
-    W1,
-    b1,
-    W2,
-    b2,
-    W3,
-    b3,
-    t,
-    l2,
-    N,
-    M,
-    alpha,
-    KEEP: tl.constexpr,
-    H: tl.constexpr,
-    BLOCK: tl.constexpr,
-    P: tl.constexpr,
-):
+    l1, W1, b1, W2, b2, W3, b3, t, l2, N, M, alpha, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+):  # fmt: skip
     """Step 4: the 12 numbers of C_xyz, rows 36 to 47 of t, and l2 (H, M), from l1 (H + 3, M), its last rows the normals."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    if KEEP:
-        V1, Vx = forward(W1, H, H, H + 3, P), forward(W1 + H, H, 3, H + 3, P)
-        V2, V3 = forward(W2, H, H, H, P), forward(W3, 12, H, H, P)
-        V4 = forward(W3 + 12 * H, H, H, H, P)
+    V1, Vx = kept(W1, H, H, H + 3, KEEP, P), kept(W1 + H, H, 3, H + 3, KEEP, P)
+    V2, V3 = kept(W2, H, H, H, KEEP, P), kept(W3, 12, H, H, KEEP, P)
+    V4 = kept(W3 + 12 * H, H, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
-        z = (
-            product(by_column(l1, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 3, P), P)
-            + tl.load(b1 + h)[None, :]
-        )
+        z = layer(by_column(l1, r, h, M, H), V1, b1, H, H, H + 3, KEEP, P)
         x = by_column(l1 + H * M, r, c, M, 3)
-        z, _ = silu(z + product(x, Vx if KEEP else forward(W1 + H, H, 3, H + 3, P), P))
-        z, _ = silu(
-            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
-        )
-        y = product(z, V3 if KEEP else forward(W3, 12, H, H, P), P) + vector(b3, c, 12)[None, :]
+        z, _ = silu(z + times(x, Vx, H, 3, H + 3, KEEP, P))
+        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
+        y = layer(z, V3, b3, 12, H, H, KEEP, P)
         store_by_column(t + 36 * M, alpha * tanh(y), r, c, M, 12)
-        y = (
-            product(z, V4 if KEEP else forward(W3 + 12 * H, H, H, H, P), P)
-            + tl.load(b3 + 12 + h)[None, :]
-        )
+        y = layer(z, V4, b3 + 12, H, H, H, KEEP, P)
         store_by_column(l2, alpha * tanh(y), r, h, M, H)
 
 
@@ -236,21 +230,15 @@ def theta_forward(
 ):  # fmt: skip
     """Step 5: post (6, M); b (6, M) = moved + post."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    if KEEP:
-        V1, Vx = forward(W1, H, H, H + 12, P), forward(W1 + H, H, 12, H + 12, P)
-        V2, V3 = forward(W2, H, H, H, P), forward(W3, 6, H, H, P)
+    V1, Vx = kept(W1, H, H, H + 12, KEEP, P), kept(W1 + H, H, 12, H + 12, KEEP, P)
+    V2, V3 = kept(W2, H, H, H, KEEP, P), kept(W3, 6, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
-        z = (
-            product(by_column(l2, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 12, P), P)
-            + tl.load(b1 + h)[None, :]
-        )
+        z = layer(by_column(l2, r, h, M, H), V1, b1, H, H, H + 12, KEEP, P)
         x = network_input(w, s2, w, r, N, M, scale, False)
-        z, _ = silu(z + product(x, Vx if KEEP else forward(W1 + H, H, 12, H + 12, P), P))
-        z, _ = silu(
-            product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :]
-        )
-        y = product(z, V3 if KEEP else forward(W3, 6, H, H, P), P) + vector(b3, c, 6)[None, :]
+        z, _ = silu(z + times(x, Vx, H, 12, H + 12, KEEP, P))
+        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
+        y = layer(z, V3, b3, 6, H, H, KEEP, P)
         if BOUNDED:
             y = bound * tanh(y)
         store_by_column(post, y, r, c, M, 6)

@@ -93,11 +93,8 @@ class _Launch:
         tiles = self.rows // block
         if self.device.type != "cuda":
             return min(tiles, INTERPRETED_PROGRAMS)
-        return min(
-            tiles,
-            per_multiprocessor
-            * torch.cuda.get_device_properties(self.device).multi_processor_count,
-        )
+        multiprocessors = torch.cuda.get_device_properties(self.device).multi_processor_count
+        return min(tiles, per_multiprocessor * multiprocessors)
 
     def forward(self) -> tuple[tuple[int], dict]:
         tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
@@ -105,98 +102,49 @@ class _Launch:
         return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
 
     def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
-        if not (self.small and wanted):
-            options = {
-                "SUMS": "outside" if wanted else "none",
-                "BLOCK": BLOCK,
-                "num_warps": self.warps,
-                "num_stages": 1,
-            }
-            return (self.rows // BLOCK,), self.size | options
-        options = {"SUMS": "inside", "BLOCK": 2 * BLOCK, "num_warps": 8, "num_stages": 1}
-        return (self.programs(2 * BLOCK, 1),), self.size | options
+        inside = self.small and wanted
+        sums = "inside" if inside else "outside" if wanted else "none"
+        block, warps = (2 * BLOCK, 8) if inside else (BLOCK, self.warps)
+        tiles = self.programs(block, 1) if inside else self.rows // block
+        return (tiles,), self.size | {
+            "SUMS": sums,
+            "BLOCK": block,
+            "num_warps": warps,
+            "num_stages": 1,
+        }
 
 
 def _evaluate(
-    launch: _Launch,
-    w: Tensor,
-    s: Tensor,
-    unit: Tensor,
-    settings: Settings,
-    weights: Sequence[Tensor],
-    G: Tensor | None,
-):
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor | None
+) -> _Buffers:  # fmt: skip
     """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
-    n, m = launch.n, launch.rows
-    b = _Buffers(
-        *(w.new_empty(k, m) for k in (6, 6, launch.hidden + 3, 48, launch.hidden + 12, 6, 6))
-    )
-    phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
+    n, m, hidden = launch.n, launch.rows, launch.hidden
+    b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
     grid, size = launch.forward()
     phi_forward[grid](
-        w,
-        s,
-        unit,
-        *phi,
-        b.pre,
-        b.s1,
-        n,
-        m,
-        scale,
-        bound,
-        BOUNDED=settings.l_max is not None,
-        **size,
-    )
-    psi1_forward[grid](w, b.s1, *psi1, b.l1, b.t, n, m, scale, alpha, **size)
-    normals[launch.lanes](b.t, b.s1, b.l1[launch.hidden :], m, scale, BLOCK=LANES)
-    psi2_forward[grid](b.l1, *psi2, b.t, b.l2, n, m, alpha, **size)
-    operator = G is not None
+        w, s, unit, *weights[:6], b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size
+    )  # fmt: skip
+    psi1_forward[grid](w, b.s1, *weights[6:14], b.l1, b.t, n, m, scale, alpha, **size)
+    normals[launch.lanes](b.t, b.s1, b.l1[hidden:], m, scale, BLOCK=LANES)
+    psi2_forward[grid](b.l1, *weights[14:20], b.t, b.l2, n, m, alpha, **size)
     assemble[launch.lanes](
-        b.t,
-        b.s1,
-        b.pre,
-        G if operator else b.t,
-        b.s2,
-        b.moved,
-        n,
-        m,
-        OPERATOR=operator,
-        BLOCK=LANES,
-    )
+        b.t, b.s1, b.pre, b.t if G is None else G, b.s2, b.moved, n, m, OPERATOR=G is not None, BLOCK=LANES
+    )  # fmt: skip
     return b
 
 
 def _evaluate_all(
-    launch: _Launch,
-    w: Tensor,
-    s: Tensor,
-    unit: Tensor,
-    settings: Settings,
-    weights: Sequence[Tensor],
-    G: Tensor,
-    h: Tensor,
-) -> tuple[_Buffers, Tensor]:
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor, h: Tensor,
+) -> tuple[_Buffers, Tensor]:  # fmt: skip
     """(buffers, post (6, M)); fills G (N, 6, 6) and h (N, 6)."""
     n, m, bound = launch.n, launch.rows, settings.l_max or 0.0
     b = _evaluate(launch, w, s, unit, settings, weights, G)
     post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
     grid, size = launch.forward()
     theta_forward[grid](
-        b.l2,
-        w,
-        b.s2,
-        b.moved,
-        *weights[20:],
-        post,
-        sums,
-        n,
-        m,
-        settings.scale,
-        bound,
-        BOUNDED=settings.l_max is not None,
-        **size,
-    )
+        b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
+    )  # fmt: skip
     finish[launch.lanes](sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES)
     return b, post
 
@@ -260,13 +208,7 @@ def _backward(
     def empty(rows: int) -> Tensor:
         return w.new_empty(rows, m)
 
-    def sums(
-        layer: int,
-        inputs: Tensor,
-        outputs: Tensor,
-        more: tuple[Tensor, Tensor] | None = None,
-        jobs: int = 5,
-    ) -> None:
+    def sums(layer: int, inputs: Tensor, outputs: Tensor, more: tuple | None = None, jobs: int = 5) -> None:  # fmt: skip
         """Gradients of the network whose first weight is weights[layer]; jobs=2: of its last layer."""
         g4, x4 = more or (outputs, inputs)
         weight_gradients[(programs, jobs)](

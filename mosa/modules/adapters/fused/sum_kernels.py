@@ -36,14 +36,8 @@ def store_square(at, D, IN: tl.constexpr, H: tl.constexpr):
 
 @triton.jit
 def store_columns(
-    at,
-    D,
-    row: tl.constexpr,
-    column: tl.constexpr,
-    first: tl.constexpr,
-    count: tl.constexpr,
-    H: tl.constexpr,
-):
+    at, D, row: tl.constexpr, column: tl.constexpr, first: tl.constexpr, count: tl.constexpr, H: tl.constexpr
+):  # fmt: skip
     """Columns `first` to `first + count` of the sums (H, 16), `row` and `column` numbers apart."""
     h, c = tl.arange(0, H)[:, None], tl.arange(0, 16)[None, :]
     tl.store(

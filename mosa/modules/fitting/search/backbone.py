@@ -6,7 +6,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -17,6 +17,9 @@ from mosa.modules.fitting.search.parts import WORTH
 from mosa.modules.fitting.search.yielding import LASTS
 from mosa.physics.constitutive.laws import law_named
 from mosa.system.progress import tqdm
+
+if TYPE_CHECKING:
+    from mosa.modules.fitting.identification import Identification
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 OFFSET_STEPS = (-0.2, 0.05, 0.3, 0.55, 0.8)
@@ -30,18 +33,9 @@ CONTACT = "contact"
 FURTHER, FURTHEST = 1.5, 100.0
 """Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
 STRIDES = {
-    "E": 1.1,
-    "mu": 1.1,
-    "kappa": 1.1,
-    "yield_stress": 1.1,
-    "viscosity": 1.6,
-    "damping": 1.6,
-    "bulk_damping": 1.6,
-    "cohesion": 0.5,
-    "nu": 0.8,
-    "friction_angle": 0.8,
-    CONTACT: 0.15,
-}
+    **dict.fromkeys((*STIFFNESS, "yield_stress"), 1.1), **dict.fromkeys(("viscosity", "damping", "bulk_damping"), 1.6),
+    "cohesion": 0.5, "nu": 0.8, "friction_angle": 0.8, CONTACT: 0.15,
+}  # fmt: skip
 """First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
 range and 17 degrees in that of the angle's."""
 FINEST = 0.2
@@ -55,32 +49,6 @@ WIDE = (0.3, 1.0, 3.2)
 """Multiples of the stiffness among these starts, each with the numbers that are no stiffness `moved`."""
 BEGUN, FIRST, KEPT, LAST = 6, 2, 3, 3
 """Of these starts the nearest, beside the end of the compass search; iterations of each; how many go on, and for how many more."""
-
-
-class Calibration(Protocol):
-    """What is asked of the identification (`identification.py`) whose start is sought."""
-
-    body: Body
-    offsets: tuple[float | None, ...]
-    gains: tuple[float, ...]
-
-    def search(self) -> float:
-        """`search` of it."""
-
-    def iterate(self) -> dict[str, float]:
-        """One iteration of Gauss-Newton."""
-
-    def score(self, gains: Sequence[float] | None = None) -> float:
-        """How far the predictions are from the cues [m]; gains: those of another criterion."""
-
-    def distance(self) -> float:
-        """Mean distance [m] of free rollouts from the cues."""
-
-    def state(self) -> dict:
-        """Beside the body's numbers."""
-
-    def restore(self, state: dict) -> None:
-        """As when `state` was taken."""
 
 
 def compass(
@@ -133,7 +101,7 @@ def valleys(found: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
 class Starts:
     """Places at which a calibration may start: unconstrained parameters by name, and their scores."""
 
-    def __init__(self, calibration: Calibration) -> None:
+    def __init__(self, calibration: Identification) -> None:
         self.calibration, self.material = calibration, calibration.body.material
         self.learned, self._begins = self.material.learned, self.material.begins
         modulated = self.material.modulated
@@ -166,7 +134,7 @@ class Starts:
         return self._scores[key]
 
 
-def search(calibration: Calibration) -> float:
+def search(calibration: Identification) -> float:
     """Start a calibration near the smallest score [m], which is returned.
 
     The deepest valleys of a coarse grid (`rows_of_grid`) come first; where there are several,
@@ -239,7 +207,7 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
 
 
 def nearest_end(
-    calibration: Calibration,
+    calibration: Identification,
     start_at: Callable[[dict[str, float]], None],
     rows: Sequence[dict[str, float]],
     kept: int = KEPT,
@@ -276,7 +244,7 @@ def nearest_end(
 
 
 def went_on(
-    calibration: Calibration, state: dict, iterations: int
+    calibration: Identification, state: dict, iterations: int
 ) -> tuple[float, dict[str, dict], dict]:
     """(score [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
     calibration.restore(state)
@@ -305,7 +273,7 @@ TRIED = 4
 def choose_law(
     body: Body,
     candidates: Sequence[str],
-    build: Callable[[], Calibration],
+    build: Callable[[], Identification],
     lasts: Callable[[], float],
 ) -> dict[str, float]:
     """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction

@@ -16,13 +16,16 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mosa.errors import SimulationDiverged
 from mosa.modules.body.body import Body
-from mosa.modules.fitting.search.backbone import Calibration, calibrate_as, calibrated
+from mosa.modules.fitting.search.backbone import calibrate_as, calibrated
 from mosa.system.progress import tqdm
 from mosa.types import RUBBING, Ground
+
+if TYPE_CHECKING:
+    from mosa.modules.fitting.identification import Identification
 
 FRICTIONS = (0.15, 0.3, 0.6, 1.2)
 """Coulomb's coefficients of bodies that leave the ground freely, each twice the one before: cloth on steel to rubber on a table."""
@@ -115,7 +118,7 @@ def better_friction(own: float, gain: Callable[[float], float]) -> tuple[float, 
 
 
 def choose_ground(
-    body: Body, known: Ground, calibration: Callable[[Ground], Calibration]
+    body: Body, known: Ground, calibration: Callable[[Ground], Identification]
 ) -> tuple[Ground, dict[str, float]]:
     """(ground, mean distance [m] of every contact that was tried by `named`, infinite where it cannot be simulated); `body` is left
     calibrated on it.
