@@ -67,13 +67,15 @@ FIRST = """
     const decltype(a) firsts[3] = {a, b, c};
     decltype(a) values[3] = {d, e, f};
 #pragma unroll
-    for (int n = 0; n < 3; ++n) {
+    for (int n = 0; n < 3; ++n)
 #pragma unroll
         for (int k = 0; k < NUMBERS; ++k) {
             const auto more = __shfl_down_sync(mask, firsts[n].c[k], 1);
             if (meeting.c[0]) values[n].c[k] += firsts[n].c[k];
             if (meeting.c[2]) values[n].c[k] += more;
         }
+#pragma unroll
+    for (int n = 0; n < 3; ++n) {
         const int adds = meeting.c[1];
         const auto x = firsts[n].c[0], y = firsts[n].c[1], z = firsts[n].c[2], w = firsts[n].c[3];
         const size_t address = __cvta_generic_to_global(field.data + first + n);ADD
