@@ -58,7 +58,8 @@ class Workspace:
         self.numerics, self.particles, self.substeps = numerics, particles, substeps
         self.with_adjoint = with_adjoint
         self.scalar, self.exact = SCALARS[numerics.dtype], needed(numerics.device)
-        self.kernels = transfer_kernels(self.scalar, self.exact)
+        self.each = 2 if torch.device(numerics.device).type == "cuda" and not self.exact else 1
+        self.kernels = transfer_kernels(self.scalar, self.exact, self.each)
         self.update = update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(
             numerics.law, self.scalar, adapted, plastic_adapted, numerics.energetic
@@ -164,10 +165,9 @@ class Workspace:
         return tensor, wp.from_torch(tensor, dtype=kind)
 
     def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
-        tensor = torch.zeros(
-            (slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device
-        )
-        return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
+        """Parts of one buffer, each where the kernels can read it in pieces."""
+        _, parts = zeros_in_one([shape] * slots, self.numerics.dtype, self.numerics.device)
+        return parts, [wp.from_torch(t, dtype=kind) for t in parts]
 
     def _slots(self, count: int) -> tuple[list[list[Tensor]], list]:
         """(`count` slots of x, v, C_affine, F, and of F_tot where the law yields, the same as a kernel's `Particles` each)."""
@@ -261,7 +261,8 @@ class Workspace:
         if pulled != self._pulled:
             rows = [[[time * g for g in gravity] for gravity in pulled[2]] for time in self.steps]
             rows = torch.tensor(rows, dtype=torch.float64)
-            self.impulses[0]._base.copy_(rows.to(self.numerics.dtype), non_blocking=True)
+            for target, row in zip(self.impulses, rows.to(self.numerics.dtype)):
+                target.copy_(row, non_blocking=True)
             self._pulled = pulled
         if self.colliders is not None:
             self.colliders.load(poses[: len(self.colliders.poses)])
@@ -447,7 +448,7 @@ class Workspace:
             clears = step + 1 < self.substeps and not self.exact
             cleared = self.grid_wp[(step + 1) % grids] if clears else None
             self.run(self.stress, n, self._stress_arguments(a, s))
-            self.run(kernels.p2g, n, [
+            self.run(kernels.p2g, -(-n // self.each), [
                 now, self._met(a, step), self.tau_wp[s], mass, self.volume_wp, self.grids, kick,
                 int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip

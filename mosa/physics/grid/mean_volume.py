@@ -63,7 +63,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     numbers = wp.types.vector(length=slots, dtype=scalar)
     adding = exact_node_access(scalar) if exact else node_access(scalar)
-    pair, add3, load3 = adding.pair, adding.add3, node_access(scalar).load3
+    run, add3, load3 = adding.run, adding.add3, node_access(scalar).load3
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
     Grids, located = stencil_functions(scalar).Grids, stencil_functions(scalar).located
     # numbers made here: Warp computes those made inside a kernel in float32
@@ -145,7 +145,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
         return part
 
     @wp.func
-    def spread(field: added_to, at: wp.vec3i, f: vec3, q: vec3, together: wp.vec2i):
+    def spread(field: added_to, at: wp.vec3i, f: vec3, q: vec3, together: wp.vec3i):
         none = vec3(zero, zero, zero)
         for i in range(2):
             for j in range(2):
@@ -164,7 +164,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
             return
         V = volume[p]
         q = vec3(V * scalar(own_ratio(wp.mat33d(F[p])) - _ONE), V, zero)
-        spread(nodes, at, hats(x[p], grids.inv_dx), q, pair(at[0]))
+        spread(nodes, at, hats(x[p], grids.inv_dx), q, run(at[0], True))
 
     @wp.kernel(module=module, enable_backward=False)
     def average(
@@ -223,7 +223,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
                 more[moduli[1]] = more[moduli[1]] + of_bulk
                 more[mu] = more[mu] + two_thirds * of_bulk
             adj_parameters[p] = more
-        spread(adj_nodes, at, f, vec3(of_mean, zero, zero), pair(at[0]))
+        spread(adj_nodes, at, f, vec3(of_mean, zero, zero), run(at[0], True))
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_collect(

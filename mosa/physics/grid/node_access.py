@@ -1,11 +1,15 @@
-"""Whole 4-vectors of a grid node in one memory instruction, as functions for Warp kernels.
+"""Memory of grid nodes and particles in as few transactions as a GPU allows, as functions for Warp kernels.
 
 Warp compiles an access to a vector into one instruction per component. A node's four float32 are 16 aligned bytes, which a GPU
 loads, stores and, from compute capability 9.0 on, adds with one instruction. Float64 goes in pairs and is added one by one. On a
-CPU these are plain accesses. Arrays must be contiguous, as torch and Warp allocate them.
+CPU these are plain accesses. Arrays must be contiguous, and begin where `launching.aligned` wants it.
 
-Sums in memory are what bounds the transfers of a GPU, and neighbouring threads mostly have neighbouring particles: two of them in a
-row that have the same nodes (`pair`) add up their terms in registers, and the first of them adds both to memory.
+Sums in memory are what bounds the transfers of a GPU, and neighbouring threads mostly have neighbouring particles: those in a row
+that have the same nodes (`run`) add up their terms in registers, in twos, fours and eights, and the first of them adds to memory.
+
+A particle's vector of 12 bytes or matrix of 36 lies across the 16 that a thread can store at once, and nine stores of a warp to
+every 36th byte cost nine times the transactions: a warp puts its particles' numbers in shared memory and stores all of them from
+there as they lie in memory. Loads do not gain by it: what one of nine leaves of a cache line, the next one finds.
 """
 
 from functools import cache
@@ -38,29 +42,61 @@ STORE = {
     pairs[1] = make_double2(z, w);""",
 }
 
-# x: index of the lowest node; -> (threads that take part, 1 where this one adds to memory + 2 where it adds the next one's too).
-# Runs of threads with the same nodes are taken two by two; the thread after the last one has others, or takes no part
-PAIR = """
+# x: index of the lowest node, -1: takes no part; -> (threads here, place in the run of those with the same x, how many come after)
+RUN = """
     const unsigned mask = __activemask(), lane = threadIdx.x & 31;
     const int before = __shfl_up_sync(mask, x, 1);
-    const bool begins = lane == 0 || !(mask >> (lane - 1) & 1) || before != x;
-    const unsigned starts = __ballot_sync(mask, begins);
-    const unsigned start = 31 - __clz(starts & ((2u << lane) - 1));
-    const bool adds = ((lane - start) & 1) == 0, next = lane < 31 && (mask >> (lane + 1) & 1) && !(starts >> (lane + 1) & 1);
-    return {static_cast<int>(mask), (adds ? 1 : 0) + (adds && next ? 2 : 0)};"""
-# of three nodes in a row, a, b and c; the next thread's numbers are asked for by all: it would wait for those that do not ask
-SHARED = """
-    const unsigned mask = static_cast<unsigned>(together.c[0]);
-    const bool both = together.c[1] & 2;
-    const int adds = together.c[1] & 1;
-    decltype(a) values[3] = {a, b, c};
+    // a thread that is not here ends a run, as the next one begins one
+    const unsigned starts = __ballot_sync(mask, before != x || !joins) | ~mask | ~mask << 1 | 1;
+    const unsigned upto = (2u << lane) - 1, later = starts & ~upto;
+    const int end = later ? __ffs(later) - 1 : 32;
+    const int own = lane, place = own - 31 + __clz(starts & upto);
+    return {static_cast<int>(mask), x == -1 ? -1 : place, end - 1 - own};"""
+# of two particles, at x and y: (same nodes; the first one adds to memory by itself; the first one of the next thread is added here)
+MEETING = """
+    const unsigned mask = __activemask(), lane = threadIdx.x & 31;
+    const int before = __shfl_up_sync(mask, y, 1);
+    const bool first = lane > 0 && mask >> (lane - 1) & 1, last = lane == 31 || !(mask >> (lane + 1) & 1);
+    const bool differs = x != y && x != -1, given = differs && first && before == x;
+    const bool takes = __shfl_down_sync(mask, static_cast<int>(given), 1) && !last;
+    return {x == y, differs && !given, takes};"""
+# of three nodes in a row; other threads' numbers are asked for by all: it would wait for those that do not ask
+# all threads of the warp that there are come here: with a constant mask they need not look which ones are there
+FIRST = """
+    constexpr unsigned mask = 0xffffffff;
+    const decltype(a) firsts[3] = {a, b, c};
+    decltype(a) values[3] = {d, e, f};
 #pragma unroll
     for (int n = 0; n < 3; ++n)
 #pragma unroll
         for (int k = 0; k < NUMBERS; ++k) {
-            const auto more = __shfl_down_sync(mask, values[n].c[k], 1);
-            if (both) values[n].c[k] += more;
+            const auto more = __shfl_down_sync(mask, firsts[n].c[k], 1);
+            if (meeting.c[0]) values[n].c[k] += firsts[n].c[k];
+            if (meeting.c[2]) values[n].c[k] += more;
         }
+#pragma unroll
+    for (int n = 0; n < 3; ++n) {
+        const int adds = meeting.c[1];
+        const auto x = firsts[n].c[0], y = firsts[n].c[1], z = firsts[n].c[2], w = firsts[n].c[3];
+        const size_t address = __cvta_generic_to_global(field.data + first + n);ADD
+    }"""
+ONLY = """
+    const unsigned mask = together.c[0];
+    decltype(a) values[3] = {a, b, c};"""
+SHARED = """
+    const int place = together.c[1], after = together.c[2];
+#pragma unroll
+    for (int step = 0; step < STEPS; ++step) {
+        const bool both = (place & ((2 << step) - 1)) == 0 && after >= 1 << step;
+#pragma unroll
+        for (int n = 0; n < 3; ++n)
+#pragma unroll
+            for (int k = 0; k < NUMBERS; ++k) {
+                const auto more = __shfl_down_sync(mask, values[n].c[k], 1 << step);
+                if (both) values[n].c[k] += more;
+            }
+    }
+    const int adds = place >= 0 && (place & ((1 << STEPS) - 1)) == 0;
 #pragma unroll
     for (int n = 0; n < 3; ++n) {
         const auto x = values[n].c[0], y = values[n].c[1], z = values[n].c[2], w = FOURTH;
@@ -71,32 +107,86 @@ PLAIN = """
     for (int n = 0; n < 3; ++n)
         for (int k = 0; k < NUMBERS; ++k) field.data[i + n].c[k] += values[n].c[k];"""
 
+# of a particle's COUNT float32, an odd number: all but one in pairs, which begin with the first of an even particle
+TAKE = """
+    const float* source = reinterpret_cast<const float*>(field.data + i);
+    const int odd = i & 1;
+    TYPE value;
+    float* target = reinterpret_cast<float*>(&value);
+    target[odd ? 0 : COUNT - 1] = __ldg(source + (odd ? 0 : COUNT - 1));
+#pragma unroll
+    for (int k = 0; k < COUNT / 2; ++k) {
+        const float2 q = __ldg(reinterpret_cast<const float2*>(source + odd) + k);
+        target[odd + 2 * k] = q.x;
+        target[odd + 2 * k + 1] = q.y;
+    }
+    return value;"""
+# of a warp of which all threads are here, all at once
+PUT = """
+    __shared__ __align__(16) float rooms[WP_TILE_BLOCK_DIM * COUNT];
+    const int lane = threadIdx.x & 31;
+    if (__activemask() == 0xffffffff) {
+        float* room = rooms + (threadIdx.x - lane) * COUNT;
+        __syncwarp();
+#pragma unroll
+        for (int k = 0; k < COUNT; ++k) room[COUNT * lane + k] = reinterpret_cast<const float*>(&value)[k];
+        __syncwarp();
+#pragma unroll
+        for (int q = lane; q < 8 * COUNT; q += 32)
+            reinterpret_cast<float4*>(field.data + i - lane)[q] = reinterpret_cast<const float4*>(room)[q];
+    } else field.data[i] = value;"""
+
 PARTS = "const auto x = value.c[0], y = value.c[1], z = value.c[2], w = {};"
 
 
 @cache
 def node_access(scalar) -> SimpleNamespace:
-    """load4, load3, store3, store4, pair, add3, add4, clear on arrays of 4-vectors of wp.float32 or wp.float64.
+    """load4, load3, store3, store4, run, add3, add4, meeting, add4_of_two, clear on arrays of 4-vectors of wp.float32 or
+    wp.float64, take3, take33, put3, put33 on those of particles' vectors and matrices.
 
     load(field, i), for memory that nothing in the same launch writes; store(field, i, value), for memory that nothing in the same
-    launch reads; clear(field, i); add(field, i, a, b, c, together), to i, i + 1 and i + 2, for the same, together = pair(x) of a
-    number x that tells to which i a thread adds, one after the other. The functions on 3-vectors leave the fourth number out; a
-    store sets it to 0.
+    launch reads; clear(field, i); add(field, i, a, b, c, together), to i, i + 1 and i + 2, for the same, together = run(x, True) of
+    a number x that tells to which i a thread adds, one after the other, -1 where to none. The functions on 3-vectors leave the
+    fourth number out; a store sets it to 0. take(field, i) as load; put(field, i, value) stores for the thread's own number i, in
+    blocks of whole warps.
+    Of two particles a thread, on a GPU, where no thread may leave before: add4_of_two(field, first, i, a, b, c, d, e, f,
+    meeting(x, y), run(y, x == y)), a, b and c to `first` and the two after it, d, e and f to `i`.
     """
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
-    field4 = wp.array(dtype=vec4)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
+    field3, field4, field33 = (wp.array(dtype=kind) for kind in (vec3, vec4, mat33))
     three, four = PARTS.format("decltype(x)(0)"), PARTS.format("value.c[3]")
 
-    def add_row(names: str) -> str:
-        fourth = "values[n].c[3]" if len(names) == 4 else "decltype(x)(0)"
-        cuda = SHARED.replace("FOURTH", fourth).replace(
-            "ADD", added(scalar, names, filler=None if len(names) == 4 else "w")
-        )
-        return _either(cuda, PLAIN).replace("NUMBERS", str(len(names)))
+    def add_row(values: str, numbers: int, steps: int, cpu: str = PLAIN) -> str:
+        fourth = "values[n].c[3]" if numbers == 4 else "decltype(x)(0)"
+        adding = added(scalar, "xyzw"[:numbers], filler=None if numbers == 4 else "w")
+        cuda = (values + SHARED).replace("FOURTH", fourth).replace("ADD", adding)
+        return _either(cuda, cpu).replace("NUMBERS", str(numbers)).replace("STEPS", str(steps))
 
-    @wp.func_native(_either(PAIR, "return {0, 1};"))
-    def pair(x: int) -> wp.vec2i: ...
+    def own(cuda: str, cpu: str, count: int) -> str:
+        if scalar is wp.float64:
+            return cpu
+        kind = {3: "wp::vec_t<3, float>", 9: "wp::mat_t<3, 3, float>"}[count]
+        return _either(cuda, cpu).replace("TYPE", kind).replace("COUNT", str(count))
+
+    @wp.func_native(own(TAKE, "return field.data[i];", 3))
+    def take3(field: field3, i: int) -> vec3: ...
+
+    @wp.func_native(own(TAKE, "return field.data[i];", 9))
+    def take33(field: field33, i: int) -> mat33: ...
+
+    @wp.func_native(own(PUT, "field.data[i] = value;", 3))
+    def put3(field: field3, i: int, value: vec3): ...
+
+    @wp.func_native(own(PUT, "field.data[i] = value;", 9))
+    def put33(field: field33, i: int, value: mat33): ...
+
+    @wp.func_native(_either(RUN, "return {0, 0, 0};"))
+    def run(x: int, joins: bool) -> wp.vec3i: ...
+
+    @wp.func_native(_either(MEETING, "return {0, 0, 0};"))
+    def meeting(x: int, y: int) -> wp.vec3i: ...
 
     @wp.func_native(
         _either(f"{LOAD[scalar]} return {{q.x, q.y, q.z, q.w}};", "return field.data[i];")
@@ -117,11 +207,17 @@ def node_access(scalar) -> SimpleNamespace:
     @wp.func_native(_either(f"{three} {STORE[scalar]}", f"{three} field.data[i] = {{x, y, z, w}};"))
     def store3(field: field4, i: int, value: vec3): ...
 
-    @wp.func_native(add_row("xyzw"))
-    def add4(field: field4, i: int, a: vec4, b: vec4, c: vec4, together: wp.vec2i): ...
+    @wp.func_native(add_row(ONLY, 4, 3))
+    def add4(field: field4, i: int, a: vec4, b: vec4, c: vec4, together: wp.vec3i): ...
 
-    @wp.func_native(add_row("xyz"))
-    def add3(field: field4, i: int, a: vec3, b: vec3, c: vec3, together: wp.vec2i): ...
+    @wp.func_native(add_row(ONLY, 3, 3))
+    def add3(field: field4, i: int, a: vec3, b: vec3, c: vec3, together: wp.vec3i): ...
+
+    @wp.func_native(add_row(FIRST, 4, 2, cpu=""))
+    def add4_of_two(
+        field: field4, first: int, i: int, a: vec4, b: vec4, c: vec4, d: vec4, e: vec4, f: vec4,
+        meeting: wp.vec3i, together: wp.vec3i,
+    ): ...  # fmt: skip
 
     @wp.func
     def clear(field: field4, i: int):
@@ -129,13 +225,14 @@ def node_access(scalar) -> SimpleNamespace:
         store4(field, i, vec4(z, z, z, z))
 
     return SimpleNamespace(
-        load4=load4, load3=load3, store4=store4, store3=store3, pair=pair, add4=add4, add3=add3, clear=clear
+        load4=load4, load3=load3, store4=store4, store3=store3, run=run, meeting=meeting, add4=add4, add3=add3,
+        add4_of_two=add4_of_two, clear=clear, take3=take3, take33=take33, put3=put3, put33=put33,
     )  # fmt: skip
 
 
 @cache
 def exact_node_access(scalar) -> SimpleNamespace:
-    """pair, add4, add3 as `node_access`, onto exact sums (4 nodes, COLUMNS) int64, to which every thread adds its own: a sum of two
+    """run, add4, add3 as `node_access`, onto exact sums (4 nodes, COLUMNS) int64, to which every thread adds its own: a sum of two
     in registers would be rounded; settle_node(sums, field, i), which stores a node's sums and clears them."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
@@ -143,15 +240,15 @@ def exact_node_access(scalar) -> SimpleNamespace:
     add_exactly, total, clear = functions.add_exactly, functions.total, functions.clear
 
     @wp.func
-    def pair(x: int):
-        return wp.vec2i(0, 1)
+    def run(x: int, joins: bool):
+        return wp.vec3i(0, 0, 0)
 
     def add(numbers: int):
         vector = vec4 if numbers == 4 else vec3
 
         @wp.func
         def add_row(
-            sums: wp.array2d(dtype=wp.int64), node: int, a: vector, b: vector, c: vector, together: wp.vec2i
+            sums: wp.array2d(dtype=wp.int64), node: int, a: vector, b: vector, c: vector, together: wp.vec3i
         ):  # fmt: skip
             for k in range(numbers):
                 add_exactly(sums, 4 * node + k, a[k])
@@ -172,4 +269,4 @@ def exact_node_access(scalar) -> SimpleNamespace:
         for k in range(4):
             clear(sums, first + k)
 
-    return SimpleNamespace(pair=pair, add4=add(4), add3=add(3), settle_node=settle_node)
+    return SimpleNamespace(run=run, add4=add(4), add3=add(3), settle_node=settle_node)
