@@ -27,7 +27,7 @@ from mosa.reconstruction.pose.starts import first_contact
 from mosa.system.limits import counted
 from mosa.twin.presets import preset
 from mosa.twin.twin import Twin
-from mosa.types import Scene
+from mosa.types import REST, Scene
 
 PARTICLE_BYTES = 5e3
 """Of a particle through reconstruction and fit, at least: modes, neighbours, frames, buffers of the rollout."""
@@ -142,9 +142,22 @@ def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
 def warn_of_little(
     world: World, body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]
 ) -> None:
-    """A warning for a film that is learned from and ends when the object has hardly begun to deform. found: starts by prefix;
-    scenes: theirs, in this order. Silent where something else than the ground may deform it."""
+    """A warning for a film that is learned from and ends when the object has hardly begun to deform, and for films of given motions
+    alone, without a force. found: starts by prefix; scenes: theirs, in this order."""
     if world.colliders or world.planes or world.driven:
+        solids = (*world.colliders, *world.driven)
+        rests = all(
+            scene.start == REST
+            for prefix, scene in zip(found, scenes)
+            if prefix.startswith("train")
+        )
+        if rests and not world.forces and any(each.motion.max_speed(1.0) > 0 for each in solids):
+            warnings.warn(
+                "world.forces: expected a measured force beside solids and driven sets of given motion, which determine "
+                "strains, found none: only the body's weight determines E, which may be several times off, and its "
+                "standard deviation is too small",
+                stacklevel=2,
+            )
         return
     for (prefix, start), scene in zip(found.items(), scenes):
         if not prefix.startswith("train") or scene.ground is None:

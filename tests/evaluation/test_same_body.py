@@ -11,6 +11,8 @@ import torch
 from mosa.data.scene import load_scene
 from mosa.evaluation.same_body import body_match, warn_of_other_bodies
 from mosa.modules.body.body import Start
+from mosa.physics.contact.colliders import Collider, HalfSpace
+from mosa.physics.contact.motion import Motion
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.training.preflight import warn_of_little
 from mosa.types import Ground
@@ -97,6 +99,22 @@ def test_without_the_training_film_a_body_is_compared_with_what_is_usual(cameras
     )
 
 
+@pytest.mark.parametrize(
+    ("speed", "start", "forces", "warns"),
+    [(0.1, "rest", (), True), (0.1, "rest", ("cell",), False), (0.1, "falling", (), False), (0.0, "rest", (), False)],
+)  # fmt: skip
+def test_given_motions_without_a_force_are_said(speed, start, forces, warns):
+    plate = Collider(
+        HalfSpace(), "slip", motion=Motion((0.0, 1.0, 0.0), velocity=(0.0, -speed, 0.0))
+    )
+    world = SimpleNamespace(colliders=(plate,), planes=(), driven=(), forces=forces)
+    scenes = [SimpleNamespace(start=start), SimpleNamespace(start="falling")]
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        warn_of_little(world, block(), {"train": at(0), "test/h": at(0)}, scenes)
+    assert [str(each.message)[:12] for each in found] == ["world.forces"] * warns
+
+
 @pytest.mark.parametrize(("frames", "held_out", "colliders", "said"), [
     (9, (), (), None), (5, (), (), 2), (9, (5, 6, 7, 8), (), 2), (5, (), ("solid",), None), (3, (), (), 1),
 ])  # fmt: skip
@@ -106,7 +124,7 @@ def test_a_film_that_ends_at_the_contact_is_said(frames, held_out, colliders, sa
     start = replace(at(0, height=0.17), velocity=torch.tensor([0.0, -2.0, 0.0]))
     scene = SimpleNamespace(frames=frames, times=torch.arange(frames) / 50.0, gravity=torch.tensor([0, -9.8, 0]), name="b",
                             up=torch.tensor([0.0, 1, 0]), ground=Ground(0.0), last_free_frame=None, sequence="train",
-                            training_frames=[t for t in range(frames) if t not in held_out])  # fmt: skip
+                            start="falling", training_frames=[t for t in range(frames) if t not in held_out])  # fmt: skip
     world = SimpleNamespace(colliders=colliders, planes=(), driven=())
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
