@@ -23,7 +23,6 @@ from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa, check_trainer
-from mosa.training.loggers import DescribingLogger
 from mosa.training.run_folder import VALIDATION
 
 log = logging.getLogger(__name__)
@@ -116,9 +115,6 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
         stored = read_checkpoint(ckpt_path)
         record = check_same(stored, module, ckpt_path)
         check_numbers(record, len(read_numbers(module.body)), ckpt_path)
-    for logger in trainer.loggers:
-        if isinstance(logger, DescribingLogger):
-            logger.law = module.body.material.law
     device = module.body.rest.device
     begun: list[bool] = []
     trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))

@@ -30,9 +30,9 @@ from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.assembly import Run, assemble, scenes
-from mosa.training.costs import before_data, estimate, estimate_text, peak_memory
 from mosa.training.fitting import build_trainer, fit
 from mosa.training.loggers import log_outcome
+from mosa.training.memory import check_before_data, check_with_data
 from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
 from mosa.training.preflight import (
     check_begin,
@@ -49,6 +49,7 @@ from mosa.training.run_folder import (
     cost,
     finished,
     most_particles,
+    peak_memory,
     quiet,
     run_folder,
 )  # fmt: skip
@@ -77,7 +78,7 @@ class StageTimes:
         yield
         took, name = time.perf_counter() - began, f"time/{stage}_s"
         self.figures[name] = self.figures.get(name, 0.0) + took
-        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory() / 1e9)
+        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory())
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -100,7 +101,7 @@ def train(cfg: DictConfig) -> float | None:
     run = assemble(cfg, device)
     data = run.data
     most = most_particles(device)
-    log.info(before_data(settings.plain(), most))
+    check_before_data(settings.plain(), most)
     with clock.measure("data"):
         scene, others = data.scenes
     if begun is not None:
@@ -108,11 +109,7 @@ def train(cfg: DictConfig) -> float | None:
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
-        parts, memory = estimate(
-            settings.plain(), scene, len(others), 1 + len(data.taught), device,
-            stored=data.reconstructed(), most=most,
-        )  # fmt: skip
-        log.info(estimate_text(parts, memory))
+        check_with_data(settings.plain(), scene, len(others), most)
     else:
         log.info(
             "tracked points only: no reconstruction from images, no figures of images, no video"

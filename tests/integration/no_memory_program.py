@@ -54,7 +54,8 @@ class Later:
 
 
 PLACES = [  # command, its words, where memory ends, what is raised there
-    ("train", FIRST, "mosa.training.workflow:estimate", MODULE), ("train", FIRST, "mosa.training.datamodule:reconstruct", TORCH),
+    ("train", FIRST, "mosa.training.workflow:check_with_data", MODULE),
+    ("train", FIRST, "mosa.training.datamodule:reconstruct", TORCH),
     ("train", FIRST, "mosa.training.datamodule:sequence_start", HANDLE),
     ("train", FIRST, "mosa.training.lit_mosa:LitMosa.training_step", WARP),
     ("train", AGAIN, "mosa.training.lit_mosa:LitMosa.on_load_checkpoint", TORCH),
