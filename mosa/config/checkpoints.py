@@ -300,10 +300,8 @@ def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
             f"{BRIGHTEST:g}, found {float(opacities.min()):g} to {float(opacities.max()):g} and "
             f"{float(colors.abs().max()):g}"
         )
-    widths, size = (
-        torch.linalg.eigvalsh(covariances.double()),
-        float((tensors["rest"].amax(0) - tensors["rest"].amin(0)).max()),
-    )
+    widths = torch.linalg.eigvalsh(covariances.double())
+    size = float((tensors["rest"].amax(0) - tensors["rest"].amin(0)).max())
     uneven = float((covariances - covariances.mT).abs().max()) > 1e-3 * float(
         covariances.abs().max()
     )

@@ -199,11 +199,10 @@ def _of_builtin(bench: Bench) -> bool:
 
 def _plain(setting: Setting) -> dict[str, Any]:
     """The setting, of the checkpoint its content in place of its path: a study may go on on another machine."""
-    content = (
-        None
-        if setting.checkpoint is None
-        else hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
-    )
+    if setting.checkpoint is None:
+        content = None
+    else:
+        content = hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
     return json.loads(
         json.dumps(asdict(setting) | {"checkpoint": content, "search": setting.search.plain()})
     )
@@ -219,11 +218,10 @@ def _identity(bench: Bench, simulator: str) -> dict[str, Any]:
     s, found = bench.setting, _plain(bench.setting)
     if simulator not in (UNTRAINED, "truth"):
         return found
-    known = (
-        {"name": s.scene}
-        if s.scene is not None
-        else scene_of(bench.simulator("learned").twin, s.checkpoint)
-    )
+    if s.scene is not None:
+        known = {"name": s.scene}
+    else:
+        known = scene_of(bench.simulator("learned").twin, s.checkpoint)
     return found | {"checkpoint": None, "scene": None, "truth": truth_of(known)}
 
 

@@ -184,11 +184,9 @@ def motion_metrics(
 def true_motion(body: Body, scene: Scene) -> Tensor | None:
     """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
     truth = scene.truth
-    return (
-        None
-        if truth is None
-        else metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
-    )
+    if truth is None:
+        return None
+    return metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
 
 
 @torch.no_grad()
@@ -253,13 +251,9 @@ def worst(name: str) -> float:
     """The figure of a rollout that there is not: no error so large and no picture so bad; of pictures compared by a metric that was
     registered, no number."""
     kind = name.split("_")[0]
-    return (
-        -math.inf
-        if kind in ("psnr", "ssim")
-        else math.nan
-        if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS
-        else math.inf
-    )
+    if kind in ("psnr", "ssim"):
+        return -math.inf
+    return math.nan if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS else math.inf
 
 
 def sequence_metrics(
@@ -329,11 +323,10 @@ def floor_figures(
         if scene.truth is None:
             continue
         x = floor_rollout(body, scene, world)
-        frames = (
-            scene.training_frames
-            if sequence.prefix.startswith("train")
-            else list(range(scene.frames))
-        )
+        if sequence.prefix.startswith("train"):
+            frames = scene.training_frames
+        else:
+            frames = list(range(scene.frames))
         result = motion_metrics(x, body, sequence, frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)
@@ -382,16 +375,12 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
     from mosa.evaluation.floor import hidden_of
 
     hidden, found = hidden_of(scene), {}
-    fibre, axis = (
-        getattr(hidden, "fibre", None),
-        [figures.get(f"id/stiffest_{name}") for name in "xyz"],
-    )
+    fibre = getattr(hidden, "fibre", None)
+    axis = [figures.get(f"id/stiffest_{name}") for name in "xyz"]
     if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
         found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
-    learned, true = (
-        body.factor(body.model().heterogeneity).detach().cpu(),
-        hidden.factor(body.rest.cpu().float()),
-    )
+    learned = body.factor(body.model().heterogeneity).detach().cpu()
+    true = hidden.factor(body.rest.cpu().float())
     if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
         found["id/stiffness_correlation"] = float(
             torch.corrcoef(torch.stack([true, learned.float()]))[0, 1]

@@ -43,11 +43,9 @@ class Option:
 
     def cost_on(self, device: str) -> float:
         """device: cpu | gpu."""
-        return (
-            float(self.cost.get(device, 1.0))
-            if isinstance(self.cost, Mapping)
-            else float(self.cost)
-        )
+        if isinstance(self.cost, Mapping):
+            return float(self.cost.get(device, 1.0))
+        return float(self.cost)
 
 
 @dataclass(frozen=True)
@@ -127,11 +125,9 @@ class Job:
     def failed(self) -> str | None:
         """Why it failed when it was last run; None where it is complete, or was not run."""
         said = self.folder / FAILED
-        return (
-            None
-            if self.finished or not said.is_file()
-            else said.read_text(errors="replace").strip()
-        )
+        if self.finished or not said.is_file():
+            return None
+        return said.read_text(errors="replace").strip()
 
 
 def section(kind: Callable[..., Any], where: str, keys: Mapping[str, Any]) -> Any:

@@ -173,10 +173,8 @@ class Fitting:
             if n in ("E", "mu", "kappa") or n.startswith("fibre_stiffness")
         ]
         try:
-            found, seen = (
-                self.predicted(theta)[rows] / self.sd[rows],
-                (self.data.value / self.sd)[rows],
-            )
+            found = self.predicted(theta)[rows] / self.sd[rows]
+            seen = (self.data.value / self.sd)[rows]
             theta[stiff] += np.log(max((found @ seen) / (found @ found), 1e-6))
         except SimulationDiverged:
             pass

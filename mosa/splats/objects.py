@@ -98,10 +98,8 @@ def read_object(
             f"{int(chosen.sum())} of {len(chosen)}; the file spans {low} to {high}"
         )
     chosen[chosen.clone()] = together(splats.means[chosen])
-    splats, harmonics = (
-        Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats))),
-        harmonics[chosen],
-    )
+    splats = Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats)))
+    harmonics = harmonics[chosen]
     longest = float((splats.means.amax(0) - splats.means.amin(0)).max())
     if (wide := float(splats.scales.amax(1).median())) > WIDE * longest:
         raise DataError(
@@ -143,11 +141,10 @@ def fill_object(
     resolution, share: as `solid_of` takes them; open_below: up (3,), where the underside is open. Errors: DataError.
     """
     solid = solid_of(appearance.splats, resolution=resolution, share=share, up=open_below)
-    spacing = (
-        filling_spacing(solid, particles, per_cell=per_cell, most=most)
-        if dx is None
-        else dx / grid_spacing(1.0, per_cell)
-    )
+    if dx is None:
+        spacing = filling_spacing(solid, particles, per_cell=per_cell, most=most)
+    else:
+        spacing = dx / grid_spacing(1.0, per_cell)
     found = fill(solid, spacing=spacing)
     near = torch.from_numpy(
         cKDTree(found.positions.numpy()).query(appearance.splats.means.numpy())[0]

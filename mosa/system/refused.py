@@ -47,11 +47,10 @@ def disk_message(error: OSError) -> str | None:
         return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
     if error.errno not in DISK:
         return None
-    keys = (
-        "XDG_CACHE_HOME"
-        if str(error.filename).startswith(cache_home())
-        else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
-    )
+    if str(error.filename).startswith(cache_home()):
+        keys = "XDG_CACHE_HOME"
+    else:
+        keys = "hydra.run.dir= and scene.cache= (eval.py: cache=)"
     return (
         f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
         f"{keys}"

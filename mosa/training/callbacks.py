@@ -168,15 +168,14 @@ class Pace(L.Callback):
         self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
     ) -> None:
         self.began = time.perf_counter()
-        self.rates = (
-            {}
-            if module.stage is None or module.stage.newton
-            else {
+        if module.stage is None or module.stage.newton:
+            self.rates = {}
+        else:
+            self.rates = {
                 f"lr/{group['name']}": group["lr"]
                 for optimizer in trainer.optimizers
                 for group in optimizer.param_groups
             }
-        )
 
     def on_train_batch_end(
         self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int

@@ -55,22 +55,20 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
     try:
         return instantiate(entry, **arguments)
     except Exception as error:
-        cause = (
-            error.__cause__
-            if isinstance(error, InstantiationException) and error.__cause__ is not None
-            else error
-        )
+        if isinstance(error, InstantiationException) and error.__cause__ is not None:
+            cause = error.__cause__
+        else:
+            cause = error
         if str(error).startswith("Error locating target"):
             raise ConfigError(
                 f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found "
                 f"{entry.get('_target_')} ({cause.__cause__ or cause})"
             ) from error
         lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
-        way = (
-            f"; pip install {cause.name}"
-            if isinstance(cause, ModuleNotFoundError) and cause.name
-            else ""
-        )
+        if isinstance(cause, ModuleNotFoundError) and cause.name:
+            way = f"; pip install {cause.name}"
+        else:
+            way = ""
         if where == "trainer" and "gpu" in str(cause):
             way = "; trainer=cpu runs without one"
         raise ConfigError(

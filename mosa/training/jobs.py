@@ -377,11 +377,10 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
     begun.append(True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
-    folder = (
-        OmegaConf.select(HydraConfig.get(), "runtime.output_dir")
-        if HydraConfig.initialized()
-        else None
-    )
+    if HydraConfig.initialized():
+        folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir")
+    else:
+        folder = None
     try:
         with (
             held(folder, wait=(cfg or {}).get("resume") == "auto")

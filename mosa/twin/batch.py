@@ -44,12 +44,10 @@ class TwinWorlds:
             shape = (count, len(read_numbers(body)))
             said = f"one for each of {count} worlds, a tensor {shape} of finite numbers"
             laws = numbers("laws", laws, said, shape)
-        self.body, self.world, self.frame_dt, self.training_start = (
-            body,
-            world,
-            frame_dt,
-            training_start,
-        )
+        self.body = body
+        self.world = world
+        self.frame_dt = frame_dt
+        self.training_start = training_start
         self.count, self.laws = count, laws
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
@@ -97,11 +95,10 @@ class TwinWorlds:
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
         which, episode = list(which), self._going()
-        given = (
-            None
-            if starts is None
-            else [start for start, _ in self._found(starts, which, (), self._box, ())]
-        )
+        if starts is None:
+            given = None
+        else:
+            given = [start for start, _ in self._found(starts, which, (), self._box, ())]
         return episode.restart(which, given)
 
     def _found(
@@ -120,11 +117,10 @@ class TwinWorlds:
             raise ConfigError(
                 f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}"
             )
-        each = (
-            [dict(starts or {})] * len(which)
-            if starts is None or isinstance(starts, Mapping)
-            else list(starts)
-        )
+        if starts is None or isinstance(starts, Mapping):
+            each = [dict(starts or {})] * len(which)
+        else:
+            each = list(starts)
         if len(each) != len(which):
             raise ConfigError(
                 f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"

@@ -133,10 +133,8 @@ class Twin:
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
                 "again), or its run kept none (a fit by Gauss-Newton does: fit.joint.optimizer=auto)"
             )
-        rollout, laws = (
-            self.simulate(**start),
-            self.posterior.draws(draws, torch.Generator().manual_seed(seed)),
-        )
+        rollout = self.simulate(**start)
+        laws = self.posterior.draws(draws, torch.Generator().manual_seed(seed))
         found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(
@@ -298,17 +296,14 @@ class Twin:
         # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
         for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
             if 0 < (far := reach(solid.shape)) < body.size:
-                low, high = (
-                    torch.minimum(low, at.amin(0).to(low) - far),
-                    torch.maximum(high, at.amax(0).to(high) + far),
-                )
+                low = torch.minimum(low, at.amin(0).to(low) - far)
+                high = torch.maximum(high, at.amax(0).to(high) + far)
         target = 0.5 * (low + high)
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
-        side = (
-            side - (side @ up) * up
-            if float((side - (side @ up) * up).norm()) > 1e-3
-            else torch.roll(up, 1)
-        )
+        if float((side - (side @ up) * up).norm()) > 1e-3:
+            side = side - (side @ up) * up
+        else:
+            side = torch.roll(up, 1)
         focal = 1.6 * size
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
         toward = side / side.norm() + 0.25 * up
@@ -332,8 +327,8 @@ class Twin:
         shown = with_solids(alone, solids, rollout.times, up, body.size / 30)
         images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
         lines = ground_lines(self.world, camera, body.size)
-        drawn = (
-            [
+        if lines:
+            drawn = [
                 on_ground(
                     to_uint8(image),
                     lines,
@@ -349,9 +344,8 @@ class Twin:
                 )
                 for image, points in zip(images, shown.means)
             ]
-            if lines
-            else []
-        )
+        else:
+            drawn = []
         return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
 
     def _met(

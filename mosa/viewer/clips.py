@@ -222,11 +222,9 @@ class Clip:
             )
         if by == "uncertainty":
             known = self.spread is not None and model == "learned"
-            return (
-                self.scales[by].paint(1e3 * self.spread[frame])
-                if known
-                else np.full_like(self.appearance, GRAY)
-            )
+            if known:
+                return self.scales[by].paint(1e3 * self.spread[frame])
+            return np.full_like(self.appearance, GRAY)
         far = self.deviation(frame, model)
         return (
             np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)

@@ -49,11 +49,9 @@ def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
 
 def layouts(clip: Clip) -> tuple[str, ...]:
     """All bodies side by side, two of them over each other, or one alone."""
-    return (
-        ("side by side", *clip.overlays, *clip.bodies)
-        if len(clip.bodies) > 1
-        else tuple(clip.bodies)
-    )
+    if len(clip.bodies) > 1:
+        return ("side by side", *clip.overlays, *clip.bodies)
+    return tuple(clip.bodies)
 
 
 class Viewer:
@@ -61,11 +59,9 @@ class Viewer:
     Errors: ConfigError without viser, or for a host that is no address of this machine."""
 
     def __init__(self, clips: Sequence[Clip], *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.clips, self.ended, self.drawing = (
-            {clip.name: clip for clip in clips},
-            threading.Event(),
-            threading.RLock(),
-        )
+        self.clips = {clip.name: clip for clip in clips}
+        self.ended = threading.Event()
+        self.drawing = threading.RLock()
         self.server = open_server(host, port)
         first = clips[0]
         gui = self.server.gui
@@ -106,10 +102,8 @@ class Viewer:
         )
         self.nodes = {}
         for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
-            centers, colors = (
-                clip.learned.centers[0].astype(np.float32),
-                clip.appearance.astype(np.float32),
-            )
+            centers = clip.learned.centers[0].astype(np.float32)
+            colors = clip.appearance.astype(np.float32)
             means, covariances, painted, opacities = clip.splats("learned", 0, "appearance")
             splats = scene.add_gaussian_splats(
                 f"/{name}/splats",
@@ -243,16 +237,13 @@ class Viewer:
                 opacities[:, None],
             )
         else:
-            colors = (
-                clip.appearance
-                if name == clip.reference
-                else clip.paint(frame, offered(self.color), name)
-            )
+            if name == clip.reference:
+                colors = clip.appearance
+            else:
+                colors = clip.paint(frame, offered(self.color), name)
             colors = np.full_like(colors, GRAY) if under else colors
-            points.points, points.colors = (
-                centers.astype(np.float32),
-                (255 * colors).astype(np.uint8),
-            )
+            points.points = centers.astype(np.float32)
+            points.colors = (255 * colors).astype(np.uint8)
         label.text = f"{name} (gray)" if under else name
         top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size
         middle = 0.5 * (centers.min(0) + centers.max(0))

@@ -161,24 +161,18 @@ def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
     """What the tables say of a claim, in words and figures."""
     figure = next(f for f in experiment.figures if f.label == claim.figure)
     rows = tables.get(claim.figure, {})
-    return (
-        within(experiment, claim, rows, tables)
-        if claim.most is not None
-        else ahead(figure, claim, rows)
-    )
+    if claim.most is not None:
+        return within(experiment, claim, rows, tables)
+    return ahead(figure, claim, rows)
 
 
 def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | None:
     """The cell of a column; of none the mean, or the only one."""
     if column is not None:
         return cells.get(column)
-    return (
-        cells["mean"]
-        if "mean" in cells
-        else next(iter(cells.values()))
-        if len(cells) == 1
-        else None
-    )
+    if "mean" in cells:
+        return cells["mean"]
+    return next(iter(cells.values())) if len(cells) == 1 else None
 
 
 @dataclass(frozen=True)
