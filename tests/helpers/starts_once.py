@@ -1,5 +1,5 @@
 """`sequence_start` once for all processes that share the tests: a start takes a second or two, and what most runs differ in comes
-after it. The first run of tests/integration/test_main_job.py is a process of its own, which finds its starts itself."""
+after it."""
 
 import hashlib
 import os

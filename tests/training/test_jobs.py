@@ -5,6 +5,7 @@ import io
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import threading
 from datetime import datetime, timedelta
 from pathlib import Path
 
+import forked
 import pytest
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -313,22 +315,29 @@ def test_a_second_stop_on_the_way_out_is_no_traceback(name):
 
 
 def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
+    """train.py's command but for the job itself, whose imports take a worker ten seconds."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    (tmp_path / "failing.py").write_text(
+        "from mosa.errors import ConfigError\n\n\ndef job(cfg):\n    raise ConfigError(f'seed: {cfg.seed}')\n"
+    )
+    program = """
+        from mosa.cli import train
+        from mosa.cli.configured import command
+        train.train = command("mosa.cli.train", "failing:job")
+        train.main()
+    """
+    (tmp_path / "program.py").write_text(textwrap.dedent(program))
     keys = [
         "hydra/launcher=joblib",
         "hydra.launcher.n_jobs=2",
-        f"hydra.sweep.dir={tmp_path}",
-        "debug=default",
-        "seed=-1,-2",
+        f"hydra.sweep.dir={tmp_path}/sweep",
+        "seed=1,2",
     ]
-    found = subprocess.run(
-        [sys.executable, "train.py", "-m", *keys],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    places = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+    found = subprocess.run([sys.executable, tmp_path / "program.py", "-m", *keys], cwd=ROOT, capture_output=True, text=True,
+                           timeout=300, env=places)  # fmt: skip
     assert found.returncode == 1 and "2 jobs of the sweep failed" in found.stderr
+    assert "0: ConfigError: seed: 1" in found.stderr and "1: ConfigError: seed: 2" in found.stderr
 
 
 OUTLIVED = """
@@ -433,52 +442,52 @@ def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkey
     assert (tmp_path / "failed" / "3.txt").read_text() == "ConfigError: seed: wrong\n"
 
 
+LAUNCHED = """
+    import sys
+    import warp as wp
+    from mosa.system import refused
+    wp.config.kernel_cache_dir = sys.argv[1]
+
+    @wp.kernel
+    def twice(x: wp.array(dtype=float)):
+        x[wp.tid()] = 2.0 * x[wp.tid()]
+
+    try:
+        wp.launch(twice, 1, inputs=[wp.ones(1, dtype=float, device="cpu")], device="cpu")
+    except Exception as error:
+        print(refused.explained(error))
+    else:
+        print("ran")
+"""
+
+
+@pytest.fixture(scope="module")
+def launched(tmp_path_factory):
+    """Launches a kernel of a folder of compiled ones in a process of its own, as a loaded kernel stays so; what it says."""
+    folder = tmp_path_factory.mktemp("launched")
+    (folder / "kernel.py").write_text(textwrap.dedent(LAUNCHED))
+
+    def launch(kernels: Path) -> str:
+        return forked.call(str(folder / "kernel.py"), str(kernels)).stdout.strip().splitlines()[-1]
+
+    assert launch(folder / "kernels") == launch(folder / "kernels") == "ran"
+    return folder / "kernels", launch
+
+
 @pytest.mark.parametrize(("ending", "damage"), [
     (".o", lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])),
     (".o", lambda file: file.write_bytes(b"")),
     (".o", lambda file: file.write_bytes(bytes(file.stat().st_size))), (".meta", lambda file: file.write_bytes(b"")),
 ])  # fmt: skip
-def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
-    """As a killed compiler or a full disk leave them; in a process of its own, as a kernel that is loaded stays so."""
-    (tmp_path / "kernel.py").write_text(
-        textwrap.dedent("""
-        import warp as wp
-        from mosa.system import refused
-        wp.config.kernel_cache_dir = "kernels"
-
-        @wp.kernel
-        def twice(x: wp.array(dtype=float)):
-            x[wp.tid()] = 2.0 * x[wp.tid()]
-
-        try:
-            wp.launch(twice, 1, inputs=[wp.ones(1, dtype=float, device="cpu")], device="cpu")
-        except Exception as error:
-            print(refused.explained(error))
-        else:
-            print("ran")
-    """)
-    )
-
-    def launched() -> str:
-        places = os.environ | {
-            "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-        }
-        told = subprocess.run(
-            [sys.executable, "kernel.py"],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            env=places,
-        )
-        return told.stdout.strip().splitlines()[-1]
-
-    assert launched() == "ran"
-    files = [file for file in (tmp_path / "kernels").rglob("*") if file.suffix == ending]
+def test_damaged_kernels_are_one_message(tmp_path, launched, ending, damage):
+    """As a killed compiler or a full disk leave them."""
+    compiled, launch = launched
+    kernels = Path(shutil.copytree(compiled, tmp_path / "kernels"))
+    files = [file for file in kernels.rglob("*") if file.suffix == ending]
     for file in files:
         damage(file)
-    found = launched()
-    assert files and str(tmp_path / "kernels") in found
+    found = launch(kernels)
+    assert files and str(kernels) in found
     assert "expected kernels as they were compiled, found some that cannot be loaded" in found
 
 
