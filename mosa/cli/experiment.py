@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mosa.config.composition import configuration
-from mosa.errors import ConfigError, MosaError
+from mosa.errors import ConfigError
 from mosa.system.console import say_version
-from mosa.system.refused import explained
+from mosa.system.refused import one_message
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
+from mosa.system.whole_files import made_folder
 
 if TYPE_CHECKING:
     from mosa.experiments.specification import Job
@@ -95,29 +96,16 @@ def main(words: list[str] | None = None) -> None:
     # or the jobs would go on without anyone who waits for them
     signal.signal(signal.SIGTERM, interrupt)
     with tolerant_output():  # hours of jobs do not end with whoever read their lines
-        code = code_of(words)
+        try:
+            with one_message():
+                code = run(arguments(sys.argv[1:] if words is None else words))
+        except KeyboardInterrupt:
+            print(
+                "\nstopped; the same command goes on from here, and --collect writes what is complete",
+                file=sys.stderr,
+            )
+            code = 130
     sys.exit(code)
-
-
-def code_of(words: list[str] | None) -> int:
-    """Exit code of a command line, of which a mistake or a stop is one message."""
-    try:
-        code = run(arguments(sys.argv[1:] if words is None else words))
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        code = 2
-    except Exception as error:
-        if (reason := explained(error)) is None:
-            raise
-        print(f"\n{reason}", file=sys.stderr)
-        code = 2
-    except KeyboardInterrupt:
-        print(
-            "\nstopped; the same command goes on from here, and --collect writes what is complete",
-            file=sys.stderr,
-        )
-        code = 130
-    return code
 
 
 def interrupt(*_) -> None:
@@ -172,8 +160,8 @@ def run(options: argparse.Namespace) -> int:
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0
-    writable("--runs", options.runs)
-    writable("--results", results)
+    made_folder(options.runs, "--runs")
+    made_folder(results, "--results")
     command, failed = shown(options), {}
     if not options.collect:
         from mosa.experiments.running import run_jobs
@@ -250,13 +238,3 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
         raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
     load_extensions(values.get("extensions"))
     check_configuration(values)
-
-
-def writable(where: str, folder: Path) -> None:
-    """Errors: ConfigError for a folder that cannot be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"{where}: expected a folder that can be written, found {folder} ({error.strerror})"
-        ) from error

@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mosa.config.build import plain
+from mosa.config.leaf_settings import EnvironmentsSettings
 from mosa.environments.arena import SIMULATORS
 from mosa.environments.policies import SEARCHES, Search
 from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, table
@@ -21,7 +22,6 @@ from mosa.errors import ConfigError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.settings import arguments_of, check
 from mosa.system.limits import named_device
-from mosa.training.preflight import check_environments
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ AT_A_TIME = 8
 
 def setting_of(values: dict) -> Setting:
     """Errors: ConfigError naming the key."""
-    check_environments(values)
+    EnvironmentsSettings.read(values)
     device, worlds = named_device(values["device"]), values["worlds"]
     if worlds == "auto":
         worlds = AT_A_TIME if device == "cpu" else values["trials"]

@@ -9,9 +9,11 @@ import re
 import sys
 import traceback
 from collections.abc import Iterator
+from contextlib import contextmanager
 from json import JSONDecodeError
 from pathlib import Path
 
+from mosa.errors import MosaError
 from mosa.system.caches import cache_home
 
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
@@ -144,6 +146,21 @@ def explained(error: Exception, folder: str | Path | None = None) -> str | None:
             f"; the fit is kept in {last}, and the same command with resume=auto goes on from there"
         )
     return f"MemoryError: {reason}"
+
+
+@contextmanager
+def one_message() -> Iterator[None]:
+    """What goes wrong within it by the user or the machine is one message and exit code 2."""
+    try:
+        yield
+    except Exception as error:
+        said = (
+            f"{type(error).__name__}: {error}" if isinstance(error, MosaError) else explained(error)
+        )
+        if said is None:
+            raise
+        print(f"\n{said}", file=sys.stderr)
+        sys.exit(2)
 
 
 def let_go() -> None:

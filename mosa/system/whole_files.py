@@ -11,14 +11,14 @@ from pathlib import Path
 from mosa.errors import ConfigError
 
 
-def made_folder(folder: str | Path) -> Path:
-    """Of an export, made with its parents. Errors: ConfigError where it cannot be written."""
+def made_folder(folder: str | Path, where: str = "export") -> Path:
+    """A folder, made with its parents. Errors: ConfigError beginning with `where`, where it cannot be written."""
     try:
         made = Path(folder)
         made.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
+            f"{where}: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
         ) from error
     return made
 

@@ -47,15 +47,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 class KeepLast(Checkpoint):
     """Saves `last.ckpt` after every step, so that an interruption costs no more than that."""
 
-    def __init__(self, folder: str | Path | None = None) -> None:
-        """folder: of the file; None: checkpoints/ in the trainer's default_root_dir."""
-        self.folder = folder
-
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        root = Path(trainer.default_root_dir)
-        self.path = (
-            root / "checkpoints" if self.folder is None else Path(self.folder)
-        ) / "last.ckpt"
+        self.path = Path(trainer.default_root_dir, "checkpoints", "last.ckpt")
 
     def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
         """The figures of an earlier run in this folder go: they would say that this one is complete."""

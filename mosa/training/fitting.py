@@ -17,7 +17,7 @@ from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
-from mosa.errors import ConfigError, DataError, SimulationDiverged
+from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
@@ -127,16 +127,8 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
             f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
             "check the checkpoint that it goes on from, or lower simulation.courant"
         ) from error
-    except (
-        ArithmeticError,
-        AttributeError,
-        FileNotFoundError,
-        LookupError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ) as error:
-        if begun or ckpt_path is None or lacks_memory(error):
+    except Exception as error:
+        if begun or ckpt_path is None or isinstance(error, MosaError) or lacks_memory(error):
             raise
         # Lightning takes its own entries as they are
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]

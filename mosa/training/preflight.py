@@ -12,7 +12,7 @@ from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
 from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
-from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
+from mosa.config.leaf_settings import CaptureSettings, SplatsSettings
 from mosa.config.record import RunRecord
 from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.data.io.splat_formats import check_formats
@@ -74,11 +74,6 @@ def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
 def check_capture(values: Mapping[str, Any]) -> CaptureSettings:
     """All that the configuration of `python -m mosa.capture` says by itself. Errors: ConfigError naming the key."""
     return CaptureSettings.read(values)
-
-
-def check_environments(values: Mapping[str, Any]) -> EnvironmentsSettings:
-    """All that the configuration of `python -m mosa.environments` says by itself. Errors: ConfigError naming the key."""
-    return EnvironmentsSettings.read(values)
 
 
 def check_particles(key: str, count: float) -> None:

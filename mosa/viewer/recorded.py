@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import logging
 import re
-import sys
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from mosa.errors import ConfigError, DataError, MosaError
+from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.marker_figures import MEASURED, PREDICTED
 from mosa.system.limits import named_device
-from mosa.system.refused import explained
+from mosa.system.refused import one_message
 from mosa.twin.twin import Twin
 from mosa.viewer.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.viewer.live import Live
@@ -323,17 +322,9 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
 
 
 def main(arguments: Sequence[str]) -> None:
-    try:
+    with one_message():
         chosen = options(arguments)
         viewer = opened(chosen)
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        sys.exit(2)
-    except Exception as error:
-        if (reason := explained(error)) is None:
-            raise
-        print(f"\n{reason}", file=sys.stderr)
-        sys.exit(2)
     port = viewer.server.get_port()
     if port != int(chosen["port"]):
         print(f"port {chosen['port']} is taken; serving on {port}")

@@ -66,7 +66,7 @@ PLACES = [  # command, its words, where memory ends, what is raised there
     ("splats", other("splats", f"ply={folder}/none.ply"), "mosa.splats.objects:check_splats", ALLOC),
     ("capture", other("capture", f"videos={folder}", f"poses={folder}", f"output={folder}/o"), "mosa.capture.making:check_capture",
      WARP),
-    ("environments", other("environments", "task=placement"), "mosa.environments.command:check_environments", TORCH),
+    ("environments", other("environments", "task=placement"), "mosa.environments.command:named_device", TORCH),
     ("view", [f"run={folder}"], "mosa.viewer.recorded:opened", HANDLE),
     ("experiment", ["table_time"], "mosa.cli.experiment:run", MODULE),
 ]  # fmt: skip
