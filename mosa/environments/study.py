@@ -218,9 +218,8 @@ def _identity(bench: Bench, simulator: str) -> dict[str, Any]:
     s, found = bench.setting, _plain(bench.setting)
     if simulator not in (UNTRAINED, "truth"):
         return found
-    if s.scene is not None:
-        known = {"name": s.scene}
-    else:
+    known: Mapping[str, Any] = {"name": s.scene}
+    if s.scene is None:
         known = scene_of(bench.simulator("learned").twin, s.checkpoint)
     return found | {"checkpoint": None, "scene": None, "truth": truth_of(known)}
 

@@ -110,17 +110,11 @@ class TwinWorlds:
         driven: Any = None,
     ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
-        listed = isinstance(starts, (list, tuple)) and all(
-            isinstance(start, Mapping) for start in starts
-        )
-        if starts is not None and not isinstance(starts, Mapping) and not listed:
+        each = [starts or {}] * len(which) if isinstance(starts, Mapping | None) else starts
+        if not isinstance(each, (list, tuple)) or not all(isinstance(s, Mapping) for s in each):
             raise ConfigError(
                 f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}"
             )
-        if starts is None or isinstance(starts, Mapping):
-            each = [dict(starts or {})] * len(which)
-        else:
-            each = list(starts)
         if len(each) != len(which):
             raise ConfigError(
                 f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"
