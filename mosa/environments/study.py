@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import logging
@@ -31,7 +30,8 @@ from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.tables import markdown
-from mosa.system.whole_files import write_whole, written_whole
+from mosa.system.whole_files import write_table as write_csv
+from mosa.system.whole_files import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -326,8 +326,7 @@ def write_table(
     page = folder / f"{task.name}.md"
     write_whole(page, "\n\n".join(text) + "\n")
     columns = ["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"]
-    with written_whole(page.with_suffix(".csv")) as partial, open(partial, "w", newline="") as file:
-        csv.writer(file).writerows([columns, *rows])
+    write_csv(page.with_suffix(".csv"), columns, rows)
     return page
 
 

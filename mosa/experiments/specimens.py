@@ -23,17 +23,10 @@ from mosa.evaluation.analysis.tables import markdown
 from mosa.evaluation.analysis.vibration import longitudinal_modulus
 from mosa.experiments.collecting import Record
 from mosa.experiments.report.drawing import WIDTH, legend, save, style_of
-from mosa.experiments.run_folders import (
-    checkpoint,
-    first_seeds,
-    label,
-    prefix,
-    pressed_file,
-    write_table,
-)
+from mosa.experiments.run_folders import checkpoint, first_seeds, label, prefix, pressed_file
 from mosa.experiments.specification import Experiment
 from mosa.modules.body.body import Body
-from mosa.system.whole_files import write_whole
+from mosa.system.whole_files import write_table, write_whole
 from mosa.twin.twin import Twin
 
 log = logging.getLogger(__name__)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -52,6 +53,14 @@ def write_whole(path: str | Path, text: str) -> None:
     """A text, as `written_whole` writes; lines end as they are given."""
     with written_whole(path) as partial:
         partial.write_bytes(text.encode())
+
+
+def write_table(
+    path: str | Path, header: Sequence[object], rows: Iterable[Sequence[object]]
+) -> None:
+    """A csv file."""
+    with written_whole(path) as partial, open(partial, "w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
 
 
 def _runs(number: str) -> bool:

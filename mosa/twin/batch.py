@@ -120,23 +120,14 @@ class TwinWorlds:
                 f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"
             )
         found: list[tuple[Start, World]] = []
+        more = {"colliders": colliders, "box": box, "driven": driven}
         for i, (b, given) in enumerate(zip(which, each)):
             StartArguments.read(given, f"starts[{b}]")
             if i and given is each[0]:
                 found.append(found[0])
                 continue
             try:
-                found.append(
-                    start_in(
-                        self.body,
-                        self.world,
-                        self.training_start,
-                        colliders=colliders,
-                        box=box,
-                        driven=driven,
-                        **given,
-                    )
-                )
+                found.append(start_in(self.body, self.world, self.training_start, **given, **more))
             except ConfigError as error:
                 raise ConfigError(f"starts[{b}]: {error}") from error
         return found

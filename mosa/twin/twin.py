@@ -327,26 +327,14 @@ class Twin:
         shown = with_solids(alone, solids, rollout.times, up, body.size / 30)
         images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
         lines = ground_lines(self.world, camera, body.size)
-        if lines:
-            drawn = [
-                on_ground(
-                    to_uint8(image),
-                    lines,
-                    1,
-                    torch.ones(3),
-                    np.max(
-                        [
-                            ground_shadow(part, self.world, camera, body.size)
-                            for part in points.tensor_split([len(alone.opacities)])
-                        ],
-                        0,
-                    ),
-                )
-                for image, points in zip(images, shown.means)
-            ]
-        else:
-            drawn = []
-        return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
+        if not lines:
+            return images
+        drawn = []
+        for image, points in zip(images, shown.means):
+            parts = points.tensor_split([len(alone.opacities)])
+            shadow = np.max([ground_shadow(p, self.world, camera, body.size) for p in parts], 0)
+            drawn.append(on_ground(to_uint8(image), lines, 1, torch.ones(3), shadow))
+        return torch.from_numpy(np.stack(drawn)).float() / 255
 
     def _met(
         self,
@@ -440,19 +428,9 @@ def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
     """Binary PLY with x y z [m] and 8-bit colours."""
-    vertex = np.empty(
-        len(points),
-        dtype=[
-            ("x", "f4"),
-            ("y", "f4"),
-            ("z", "f4"),
-            ("red", "u1"),
-            ("green", "u1"),
-            ("blue", "u1"),
-        ],
-    )
-    for i, name in enumerate(("x", "y", "z")):
-        vertex[name] = points[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        vertex[name] = np.clip(colors[:, i] * 255 + 0.5, 0, 255).astype(np.uint8)
+    kinds = {"x": "f4", "y": "f4", "z": "f4", "red": "u1", "green": "u1", "blue": "u1"}
+    vertex = np.empty(len(points), dtype=list(kinds.items()))
+    numbers = np.concatenate([points, np.clip(colors * 255 + 0.5, 0, 255)], 1)
+    for i, name in enumerate(kinds):
+        vertex[name] = numbers[:, i]
     PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path))
