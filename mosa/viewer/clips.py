@@ -22,7 +22,7 @@ from mosa.physics.contact.colliders import Shape
 from mosa.reconstruction.motion.cues import neighbourhood
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.rendering.observer import deformed_covariances
-from mosa.system.npz import read_npz
+from mosa.system.npz import Arrays
 from mosa.twin.rollout_file import shape_of
 from mosa.twin.shown_body import FILE, ShownBody
 from mosa.twin.twin import Twin
@@ -291,9 +291,12 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
             f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
             f"found no folder {folder}"
         )
-    learned = Arrays.of(
-        folder / "rollout.npz", needed=True
-    )  # first: what a run that has not ended lacks
+    learned = Arrays.of(folder / "rollout.npz")
+    if not learned.path.is_file():  # what a run that has not ended lacks
+        raise DataError(
+            f"{learned.path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
+            "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt"
+        )
     body = shown_body(folder, checkpoint)
     files = {kind: Arrays.of(folder / f"{kind}.npz") for kind in BODIES[:-1]} | {"learned": learned}
     spreads, tracked = Arrays.of(folder / "uncertainty.npz"), Arrays.of(folder / "markers.npz")
@@ -328,39 +331,6 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
     if not clips:
         raise DataError(f"{learned.path}: expected the rollouts of a run, found none")
     return clips
-
-
-@dataclass(frozen=True)
-class Arrays:
-    """What an npz file of a run holds, which may come from a stranger."""
-
-    path: Path
-    stored: dict[str, np.ndarray]
-
-    @classmethod
-    def of(cls, path: Path, needed: bool = False) -> Arrays:
-        """Empty where there is no file. Errors: DataError naming one that is damaged, or needed and not there."""
-        if needed and not path.is_file():
-            raise DataError(
-                f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
-                "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt"
-            )
-        return cls(path, read_npz(path) if path.is_file() else {})
-
-    def entry(self, key: str, *shape: int | None, holes: bool = False) -> np.ndarray | None:
-        """Numbers of this shape (None: of any length), None where there are none. holes: NaN may be among them. Errors: DataError
-        naming file and entry."""
-        found = self.stored.get(key)
-        if found is None:
-            return None
-        fits = len(shape) == found.ndim and all(a in (None, b) for a, b in zip(shape, found.shape))
-        if not fits or found.dtype.kind != "f" or not (holes or np.isfinite(found).all()):
-            said = ", ".join("any" if each is None else str(each) for each in shape)
-            raise DataError(
-                f"{self.path}: {key}: expected finite floating point numbers of shape ({said}), found {found.dtype} "
-                f"{found.shape}; all files must be of one run"
-            )
-        return found
 
 
 def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
