@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mosa.config.checkpoints import TENSORS, check_tensors, checked_splats
+from mosa.config.checkpoints import TENSORS, check_tensors
+from mosa.config.record import SplatsRecord
 from mosa.errors import DataError, MosaError
 from mosa.modules.body.body import Body, World
 from mosa.rendering.appearance.carried_splats import CarriedSplats
@@ -47,15 +48,15 @@ class ShownBody:
         Errors: DataError naming file and part."""
         file = Arrays(path, read_npz(path))
         found = {name: torch.from_numpy(array) for name, array in file.stored.items()}
+        written = {
+            name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)
+        }
         try:
-            check_tensors({name: found.get(name) for name in TENSORS}, path)
-            written = {
-                name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)
-            }
-            known = checked_splats(written or None, path)
-            splats = None if known is None else CarriedSplats.read(known, found["rest"])
+            check_tensors({name: found.get(name) for name in TENSORS})
+            known = SplatsRecord.read(written, "splats").plain() if written else None
         except MosaError as error:
-            raise DataError(str(error).removeprefix("ckpt_path: ")) from error
+            raise DataError(f"{path}: {error}") from error
+        splats = None if known is None else CarriedSplats.read(known, found["rest"])
         factor, up = file.entry("factor", len(found["rest"])), file.entry("up", 3)
         ground = file.entry("ground")
         if factor is None or up is None or not up.any():
