@@ -271,29 +271,24 @@ def sequence_metrics(
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
     # without a camera there is nothing to compare
     images = render(body, rollout, scene, cameras) if cameras else scene.images
-    figures: Mapping[str, float] = {
-        **motion_metrics(x, body, sequence, frames, settings, target),
-        **image_metrics(images, scene, cameras, frames),
-    }
-    result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
+
+    def measured(part: str, frames: list[int]) -> dict[str, float]:
+        figures = motion_metrics(x, body, sequence, frames, settings, target)
+        figures |= image_metrics(images, scene, cameras, frames)
+        return {f"{model}{part}/{k}": v for k, v in figures.items()}
+
+    result = measured(sequence.prefix, frames)
     if "frames" in parts:
-        held = list(scene.holdout_frames)
-        figures = {
-            **motion_metrics(x, body, sequence, held, settings, target),
-            **image_metrics(images, scene, cameras, held),
-        }
-        result |= {f"{model}frames/{k}": v for k, v in figures.items()}
+        result |= measured("frames", list(scene.holdout_frames))
     if "camera" in parts:
         held = list(scene.holdout_cameras)
-        images = render(body, rollout, scene, held)
-        result |= {
-            f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()
-        }
+        seen_there = render(body, rollout, scene, held)
+        figures = image_metrics(seen_there, scene, held, frames)
+        result |= {f"{model}camera/{k}": v for k, v in figures.items()}
         for t in frames:
-            per_frame = image_metrics(images, scene, held, [t])
-            result |= {
-                f"{model}camera/frame_{t:02d}/{k}": per_frame[k] for k in ("psnr_crop", "ssim_crop")
-            }
+            figures = image_metrics(seen_there, scene, held, [t])
+            where = f"{model}camera/frame_{t:02d}"
+            result |= {f"{where}/{k}": figures[k] for k in ("psnr_crop", "ssim_crop")}
     return result
 
 

@@ -26,14 +26,16 @@ from mosa.viewer.live import Live
 from mosa.viewer.live_viewer import LiveViewer
 from mosa.viewer.pages import (
     add_ground,
+    add_points,
     add_solid,
     aim,
     beside_panel,
     offered,
     open_server,
+    splat_parts,
     turn,
     view_of,
-)
+)  # fmt: skip
 
 GEOMETRY = ("splats", "particles")
 
@@ -95,39 +97,17 @@ class Viewer:
             add_ground(
                 scene, clip.up, clip.across, clip.world.ground.height, clip.size, target, far
             )
-        # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
-        self.unit = float(
-            np.sqrt(np.linalg.eigvalsh(clip.splats("learned", 0, "appearance")[1]).max())
-        )
-        self.nodes = {}
+        whole = clip.splats("learned", 0, "appearance")
+        self.unit = float(np.sqrt(np.linalg.eigvalsh(whole[1]).max()))
+        self.nodes, centers = {}, clip.learned.centers[0]
         for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
-            centers = clip.learned.centers[0].astype(np.float32)
-            colors = clip.appearance.astype(np.float32)
-            means, covariances, painted, opacities = clip.splats("learned", 0, "appearance")
-            splats = scene.add_gaussian_splats(
-                f"/{name}/splats",
-                means.astype(np.float32),
-                covariances,
-                painted,
-                opacities[:, None],
-                scale=self.unit,
-                visible=False,
-            )
+            parts = splat_parts(1.0, *whole)
             spacing = 0.5 * clip.size / len(centers) ** (1 / 3)
-            points = scene.add_point_cloud(
-                f"/{name}/particles",
-                centers,
-                colors,
-                point_size=spacing,
-                point_shape="circle",
-                precision="float32",
-                visible=False,
-            )
             self.nodes[name] = (
-                splats,
-                points,
+                scene.add_gaussian_splats(f"/{name}/splats", *parts, scale=self.unit, visible=False),
+                add_points(scene, f"/{name}/particles", centers, clip.appearance.astype(np.float32), spacing, visible=False),
                 scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
-            )
+            )  # fmt: skip
 
         self.solids = {
             (each.name, place): [
@@ -137,18 +117,9 @@ class Viewer:
             for each in clips
             for place in range(len(each.bodies))
         }
-        self.points = [
-            scene.add_point_cloud(
-                f"/points/{kind}",
-                np.zeros((1, 3), np.float32),
-                color,
-                point_size=0.02 * clip.size,
-                point_shape="circle",
-                precision="float32",
-                visible=False,
-            )
-            for kind, color in (("measured", MEASURED), ("predicted", PREDICTED))
-        ]
+        none, size = np.zeros((1, 3)), 0.02 * clip.size
+        self.points = [add_points(scene, f"/points/{kind}", none, color, size, visible=False)
+                       for kind, color in (("measured", MEASURED), ("predicted", PREDICTED))]  # fmt: skip
 
     def look(self, *cameras) -> None:
         """The current sequence's first view, for what viser calls cameras."""
@@ -189,14 +160,8 @@ class Viewer:
             for name, nodes in self.nodes.items():
                 shown = name in clip.bodies and (layout == "side by side" or name in (above, below))
                 shown = shown and frame < len(clip.bodies[name].centers)
-                for node, wanted in zip(
-                    nodes,
-                    (
-                        offered(self.geometry) == "splats",
-                        offered(self.geometry) == "particles",
-                        True,
-                    ),
-                ):
+                kind = offered(self.geometry)
+                for node, wanted in zip(nodes, (kind == "splats", kind == "particles", True)):
                     node.visible = shown and wanted
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
@@ -226,19 +191,14 @@ class Viewer:
         centers = clip.bodies[name].centers[frame] + shift
         if splats.visible:
             means, covariances, colors, opacities = clip.splats(name, frame, offered(self.color))
-            colors, opacities = (
-                (np.full_like(colors, GRAY), FAINT * opacities) if under else (colors, opacities)
-            )
+            if under:
+                colors, opacities = np.full_like(colors, GRAY), FAINT * opacities
             splats.set_gaussians(
-                ((means + shift) / self.unit).astype(np.float32),
-                covariances / self.unit**2,
-                colors,
-                opacities[:, None],
+                *splat_parts(self.unit, means + shift, covariances, colors, opacities)
             )
         else:
-            if name == clip.reference:
-                colors = clip.appearance
-            else:
+            colors = clip.appearance
+            if name != clip.reference:
                 colors = clip.paint(frame, offered(self.color), name)
             colors = np.full_like(colors, GRAY) if under else colors
             points.points = centers.astype(np.float32)
