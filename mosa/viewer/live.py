@@ -140,7 +140,7 @@ class Live:
 
     def soften(self, E: float) -> None:
         """Young's modulus [Pa] of the drops to come."""
-        self.twin.material.E = E
+        self.twin.material.set(E=E)
 
     def reset(self) -> bool:
         """Back to the beginning of the last drop, the ball at home, paused."""
