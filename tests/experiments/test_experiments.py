@@ -568,6 +568,7 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(
     cache, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(specimens, "ANGLES", 4)
+    monkeypatch.setattr(running, "PROGRAM", "starts_once:train")
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
              "--only", "method=ours"]  # fmt: skip
     more = [f"scene.cache={cache}", "evaluation.samples=500", "evaluation.assignment=100"]

@@ -17,6 +17,15 @@ FOLDER = "TESTS_STARTS"
 """Variable of the environment: where they are kept; tests/conftest.py sets it, and a fork has it too."""
 
 
+def train() -> None:
+    """train.py, which finds a start once."""
+    from mosa.cli.train import main
+    from mosa.training import datamodule
+
+    datamodule.sequence_start = start_once
+    main()
+
+
 def start_once(shape: RestShape, seen: Appearance, scene: Scene, **named: bool):
     """By all that a start is found from: the body, how it looks, its film and its world."""
     if FOLDER not in os.environ or scene.markers is not None:
