@@ -431,12 +431,12 @@ def test_eval_puts_the_starts_where_the_body_is(run, tmp_path, monkeypatch):
 def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monkeypatch):
     raised = Ground(0.07, "separate", 0.3)
 
-    def scenes(run_config):
-        scene, others = load(run_config)
+    def scenes(keys):
+        scene, others = load(keys)
         return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), others
 
-    load = pipeline.scenes
-    monkeypatch.setattr(pipeline, "scenes", scenes)
+    load = pipeline.load_sequences
+    monkeypatch.setattr(pipeline, "load_sequences", scenes)
     monkeypatch.setattr(
         pipeline,
         "sequence_start",
