@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from torch import Tensor
+
 from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.errors import ConfigError
 from mosa.evaluation.uncertainty import DRAWS
@@ -105,17 +107,23 @@ def check_before_data(cfg: Mapping[str, Any], most: int) -> None:
 def check_with_data(cfg: Mapping[str, Any], scene: Scene, others: int, most: int) -> None:
     """`check_memory` of films that were read, with `others` further sequences. most: particles where their number is left open.
     Errors: ConfigError."""
-    chosen, origins, directions, tangents = lines_of_sight(scene, 0)
-    radius = float((scene.box[1] - scene.box[0]).min()) / 6
-    if len(chosen) >= 2:
-        place, _ = misses(origins, directions, tangents)
-        radius = float((tangents * ((place - origins) * directions).sum(1)).mean())
+    seen = ball_of(scene)
+    radius = float((scene.box[1] - scene.box[0]).min()) / 6 if seen is None else seen[1]
     particles, dx = particles_of(cfg, most), cfg["simulation"]["dx"]
     if dx is not None:
         cells = 4.2 * min(radius / dx, 1e30) ** 3
         particles = round(cells * cfg["simulation"]["particles_per_cell"])
     cameras, frames, height, width = scene.images.shape[:4]
     check_memory(cfg, Size(particles, cameras, frames, height * width, 1 + others))
+
+
+def ball_of(scene: Scene) -> tuple[Tensor, float] | None:
+    """(centre (3,), radius) [m] of the object as frame 0 shows it; None where fewer than two mattes are whole."""
+    chosen, origins, directions, tangents = lines_of_sight(scene, 0)
+    if len(chosen) < 2:
+        return None
+    place, _ = misses(origins, directions, tangents)
+    return place, float((tangents * ((place - origins) * directions).sum(1)).mean())
 
 
 def particles_of(cfg: Mapping[str, Any], most: int) -> int:

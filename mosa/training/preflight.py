@@ -14,7 +14,6 @@ from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import CaptureSettings, SplatsSettings
 from mosa.config.record import RunRecord
-from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
@@ -25,6 +24,7 @@ from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
 from mosa.system.limits import counted
+from mosa.training.memory import ball_of
 from mosa.twin.presets import preset
 from mosa.twin.twin import Twin
 from mosa.types import REST, Scene
@@ -104,22 +104,15 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
     world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
-    turn_along(
-        [
-            *([ground_plane(world.ground, world.up)] if world.ground is not None else []),
-            *world.planes,
-        ]
-    )
-    chosen, origins, directions, radii = lines_of_sight(scene, 0)
-    if len(chosen) < 2:
+    ground = [] if world.ground is None else [ground_plane(world.ground, world.up)]
+    turn_along([*ground, *world.planes])
+    if (seen := ball_of(scene)) is None:
         return
-    place, _ = misses(origins, directions, radii)
+    place, radius = seen
     solids = colliders_from_config(plain(cfg.world)["colliders"] or ())
     check_clear(solids, place[None], "the object, as frame 0 shows it,")
-    dx, radius = cfg.simulation.dx, float((radii * ((place - origins) * directions).sum(1)).mean())
-    if dx is not None:
+    if (dx := cfg.simulation.dx) is not None:
         count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
-        check_particles("simulation.dx", count)
         if count < FEWEST:
             raise ConfigError(
                 f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
