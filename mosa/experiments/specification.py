@@ -278,26 +278,16 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
                 found[folder] = replace(known, places=(*known.places, place))
                 continue
             parts = {each: each.split("=")[0].split(".") for each in overrides}
-            film = [
-                each
-                for each, key in parts.items()
-                if key[0] in ("scene", "experiment") and key[1:] not in USES
-            ]
+            uses = ("scene", "experiment")
+            film = [each for each, key in parts.items() if key[0] in uses and key[1:] not in USES]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
+            shared = " ".join(film), " ".join([*film, *rest])
             minutes = {
                 device: value * math.prod(option.cost_on(device) for option in options)
                 for device, value in experiment.minutes.items()
             }
-            found[folder] = Job(
-                folder,
-                overrides,
-                seed,
-                (place,),
-                minutes,
-                " ".join(film),
-                " ".join([*film, *rest]),
-                experiment.alone,
-            )
+            alone = experiment.alone
+            found[folder] = Job(folder, overrides, seed, (place,), minutes, *shared, alone)
     return list(found.values())
 
 

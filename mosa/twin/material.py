@@ -182,13 +182,8 @@ class TwinMaterial:
         if settings:
             prior = {} if new else settings.get("prior", {})
             values, law = values_of(material), material.law.removesuffix(DAMPED)
-            settings["prior"] = {
-                **prior,
-                "law": law,
-                "parameters": values,
-                "candidates": None,
-                "frozen": None,
-            }
+            chosen = {"law": law, "parameters": values, "candidates": None, "frozen": None}
+            settings["prior"] = {**prior, **chosen}
             if body.adapter is None:
                 settings["adapter"] = {"name": None}
             if body.heterogeneity is None:

@@ -151,16 +151,8 @@ def add_ground(
     # lines at multiples of the width
     at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ up])
     extent = 2 * width * math.ceil(far / width)
-    scene.add_grid(
-        "/ground",
-        extent,
-        extent,
-        plane="xy",
-        cell_size=width,
-        section_size=10 * width,
-        position=at,
-        wxyz=turn(axes),
-    )
+    look = {"plane": "xy", "cell_size": width, "section_size": 10 * width}
+    scene.add_grid("/ground", extent, extent, position=at, wxyz=turn(axes), **look)
 
 
 def turn(rotation: np.ndarray) -> np.ndarray:

@@ -105,13 +105,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             f"## Without images\n\nLaws learned from the true motion of a body: {', '.join(beside)}."
         )
     page = results.parent / "results.md"
-    header = [
-        "",
-        "jobs complete",
-        "commit (changes of the program since)",
-        "the paper's claims",
-        "claims about ours",
-    ]
+    header = ["", "jobs complete", "commit (changes of the program since)", "the paper's claims", "claims about ours"]  # fmt: skip
     whole = [INTRODUCTION, markdown(header, lines), *parts]
     write_whole(page, "\n\n".join(whole) + "\n")
     return page
