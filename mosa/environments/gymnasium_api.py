@@ -48,13 +48,9 @@ def arena_of(
 ) -> Arena:
     """Errors: ConfigError, DataError."""
     made = simulator_named(simulator, checkpoint, scene=scene, device=device, spacing=spacing)
-    return Arena(
-        made,
-        task
-        if isinstance(task, Task)
-        else task_named(task, made.twin.body.rest, **(options or {})),
-        worlds,
-    )
+    if not isinstance(task, Task):
+        task = task_named(task, made.twin.body.rest, **(options or {}))
+    return Arena(made, task, worlds)
 
 
 def action_space(task: Task) -> spaces.Box:

@@ -331,13 +331,8 @@ def floor_figures(
         if scene.truth is not None or scene.particles is not None
     ]
     if clouds:
-        floors = metrics.sampling_floors(
-            clouds[0],
-            len(body.rest),
-            len(clouds[0]),
-            samples=settings.samples,
-            assignment=settings.assignment,
-        )
+        sizes = {"samples": settings.samples, "assignment": settings.assignment}
+        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), **sizes)
         figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}
     return figures
 
@@ -390,13 +385,8 @@ def law_figures(body: Body) -> dict[str, float]:
         return {}
     figures = {}
     adapter.follow(material.poisson())
-    growth = vibration_growth(
-        material,
-        adapter,
-        density=body.density,
-        stride=body.settings.stride,
-        law_options=body.law_options,
-    )
+    run = {"stride": body.settings.stride, "law_options": body.law_options}
+    growth = vibration_growth(material, adapter, density=body.density, **run)
     figures["id/growth_per_period"] = growth
     if growth > GROWTH_LIMIT:
         warn(

@@ -116,12 +116,8 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             log.warning("%s: %s", record.job.folder.name, error)
             models[each] = None
             continue
-        models[each] = {
-            "modulus_Pa": [p.modulus for p in own],
-            "force_off": max(
-                abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(own, true)
-            ),
-        }
+        off = [abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(own, true)]
+        models[each] = {"modulus_Pa": [p.modulus for p in own], "force_off": max(off)}
     found = {"degrees": degrees, "truth_Pa": [p.modulus for p in true], "models": models}
     write_whole(kept, json.dumps(found, indent=1) + "\n")
     return found

@@ -126,15 +126,8 @@ class Fitting:
             return np.concatenate([misfit / noise, theta[self.own] / sigma, prior])
 
         def solve(theta: np.ndarray, evaluations: int):
-            return least_squares(
-                residuals,
-                theta,
-                args=(noise, sigma),
-                diff_step=1e-6,
-                ftol=1e-7,
-                xtol=1e-7,
-                max_nfev=evaluations,
-            )
+            ends = {"diff_step": 1e-6, "ftol": 1e-7, "xtol": 1e-7, "max_nfev": evaluations}
+            return least_squares(residuals, theta, args=(noise, sigma), **ends)
 
         best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
         if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:

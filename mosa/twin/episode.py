@@ -349,14 +349,8 @@ class Episode:
             v, w, end = self._twist(commands.get(k, {}), x, R)
             turns = w.requires_grad or bool((w != 0).any())
             turned = exponential(times * w) @ R if turns else R.expand(count, *R.shape)
-            columns.append(
-                [
-                    x + times * v + self._raised,
-                    turned,
-                    v.expand(count, *x.shape),
-                    w.expand(count, *x.shape),
-                ]
-            )
+            speeds = v.expand(count, *x.shape), w.expand(count, *x.shape)
+            columns.append([x + times * v + self._raised, turned, *speeds])
             after = exponential(self.frame_dt * w) @ R if turns else R
             last.append([end.get("position", x + self.frame_dt * v), end.get("rotation", after)])
         axis = 1 + len(self._leading())

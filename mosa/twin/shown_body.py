@@ -62,12 +62,8 @@ class ShownBody:
         if factor is None or up is None or not up.any():
             raise DataError(f"{path}: factor, up: expected both, and a direction that is not 0")
         vertical = torch.from_numpy(up).float()
-        world = World(
-            None if ground is None else Ground(float(ground)),
-            torch.zeros(3),
-            vertical / vertical.norm(),
-            torch.zeros(2, 3),
-        )
+        met = None if ground is None else Ground(float(ground))
+        world = World(met, torch.zeros(3), vertical / vertical.norm(), torch.zeros(2, 3))
         parts = (
             found[name].float() for name in ("rest", "colors", "opacities", "covariances", "factor")
         )

@@ -316,13 +316,8 @@ class Twin:
             toward = float(toward.norm()) * given / given.norm()
         eye = target + distance * toward
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-        camera = Cameras(
-            K[None].to(body.rest),
-            look_at(eye, target, up)[None].to(body.rest),
-            size,
-            size,
-            ("view",),
-        )
+        K, w2c = (t[None].to(body.rest) for t in (K, look_at(eye, target, up)))
+        camera = Cameras(K, w2c, size, size, ("view",))
         alone = seen(body, rollout.x, rollout.F_tot)
         shown = with_solids(alone, solids, rollout.times, up, body.size / 30)
         images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()

@@ -241,12 +241,8 @@ class Clip:
         if motion.carried is None:
             return motion.centers[frame], motion.covariances[frame], colors, self.opacities
         colors = motion.carried.colors[frame] if plain else colors[self.splat_particles]
-        return (
-            motion.carried.centers[frame],
-            motion.carried.covariances[frame],
-            colors,
-            self.splat_opacities,
-        )
+        carried = motion.carried
+        return carried.centers[frame], carried.covariances[frame], colors, self.splat_opacities
 
     def caption(self, frame: int) -> str:
         """What a frame is, and what the scene leaves out."""

@@ -137,17 +137,10 @@ def drawn(
     if colors is None:
         return seen(body, rollout.x, rollout.F_tot).images(cameras, background)[0].clamp(0, 1).cpu()
     covariances = deformed_covariances(rollout.F_tot, body.covariances)
-    parts = [
-        observe(
-            rollout.x[[t]],
-            covariances[[t]],
-            body.opacities,
-            colors[t].to(body.colors),
-            cameras,
-            background,
-        ).images[0]
-        for t in range(len(rollout.x))
-    ]
+    parts = []
+    for t in range(len(rollout.x)):
+        own = rollout.x[[t]], covariances[[t]], body.opacities, colors[t].to(body.colors)
+        parts.append(observe(*own, cameras, background).images[0])
     return torch.cat(parts).clamp(0, 1).cpu()
 
 
