@@ -18,7 +18,8 @@ from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.modules.body.body import Body, Start, World
-from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.colliders import Collider, colliders_from_config
+from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
@@ -133,7 +134,7 @@ def warn_of_little(
     """A warning for a film that is learned from and ends when the object has hardly begun to deform, and for films of given motions
     alone, without a force. found: starts by prefix; scenes: theirs, in this order."""
     if world.colliders or world.planes or world.driven:
-        solids = (*world.colliders, *world.driven)
+        solids: list[Collider | Driven] = [*world.colliders, *world.driven]
         rests = all(
             scene.start == REST
             for prefix, scene in zip(found, scenes)
