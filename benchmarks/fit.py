@@ -42,29 +42,16 @@ def assembled(overrides: list[str], device: str):
     import lightning
     from hydra import compose, initialize_config_dir
 
+    from mosa.config.build import plain
+    from mosa.training.datamodule import SceneDataModule
+    from mosa.training.lit_mosa import LitMosa
+
     with initialize_config_dir(str(Path.cwd() / "conf"), version_base="1.3"):
         cfg = compose("train", overrides=overrides)
     lightning.seed_everything(cfg.seed, verbose=False)
-    try:
-        from mosa.training.assembly import assemble
-    except ModuleNotFoundError:  # a commit to compare with that has no such seam
-        module = assembled_from_parts(cfg, device)
-    else:
-        module = assemble(cfg, device, held_out=False).module
+    module = LitMosa(plain(cfg))
+    module.attach(SceneDataModule(cfg, device=device, held_out=False))
     return module, list(range(min(cfg.fit.views, len(module.takes[0].observations.cameras))))
-
-
-def assembled_from_parts(cfg, device: str):
-    """The module of f7484c1 and later commits without `mosa.training.assembly`, by their functions."""
-    from mosa.config.build import plain, run_config
-    from mosa.training import workflow as pipeline
-
-    scene, _ = pipeline.scenes(cfg)
-    reconstruction, dx = pipeline.reconstruct_scene(cfg, scene, device)
-    config = run_config(plain(cfg), scene, dx)
-    body = pipeline.body_of(reconstruction, config).to(device)
-    start = pipeline.starts(body, reconstruction, scene, [])["train"]
-    return pipeline.assemble_fit(cfg, scene, reconstruction, body, start, config, device)[0]
 
 
 class Steps:

@@ -24,7 +24,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from mosa.config.build import build_body
+from mosa.config.build import build_body, plain, world_of
 from mosa.config.record import BodyRecord
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.evaluation.evaluate import true_motion
@@ -43,7 +43,7 @@ from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.residuals import sampled
 from mosa.modules.fitting.training_sequences import Take
 from mosa.reconstruction.motion.response import Response
-from mosa.training.assembly import assemble
+from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa
 from mosa.types import MotionCues
 
@@ -64,22 +64,23 @@ def rms_mm(away: Tensor) -> float:
 def make(overrides: list[str], folder: Path, device: str) -> Path:
     """The problem of one scene, with cues of every sequence that it is learned from (scene.also_train)."""
     cfg = configuration(overrides)
-    made = assemble(cfg, device)
-    scene, body, chosen = made.scene, made.body, sampled(len(made.body.rest), torch.device("cpu"))
+    data, module = SceneDataModule(cfg, device=device), LitMosa(plain(cfg))
+    module.attach(data)
+    scene, body = data.scene, module.body
+    chosen = sampled(len(body.rest), torch.device("cpu"))
     # of the contact height that a run starts from, which a calibration under the wrong law may leave
     floors = {
-        each.prefix: floor_rollout(body, each.scene, made.world)[:, chosen].cpu()
-        for each in made.sequences
+        each.prefix: floor_rollout(body, each.scene, world_of(data.measured))[:, chosen].cpu()
+        for each in data.sequences
     }
     # as a run does before its joint stage: the cues once more, about the calibrated backbone's motion
-    module = made.module
     calibration = module.identifying(module.stages[0])
     calibration.search()
     fits.iterated(calibration, module.stages[0].iterations)
     module.inform()
     sequences, hidden = {}, hidden_of(scene)
     takes = iter(module.takes)  # the sequences that are learned from come first, in their order
-    for each in made.sequences:
+    for each in data.sequences:
         s = each.scene
         sequences[each.prefix] = {
             "start": each.start.written(), "contact": each.contact, "frames": s.frames,
@@ -97,7 +98,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
                 for part in dataclasses.fields(Response)
             }
     problem = {
-        "record": made.data.measured.plain(), "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
+        "record": data.measured.plain(), "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
         "factor": hidden.factor(body.rest.cpu().float()),
     }  # fmt: skip
@@ -108,7 +109,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
     path = folder / f"{name}_{len(body.rest)}.pt"
     folder.mkdir(parents=True, exist_ok=True)
     torch.save(problem, path)
-    for (prefix, s), each in zip(sequences.items(), made.sequences):
+    for (prefix, s), each in zip(sequences.items(), data.sequences):
         laid = (body.rest - body.center) @ each.start.rotation.T + each.start.center
         print(
             f"{path}: start of {prefix} off by {rms_mm(laid[chosen].cpu() - s['truth'][0]):.2f} mm",

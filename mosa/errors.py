@@ -11,11 +11,9 @@ class MosaError(Exception):
 
     def __str__(self) -> str:
         message = " ".join(super().__str__().splitlines())  # one line, whatever was found
-        return (
-            message
-            if len(message) <= LONGEST
-            else f"{message[: LONGEST - 500]} ... {message[-500:]}"
-        )
+        if len(message) <= LONGEST:
+            return message
+        return f"{message[: LONGEST - 500]} ... {message[-500:]}"
 
 
 class DataError(MosaError):

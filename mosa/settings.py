@@ -4,7 +4,8 @@ A field is written once, with its default, its range and a line of description:
 
     class Search(Settings):
         where = "search"
-        rate: Positive = Field(0.02, description="learning rate of Adam")
+        rate: Positive = 0.02
+        "learning rate of Adam"
 
 The checks of a configuration, Hydra's keys (`mosa.config.composition`), the reference (docs/reference/configuration.md) and the
 record of a run follow from the models. Nothing is converted: a flag is no number, a text is no number, a number is finite.
@@ -136,7 +137,8 @@ class Settings(BaseModel, metaclass=_Checked):
     expected and what was found."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, arbitrary_types_allowed=True, protected_namespaces=()
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, arbitrary_types_allowed=True, protected_namespaces=(),
+        use_attribute_docstrings=True,
     )  # fmt: skip
     where: ClassVar[str] = ""
     needs: ClassVar[dict[str, str]] = {}

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Held = TypeVar("Held", bound="DataclassInstance")
 
 
 def in_brief(held: Any) -> str:
@@ -32,6 +37,19 @@ def dense(value: Any) -> bool:
     if not isinstance(value, Tensor) or value.is_quantized or value.is_nested:
         return False
     return value.layout is torch.strided and not value.is_meta
+
+
+def moved(held: Held, device: torch.device | str) -> Held:
+    """A dataclass with its tensors, and those of its parts, on a device."""
+
+    def at(value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return value.to(device)
+        return (
+            moved(value, device) if is_dataclass(value) and not isinstance(value, type) else value
+        )
+
+    return replace(held, **{f.name: at(getattr(held, f.name)) for f in fields(held)})
 
 
 @dataclass(frozen=True)
@@ -62,7 +80,7 @@ class Cameras:
         )
 
     def to(self, device: torch.device | str) -> Cameras:
-        return replace(self, K=self.K.to(device), w2c=self.w2c.to(device))
+        return moved(self, device)
 
 
 AUTO = "auto"
@@ -199,7 +217,7 @@ class Splats:
     colors: Tensor
 
     def to(self, device: torch.device | str) -> Splats:
-        return Splats(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return moved(self, device)
 
 
 @dataclass(frozen=True)
@@ -217,10 +235,7 @@ class Appearance:
     light: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Appearance:
-        normals, light = (
-            None if value is None else value.to(device) for value in (self.normals, self.light)
-        )
-        return Appearance(self.splats.to(device), self.harmonics.to(device), normals, light)
+        return moved(self, device)
 
 
 @dataclass(frozen=True)
@@ -241,7 +256,7 @@ class MotionCues:
     covariances: Tensor
 
     def to(self, device: torch.device | str) -> MotionCues:
-        return MotionCues(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return moved(self, device)
 
     def first(self, frames: int) -> MotionCues:
         """Of the first `frames` frames."""
@@ -262,7 +277,7 @@ class MarkerCues:
     weights: Tensor
 
     def to(self, device: torch.device | str) -> MarkerCues:
-        return MarkerCues(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return moved(self, device)
 
     def first(self, frames: int) -> MarkerCues:
         """Of the first `frames` frames."""
@@ -377,14 +392,7 @@ class Rollout:
         return -(-sum(self.counts) // max(1, len(self.counts)))
 
     def to(self, device: torch.device | str) -> Rollout:
-        moved = {name: getattr(self, name).to(device) for name in ("x", "v", "F", "F_tot", "times")}
-        final = ParticleState(*(getattr(self.final, f.name).to(device) for f in fields(self.final)))
-        return replace(
-            self,
-            **moved,
-            final=final,
-            reactions=None if self.reactions is None else self.reactions.to(device),
-        )
+        return moved(self, device)
 
     def worlds(self) -> list[Rollout]:
         """The rollouts of B worlds, one by one; `inverted` is then of all of them."""

@@ -83,7 +83,7 @@ def f():
 def test_there_is_no_import_circle():
     graph = imports("mosa")
     assert (
-        "mosa.training.lit_mosa" in graph["mosa.training.assembly"]
+        "mosa.training.lit_mosa" in graph["mosa.training.workflow"]
         and "mosa.data.formats.pacnerf" in graph["mosa.data.scene"]
     )
     assert len(graph) > 150

@@ -39,10 +39,6 @@ class DirectAdapter(Adapter):
         b = raw if self.l_max is None else self.l_max * torch.tanh(raw)
         return rested(b[:-1], b[-1:], w, s) if self.rest_free else b[:-1]
 
-    def redistribution(self, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """(I (N, 6, 6), b (N, 6)): a black box redistributes nothing."""
-        return torch.eye(6).to(s).expand(len(s), 6, 6), self.increment(w, s)
-
     def forward(self, state: MaterialState) -> AdapterOperator:
         """As `StressAdapter.forward`, with G = 0."""
         self.check_on()

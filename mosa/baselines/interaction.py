@@ -201,11 +201,5 @@ def following(X: np.ndarray, nodes: np.ndarray, tree: cKDTree) -> tuple[np.ndarr
     weight /= weight.sum(1, keepdims=True)
     center = np.einsum("nk,nka->na", weight, nodes[near])
     arms = nodes[near] - center[:, None]
-    return (
-        near,
-        weight,
-        center,
-        np.linalg.pinv(
-            np.einsum("nk,nka,nkb->nab", weight, arms, arms), rcond=1e-4, hermitian=True
-        ),
-    )
+    moments = np.einsum("nk,nka,nkb->nab", weight, arms, arms)
+    return near, weight, center, np.linalg.pinv(moments, rcond=1e-4, hermitian=True)

@@ -128,10 +128,6 @@ class NeuralLaw(Adapter):
         """(N, 6) dimensionless: the law's stress less the prior's s (N, 6)."""
         return self.stress(w) - s
 
-    def redistribution(self, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """(0 (N, 6, 6), stress (N, 6)): nothing of the prior's stress is redistributed."""
-        return s.new_zeros(len(s), 6, 6), self.stress(w)
-
     def forward(self, state: MaterialState) -> AdapterOperator:
         """The law's stress as an offset to the prior's, exact at the state it was asked at.
 

@@ -25,10 +25,8 @@ class LowRankLinear(nn.Linear):
     def __init__(self, held: nn.Linear, rank: int, scaling: float) -> None:
         super().__init__(held.in_features, held.out_features, bias=False)
         self.weight = nn.Parameter(held.weight.detach().clone(), requires_grad=False)
-        self.A, self.B = (
-            nn.Parameter(torch.empty(rank, held.in_features)),
-            nn.Parameter(torch.zeros(held.out_features, rank)),
-        )
+        self.A = nn.Parameter(torch.empty(rank, held.in_features))
+        self.B = nn.Parameter(torch.zeros(held.out_features, rank))
         nn.init.kaiming_uniform_(self.A, a=5**0.5)
         self.factor = scaling / rank
 

@@ -70,17 +70,8 @@ class Interactions:
         a, b, c = Fs.detach().unbind(-2)
         inverted = int(((a * torch.linalg.cross(b, c)).sum(-1) <= 0).sum())
         final = ParticleState(xs[-1], vs[-1], C, Fs[-1], Fs[-1])
-        return Rollout(
-            x=xs,
-            v=vs,
-            F=Fs,
-            F_tot=Fs,
-            times=times,
-            final=final,
-            inverted=inverted,
-            reactions=None,
-            counts=(self.substeps,) * (frames - 1),
-        )
+        counts = (self.substeps,) * (frames - 1)
+        return Rollout(xs, vs, Fs, Fs, times, final, inverted=inverted, counts=counts)
 
     def stepper(self, *_, **__) -> None:
         raise ConfigError(

@@ -35,6 +35,6 @@ def command(module: str, job: str) -> Callable[[], None]:
     )(run)
 
     def main() -> None:
-        run_command(configured, configuration())
+        run_command(configured)
 
     return main

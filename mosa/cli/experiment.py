@@ -8,14 +8,15 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mosa.config.composition import configuration
-from mosa.errors import ConfigError, MosaError
+from mosa.errors import ConfigError
 from mosa.system.console import say_version
-from mosa.system.refused import explained
+from mosa.system.refused import one_message
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
+from mosa.system.whole_files import made_folder
 
 if TYPE_CHECKING:
     from mosa.experiments.specification import Job
@@ -23,69 +24,31 @@ if TYPE_CHECKING:
 RESULTS = Path("docs/results")
 
 
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--quick": {"action": "store_true", "help": "the small variant, minutes on two cores"},
+    "--dry-run": {"action": "store_true", "help": "list the jobs with the estimated time, run nothing"},
+    "--collect": {"action": "store_true", "help": "run nothing, write the results of complete jobs"},
+    "--page": {"action": "store_true", "help": "write the page of all results beside their folder"},
+    "--specifications": {"type": Path, "metavar": "FOLDER", "help": "experiments of one's own, in "
+                         "place of the paper's (docs/reproduce.md)"},
+    "--runs": {"type": Path, "default": Path("experiments"), "help": "folder of the jobs' folders"},
+    "--results": {"type": Path, "help": "folder of the tables; default: docs/results, quick: RUNS/results"},
+    "--jobs": {"type": int, "default": 1, "help": "jobs side by side, on each device"},
+    "--devices": {"help": "GPUs by number, as 0,1; default: the CPU"},
+    "--seeds": {"help": "instead of the experiment's, as 0,1,2"},
+    "--only": {"action": "append", "metavar": "AXIS=NAME,NAME", "help": "these of an axis alone"},
+    "--set": {"action": "append", "metavar": "KEY=VALUE", "dest": "overrides", "help": "override for "
+              "every job, as train.py takes it"},
+}  # fmt: skip
+
+
 def arguments(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
-    parser.add_argument(
-        "names",
-        nargs="*",
-        metavar="NAME",
-        help="experiments, or all; the jobs of what is named first begin first; none: list them",
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="the small variant, minutes on two cores"
-    )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing"
-    )
-    parser.add_argument(
-        "--collect",
-        action="store_true",
-        help="run nothing, write the results of the jobs that are complete",
-    )
-    parser.add_argument(
-        "--page",
-        action="store_true",
-        help="write the page of all results, results.md beside their folder",
-    )
-    parser.add_argument(
-        "--specifications",
-        type=Path,
-        default=None,
-        metavar="FOLDER",
-        help="files of experiments of one's own, in place of the paper's (docs/reproduce.md)",
-    )
-    parser.add_argument(
-        "--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders"
-    )
-    parser.add_argument(
-        "--results",
-        type=Path,
-        default=None,
-        help="folder of the tables; default: docs/results, quick: RUNS/results",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=1,
-        help="jobs side by side, on each device where there are devices",
-    )
-    parser.add_argument("--devices", default=None, help="GPUs by number, as 0,1; default: the CPU")
-    parser.add_argument("--seeds", default=None, help="instead of the experiment's, as 0,1,2")
-    parser.add_argument(
-        "--only",
-        action="append",
-        default=[],
-        metavar="AXIS=NAME,NAME",
-        help="these of an axis alone",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="overrides",
-        help="override for every job, as train.py takes it",
-    )
+    first = "experiments, or all; the jobs of what is named first begin first; none: list them"
+    parser.add_argument("names", nargs="*", metavar="NAME", help=first)
+    parser.set_defaults(only=[], overrides=[])
+    for name, how in OPTIONS.items():
+        parser.add_argument(name, **how)
     return parser.parse_args(words)
 
 
@@ -95,29 +58,16 @@ def main(words: list[str] | None = None) -> None:
     # or the jobs would go on without anyone who waits for them
     signal.signal(signal.SIGTERM, interrupt)
     with tolerant_output():  # hours of jobs do not end with whoever read their lines
-        code = code_of(words)
+        try:
+            with one_message():
+                code = run(arguments(sys.argv[1:] if words is None else words))
+        except KeyboardInterrupt:
+            print(
+                "\nstopped; the same command goes on from here, and --collect writes what is complete",
+                file=sys.stderr,
+            )
+            code = 130
     sys.exit(code)
-
-
-def code_of(words: list[str] | None) -> int:
-    """Exit code of a command line, of which a mistake or a stop is one message."""
-    try:
-        code = run(arguments(sys.argv[1:] if words is None else words))
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        code = 2
-    except Exception as error:
-        if (reason := explained(error)) is None:
-            raise
-        print(f"\n{reason}", file=sys.stderr)
-        code = 2
-    except KeyboardInterrupt:
-        print(
-            "\nstopped; the same command goes on from here, and --collect writes what is complete",
-            file=sys.stderr,
-        )
-        code = 130
-    return code
 
 
 def interrupt(*_) -> None:
@@ -172,8 +122,8 @@ def run(options: argparse.Namespace) -> int:
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0
-    writable("--runs", options.runs)
-    writable("--results", results)
+    made_folder(options.runs, "--runs")
+    made_folder(results, "--results")
     command, failed = shown(options), {}
     if not options.collect:
         from mosa.experiments.running import run_jobs
@@ -250,13 +200,3 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
         raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
     load_extensions(values.get("extensions"))
     check_configuration(values)
-
-
-def writable(where: str, folder: Path) -> None:
-    """Errors: ConfigError for a folder that cannot be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"{where}: expected a folder that can be written, found {folder} ({error.strerror})"
-        ) from error

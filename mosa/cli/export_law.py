@@ -6,8 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from mosa.errors import MosaError
 from mosa.system.console import say_version
+from mosa.system.refused import one_message
 from mosa.system.threads import settle_threads
 
 
@@ -28,11 +28,8 @@ def main(words: list[str] | None = None) -> None:
     given = parser.parse_args(words)
     from mosa.export.run import LARGEST, export
 
-    try:
+    with one_message():
         differences = export(given.source, given.folder, given.check)
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        sys.exit(2)
     for name, value in differences.items():
         print(f"{name:14s} {value:.1e} relative difference at {given.check} deformations")
     if "umat stress" not in differences and given.check:

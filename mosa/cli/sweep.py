@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from mosa.errors import MosaError
 from mosa.system.console import say_version
+from mosa.system.refused import one_message
 
 
 def main(words: list[str] | None = None) -> None:
@@ -17,11 +16,8 @@ def main(words: list[str] | None = None) -> None:
     folder = parser.parse_args(words).folder
     from mosa.training.sweep_table import text_of, write_table
 
-    try:
+    with one_message():
         rows, files = write_table(folder)
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        sys.exit(2)
     print(text_of(rows))
     print("\nall figures: " + ", ".join(map(str, files)))
 

@@ -68,15 +68,10 @@ def build_world(config: Mapping[str, Any]) -> World:
     gravity, up, box = (
         torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box")
     )
-    return World(
-        ground,
-        gravity,
-        up,
-        box,
-        build_walls(config.get("walls"), box),
-        colliders_from_config(config.get("colliders") or ()),
-        driven_from_config(config.get("driven") or ()),
-    )
+    walls = build_walls(config.get("walls"), box)
+    solids = colliders_from_config(config.get("colliders") or ())
+    driven = driven_from_config(config.get("driven") or ())
+    return World(ground, gravity, up, box, walls, solids, driven)
 
 
 def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ...]:
@@ -94,15 +89,9 @@ def world_of(record: BodyRecord) -> World:
     """The world of a run: what was measured, and the walls and solids of its settings. Errors: ConfigError."""
     given = record.sections.world
     ground = None if record.ground is None else record.ground.plain()
-    return build_world(
-        record.world.plain()
-        | {
-            "ground": ground,
-            "walls": given.walls,
-            "colliders": given.colliders,
-            "driven": [*record.world.driven, *(given.driven or ())],
-        }
-    )
+    driven = [*record.world.driven, *(given.driven or ())]
+    own = {"ground": ground, "walls": given.walls, "colliders": given.colliders, "driven": driven}
+    return build_world(record.world.plain() | own)
 
 
 def measured(

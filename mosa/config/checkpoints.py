@@ -5,12 +5,12 @@ What is promised, and what is not, is in docs/safety.md.
 
 from __future__ import annotations
 
-import math
 import os
 import pickletools
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.config.record import VERSION, BodyRecord, PosteriorRecord, RunRecord, SplatsRecord
+from mosa.config.record import VERSION, BodyRecord, PosteriorRecord, RunRecord
 from mosa.data.formats.footage import read_json
-from mosa.errors import ConfigError, DataError
+from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation.uncertainty import INFLATION
 from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.settings import Names, check
 from mosa.system.limits import machine_memory
+from mosa.types import dense
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
@@ -51,17 +52,26 @@ SPACING = 0.02, 5.0
 """Distance between particles, in cells: 1/64 to 50 of them in a cell's volume, with room."""
 
 
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Errors: DataError naming the file, for whatever is wrong with it."""
+    try:
+        yield
+    except MosaError as error:
+        raise DataError(f"ckpt_path: {path}: {error}") from error
+
+
 def read_checkpoint(path: str | Path) -> dict:
     """The checkpoint's dictionary: plain containers and dense tensors, nothing executed. Errors: DataError naming the file."""
     if not isinstance(path, (str, Path)):
         raise DataError(f"ckpt_path: expected the path of a checkpoint, found {path!r}")
-    path = Path(path)
     try:
-        if not path.is_file():
+        if not Path(path).is_file():
             raise DataError(
                 f"ckpt_path: no file {path}; a run writes <run folder>/checkpoints/last.ckpt"
             )
-        check_archive(path)
+        with reading(path):
+            check_archive(Path(path))
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except DataError:
         raise
@@ -70,45 +80,38 @@ def read_checkpoint(path: str | Path) -> dict:
         raise DataError(
             f"ckpt_path: {path} is not a readable checkpoint ({type(error).__name__}: {first})"
         ) from error
-    check_containers(checkpoint, path)
-    if not isinstance(checkpoint, dict) or "mosa" not in checkpoint:
-        raise DataError(f"ckpt_path: {path} was not written by this program (no entry 'mosa')")
-    saved = checkpoint["mosa"]
-    version = saved.get("version") if isinstance(saved, dict) else None
-    if version != VERSION or isinstance(version, bool):
-        raise DataError(
-            f"ckpt_path: {path}: mosa.version: expected {VERSION}, found {str(version)[:80]!r}: it is of another version of this "
-            "program, whose records are not read; learn it again"
-        )
+    with reading(path):
+        check_containers(checkpoint)
+        if not isinstance(checkpoint, dict) or "mosa" not in checkpoint:
+            raise DataError("was not written by this program (no entry 'mosa')")
+        saved = checkpoint["mosa"]
+        version = saved.get("version") if isinstance(saved, dict) else None
+        if version != VERSION or isinstance(version, bool):
+            raise DataError(
+                f"mosa.version: expected {VERSION}, found {str(version)[:80]!r}: it is of another version of this program, whose "
+                "records are not read; learn it again"
+            )
     return checkpoint
 
 
 def check_archive(path: Path) -> None:
     """The archive unpacks to no more than its own size, and its pickle names nothing but tensors. Errors: DataError."""
+    unreadable = "not a readable checkpoint"
     if not zipfile.is_zipfile(path):
-        raise DataError(
-            f"ckpt_path: {path} is not a readable checkpoint (expected a zip archive: cut off, or another file?)"
-        )
-    size = path.stat().st_size
-    if size > machine_memory():
-        raise DataError(
-            f"ckpt_path: {path} has {size / 1e9:.1f} GB, this machine {machine_memory() / 1e9:.1f} GB of memory"
-        )
+        raise DataError(f"{unreadable} (expected a zip archive: cut off, or another file?)")
+    if (size := path.stat().st_size) > machine_memory():
+        raise DataError(f"{size / 1e9:.1f} GB are more than this machine's memory")
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > size:
             raise DataError(
-                f"ckpt_path: {path} unpacks to more than its {size} bytes; a run's checkpoint is not compressed"
+                f"unpacks to more than its {size} bytes; a run's checkpoint is not compressed"
             )
         names = archive.namelist()
         if len(set(names)) < len(names):
-            raise DataError(
-                f"ckpt_path: {path} is not a readable checkpoint (an entry of its archive is there twice)"
-            )
+            raise DataError(f"{unreadable} (an entry of its archive is there twice)")
         # torch does not compare the sums: a flipped bit would be another number
         if (damaged := archive.testzip()) is not None:
-            raise DataError(
-                f"ckpt_path: {path} is damaged: its part {damaged} is not what was written (another sum)"
-            )
+            raise DataError(f"damaged: its part {damaged} is not what was written (another sum)")
         for entry in names:
             if not entry.endswith(".pkl"):
                 continue
@@ -116,8 +119,8 @@ def check_archive(path: Path) -> None:
                 # STACK_GLOBAL names nothing here, and is not written
                 if "GLOBAL" in code.name and named not in NAMED:
                     raise DataError(
-                        f"ckpt_path: {path} refers to {named or 'a function or class'}; a run's checkpoint holds "
-                        "numbers, texts and tensors only, and nothing else is loaded"
+                        f"refers to {named or 'a function or class'}; a run's checkpoint holds numbers, texts and tensors only, "
+                        "and nothing else is loaded"
                     )
 
 
@@ -134,7 +137,7 @@ def check_plain(where: str, value: Any) -> None:
         )
 
 
-def check_containers(checkpoint: Any, path: Path) -> None:
+def check_containers(checkpoint: Any) -> None:
     """Plain values in a bounded tree, whole tensors, no interpolation. Errors: DataError."""
     left, waiting = NODES, [(checkpoint, 0, "")]
     while waiting:
@@ -142,63 +145,55 @@ def check_containers(checkpoint: Any, path: Path) -> None:
         left -= 1
         if left < 0 or depth > DEPTH:
             raise DataError(
-                f"ckpt_path: {path}: expected at most {NODES} entries in {DEPTH} levels, found more at {where}"
+                f"expected at most {NODES} entries in {DEPTH} levels, found more at {where}"
             )
         if isinstance(value, Mapping):
             if bad := [key for key in value if not isinstance(key, (str, int))]:
-                raise DataError(f"ckpt_path: {path}: {where}: expected names, found {bad[0]!r}")
+                raise DataError(f"{where}: expected names, found {bad[0]!r}")
             waiting += [(v, depth + 1, f"{where}.{k}".strip(".")) for k, v in value.items()]
         elif isinstance(value, (list, tuple)):
             waiting += [(v, depth + 1, where) for v in value]
         elif isinstance(value, Tensor):
-            plain = (
-                value.layout == torch.strided
-                and value.device.type == "cpu"
-                and not value.is_quantized
-            )
-            if not plain or value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            whole = dense(value) and value.device.type == "cpu"
+            if not whole or value.numel() * value.element_size() > value.untyped_storage().nbytes():
                 raise DataError(
-                    f"ckpt_path: {path}: {where}: expected a dense tensor of as many numbers as are stored, found one "
-                    f"of shape {tuple(value.shape)}"
+                    f"{where}: expected a dense tensor of as many numbers as are stored, found one of shape "
+                    f"{tuple(value.shape)}"
                 )
-        elif (
-            isinstance(value, str)
-            and where.startswith("mosa.settings")
-            and ("${" in value or "\0" in value)
-        ):
-            raise DataError(
-                f"ckpt_path: {path}: {where}: expected a value, found {value[:80]!r}: interpolations of a stored "
-                "configuration are not resolved"
-            )
         elif not isinstance(value, (str, int, float, type(None))):
             raise DataError(
-                f"ckpt_path: {path}: {where}: expected numbers, texts and tensors, found {type(value).__name__}"
+                f"{where}: expected numbers, texts and tensors, found {type(value).__name__}"
+            )
+        elif where.startswith("mosa.settings") and ("${" in str(value) or "\0" in str(value)):
+            raise DataError(
+                f"{where}: expected a value, found {value[:80]!r}: interpolations of a stored configuration are not resolved"
             )
 
 
 def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     """The record in a read checkpoint; its settings of the body are checked with it. Errors: DataError naming file and part."""
-    try:
+    with reading(f"{path}: stored record"):
         record = RunRecord.read(checkpoint["mosa"])
         adapter_class(record.sections.adapter.plain())
-    except ConfigError as error:
-        raise DataError(f"ckpt_path: {path}: stored record: {error}") from error
     return record
 
 
 def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[RunRecord, dict[str, Tensor]]:
     """(record, tensors of the body) of a read checkpoint. Errors: DataError naming file and part."""
     record, state = record_of(checkpoint, path), checkpoint.get("state_dict")
-    if not isinstance(state, Mapping):
-        raise DataError(f"ckpt_path: {path}: expected the part state_dict, found none")
-    tensors = {
-        k.removeprefix("body."): v
-        for k, v in state.items()
-        if isinstance(k, str) and k.startswith("body.")
-    }
-    check_tensors(tensors, path)
-    check_spacing(record, tensors, path)
+    with reading(path):
+        if not isinstance(state, Mapping):
+            raise DataError("expected the part state_dict, found none")
+        tensors = body_tensors(state)
+        check_tensors(tensors)
+        check_spacing(record, tensors)
     return record, tensors
+
+
+def body_tensors(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a module's state, by their names in the body."""
+    own = (k for k in state if isinstance(k, str) and k.startswith("body."))
+    return {k.removeprefix("body."): state[k] for k in own}
 
 
 def check_numbers(record: RunRecord, count: int, path: str | Path) -> None:
@@ -253,80 +248,59 @@ def _as_operator(name: str) -> str:
     return name if number == name else f"operator[{int(number) - 1}]"
 
 
-def checked_splats(found: Any, path: str | Path) -> dict[str, Tensor] | None:
-    """What `CarriedSplats.read` takes, of a file beside a rollout; None where there is none. Errors: DataError."""
-    try:
-        return None if found is None else SplatsRecord.read(found, "splats").plain()
-    except ConfigError as error:
-        raise DataError(f"{path}: {error}") from error
-
-
-def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
+def check_tensors(tensors: Mapping[str, Any]) -> None:
     """Shapes, types and numbers of a body's tensors. Errors: DataError naming the tensor."""
     if missing := [name for name in TENSORS if not isinstance(tensors.get(name), Tensor)]:
         raise DataError(
-            f"ckpt_path: {path}: expected the tensors {', '.join(TENSORS)} of a body, found no {', '.join(missing)}"
+            f"expected the tensors {', '.join(TENSORS)} of a body, found no {', '.join(missing)}"
         )
     count = len(tensors["rest"]) if tensors["rest"].ndim else 0
     for name, each in TENSORS.items():
         found = tensors[name]
-        if (
-            tuple(found.shape) != (count, *each)
-            or count == 0
-            or found.dtype not in (torch.float32, torch.float64)
-        ):
+        known = found.dtype in (torch.float32, torch.float64)
+        if tuple(found.shape) != (count, *each) or count == 0 or not known:
             raise DataError(
-                f"ckpt_path: {path}: body.{name}: expected floating point numbers of shape "
-                f"({', '.join(('N', *map(str, each)))}), N particles, found {found.dtype} {tuple(found.shape)}"
+                f"body.{name}: expected floating point numbers of shape ({', '.join(('N', *map(str, each)))}), N "
+                f"particles, found {found.dtype} {tuple(found.shape)}"
             )
     for name, value in tensors.items():
         if not isinstance(value, Tensor):
-            raise DataError(
-                f"ckpt_path: {path}: body.{name}: expected a tensor, found {type(value).__name__}"
-            )
+            raise DataError(f"body.{name}: expected a tensor, found {type(value).__name__}")
         # an adapter that was not switched on yet has no unit
         unset = name.startswith("adapter.") and value.ndim == 0
         if value.is_floating_point() and not unset and not bool(torch.isfinite(value).all()):
-            raise DataError(f"ckpt_path: {path}: body.{name}: expected finite numbers")
-    opacities, colors, covariances = (
-        tensors[name].detach() for name in ("opacities", "colors", "covariances")
-    )
-    if (
-        not 0 <= float(opacities.min()) <= float(opacities.max()) <= 1
-        or float(colors.abs().max()) > BRIGHTEST
-    ):
+            raise DataError(f"body.{name}: expected finite numbers")
+    rest, volume, colors, opacities, covariances = (tensors[name].detach() for name in TENSORS)
+    low, high, most = (float(v) for v in (opacities.min(), opacities.max(), colors.abs().max()))
+    if not 0 <= low <= high <= 1 or most > BRIGHTEST:
         raise DataError(
-            f"ckpt_path: {path}: body.opacities, body.colors: expected opacities from 0 to 1 and colours within "
-            f"{BRIGHTEST:g}, found {float(opacities.min()):g} to {float(opacities.max()):g} and "
-            f"{float(colors.abs().max()):g}"
+            "body.opacities, body.colors: expected opacities from 0 to 1 and colours within "
+            f"{BRIGHTEST:g}, found {low:g} to {high:g} and {most:g}"
         )
-    widths, size = (
-        torch.linalg.eigvalsh(covariances.double()),
-        float((tensors["rest"].amax(0) - tensors["rest"].amin(0)).max()),
-    )
-    uneven = float((covariances - covariances.mT).abs().max()) > 1e-3 * float(
-        covariances.abs().max()
-    )
-    if uneven or float(widths.min()) < -1e-3 * float(widths.max()) or float(widths.max()) > size**2:
+    widths = torch.linalg.eigvalsh(covariances.double())
+    low, high, size = float(widths.min()), float(widths.max()), float(extent(rest))
+    uneven = float((covariances - covariances.mT).abs().max())
+    if uneven > 1e-3 * float(covariances.abs().max()) or low < -1e-3 * high or high > size**2:
         raise DataError(
-            f"ckpt_path: {path}: body.covariances: expected symmetric, positive ones of particles smaller than the "
-            f"body of {size:.3g} m, found squared widths of {float(widths.min()):.3g} to {float(widths.max()):.3g} m^2"
+            "body.covariances: expected symmetric, positive ones of particles smaller than the "
+            f"body of {size:.3g} m, found squared widths of {low:.3g} to {high:.3g} m^2"
         )
-    if not float(tensors["volume"].min()) > 0 or not math.isfinite(
-        float(tensors["rest"].abs().max())
-    ):
-        raise DataError(
-            f"ckpt_path: {path}: body.volume: expected volumes above 0 m^3, found {float(tensors['volume'].min()):g}"
-        )
+    if not float(volume.min()) > 0:
+        raise DataError(f"body.volume: expected volumes above 0 m^3, found {float(volume.min()):g}")
 
 
-def check_spacing(record: BodyRecord, tensors: Mapping[str, Tensor], path: str | Path) -> None:
+def extent(rest: Tensor) -> Tensor:
+    """() longest side [m] of the box about points (N, 3)."""
+    return (rest.amax(0) - rest.amin(0)).max()
+
+
+def check_spacing(record: BodyRecord, tensors: Mapping[str, Tensor]) -> None:
     """Particles as far apart as the cells of their grid are wide. Errors: DataError."""
     share = float(tensors["volume"].double().mean()) ** (1 / 3) / record.dx
     if not SPACING[0] < share < SPACING[1]:
         raise DataError(
-            f"ckpt_path: {path}: body.volume: expected particles {SPACING[0]:g} to {SPACING[1]:g} cells of "
-            f"dx = {record.dx:g} m apart, found {share:.3g}"
+            f"body.volume: expected particles {SPACING[0]:g} to {SPACING[1]:g} cells of dx = {record.dx:g} m apart, found "
+            f"{share:.3g}"
         )
 
 
@@ -345,34 +319,36 @@ def check_same(
     record = record_of(checkpoint, path)
     assert record.fit is not None, "check_resumed comes before"
     here, there = module.state_dict(), checkpoint["state_dict"]
-    count = len(here["body.rest"])
-    if record.fit.particles != count:
-        raise DataError(
-            f"ckpt_path: {path}: expected a body of {count} particles, found {record.fit.particles}: the "
-            "checkpoint belongs to another scene, reconstruction or simulation.particles"
-        )
-    for name in sorted(set(here) | set(there)):
-        found = [
-            f"{tuple(state[name].shape)}{'' if state[name].is_floating_point() else ' of whole numbers or flags'}"
-            if isinstance(state.get(name), Tensor)
-            else None
-            for state in (here, there)
-        ]
-        if found[0] != found[1]:
+    other = "the checkpoint belongs to another"
+    with reading(path):
+        if record.fit.particles != (count := len(here["body.rest"])):
             raise DataError(
-                f"ckpt_path: {path}: {name}: expected {found[0] or 'nothing of that name'}, found {found[1]}: "
-                "the checkpoint belongs to another configuration (adapter, prior, heterogeneity)"
+                f"expected a body of {count} particles, found {record.fit.particles}: {other} scene, reconstruction or "
+                "simulation.particles"
             )
-    check_tensors(
-        {k.removeprefix("body."): v for k, v in there.items() if k.startswith("body.")}, path
-    )
-    stage, most = record.fit.stage, len(module.stages)
-    if stage > most:
-        raise DataError(
-            f"ckpt_path: {path}: mosa.fit.stage: expected at most {most}, the stages of this fit, found {stage}: the "
-            "checkpoint belongs to another configuration (fit)"
-        )
+        for name in sorted(set(here) | set(there)):
+            wanted, found = kind_of(here.get(name)), kind_of(there.get(name))
+            if wanted != found:
+                raise DataError(
+                    f"{name}: expected {wanted or 'nothing of that name'}, found {found}: {other} configuration (adapter, prior, "
+                    "heterogeneity)"
+                )
+        check_tensors(body_tensors(there))
+        if record.fit.stage > (most := len(module.stages)):
+            raise DataError(
+                f"mosa.fit.stage: expected at most {most}, the stages of this fit, found {record.fit.stage}: {other} "
+                "configuration (fit)"
+            )
     return record
+
+
+def kind_of(value: Any) -> str | None:
+    """Shape of a tensor, and whether it has floating point numbers; None of anything else."""
+    if not isinstance(value, Tensor):
+        return None
+    return (
+        f"{tuple(value.shape)}{'' if value.is_floating_point() else ' of whole numbers or flags'}"
+    )
 
 
 def check_same_run(record: RunRecord, values: Mapping[str, Any], folder: str | Path) -> None:
@@ -437,20 +413,24 @@ def differing(
 
 def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     """The record of a checkpoint that has all that a fit goes on from. Errors: DataError naming what is missing."""
-    again = "; a fit goes on from a checkpoint that train.py wrote"
-    wanted = (*RESUMED, "state_dict")
-    if missing := [name for name in wanted if name not in checkpoint]:
-        raise DataError(
-            f"ckpt_path: {path}: checkpoint: expected the parts {', '.join(wanted)}, found none called {', '.join(missing)}{again}"
-        )
-    state = checkpoint["state_dict"]
-    if not (isinstance(state, Mapping) and all(isinstance(name, str) for name in state)):
-        raise DataError(f"ckpt_path: {path}: state_dict: expected tensors by name{again}")
+    again, wanted = (
+        "; a fit goes on from a checkpoint that train.py wrote",
+        (*RESUMED, "state_dict"),
+    )
+    with reading(path):
+        if missing := [name for name in wanted if name not in checkpoint]:
+            raise DataError(
+                f"checkpoint: expected the parts {', '.join(wanted)}, found none called {', '.join(missing)}{again}"
+            )
+        state = checkpoint["state_dict"]
+        if not (isinstance(state, Mapping) and all(isinstance(name, str) for name in state)):
+            raise DataError(f"state_dict: expected tensors by name{again}")
     record = record_of(checkpoint, path)
-    if record.ground_is_sought:
-        raise DataError(
-            f"ckpt_path: {path}: mosa.ground.mode: expected sticky or slip or separate or touch, found 'auto'{again}"
-        )
-    if record.fit is None:
-        raise DataError(f"ckpt_path: {path}: mosa.fit: expected this key, found none{again}")
+    with reading(path):
+        if record.ground_is_sought:
+            raise DataError(
+                f"mosa.ground.mode: expected sticky or slip or separate or touch, found 'auto'{again}"
+            )
+        if record.fit is None:
+            raise DataError(f"mosa.fit: expected this key, found none{again}")
     return record

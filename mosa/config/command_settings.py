@@ -60,9 +60,8 @@ class AdapterSection(Settings):
     model_config = ConfigDict(extra="allow")
     where: ClassVar[str] = "adapter"
 
-    name: Text | None = Field(
-        None, description="the adapter, by the name that it is registered with; null: none"
-    )
+    name: Text | None = None
+    """the adapter, by the name that it is registered with; null: none"""
 
 
 class SceneSection(Settings):
@@ -71,92 +70,83 @@ class SceneSection(Settings):
     model_config = ConfigDict(extra="allow")
     where: ClassVar[str] = "scene"
 
-    also_train: Sequences | None = Field(
-        None, description="further sequences to learn from (docs/several_recordings.md)"
-    )
-    test: Sequences | None = Field(
-        None, description="held-out sequences, which results report as test/<name>"
-    )
-    cache: Folder | None = Field(
-        None, description="folder of computed files; null: mosa/ in the user's cache folder"
-    )
+    also_train: Sequences | None = None
+    """further sequences to learn from (docs/several_recordings.md)"""
+    test: Sequences | None = None
+    """held-out sequences, which results report as test/<name>"""
+    cache: Folder | None = None
+    """folder of computed files; null: mosa/ in the user's cache folder"""
 
 
 class LawSections(Settings):
     """What a body's law is built from."""
 
-    seed: Seed = Field(0, description="seed of all random numbers")
-    prior: PriorSection = Field(description="the isotropic law")
-    simulation: SimulationSection = Field(SimulationSection(), description="grid and time steps")
-    heterogeneity: HeterogeneitySettings = Field(
-        HeterogeneitySettings(), description="variation of the stiffness"
-    )
-    adapter: AdapterSection = Field(AdapterSection(), description="the correction of the law")
+    seed: Seed = 0
+    """seed of all random numbers"""
+    prior: PriorSection
+    """the isotropic law"""
+    simulation: SimulationSection = SimulationSection()
+    """grid and time steps"""
+    heterogeneity: HeterogeneitySettings = HeterogeneitySettings()
+    """variation of the stiffness"""
+    adapter: AdapterSection = AdapterSection()
+    """the correction of the law"""
 
 
 class BodySections(LawSections):
     """What a body and its world are built from."""
 
-    world: WorldSection = Field(WorldSection(), description="surroundings of the body")
+    world: WorldSection = WorldSection()
+    """surroundings of the body"""
 
 
 class DataSections(Settings):
     """What a scene's data are made by."""
 
-    seed: Seed = Field(0, description="seed of all random numbers")
-    scene: SceneSection = Field(description="the films")
-    reconstruction: ReconstructionSettings = Field(
-        ReconstructionSettings(), description="body and motion from images"
-    )
-    simulation: SimulationSection = Field(SimulationSection(), description="grid and time steps")
-    fit: FitSection = Field(FitSection(), description="stages of the fit")
-    rendering: RenderingSettings = Field(
-        RenderingSettings(), description="images that are rendered"
-    )
+    seed: Seed = 0
+    """seed of all random numbers"""
+    scene: SceneSection
+    """the films"""
+    reconstruction: ReconstructionSettings = ReconstructionSettings()
+    """body and motion from images"""
+    simulation: SimulationSection = SimulationSection()
+    """grid and time steps"""
+    fit: FitSection = FitSection()
+    """stages of the fit"""
+    rendering: RenderingSettings = RenderingSettings()
+    """images that are rendered"""
 
 
 class TrainSettings(BodySections, DataSections):
     """train.py"""
 
-    deterministic: bool = Field(
-        False,
-        description=(
-            "the same bits in every run on the same GPU; slower there. On a CPU a run's"
-            " bits are always the same. This key, not trainer.deterministic"
-        ),
-    )
+    deterministic: bool = False
+    """the same bits in every run on the same GPU; slower there. On a CPU a run's bits are always
+    the same. This key, not trainer.deterministic"""
     extensions: Extensions = []
-    ckpt_path: Text | None = Field(
-        None, description="checkpoint, of the same configuration, that the fit goes on from"
-    )
-    resume: Literal["auto"] | None = Field(
-        None,
-        description=(
-            "auto: skip where the run folder has metrics.json, go on from its "
-            "checkpoints/last.ckpt (docs/sweeps.md); a checkpoint's path is ckpt_path"
-        ),
-    )
-    optimized_metric: Figure = Field(
-        "test/rms_m",
-        description=(
-            "figure that a run returns to a sweep; a run that lacks it returns test/rms_m,"
-            " train/rms_m or a PSNR. A search needs val/loss, which has no substitute, and held-out"
-            " cameras or frames: otherwise it chooses by the test films"
-        ),
-    )
-    criterion: Criterion = Field(
-        Criterion(), description="simulation that is compared with the cues"
-    )
-    trainer: Section = Field({}, description="arguments of Lightning's Trainer")
-    callbacks: Section | None = Field({}, description="callbacks by name, each with _target_")
-    logger: Section | None = Field({}, description="loggers by name, each with _target_")
-    identification: IdentificationSettings = Field(
-        IdentificationSettings(), description="Gauss-Newton"
-    )
-    losses: LossWeights = Field(LossWeights(), description="weights of the loss terms")
-    evaluation: EvaluationSettings = Field(
-        EvaluationSettings(), description="evaluation of the learned law"
-    )
+    ckpt_path: Text | None = None
+    """checkpoint, of the same configuration, that the fit goes on from"""
+    resume: Literal["auto"] | None = None
+    """auto: skip where the run folder has metrics.json, go on from its checkpoints/last.ckpt
+    (docs/sweeps.md); a checkpoint's path is ckpt_path"""
+    optimized_metric: Figure = "test/rms_m"
+    """figure that a run returns to a sweep; a run that lacks it returns test/rms_m, train/rms_m or
+    a PSNR. A search needs val/loss, which has no substitute, and held-out cameras or frames:
+    otherwise it chooses by the test films"""
+    criterion: Criterion = Criterion()
+    """simulation that is compared with the cues"""
+    trainer: Section = {}
+    """arguments of Lightning's Trainer"""
+    callbacks: Section | None = {}
+    """callbacks by name, each with _target_"""
+    logger: Section | None = {}
+    """loggers by name, each with _target_"""
+    identification: IdentificationSettings = IdentificationSettings()
+    """Gauss-Newton"""
+    losses: LossWeights = LossWeights()
+    """weights of the loss terms"""
+    evaluation: EvaluationSettings = EvaluationSettings()
+    """evaluation of the learned law"""
 
 
 class SimulateSection(Settings):
@@ -164,10 +154,10 @@ class SimulateSection(Settings):
 
     where: ClassVar[str] = "simulate"
 
-    velocity: Three | None = Field(
-        None, description="[vx, vy, vz] m/s; any of these six starts a new simulation"
-    )
-    rotation: Four | None = Field(None, description="[ax, ay, az, degrees] about the body's centre")
+    velocity: Three | None = None
+    """[vx, vy, vz] m/s; any of these six starts a new simulation"""
+    rotation: Four | None = None
+    """[ax, ay, az, degrees] about the body's centre"""
     position: (
         Annotated[
             list[float | None],
@@ -175,53 +165,42 @@ class SimulateSection(Settings):
             such(lambda v: len(v) == 3),
         ]
         | None
-    ) = Field(
-        None,
-        description="[x, y, z] m of the body's centre, null for a number that is left as it is",
-    )
-    height: Number | None = Field(None, description="m, lowest point of the body above the ground")
-    angular_velocity: Three | None = Field(None, description="[wx, wy, wz] rad/s")
-    colliders: Entries | None = Field(
-        None, description="in place of the world's: a list as world.colliders of train.py"
-    )
-    driven: Entries | None = Field(
-        None, description="in place of the world's: a list as world.driven of train.py"
-    )
-    frames: Count = Field(
-        30,
-        description="number of frames; has an effect with one of the keys above, as variant does",
-    )
-    variant: Literal["adapted", "prior_eta", "prior"] = Field(
-        "adapted", description="model to simulate: prior, prior_eta or adapted (docs/figures.md)"
-    )
+    ) = None
+    """[x, y, z] m of the body's centre, null for a number that is left as it is"""
+    height: Number | None = None
+    """m, lowest point of the body above the ground"""
+    angular_velocity: Three | None = None
+    """[wx, wy, wz] rad/s"""
+    colliders: Entries | None = None
+    """in place of the world's: a list as world.colliders of train.py"""
+    driven: Entries | None = None
+    """in place of the world's: a list as world.driven of train.py"""
+    frames: Count = 30
+    """number of frames; has an effect with one of the keys above, as variant does"""
+    variant: Literal["adapted", "prior_eta", "prior"] = "adapted"
+    """model to simulate: prior, prior_eta or adapted (docs/figures.md)"""
 
 
 class EvalSettings(Settings):
     """eval.py"""
 
     extensions: Extensions = []
-    ckpt_path: Text = Field(description="checkpoint of a run")
-    device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
-    deterministic: bool = Field(False, description="as in train.py")
-    cache: Folder | None = Field(
-        None,
-        description=(
-            "folder of computed files; null: ~/.cache/mosa, never the folder "
-            "that a checkpoint names"
-        ),
-    )
-    appearance: Literal["splats", "particles"] | None = Field(
-        None, description="splats or particles in images; null: as in the run"
-    )
-    plan: Annotated[int, Interval(ge=2, le=10**9)] | None = Field(
-        None,
-        description=(
-            "candidates: instead of the evaluation, rank drops and presses from so many poses "
-            "by what their motion would tell"
-        ),
-    )
-    scene: Section | None = Field(None, description="another scene to evaluate on; null: the run's")
-    evaluation: EvaluationSettings = Field(
-        EvaluationSettings(), description="evaluation of the learned law"
-    )
-    simulate: SimulateSection = Field(SimulateSection(), description="simulate a new start")
+    ckpt_path: Text
+    """checkpoint of a run"""
+    device: Text = "cpu"
+    """cpu, cuda or cuda:<number>"""
+    deterministic: bool = False
+    """as in train.py"""
+    cache: Folder | None = None
+    """folder of computed files; null: ~/.cache/mosa, never the folder that a checkpoint names"""
+    appearance: Literal["splats", "particles"] | None = None
+    """splats or particles in images; null: as in the run"""
+    plan: Annotated[int, Interval(ge=2, le=10**9)] | None = None
+    """candidates: instead of the evaluation, rank drops and presses from so many poses by what
+    their motion would tell"""
+    scene: Section | None = None
+    """another scene to evaluate on; null: the run's"""
+    evaluation: EvaluationSettings = EvaluationSettings()
+    """evaluation of the learned law"""
+    simulate: SimulateSection = SimulateSection()
+    """simulate a new start"""

@@ -41,10 +41,10 @@ class GroundSection(Settings):
 
     where: ClassVar[str] = "ground"
 
-    mode: Literal["sticky", "slip", "separate", "touch"] = Field(
-        "separate", description="kind of contact (docs/twin.md#colliders)"
-    )
-    friction: Weight = Field(0.5, description="Coulomb's coefficient, of separate and touch")
+    mode: Literal["sticky", "slip", "separate", "touch"] = "separate"
+    """kind of contact (docs/twin.md#colliders)"""
+    friction: Weight = 0.5
+    """Coulomb's coefficient, of separate and touch"""
 
 
 class FilmSection(Settings):
@@ -52,154 +52,123 @@ class FilmSection(Settings):
 
     where: ClassVar[str] = "film"
 
-    size: int = Field(400, ge=8, le=8192, description="px, of its width and height")
-    fps: Positive | None = Field(
-        None,
-        description="frames per second; null: 0.3 of real time; the value of `rate`: real time",
-    )
-    view: Three | None = Field(
-        None,
-        description="direction from the object to the camera; null: from the side, a little above",
-    )
+    size: int = Field(400, ge=8, le=8192)
+    """px, of its width and height"""
+    fps: Positive | None = None
+    """frames per second; null: 0.3 of real time; the value of `rate`: real time"""
+    view: Three | None = None
+    """direction from the object to the camera; null: from the side, a little above"""
 
 
 class SplatsSettings(LawSections):
     """python -m mosa.splats"""
 
     extensions: Extensions = []
-    ply: Text = Field(description="3DGS PLY (INRIA's layout) of the object")
-    ckpt_path: Text | None = Field(
-        None, description="a run whose law the object gets, in place of `prior`"
-    )
-    device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
-    size: Positive | None = Field(
-        None, description="m, of the object's longest side; null: the file is in metres"
-    )
-    up: Three = Field(
-        [0, 1, 0],
-        description="upwards in the file's axes, which the scene keeps; COLMAP: [0, -1, 0]",
-    )
+    ply: Text
+    """3DGS PLY (INRIA's layout) of the object"""
+    ckpt_path: Text | None = None
+    """a run whose law the object gets, in place of `prior`"""
+    device: Text = "cpu"
+    """cpu, cuda or cuda:<number>"""
+    size: Positive | None = None
+    """m, of the object's longest side; null: the file is in metres"""
+    up: Three = [0, 1, 0]
+    """upwards in the file's axes, which the scene keeps; COLMAP: [0, -1, 0]"""
     box: (
         Annotated[
             list[Three], Expected("two corners [[x, y, z], [x, y, z]]"), such(lambda v: len(v) == 2)
         ]
         | None
-    ) = Field(
-        None,
-        description="[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all",
-    )
-    opacity: Share = Field(0.1, description="Gaussians with a smaller opacity are left out")
-    open_below: bool = Field(False, description="the underside was never filmed: it is closed")
-    resolution: int = Field(
-        80,
-        ge=8,
-        le=512,
-        description="voxels along the longest side of the solid that the Gaussians enclose",
-    )
-    share: float = Field(
-        0.9,
-        gt=0,
-        le=1,
-        description="a place is inside if this share of 26 rays from it ends at Gaussians",
-    )
-    density: Positive | None = Field(
-        None, description="kg/m^3; null: 1000, or that of the run or preset"
-    )
-    preset: Text | None = Field(
-        None,
-        description="jelly, silicone_10A, natural_rubber, clay, honey or dry_sand, in place of prior",
-    )
-    gravity: Weight = Field(9.81, description="m/s^2")
-    height: Weight = Field(0.2, description="m, of the lowest particle above the ground")
-    ground: GroundSection = Field(GroundSection(), description="the ground")
-    colliders: Entries | None = Field(
-        [],
-        description=(
-            "obstacles, such as {type: sphere, radius: 0.05, position: [0, 0.05, 0]}: as "
-            "world.colliders of train.py, in the file's axes, in metres"
-        ),
-    )
-    recentre: bool = Field(
-        False, description="the origin becomes the point of the ground below the object's middle"
-    )
-    rotation: Four | None = Field(
-        None,
-        description="[ax, ay, az, degrees] about the body's centre, in the file's axes, before it falls",
-    )
-    velocity: Three = Field([0, 0, 0], description="m/s")
-    angular_velocity: Three = Field([0, 0, 0], description="rad/s")
-    frames: Count = Field(40, description="number of frames")
-    rate: Positive = Field(30, description="simulated frames per second")
-    formats: Names = Field(
-        ["ply"],
-        description="ply, gltf, sog: a file for each frame; usd, rrd: one file (docs/splats.md)",
-    )
-    video: bool = Field(True, description="make simulation.mp4")
-    film: FilmSection = Field(FilmSection(), description="the video")
+    ) = None
+    """[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all"""
+    opacity: Share = 0.1
+    """Gaussians with a smaller opacity are left out"""
+    open_below: bool = False
+    """the underside was never filmed: it is closed"""
+    resolution: int = Field(80, ge=8, le=512)
+    """voxels along the longest side of the solid that the Gaussians enclose"""
+    share: float = Field(0.9, gt=0, le=1)
+    """a place is inside if this share of 26 rays from it ends at Gaussians"""
+    density: Positive | None = None
+    """kg/m^3; null: 1000, or that of the run or preset"""
+    preset: Text | None = None
+    """jelly, silicone_10A, natural_rubber, clay, honey or dry_sand, in place of prior"""
+    gravity: Weight = 9.81
+    """m/s^2"""
+    height: Weight = 0.2
+    """m, of the lowest particle above the ground"""
+    ground: GroundSection = GroundSection()
+    """the ground"""
+    colliders: Entries | None = []
+    """obstacles, such as {type: sphere, radius: 0.05, position: [0, 0.05, 0]}: as world.colliders
+    of train.py, in the file's axes, in metres"""
+    recentre: bool = False
+    """the origin becomes the point of the ground below the object's middle"""
+    rotation: Four | None = None
+    """[ax, ay, az, degrees] about the body's centre, in the file's axes, before it falls"""
+    velocity: Three = [0, 0, 0]
+    """m/s"""
+    angular_velocity: Three = [0, 0, 0]
+    """rad/s"""
+    frames: Count = 40
+    """number of frames"""
+    rate: Positive = 30
+    """simulated frames per second"""
+    formats: Names = ["ply"]
+    """ply, gltf, sog: a file for each frame; usd, rrd: one file (docs/splats.md)"""
+    video: bool = True
+    """make simulation.mp4"""
+    film: FilmSection = FilmSection()
+    """the video"""
 
 
 class PhoneSection(Settings):
     """What one phone has otherwise."""
 
-    fps: Rate | None = Field(None, description="frames per second as they were taken")
-    scan: Scan = Field("auto", description="where the sensor's next row lies in the picture")
-    readout: Readout | None = Field(None, description="s from the sensor's first row to its last")
+    fps: Rate | None = None
+    """frames per second as they were taken"""
+    scan: Scan = "auto"
+    """where the sensor's next row lies in the picture"""
+    readout: Readout | None = None
+    """s from the sensor's first row to its last"""
 
 
 class CaptureSettings(Settings):
     """python -m mosa.capture"""
 
-    videos: Folder = Field(description="folder of videos, one of each phone")
-    poses: Folder = Field(
-        description=(
-            "folder of a COLMAP model (.bin or .txt), or a transforms.json; images "
-            "named as the videos"
-        )
-    )
-    output: Folder = Field(description="folder that gets transforms.json, images, capture.md")
-    like: Folder | None = Field(
-        None,
-        description=(
-            "folder of an earlier capture by the same phones, whose world (scale, up, "
-            "ground) this one gets"
-        ),
-    )
-    mattes: Literal["plates", "masks"] = Field(
-        "plates",
-        description="plates: empty backgrounds; masks: videos of masks, of any other program",
-    )
-    plates: Folder | None = Field(
-        None,
-        description="folder of <phone>.png, .jpg or .mp4; null: plates beside or in the videos' folder",
-    )
-    plate_seconds: Period | None = Field(
-        None, description="[from, to] of each video's clock in which it shows the empty background"
-    )
-    masks: Folder | None = Field(
-        None, description="folder of mask videos <phone>.mp4, white: the object"
-    )
-    fps: Rate | None = Field(
-        None,
-        description="frames per second as they were taken; null: what the videos say (slow motion: set it)",
-    )
-    scan: Scan = Field(
-        "auto", description="where the sensor's next row lies in the picture; auto: from the video"
-    )
-    readout: Readout | None = Field(
-        None, description="s from the sensor's first row to its last; null: found from the fall"
-    )
-    phones: dict[str, PhoneSection] | None = Field(
-        None,
-        description="settings of single phones: {phone3: {fps: 240, scan: left, readout: 0.01}}",
-    )
-    max_offset: Seconds = Field(5.0, description="s by which the videos' beginnings may be apart")
-    flight: Period | None = Field(
-        None, description="[from, to] s on the first phone's clock, of the free fall; null: found"
-    )
-    gravity: float = Field(9.81, ge=0.01, le=1000, description="m/s^2")
-    scale: Annotated[float, Interval(ge=1e-6, le=1e6)] | None = Field(
-        None, description="metres per unit of the poses; null: from the acceleration of the fall"
-    )
+    videos: Folder
+    """folder of videos, one of each phone"""
+    poses: Folder
+    """folder of a COLMAP model (.bin or .txt), or a transforms.json; images named as the videos"""
+    output: Folder
+    """folder that gets transforms.json, images, capture.md"""
+    like: Folder | None = None
+    """folder of an earlier capture by the same phones, whose world (scale, up, ground) this one
+    gets"""
+    mattes: Literal["plates", "masks"] = "plates"
+    """plates: empty backgrounds; masks: videos of masks, of any other program"""
+    plates: Folder | None = None
+    """folder of <phone>.png, .jpg or .mp4; null: plates beside or in the videos' folder"""
+    plate_seconds: Period | None = None
+    """[from, to] of each video's clock in which it shows the empty background"""
+    masks: Folder | None = None
+    """folder of mask videos <phone>.mp4, white: the object"""
+    fps: Rate | None = None
+    """frames per second as they were taken; null: what the videos say (slow motion: set it)"""
+    scan: Scan = "auto"
+    """where the sensor's next row lies in the picture; auto: from the video"""
+    readout: Readout | None = None
+    """s from the sensor's first row to its last; null: found from the fall"""
+    phones: dict[str, PhoneSection] | None = None
+    """settings of single phones: {phone3: {fps: 240, scan: left, readout: 0.01}}"""
+    max_offset: Seconds = 5.0
+    """s by which the videos' beginnings may be apart"""
+    flight: Period | None = None
+    """[from, to] s on the first phone's clock, of the free fall; null: found"""
+    gravity: float = Field(9.81, ge=0.01, le=1000)
+    """m/s^2"""
+    scale: Annotated[float, Interval(ge=1e-6, le=1e6)] | None = None
+    """metres per unit of the poses; null: from the acceleration of the fall"""
     up: (
         Annotated[
             list[float],
@@ -207,29 +176,21 @@ class CaptureSettings(Settings):
             such(lambda v: len(v) == 3 and any(v)),
         ]
         | None
-    ) = Field(
-        None, description="upwards in the poses' world; null: against the acceleration of the fall"
-    )
-    ground: Three | None = Field(
-        None,
-        description="a point of the floor in the poses' world; null: where the object is lowest",
-    )
-    rate: Annotated[float, Interval(ge=1, le=2000)] | None = Field(
-        None, description="frames per second that are written; null: the slowest phone's"
-    )
-    before: Seconds = Field(0.1, description="s of free fall that are written")
-    after: Seconds = Field(0.25, description="s after the end of the free fall that are written")
-    interpolation: Literal["flow", "shift", "none"] = Field(
-        "flow",
-        description="images between frames; shift: the nearest frame, moved; none: the nearest frame",
-    )
-    colours: Literal["floor", "none"] = Field(
-        "floor",
-        description=(
-            "floor: the phones' colours are matched by the floor that all "
-            "plates show; none: no matching"
-        ),
-    )
+    ) = None
+    """upwards in the poses' world; null: against the acceleration of the fall"""
+    ground: Three | None = None
+    """a point of the floor in the poses' world; null: where the object is lowest"""
+    rate: Annotated[float, Interval(ge=1, le=2000)] | None = None
+    """frames per second that are written; null: the slowest phone's"""
+    before: Seconds = 0.1
+    """s of free fall that are written"""
+    after: Seconds = 0.25
+    """s after the end of the free fall that are written"""
+    interpolation: Literal["flow", "shift", "none"] = "flow"
+    """images between frames; shift: the nearest frame, moved; none: the nearest frame"""
+    colours: Literal["floor", "none"] = "floor"
+    """floor: the phones' colours are matched by the floor that all plates show; none: no
+    matching"""
 
 
 class TruthSection(Settings):
@@ -237,10 +198,10 @@ class TruthSection(Settings):
 
     where: ClassVar[str] = "truth"
 
-    scene: Text | None = Field(None, description="built-in scene; null: that of the run")
-    spacing: Spacing | None = Field(
-        None, description="m, particle spacing of the truth; null: that of the films"
-    )
+    scene: Text | None = None
+    """built-in scene; null: that of the run"""
+    spacing: Spacing | None = None
+    """m, particle spacing of the truth; null: that of the films"""
 
 
 class SearchSection(Settings):
@@ -248,22 +209,22 @@ class SearchSection(Settings):
 
     where: ClassVar[str] = "search"
 
-    iterations: Count = Field(60, description="number of iterations")
-    batch: int = Field(16, ge=1, le=10**5, description="trials per iteration")
-    rate: float = Field(
-        0.02, gt=0, le=10, description="gradient: Adam's learning rate, falling to a tenth"
-    )
-    clip: Positive = Field(
-        0.5, description="gradient: largest norm of one trial's gradient with respect to one action"
-    )
-    every: Count = Field(10, description="iterations between validations")
-    validation: Count = Field(32, description="validation trials, in the training simulator")
-    candidates: int = Field(
-        32, ge=4, le=10**9, description="model: candidate batches per iteration"
-    )
-    spread: Positive = Field(
-        0.4, description="model: initial standard deviation of actions about those of the policy"
-    )
+    iterations: Count = 60
+    """number of iterations"""
+    batch: int = Field(16, ge=1, le=10**5)
+    """trials per iteration"""
+    rate: float = Field(0.02, gt=0, le=10)
+    """gradient: Adam's learning rate, falling to a tenth"""
+    clip: Positive = 0.5
+    """gradient: largest norm of one trial's gradient with respect to one action"""
+    every: Count = 10
+    """iterations between validations"""
+    validation: Count = 32
+    """validation trials, in the training simulator"""
+    candidates: int = Field(32, ge=4, le=10**9)
+    """model: candidate batches per iteration"""
+    spread: Positive = 0.4
+    """model: initial standard deviation of actions about those of the policy"""
 
 
 OPTIONS = (
@@ -276,10 +237,10 @@ OPTIONS = (
 class EnvironmentsSettings(Settings):
     """python -m mosa.environments"""
 
-    task: Text = Field("placement", description="placement or hanging")
-    checkpoint: Text | None = Field(
-        None, description="checkpoint of a run: source of the learned and of the isotropic twin"
-    )
+    task: Text = "placement"
+    """placement or hanging"""
+    checkpoint: Text | None = None
+    """checkpoint of a run: source of the learned and of the isotropic twin"""
     simulator: Annotated[
         Any,
         Expected("a name, or a list of names"),
@@ -289,80 +250,61 @@ class EnvironmentsSettings(Settings):
                 or (isinstance(v, list) and bool(v) and all(isinstance(n, str) for n in v))
             )
         ),
-    ] = Field(
-        "learned",
-        description="simulator to train in: learned, isotropic or truth; a list makes a table",
-    )
-    seed: Seed = Field(0, description="seed of one policy")
-    seeds: Annotated[list[Seed], Expected("a list of whole numbers"), such(bool)] = Field(
-        [0, 1, 2], description="seeds of the table"
-    )
-    policy: Text = Field("gradient", description="gradient or model")
-    trials: Count = Field(
-        100, description="number of tests, in the truth and in the training simulator"
-    )
-    device: Text = Field("cpu", description="cpu, cuda or cuda:<number>")
-    worlds: Count | Literal["auto"] = Field(
-        "auto", description="tests that run together; auto: 8 on a CPU, all of them on a GPU"
-    )
-    out: Text | None = Field(None, description="folder of the results; null: the run folder")
-    jobs_only: bool = Field(
-        False,
-        description=(
-            "run the jobs of a list without making the table: for several "
-            "processes that share one `out`"
-        ),
-    )
-    films: int = Field(
-        3, ge=0, le=100, description="number of tests that are filmed, the first ones"
-    )
+    ] = "learned"
+    """simulator to train in: learned, isotropic or truth; a list makes a table"""
+    seed: Seed = 0
+    """seed of one policy"""
+    seeds: Annotated[list[Seed], Expected("a list of whole numbers"), such(bool)] = [0, 1, 2]
+    """seeds of the table"""
+    policy: Text = "gradient"
+    """gradient or model"""
+    trials: Count = 100
+    """number of tests, in the truth and in the training simulator"""
+    device: Text = "cpu"
+    """cpu, cuda or cuda:<number>"""
+    worlds: Count | Literal["auto"] = "auto"
+    """tests that run together; auto: 8 on a CPU, all of them on a GPU"""
+    out: Text | None = None
+    """folder of the results; null: the run folder"""
+    jobs_only: bool = False
+    """run the jobs of a list without making the table: for several processes that share one
+    `out`"""
+    films: int = Field(3, ge=0, le=100)
+    """number of tests that are filmed, the first ones"""
     options: Annotated[
         dict[str, Any],
         Expected("numbers by the names of the task's fields"),
         such(lambda v: all(value is None or is_number(value) for value in v.values())),
-    ] = Field(
-        dict.fromkeys(OPTIONS),
-        description="fields of the task's class (docs/environments.md); null: their defaults",
-    )
-    truth: TruthSection = Field(TruthSection(), description="the hidden truth")
-    search: SearchSection = Field(SearchSection(), description="the search of a policy")
+    ] = dict.fromkeys(OPTIONS)
+    """fields of the task's class (docs/environments.md); null: their defaults"""
+    truth: TruthSection = TruthSection()
+    """the hidden truth"""
+    search: SearchSection = SearchSection()
+    """the search of a policy"""
 
 
 class MaterialSettings(LawSections):
     """mosa-material"""
 
     extensions: Extensions = []
-    tests: Text = Field(
-        description="csv: test, mode, first, stress_1, ... (docs/material_tests.md)"
-    )
-    unit: Literal["Pa", "kPa", "MPa"] = Field("Pa", description="unit of the file's stresses")
-    incompressible: bool = Field(
-        True,
-        description=(
-            "true: the volume is constant; false: lateral stretches are solved "
-            "for so that free faces carry no stress"
-        ),
-    )
-    symmetry: Literal["full", "orthotropic"] = Field(
-        "full",
-        description="symmetry of the learned stiffness; orthotropic: mirrors across x, y and z",
-    )
-    starts: int = Field(
-        4, ge=1, le=100, description="starts of the least squares; the best result is kept"
-    )
-    leave_out: bool = Field(
-        True, description="fit once more without each test, and predict that test"
-    )
-    known: Text | None = Field(
-        None,
-        description=(
-            "checkpoint of a fit, or material.json of other tests: what it says of the law's "
-            "numbers is their prior (docs/several_recordings.md)"
-        ),
-    )
-    density: Positive = Field(
-        1000, description="kg/m^3, density of the cube in checkpoints/specimen.ckpt"
-    )
+    tests: Text
+    """csv: test, mode, first, stress_1, ... (docs/material_tests.md)"""
+    unit: Literal["Pa", "kPa", "MPa"] = "Pa"
+    """unit of the file's stresses"""
+    incompressible: bool = True
+    """true: the volume is constant; false: lateral stretches are solved for so that free faces
+    carry no stress"""
+    symmetry: Literal["full", "orthotropic"] = "full"
+    """symmetry of the learned stiffness; orthotropic: mirrors across x, y and z"""
+    starts: int = Field(4, ge=1, le=100)
+    """starts of the least squares; the best result is kept"""
+    leave_out: bool = True
+    """fit once more without each test, and predict that test"""
+    known: Text | None = None
+    """checkpoint of a fit, or material.json of other tests: what it says of the law's numbers is
+    their prior (docs/several_recordings.md)"""
+    density: Positive = 1000
+    """kg/m^3, density of the cube in checkpoints/specimen.ckpt"""
 
 
 COMMANDS: dict[str, type[Settings]] = {

@@ -293,10 +293,8 @@ class SplatsRecord(Settings):
 
     @model_validator(mode="after")
     def _shapes(self) -> Self:
-        count, most = (
-            len(self.means) if self.means.ndim else 0,
-            machine_memory() // (2 * BOUND_BYTES),
-        )
+        count = len(self.means) if self.means.ndim else 0
+        most = machine_memory() // (2 * BOUND_BYTES)
         if not 0 < count <= most:
             raise ConfigError(
                 f"mosa.splats.means: expected 1 to {most} splats, which take half of this machine's memory, found {count}"

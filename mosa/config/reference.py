@@ -64,6 +64,11 @@ def default_of(f: FieldInfo) -> str:
     )
 
 
+def about(f: FieldInfo) -> str:
+    """The docstring below a field, in one line."""
+    return " ".join(str(f.description).split())
+
+
 def rows(model: type[Settings], instance: Settings | None, where: str = "") -> Iterator[tuple[str, str, str, str]]:  # fmt: skip
     """(key, default, expected, meaning) of all keys, those of sections under them."""
     for name, f in model.model_fields.items():
@@ -73,11 +78,11 @@ def rows(model: type[Settings], instance: Settings | None, where: str = "") -> I
             default = getattr(instance, name)
         inner = model_in(kind)
         if inner is not None and issubclass(inner, Settings):
-            yield key, "", "", str(f.description)
+            yield key, "", "", about(f)
             yield from rows(inner, default if isinstance(default, inner) else None, f"{key}.")
             continue
         shown = default_of(f) if instance is None else default_of(FieldInfo(default=default))
-        yield key, shown, described(kind), str(f.description)
+        yield key, shown, described(kind), about(f)
 
 
 def in_file(group: str, option: str) -> dict[str, tuple[str, str]]:

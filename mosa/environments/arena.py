@@ -47,11 +47,10 @@ def simulator_named(
     """
     check("simulator", name, Literal[SIMULATORS])
     if checkpoint is None and (name != "truth" or scene is None):
-        wanted = (
-            "a run's checkpoint, or truth.scene=<a built-in scene>"
-            if name == "truth"
-            else "a run's checkpoint"
-        )
+        if name == "truth":
+            wanted = "a run's checkpoint, or truth.scene=<a built-in scene>"
+        else:
+            wanted = "a run's checkpoint"
         raise ConfigError(f"checkpoint: expected {wanted} for simulator={name}, found none")
     learned = None if checkpoint is None else Twin.load(checkpoint, device)
     if name != "truth":

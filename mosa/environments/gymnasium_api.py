@@ -48,13 +48,9 @@ def arena_of(
 ) -> Arena:
     """Errors: ConfigError, DataError."""
     made = simulator_named(simulator, checkpoint, scene=scene, device=device, spacing=spacing)
-    return Arena(
-        made,
-        task
-        if isinstance(task, Task)
-        else task_named(task, made.twin.body.rest, **(options or {})),
-        worlds,
-    )
+    if not isinstance(task, Task):
+        task = task_named(task, made.twin.body.rest, **(options or {}))
+    return Arena(made, task, worlds)
 
 
 def action_space(task: Task) -> spaces.Box:
@@ -113,10 +109,8 @@ class TwinEnv(gymnasium.Env, _Worlds):
     ) -> None:  # fmt: skip
         self.arena = arena_of(task, 1, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.render_mode, self.size = self.arena.task, render_mode, size
-        self.action_space, self.observation_space = (
-            action_space(self.task),
-            observation_space(self.task),
-        )
+        self.action_space = action_space(self.task)
+        self.observation_space = observation_space(self.task)
 
     @typed
     def reset(
@@ -167,10 +161,8 @@ class TwinVectorEnv(VectorEnv, _Worlds):
     ) -> None:  # fmt: skip
         self.arena = arena_of(task, worlds, simulator, checkpoint, scene, device, spacing, options)
         self.task, self.num_envs, self.render_mode = self.arena.task, worlds, None
-        self.single_action_space, self.single_observation_space = (
-            action_space(self.task),
-            observation_space(self.task),
-        )
+        self.single_action_space = action_space(self.task)
+        self.single_observation_space = observation_space(self.task)
         self.action_space = batch_space(self.single_action_space, worlds)
         self.observation_space = batch_space(self.single_observation_space, worlds)
 

@@ -62,13 +62,8 @@ def scenery(
     for k, solid in enumerate(colliders_from_config(solids, "solids")):
         points = solid_surface(solid, None if places is None else places[k])
         color = torch.tensor(COLORS.get(solid.name, (0.5, 0.5, 0.5)))
-        parts.append(
-            (
-                points,
-                torch.full((len(points),), WIDTH * PITCH),
-                shaded(points, torch.tensor([0.0, 1.0, 0.0]), color),
-            )
-        )
+        wide = torch.full((len(points),), WIDTH * PITCH)
+        parts.append((points, wide, shaded(points, torch.tensor([0.0, 1.0, 0.0]), color)))
     return tuple(torch.cat(values) for values in zip(*parts))
 
 

@@ -118,12 +118,8 @@ class PolicyChecks:
     def found(self) -> Found:
         """The policy as it was at its best."""
         self.policy.load_state_dict(self.best[1])
-        return Found(
-            self.policy.requires_grad_(False),
-            self.history,
-            time.perf_counter() - self.began,
-            self.played,
-        )
+        seconds = time.perf_counter() - self.began
+        return Found(self.policy.requires_grad_(False), self.history, seconds, self.played)
 
 
 def by_gradient(

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import logging
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from mosa.config.leaf_settings import EnvironmentsSettings
 from mosa.environments.arena import (
     Arena,
     Simulator,
@@ -26,12 +26,13 @@ from mosa.environments.arena import (
     truth_of,
 )
 from mosa.environments.pictures import film, write_films
-from mosa.environments.policies import SEARCHES, Found, LinearPolicy, Search
+from mosa.environments.policies import SEARCHES, Found, LinearPolicy
 from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.tables import markdown
-from mosa.system.whole_files import write_whole, written_whole
+from mosa.system.whole_files import write_table as write_csv
+from mosa.system.whole_files import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -41,27 +42,10 @@ TEST_SEED = 20_000_000
 """Of the tested trials: the same for all policies, and none that a search has drawn."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """What a study needs: the bodies, the task, and the sizes. worlds: trials tested at a time; spacing [m]: of the truth's
-    particles, None for the films' own."""
-
-    task: str
-    checkpoint: str | None
-    scene: str | None
-    device: str
-    policy: str
-    search: Search
-    trials: int
-    worlds: int
-    spacing: float | None
-    options: Mapping[str, Any]
-
-
 class Bench:
     """The simulators and arenas of a study, each made once."""
 
-    def __init__(self, setting: Setting) -> None:
+    def __init__(self, setting: EnvironmentsSettings) -> None:
         self.setting = setting
         self._simulators: dict[str, Simulator] = {}
         self._arenas: dict[tuple[str, int], Arena] = {}
@@ -71,7 +55,7 @@ class Bench:
         s = self.setting
         if name not in self._simulators:
             self._simulators[name] = simulator_named(
-                name, s.checkpoint, scene=s.scene, device=s.device, spacing=s.spacing
+                name, s.checkpoint, device=s.device, **s.truth.plain()
             )
         return self._simulators[name]
 
@@ -180,7 +164,7 @@ def _record(bench: Bench, simulator: str, seed: int) -> dict[str, Any]:
         found = Found(LinearPolicy(bench.task("truth")).requires_grad_(False), [], 0.0, 0)
     else:
         found = train(bench, simulator, seed)
-    known = s.scene is not None or _of_builtin(bench)
+    known = s.truth.scene is not None or _of_builtin(bench)
     own = None if simulator in (UNTRAINED, "truth") else test(bench, simulator, found.policy)
     truth = test(bench, "truth", found.policy) if known else None
     return {
@@ -197,20 +181,14 @@ def _of_builtin(bench: Bench) -> bool:
     return True
 
 
-def _plain(setting: Setting) -> dict[str, Any]:
-    """The setting, of the checkpoint its content in place of its path: a study may go on on another machine."""
-    content = (
-        None
-        if setting.checkpoint is None
-        else hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
-    )
-    return json.loads(
-        json.dumps(asdict(setting) | {"checkpoint": content, "search": setting.search.plain()})
-    )
-
-
-FREE = ("device", "worlds")
-"""Of a setting: where it is computed, which does not make a result another one."""
+def _plain(setting: EnvironmentsSettings) -> dict[str, Any]:
+    """What results depend on; of the checkpoint its content in place of its path: a study may go on on another machine."""
+    content = None
+    if setting.checkpoint is not None:
+        content = hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
+    plain = setting.plain()
+    return {"task": setting.task, "checkpoint": content, **plain["truth"],
+            **{key: plain[key] for key in ("policy", "search", "trials", "options")}}  # fmt: skip
 
 
 def _identity(bench: Bench, simulator: str) -> dict[str, Any]:
@@ -219,11 +197,9 @@ def _identity(bench: Bench, simulator: str) -> dict[str, Any]:
     s, found = bench.setting, _plain(bench.setting)
     if simulator not in (UNTRAINED, "truth"):
         return found
-    known = (
-        {"name": s.scene}
-        if s.scene is not None
-        else scene_of(bench.simulator("learned").twin, s.checkpoint)
-    )
+    known: Mapping[str, Any] = {"name": s.truth.scene}
+    if s.truth.scene is None:
+        known = scene_of(bench.simulator("learned").twin, s.checkpoint)
     return found | {"checkpoint": None, "scene": None, "truth": truth_of(known)}
 
 
@@ -233,12 +209,11 @@ def _read(file: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     try:
         record = json.loads(file.read_text())
-        kept = {k: v for k, v in record["setting"].items() if k not in FREE}
+        kept = dict(record["setting"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{file}: expected the result of a job, found a damaged one ({error}); remove it and try again"
         ) from error
-    wanted = {k: v for k, v in wanted.items() if k not in FREE}
     if kept != wanted:
         other = ", ".join(
             f"{k}={kept.get(k)!r} instead of {wanted[k]!r}"
@@ -291,7 +266,7 @@ def about_twin(bench: Bench) -> str:
 
 
 def write_table(
-    setting: Setting,
+    setting: EnvironmentsSettings,
     records: Mapping[tuple[str, int], Mapping[str, Any]],
     task: Task,
     folder: Path,
@@ -329,12 +304,11 @@ def write_table(
     page = folder / f"{task.name}.md"
     write_whole(page, "\n\n".join(text) + "\n")
     columns = ["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"]
-    with written_whole(page.with_suffix(".csv")) as partial, open(partial, "w", newline="") as file:
-        csv.writer(file).writerows([columns, *rows])
+    write_csv(page.with_suffix(".csv"), columns, rows)
     return page
 
 
-UNSAID = ("search", "options", "checkpoint", *FREE)
+UNSAID = ("search", "options", "checkpoint")
 """Of a setting: what a page says elsewhere, or what is a place on one machine."""
 
 

@@ -10,12 +10,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
-from mosa.environments.task import Quantity, Task, Trials, View
+from mosa.environments.task import (
+    Angle,
+    Height,
+    Length,
+    Quantity,
+    Size,
+    Speed,
+    Steps,
+    Task,
+    Trials,
+    View,
+)
 from mosa.physics.contact.motion import exponential
 from mosa.settings import call, check
 
@@ -31,13 +43,13 @@ class Placement(Task):
     `still`. A body that fell off is beside the box.
     """
 
-    steps: int = 60
-    low: float = 0.08
-    high: float = 0.14
-    near: float = 0.04
-    lean: float = math.radians(20.0)
-    still: float = 0.3
-    askew: float = 0.15
+    steps: Steps = 60
+    low: Height = 0.08
+    high: Height = 0.14
+    near: Size = 0.04
+    lean: Annotated[float, Interval(ge=1e-3, le=math.pi)] = math.radians(20.0)
+    still: Annotated[float, Interval(ge=1e-4, le=100)] = 0.3
+    askew: Angle = 0.15
     name = "placement"
 
     @property
@@ -89,27 +101,27 @@ class Hanging(Task):
     and the speed is below `still`.
     """
 
-    steps: int = 32
-    tilt: float = 0.25
-    aim: float = 0.08
-    low: float = 0.35
-    high: float = 0.45
-    unsteady_tilt: float = 0.005
-    unsteady_aim: float = 0.001
-    unsteady_throw: float = 0.01
-    leaning: float = math.radians(60.0)
-    hardest: float = 2.0
-    before: float = 0.25
-    far: float = 0.1
-    close: float = 0.0
-    aside: float = 0.03
-    grip: float = 0.36
-    shut: int = 13
-    closing: int = 3
-    squeeze: float = 0.2
-    near: float = 0.03
-    free: float = 0.05
-    still: float = 0.25
+    steps: Steps = 32
+    tilt: Angle = 0.25
+    aim: Length = 0.08
+    low: Height = 0.35
+    high: Height = 0.45
+    unsteady_tilt: Angle = 0.005
+    unsteady_aim: Length = 0.001
+    unsteady_throw: Speed = 0.01
+    leaning: Annotated[float, Interval(ge=-math.pi, le=math.pi)] = math.radians(60.0)
+    hardest: Speed = 2.0
+    before: Length = 0.25
+    far: Length = 0.1
+    close: Length = 0.0
+    aside: Length = 0.03
+    grip: Length = 0.36
+    shut: Annotated[int, Interval(ge=0, le=10**5)] = 13
+    closing: Steps = 3
+    squeeze: Annotated[float, Interval(ge=0, le=0.9)] = 0.2
+    near: Size = 0.03
+    free: Length = 0.05
+    still: Annotated[float, Interval(ge=1e-4, le=100)] = 0.25
     name = "hanging"
     watched_height = 0.25
     JAW, OPEN = (0.12, 0.08, 0.05), 0.09

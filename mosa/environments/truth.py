@@ -106,10 +106,6 @@ def true_twin(
     box = torch.tensor([[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]])
     ground = Ground(0.0, meeting.mode, meeting.friction)
     world = World(ground, tensor(GRAVITY), torch.tensor([0.0, 1.0, 0.0]), box)
-    start = Start(
-        tensor(drop.rotation),
-        tensor(begun.mean(0)),
-        tensor([0.0, -drop.speed, 0.0]),
-        torch.zeros(3),
-    )
+    falling = tensor([0.0, -drop.speed, 0.0])
+    start = Start(tensor(drop.rotation), tensor(begun.mean(0)), falling, torch.zeros(3))
     return Twin(made.to(device).eval(), world, 1 / body.footage.fps, None, start)

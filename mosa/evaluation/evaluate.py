@@ -184,11 +184,9 @@ def motion_metrics(
 def true_motion(body: Body, scene: Scene) -> Tensor | None:
     """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
     truth = scene.truth
-    return (
-        None
-        if truth is None
-        else metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
-    )
+    if truth is None:
+        return None
+    return metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
 
 
 @torch.no_grad()
@@ -253,13 +251,9 @@ def worst(name: str) -> float:
     """The figure of a rollout that there is not: no error so large and no picture so bad; of pictures compared by a metric that was
     registered, no number."""
     kind = name.split("_")[0]
-    return (
-        -math.inf
-        if kind in ("psnr", "ssim")
-        else math.nan
-        if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS
-        else math.inf
-    )
+    if kind in ("psnr", "ssim"):
+        return -math.inf
+    return math.nan if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS else math.inf
 
 
 def sequence_metrics(
@@ -277,29 +271,24 @@ def sequence_metrics(
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
     # without a camera there is nothing to compare
     images = render(body, rollout, scene, cameras) if cameras else scene.images
-    figures: Mapping[str, float] = {
-        **motion_metrics(x, body, sequence, frames, settings, target),
-        **image_metrics(images, scene, cameras, frames),
-    }
-    result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
+
+    def measured(part: str, frames: list[int]) -> dict[str, float]:
+        figures = motion_metrics(x, body, sequence, frames, settings, target)
+        figures |= image_metrics(images, scene, cameras, frames)
+        return {f"{model}{part}/{k}": v for k, v in figures.items()}
+
+    result = measured(sequence.prefix, frames)
     if "frames" in parts:
-        held = list(scene.holdout_frames)
-        figures = {
-            **motion_metrics(x, body, sequence, held, settings, target),
-            **image_metrics(images, scene, cameras, held),
-        }
-        result |= {f"{model}frames/{k}": v for k, v in figures.items()}
+        result |= measured("frames", list(scene.holdout_frames))
     if "camera" in parts:
         held = list(scene.holdout_cameras)
-        images = render(body, rollout, scene, held)
-        result |= {
-            f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()
-        }
+        seen_there = render(body, rollout, scene, held)
+        figures = image_metrics(seen_there, scene, held, frames)
+        result |= {f"{model}camera/{k}": v for k, v in figures.items()}
         for t in frames:
-            per_frame = image_metrics(images, scene, held, [t])
-            result |= {
-                f"{model}camera/frame_{t:02d}/{k}": per_frame[k] for k in ("psnr_crop", "ssim_crop")
-            }
+            figures = image_metrics(seen_there, scene, held, [t])
+            where = f"{model}camera/frame_{t:02d}"
+            result |= {f"{where}/{k}": figures[k] for k in ("psnr_crop", "ssim_crop")}
     return result
 
 
@@ -329,11 +318,10 @@ def floor_figures(
         if scene.truth is None:
             continue
         x = floor_rollout(body, scene, world)
-        frames = (
-            scene.training_frames
-            if sequence.prefix.startswith("train")
-            else list(range(scene.frames))
-        )
+        if sequence.prefix.startswith("train"):
+            frames = scene.training_frames
+        else:
+            frames = list(range(scene.frames))
         result = motion_metrics(x, body, sequence, frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)
@@ -343,13 +331,8 @@ def floor_figures(
         if scene.truth is not None or scene.particles is not None
     ]
     if clouds:
-        floors = metrics.sampling_floors(
-            clouds[0],
-            len(body.rest),
-            len(clouds[0]),
-            samples=settings.samples,
-            assignment=settings.assignment,
-        )
+        sizes = {"samples": settings.samples, "assignment": settings.assignment}
+        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), **sizes)
         figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}
     return figures
 
@@ -382,16 +365,12 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
     from mosa.evaluation.floor import hidden_of
 
     hidden, found = hidden_of(scene), {}
-    fibre, axis = (
-        getattr(hidden, "fibre", None),
-        [figures.get(f"id/stiffest_{name}") for name in "xyz"],
-    )
+    fibre = getattr(hidden, "fibre", None)
+    axis = [figures.get(f"id/stiffest_{name}") for name in "xyz"]
     if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
         found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
-    learned, true = (
-        body.factor(body.model().heterogeneity).detach().cpu(),
-        hidden.factor(body.rest.cpu().float()),
-    )
+    learned = body.factor(body.model().heterogeneity).detach().cpu()
+    true = hidden.factor(body.rest.cpu().float())
     if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
         found["id/stiffness_correlation"] = float(
             torch.corrcoef(torch.stack([true, learned.float()]))[0, 1]
@@ -406,13 +385,8 @@ def law_figures(body: Body) -> dict[str, float]:
         return {}
     figures = {}
     adapter.follow(material.poisson())
-    growth = vibration_growth(
-        material,
-        adapter,
-        density=body.density,
-        stride=body.settings.stride,
-        law_options=body.law_options,
-    )
+    run = {"stride": body.settings.stride, "law_options": body.law_options}
+    growth = vibration_growth(material, adapter, density=body.density, **run)
     figures["id/growth_per_period"] = growth
     if growth > GROWTH_LIMIT:
         warn(

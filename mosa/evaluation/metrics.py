@@ -111,11 +111,9 @@ def rms(x: Tensor, target: Tensor) -> float:
 def subsample(points: Tensor, count: int, seed: int) -> np.ndarray:
     """At most `count` points without replacement, float64."""
     found = points.detach().cpu().double().numpy()
-    return (
-        found
-        if len(found) <= count
-        else found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
-    )
+    if len(found) <= count:
+        return found
+    return found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
 
 
 def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -171,10 +169,8 @@ def sampling_floors(
 
     cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.
     """
-    a, b = (
-        resample_shape(cloud, first, 2 * seed + 101),
-        resample_shape(cloud, second, 2 * seed + 102),
-    )
+    a = resample_shape(cloud, first, 2 * seed + 101)
+    b = resample_shape(cloud, second, 2 * seed + 102)
     return chamfer_distances(a, b, samples=samples, seed=seed) | {
         "emd_m": emd(a, b, samples=assignment, seed=seed)
     }

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pydantic import Field
-
 from mosa.settings import Count, Settings
 
 
@@ -14,11 +12,11 @@ class EvaluationSettings(Settings):
 
     where: ClassVar[str] = "evaluation"
 
-    floor: bool = Field(
-        True, description="built-in scenes: simulate the true law on the learner's grid (row floor)"
-    )
-    samples: Count = Field(8192, description="points of the chamfer distance")
-    assignment: Count = Field(
-        2048, description="points of the exact assignment of the earth mover's distance"
-    )
-    video: bool = Field(True, description="make video.mp4 and strip.png")
+    floor: bool = True
+    """built-in scenes: simulate the true law on the learner's grid (row floor)"""
+    samples: Count = 8192
+    """points of the chamfer distance"""
+    assignment: Count = 2048
+    """points of the exact assignment of the earth mover's distance"""
+    video: bool = True
+    """make video.mp4 and strip.png"""

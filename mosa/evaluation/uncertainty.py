@@ -92,29 +92,29 @@ def predicted_spread(
     if figures["posterior/draws"] < LEAST_DRAWS:
         return figures, spreads
     for s in sequences:
-        sd = total_spread(torch.stack([each[s.prefix] for each in drawn]), posterior.model_error, among_forms(base[s.prefix],
-                          [each[s.prefix] for each in others]), seen=s.prefix.startswith("train"))  # fmt: skip
+        own, *others_here = (each[s.prefix] for each in (base, *others))
+        sd = spread_of(own, [each[s.prefix] for each in drawn], others_here, posterior, s)
         spreads[s.prefix] = sd.cpu()
         figures[f"posterior/{s.prefix}/sd_m"] = float(sd[s.contact :].square().mean().sqrt())
+        target = true_motion(body, s.scene)
         if s.scene.markers is not None:
             cues = cues_of_markers(s.scene, body.rest.cpu())
-            here, *rivals = (cues.seen(each[s.prefix].cpu()) for each in (base, *others))
-            points = total_spread(
-                torch.stack([cues.seen(each[s.prefix].cpu()) for each in drawn]),
-                posterior.model_error,
-                among_forms(here, rivals),
-                seen=s.prefix.startswith("train"),
-            )
-            error = (here - cues.positions).norm(dim=-1)[s.contact :]
-            within = (error <= 2 * points[s.contact :])[torch.isfinite(error)]
-            figures[f"posterior/{s.prefix}/coverage"] = float(within.double().mean())
-        target = true_motion(body, s.scene)
+            own, *others_here = (cues.seen(x.cpu()) for x in (own, *others_here))
+            seen = [cues.seen(each[s.prefix].cpu()) for each in drawn]
+            sd, target = spread_of(own, seen, others_here, posterior, s), cues.positions
         if target is not None:
-            error = (base[s.prefix].cpu() - target)[s.contact :].norm(dim=-1)
-            figures[f"posterior/{s.prefix}/coverage"] = float(
-                (error <= 2 * sd.cpu()[s.contact :]).double().mean()
-            )
+            error = (own.cpu() - target).norm(dim=-1)[s.contact :]
+            within = (error <= 2 * sd.cpu()[s.contact :])[torch.isfinite(error)]
+            figures[f"posterior/{s.prefix}/coverage"] = float(within.double().mean())
     return figures, spreads
+
+
+def spread_of(
+    own: Tensor, drawn: Ordered[Tensor], others: Ordered[Tensor], posterior: Posterior, s: Sequence
+) -> Tensor:
+    """`total_spread` on a sequence of points (T, N, 3) [m] that the law, its draws and its rivals predict."""
+    forms, seen = among_forms(own, others), s.prefix.startswith("train")
+    return total_spread(torch.stack([*drawn]), posterior.model_error, forms, seen=seen)
 
 
 Predicted = TypeVar("Predicted")

@@ -33,11 +33,12 @@ from mosa.experiments.report.drawing import (
     style_of,
     wide,
 )
-from mosa.experiments.run_folders import label, loaded, prefix, write_table
+from mosa.experiments.run_folders import label, loaded, prefix
 from mosa.experiments.specification import Experiment
 from mosa.experiments.specimens import compression
 from mosa.modules.body.body import Body
 from mosa.modules.body.material import material_states
+from mosa.system.whole_files import write_table
 
 log = logging.getLogger(__name__)
 

@@ -24,15 +24,11 @@ def git(*words: str) -> str | None:
 
 def commit() -> str:
     """Of the checkout that the package lies in, with a mark where it has changes; `unknown` where it is installed."""
-    found, changed = (
-        git("rev-parse", "--short=12", "HEAD"),
-        git("status", "--porcelain", "--untracked-files=no"),
-    )
-    return (
-        "unknown"
-        if found is None or changed is None
-        else found + (", with changes" if changed else "")
-    )
+    found = git("rev-parse", "--short=12", "HEAD")
+    changed = git("status", "--porcelain", "--untracked-files=no")
+    if found is None or changed is None:
+        return "unknown"
+    return found + (", with changes" if changed else "")
 
 
 def commits_since(lines: Sequence[str]) -> tuple[str, int] | None:

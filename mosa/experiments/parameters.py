@@ -10,9 +10,9 @@ from pathlib import Path
 from mosa.data.synthetic.bodies.objects import OBJECTS
 from mosa.evaluation.analysis.tables import markdown
 from mosa.experiments.collecting import Record
-from mosa.experiments.run_folders import write_table
 from mosa.experiments.specification import Experiment
 from mosa.modules.body.material import RELATIVE, unit_of
+from mosa.system.whole_files import write_table
 
 
 def setting(overrides: Sequence[str], key: str) -> str | None:

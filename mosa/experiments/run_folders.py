@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mosa.experiments.collecting import Record
 from mosa.experiments.specification import PRESSED, Experiment
-from mosa.system.whole_files import written_whole
 from mosa.twin.twin import Twin
 
 
@@ -19,11 +17,6 @@ def label(experiment: Experiment, record: Record) -> str:
 
 def prefix(record: Record) -> str:
     return "".join(option.prefix for option in record.place.values())
-
-
-def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence]) -> None:
-    with written_whole(path) as partial, open(partial, "w", newline="") as file:
-        csv.writer(file).writerows([header, *rows])
 
 
 def checkpoint(record: Record) -> Path:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
 from mosa.errors import ConfigError, DataError
+from mosa.settings import call
 from mosa.training.sweep_table import seconds
 
-PLOTS = ("bars", "lines", "map", None)
 SPECIFICATIONS = Path(__file__).with_name("specifications")
 """Folder of the files of all experiments."""
 SHARED = "_shared"
@@ -43,11 +43,9 @@ class Option:
 
     def cost_on(self, device: str) -> float:
         """device: cpu | gpu."""
-        return (
-            float(self.cost.get(device, 1.0))
-            if isinstance(self.cost, Mapping)
-            else float(self.cost)
-        )
+        if isinstance(self.cost, Mapping):
+            return float(self.cost.get(device, 1.0))
+        return float(self.cost)
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ class Experiment:
     printed: str | None = None
     note: str = ""
     minutes: dict[str, float] = field(default_factory=lambda: {"cpu": 10.0, "gpu": 2.0})
-    plot: str | None = "bars"
+    plot: Literal["bars", "lines", "map"] | None = "bars"
     analysis: str | None = None
     mean: bool = True
     alone: bool = False
@@ -127,20 +125,9 @@ class Job:
     def failed(self) -> str | None:
         """Why it failed when it was last run; None where it is complete, or was not run."""
         said = self.folder / FAILED
-        return (
-            None
-            if self.finished or not said.is_file()
-            else said.read_text(errors="replace").strip()
-        )
-
-
-def section(kind: Callable[..., Any], where: str, keys: Mapping[str, Any]) -> Any:
-    """A dataclass made of a section of an experiment's file. Errors: ConfigError naming the section."""
-    try:
-        return kind(**keys)
-    except TypeError as error:
-        fields = ", ".join(kind.__dataclass_fields__)
-        raise ConfigError(f"{where}: expected fields of {fields} ({error})") from error
+        if self.finished or not said.is_file():
+            return None
+        return said.read_text(errors="replace").strip()
 
 
 def experiment_names(folder: Path) -> list[str]:
@@ -178,40 +165,31 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
         if not small:
             raise ConfigError(f"{name}: expected a section quick, found none")
         keys |= small
-    known = set(Experiment.__dataclass_fields__) - {"name", "quick"}
-    if unknown := sorted(set(keys) - known):
-        raise ConfigError(
-            f"{name}: {unknown[0]}: unknown key; expected one of {', '.join(sorted(known | {'quick'}))}"
-        )
-    if missing := [
-        key for key in ("title", "axes", "rows", "columns", "figures") if key not in keys
-    ]:
-        raise ConfigError(f"{name}: {missing[0]}: expected this key, found none")
+    for key in ("axes", "figures"):
+        if key not in keys:
+            raise ConfigError(f"{name}.{key}: expected this key, found none")
     keys["axes"] = {
         axis: options_of(f"{name}: axes.{axis}", found, shared)
         for axis, found in keys["axes"].items()
     }
-    for place in ("rows", "columns"):
-        if keys[place] not in keys["axes"]:
-            raise ConfigError(
-                f"{name}: {place}: expected one of {', '.join(keys['axes'])}, found {keys[place]!r}"
-            )
-    if keys.get("plot", "bars") not in PLOTS:
-        raise ConfigError(
-            f"{name}: plot: expected bars, lines, map or null, found {keys['plot']!r}"
-        )
-    keys["figures"] = tuple(section(Figure, f"{name}: figures", each) for each in keys["figures"])
+    keys["figures"] = tuple(call(f"{name}.figures", Figure, each) for each in keys["figures"])
     keys["claims"] = tuple(
         claim_of(f"{name}: claims[{i}]", each, keys["figures"])
         for i, each in enumerate(keys.get("claims", ()))
     )
-    keys["seeds"], keys["common"] = tuple(keys.get("seeds", (0,))), tuple(keys.get("common", ()))
-    return Experiment(name=name, quick=quick, **keys)
+    keys |= {key: tuple(keys[key]) for key in ("seeds", "common") if key in keys}
+    found = call(name, Experiment, keys, name=name, quick=quick)
+    for place in (found.rows, found.columns):
+        if place not in found.axes:
+            raise ConfigError(
+                f"{name}: rows, columns: expected two of {', '.join(found.axes)}, found {place!r}"
+            )
+    return found
 
 
 def claim_of(where: str, found: Any, figures: Sequence[Figure]) -> Claim:
     """Errors: ConfigError naming the key."""
-    claim = section(Claim, where, found | {"against": tuple(found.get("against", ()))})
+    claim = call(where, Claim, found | {"against": tuple(found.get("against", ()))})
     labels = [figure.label for figure in figures]
     for key in ("figure", "unless"):
         if (label := getattr(claim, key)) is not None and label not in labels:
@@ -239,7 +217,7 @@ def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Optio
     for name, content in found.items():
         keys = dict(content) if isinstance(content, Mapping) else {"overrides": content}
         keys["overrides"] = tuple(str(each) for each in keys.get("overrides") or ())
-        options.append(section(Option, f"{where}.{name}", {"name": str(name), **keys}))
+        options.append(call(f"{where}.{name}", Option, keys, name=str(name)))
     return chosen(where, tuple(options), only)
 
 
@@ -300,26 +278,16 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
                 found[folder] = replace(known, places=(*known.places, place))
                 continue
             parts = {each: each.split("=")[0].split(".") for each in overrides}
-            film = [
-                each
-                for each, key in parts.items()
-                if key[0] in ("scene", "experiment") and key[1:] not in USES
-            ]
+            uses = ("scene", "experiment")
+            film = [each for each, key in parts.items() if key[0] in uses and key[1:] not in USES]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
+            shared = " ".join(film), " ".join([*film, *rest])
             minutes = {
                 device: value * math.prod(option.cost_on(device) for option in options)
                 for device, value in experiment.minutes.items()
             }
-            found[folder] = Job(
-                folder,
-                overrides,
-                seed,
-                (place,),
-                minutes,
-                " ".join(film),
-                " ".join([*film, *rest]),
-                experiment.alone,
-            )
+            alone = experiment.alone
+            found[folder] = Job(folder, overrides, seed, (place,), minutes, *shared, alone)
     return list(found.values())
 
 

@@ -23,17 +23,10 @@ from mosa.evaluation.analysis.tables import markdown
 from mosa.evaluation.analysis.vibration import longitudinal_modulus
 from mosa.experiments.collecting import Record
 from mosa.experiments.report.drawing import WIDTH, legend, save, style_of
-from mosa.experiments.run_folders import (
-    checkpoint,
-    first_seeds,
-    label,
-    prefix,
-    pressed_file,
-    write_table,
-)
+from mosa.experiments.run_folders import checkpoint, first_seeds, label, prefix, pressed_file
 from mosa.experiments.specification import Experiment
 from mosa.modules.body.body import Body
-from mosa.system.whole_files import write_whole
+from mosa.system.whole_files import write_table, write_whole
 from mosa.twin.twin import Twin
 
 log = logging.getLogger(__name__)
@@ -123,12 +116,8 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             log.warning("%s: %s", record.job.folder.name, error)
             models[each] = None
             continue
-        models[each] = {
-            "modulus_Pa": [p.modulus for p in own],
-            "force_off": max(
-                abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(own, true)
-            ),
-        }
+        off = [abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(own, true)]
+        models[each] = {"modulus_Pa": [p.modulus for p in own], "force_off": max(off)}
     found = {"degrees": degrees, "truth_Pa": [p.modulus for p in true], "models": models}
     write_whole(kept, json.dumps(found, indent=1) + "\n")
     return found

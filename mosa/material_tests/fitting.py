@@ -126,15 +126,8 @@ class Fitting:
             return np.concatenate([misfit / noise, theta[self.own] / sigma, prior])
 
         def solve(theta: np.ndarray, evaluations: int):
-            return least_squares(
-                residuals,
-                theta,
-                args=(noise, sigma),
-                diff_step=1e-6,
-                ftol=1e-7,
-                xtol=1e-7,
-                max_nfev=evaluations,
-            )
+            ends = {"diff_step": 1e-6, "ftol": 1e-7, "xtol": 1e-7, "max_nfev": evaluations}
+            return least_squares(residuals, theta, args=(noise, sigma), **ends)
 
         best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
         if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:
@@ -173,10 +166,8 @@ class Fitting:
             if n in ("E", "mu", "kappa") or n.startswith("fibre_stiffness")
         ]
         try:
-            found, seen = (
-                self.predicted(theta)[rows] / self.sd[rows],
-                (self.data.value / self.sd)[rows],
-            )
+            found = self.predicted(theta)[rows] / self.sd[rows]
+            seen = (self.data.value / self.sd)[rows]
             theta[stiff] += np.log(max((found @ seen) / (found @ found), 1e-6))
         except SimulationDiverged:
             pass

@@ -141,17 +141,8 @@ def plot(
         x = given[:, c] if np.ptp(given[:, c]) > 0 else given[:, 1 - c]
         order = np.argsort(x, kind="stable")
         sd = None if np.isnan(data.sd).any() else data.sd[chosen][order] / scale
-        label = f"stress_{c + 1}"
-        panel.errorbar(
-            x[order],
-            data.value[chosen][order] / scale,
-            sd,
-            fmt="o",
-            ms=3,
-            lw=0.6,
-            color=color,
-            label=label,
-        )
+        look = {"fmt": "o", "ms": 3, "lw": 0.6, "color": color, "label": f"stress_{c + 1}"}
+        panel.errorbar(x[order], data.value[chosen][order] / scale, sd, **look)
         panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color)
         if data.names[k] in left_out:
             found = left_out[data.names[k]][chosen[own]]

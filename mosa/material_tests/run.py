@@ -60,14 +60,8 @@ def fit_tests(cfg: DictConfig) -> float:
     law, known = build_law(values), None
     if values["known"] is not None:
         known = known_numbers(values["known"], law.material, law.adapter, "known")
-    fitting = Fitting(
-        law,
-        data,
-        values["incompressible"],
-        starts=values["starts"],
-        seed=values["seed"],
-        known=known,
-    )
+    options = {name: values[name] for name in ("incompressible", "starts", "seed")}
+    fitting = Fitting(law, data, known=known, **options)
     if not fitting.law.names:
         raise ConfigError("prior.frozen: expected a parameter that is learned, found none")
     fit = fitting.fit()

@@ -14,13 +14,8 @@ class RenderingSettings(Settings):
 
     where: ClassVar[str] = "rendering"
 
-    margin: int = Field(
-        6, ge=0, le=256, description="px around the mattes' box that a training step renders"
-    )
-    appearance: Literal["splats", "particles"] = Field(
-        "splats",
-        description=(
-            "Gaussians in evaluation, video, viewer and export: splats carried "
-            "by the rollout, or particles"
-        ),
-    )
+    margin: int = Field(6, ge=0, le=256)
+    """px around the mattes' box that a training step renders"""
+    appearance: Literal["splats", "particles"] = "splats"
+    """Gaussians in evaluation, video, viewer and export: splats carried by the rollout, or
+    particles"""

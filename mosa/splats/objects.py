@@ -10,10 +10,9 @@ import copy
 import logging
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from mosa.config.build import build_body, plain, world_of
 from mosa.config.extensions import load_extensions
+from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import BodyRecord
 from mosa.data.formats.scene_from_footage import check_density
 from mosa.data.io.gaussian_ply import read_ply
@@ -33,7 +33,7 @@ from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.geometry.filling import fill
 from mosa.reconstruction.geometry.shell import solid_of, together
 from mosa.reconstruction.pipeline import FEW, filling_spacing
-from mosa.reconstruction.resolution import PER_CELL, grid_spacing
+from mosa.reconstruction.resolution import grid_spacing
 from mosa.rendering.appearance.carried_splats import CarriedSplats
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
@@ -98,10 +98,8 @@ def read_object(
             f"{int(chosen.sum())} of {len(chosen)}; the file spans {low} to {high}"
         )
     chosen[chosen.clone()] = together(splats.means[chosen])
-    splats, harmonics = (
-        Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats))),
-        harmonics[chosen],
-    )
+    splats = Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats)))
+    harmonics = harmonics[chosen]
     longest = float((splats.means.amax(0) - splats.means.amin(0)).max())
     if (wide := float(splats.scales.amax(1).median())) > WIDE * longest:
         raise DataError(
@@ -127,27 +125,18 @@ def read_object(
 
 
 def fill_object(
-    appearance: Appearance,
-    *,
-    particles: int | None,
-    dx: float | None = None,
-    per_cell: float = PER_CELL,
-    most: int = FEW,
-    resolution: int = 80,
-    share: float = 0.9,
-    open_below: Tensor | None = None,
+    appearance: Appearance, settings: SplatsSettings, most: int = FEW
 ) -> tuple[dict[str, Tensor], Appearance, float]:
-    """(tensors of a body of about so many particles inside the Gaussians, the Gaussians that belong to it, grid spacing [m]).
-
-    particles, per_cell, most: as `reconstruction.pipeline.spacing_for` takes them; dx: grid spacing [m] in place of their number;
-    resolution, share: as `solid_of` takes them; open_below: up (3,), where the underside is open. Errors: DataError.
-    """
-    solid = solid_of(appearance.splats, resolution=resolution, share=share, up=open_below)
-    spacing = (
-        filling_spacing(solid, particles, per_cell=per_cell, most=most)
-        if dx is None
-        else dx / grid_spacing(1.0, per_cell)
-    )
+    """(tensors of a body of particles inside the Gaussians, the Gaussians that belong to it, grid spacing [m]). most: as
+    `reconstruction.pipeline.spacing_for` takes it. Errors: DataError."""
+    up = torch.tensor(settings.up, dtype=torch.float32) if settings.open_below else None
+    solid = solid_of(appearance.splats, resolution=settings.resolution, share=settings.share, up=up)
+    grid = settings.simulation
+    if grid.dx is None:
+        particles = None if grid.particles == "auto" else grid.particles
+        spacing = filling_spacing(solid, particles, per_cell=grid.particles_per_cell, most=most)
+    else:
+        spacing = grid.dx / grid_spacing(1.0, grid.particles_per_cell)
     found = fill(solid, spacing=spacing)
     near = torch.from_numpy(
         cKDTree(found.positions.numpy()).query(appearance.splats.means.numpy())[0]
@@ -158,85 +147,52 @@ def fill_object(
     shapes = (HALF_CELL * spacing) ** 2 * torch.eye(3).expand(n, 3, 3)
     tensors = {"rest": found.positions, "volume": found.volume, "colors": inherited_colors(found.positions, splats),
                "opacities": torch.full((n,), 0.8), "covariances": shapes.contiguous()}  # fmt: skip
-    return tensors, Appearance(splats, appearance.harmonics[kept]), grid_spacing(spacing, per_cell)
+    cell = grid_spacing(spacing, grid.particles_per_cell)
+    return tensors, Appearance(splats, appearance.harmonics[kept]), cell
 
 
 def object_twin(
-    appearance: Appearance,
-    law: Mapping[str, Any] | Twin,
-    *,
-    particles: int | None,
-    dx: float | None = None,
-    per_cell: float = PER_CELL,
-    most: int = FEW,
-    density: float | None = None,
-    up: Sequence[float] = (0, 1, 0),
-    gravity: float = 9.81,
-    height: float = 0.2,
-    ground: Mapping[str, Any] | None = None,
-    frame_dt: float = 1 / 30,
-    resolution: int = 80,
-    share: float = 0.9,
-    open_below: bool = False,
-    colliders: Sequence[Mapping[str, Any]] = (),
-    recentre: bool = False,
+    appearance: Appearance, settings: SplatsSettings, learned: Twin | None = None, most: int = FEW
 ) -> Twin:
     """A twin of the object that Gaussians show.
 
-    law: configuration with seed, simulation, prior, heterogeneity and adapter, as conf/splats.yaml composes it; or a learned twin,
-    of which material, adapter and contact are taken, and no stiffness field, which is of another body's places. particles, dx,
-    per_cell, most: as `fill_object` takes them; density [kg/m^3]:
-    None for the learned one's, or 1000; up: (3,) in the
-    file's axes; height [m] of its lowest particle above the ground; ground:
-    mode and friction; colliders: obstacles, as `Twin.simulate` takes them; recentre: move the object
-    so that the point of the ground below its middle is the origin. Errors: ConfigError, DataError.
+    learned: of which material, adapter and contact are taken in place of those of the settings, and no stiffness field, which is of
+    another body's places; most: as `fill_object` takes it. Errors: ConfigError, DataError.
     """
-    learned = law if isinstance(law, Twin) else None
-    if density is None:
+    if (density := settings.density) is None:
         density = 1000.0 if learned is None else learned.body.density
     check_density("density", density)
-    direction = numbers("up", up, "a direction (x, y, z)", (3,))
+    direction = numbers("up", settings.up, "a direction (x, y, z)", (3,))
     if not float(direction.norm()) > 0:
-        raise ConfigError(f"up: expected a direction (x, y, z), found {list(up)}")
+        raise ConfigError(f"up: expected a direction (x, y, z), found {settings.up}")
     direction = direction / direction.norm()
-    tensors, shown, cell = fill_object(
-        appearance,
-        particles=particles,
-        dx=dx,
-        per_cell=per_cell,
-        most=most,
-        resolution=resolution,
-        share=share,
-        open_below=direction if open_below else None,
-    )
-    rest = tensors["rest"]
-    if recentre:
+    tensors, shown, cell = fill_object(appearance, settings, most)
+    rest, height = tensors["rest"], settings.height
+    if settings.recentre:
         middle = 0.5 * (rest.amin(0) + rest.amax(0))
         above = float(middle @ direction) - float((rest @ direction).min()) + height
         origin = middle - above * direction
         tensors["rest"] = rest = rest - origin
         means = shown.splats.means - origin.to(shown.splats.means)
         shown = replace(shown, splats=replace(shown.splats, means=means))
-    cfg = copy.deepcopy(dict(learned.record.settings if learned is not None else law))
-    cfg["heterogeneity"] = {**cfg.get("heterogeneity", {}), "enabled": False}
-    cfg["world"] = {"colliders": [dict(each) for each in colliders]}
+    if learned is None:
+        given, chosen = settings.plain(), None
+    else:
+        given, chosen = copy.deepcopy(dict(learned.record.settings)), learned.record.law
+    given["heterogeneity"] = {**given.get("heterogeneity", {}), "enabled": False}
+    given["world"] = {"colliders": [dict(each) for each in settings.colliders or ()]}
     room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height
-    met = {
-        "height": float((rest @ direction).min()) - height,
-        "mode": "sticky",
-        "friction": 0.0,
-        **(ground or {}),
-    }
-    world = {"gravity": (-gravity * direction).tolist(), "up": direction.tolist(),
+    met = {"height": float((rest @ direction).min()) - height, **settings.ground.plain()}
+    world = {"gravity": (-settings.gravity * direction).tolist(), "up": direction.tolist(),
              "box": [(rest.amin(0) - room).tolist(), (rest.amax(0) + room).tolist()]}  # fmt: skip
-    chosen = learned.record.law if learned is not None else None
-    record = BodyRecord(settings=cfg, law=chosen, ground=met, world=world, density=density, dx=cell, frame_dt=frame_dt)  # fmt: skip
+    record = BodyRecord(settings=given, law=chosen, ground=met, world=world, density=density, dx=cell,
+                        frame_dt=1 / settings.rate)  # fmt: skip
     body = build_body(record, tensors)
     if learned is not None:
         take_law(body, learned.body)
     body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
-    twin = Twin(body.eval(), world_of(record), frame_dt, record, start)
+    twin = Twin(body.eval(), world_of(record), record.frame_dt, record, start)
     for k, solid in enumerate(twin.world.colliders):
         middle = poses([solid], torch.zeros(1))[0][0, 0].to(direction)
         above, far = float(middle @ direction) - met["height"], reach(solid.shape)
@@ -274,33 +230,13 @@ def drop(cfg: DictConfig) -> None:
         )
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
-    check_splats(values)
-    given = {name: values[name] for name in ("box", "opacity", "size", "up")}
-    found = read_object(cfg.ply, **given)
-    law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
-    names = (
-        "density",
-        "up",
-        "gravity",
-        "height",
-        "ground",
-        "resolution",
-        "share",
-        "open_below",
-        "recentre",
+    settings = check_splats(values)
+    device = named_device(settings.device)
+    found = read_object(
+        settings.ply, box=settings.box, opacity=settings.opacity, size=settings.size, up=settings.up
     )
-    simulation, device = values["simulation"], named_device(cfg.device)
-    particles = None if simulation["particles"] == "auto" else simulation["particles"]
-    grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
-            "most": most_particles(device)}  # fmt: skip
-    twin = object_twin(
-        found,
-        law,
-        frame_dt=1 / cfg.rate,
-        **grid,
-        colliders=values["colliders"] or (),
-        **{name: values[name] for name in names},
-    )
+    learned = None if settings.ckpt_path is None else Twin.load(settings.ckpt_path)
+    twin = object_twin(found, settings, learned, most_particles(device))
     twin.body.to(device)
     volume, size = float(twin.body.volume.sum()), twin.body.size
     log.info(
@@ -319,17 +255,15 @@ def drop(cfg: DictConfig) -> None:
         middle,
         len(twin.world.colliders),
     )
-    if cfg.preset is not None:
-        twin.material.preset(cfg.preset)
-        if cfg.density is not None:
-            twin.material.set(density=cfg.density)
+    if settings.preset is not None:
+        twin.material.preset(settings.preset)
+        if settings.density is not None:
+            twin.material.set(density=settings.density)
     save_twin(twin, folder / "checkpoints" / "last.ckpt")
     rollout = twin.simulate(
-        frames=cfg.frames,
-        progress=True,
-        box=[[-ANYWHERE] * 3, [ANYWHERE] * 3],
-        **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")},
-    )
-    kinds = {"formats": values["formats"], "video": cfg.video, **values["film"]}
+        frames=settings.frames, progress=True, box=[[-ANYWHERE] * 3, [ANYWHERE] * 3], height=settings.height,
+        rotation=settings.rotation, velocity=settings.velocity, angular_velocity=settings.angular_velocity,
+    )  # fmt: skip
+    kinds = {"formats": settings.formats, "video": settings.video, **settings.film.plain()}
     twin.export(rollout, folder, title="object", **kinds)
     log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)

@@ -27,11 +27,9 @@ def begin_log() -> None:
 
 def one_line(message, category, filename, lineno, line=None) -> str:
     """Our own warnings say themselves what they are about, others where they come from."""
-    return (
-        f"warning: {message}"
-        if category is UserWarning
-        else f"{filename}:{lineno}: {category.__name__}: {message}"
-    )
+    if category is UserWarning:
+        return f"warning: {message}"
+    return f"{filename}:{lineno}: {category.__name__}: {message}"
 
 
 def fail(message: str) -> None:

@@ -31,10 +31,8 @@ def counted(where: str, sizes: Iterable[float], remedy: str, *, each: float = 8,
             error: type[MosaError] = ConfigError) -> tuple[int, ...]:  # fmt: skip
     """Sizes (whole numbers) of an array that is about to be allocated. Their product is compared in floating point, before they
     become integers, which would wrap. It may be `most`, and as many of `each` bytes as fill half of the memory. Errors: `error`."""
-    sizes, most = (
-        [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes],
-        min(most, machine_memory() / (2 * each)),
-    )
+    sizes = [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes]
+    most = min(most, machine_memory() / (2 * each))
     if not math.prod(map(float, sizes)) <= most:  # as NaN is not
         raise error(
             f"{where}: expected at most {int(most)}, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}"

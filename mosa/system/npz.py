@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -71,3 +72,31 @@ def check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) ->
                 f"{path}: {entry.filename}: expected as many numbers as are stored, found a header of shape {shape} "
                 f"over {entry.file_size} bytes"
             )
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """What an npz file holds, which may come from a stranger."""
+
+    path: Path
+    stored: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of(cls, path: Path) -> Arrays:
+        """Empty where there is no file. Errors: DataError naming a damaged one."""
+        return cls(path, read_npz(path) if path.is_file() else {})
+
+    def entry(self, key: str, *shape: int | None, holes: bool = False) -> np.ndarray | None:
+        """Numbers of this shape (None: of any length), None where there are none. holes: NaN may be among them. Errors: DataError
+        naming file and entry."""
+        found = self.stored.get(key)
+        if found is None:
+            return None
+        fits = len(shape) == found.ndim and all(a in (None, b) for a, b in zip(shape, found.shape))
+        if not fits or found.dtype.kind != "f" or not (holes or np.isfinite(found).all()):
+            said = ", ".join("any" if each is None else str(each) for each in shape)
+            raise DataError(
+                f"{self.path}: {key}: expected finite floating point numbers of shape ({said}), found {found.dtype} "
+                f"{found.shape}; all files must be of one run"
+            )
+        return found

@@ -43,11 +43,10 @@ def check_ply(path: Path) -> None:
     element, properties = b"", 0
     for line in header.splitlines():
         words = line.split()
-        element, properties = (
-            (line, 0)
-            if words[:1] == [b"element"]
-            else (element, properties + (words[:1] == [b"property"]))
-        )
+        if words[:1] == [b"element"]:
+            element, properties = (line, 0)
+        else:
+            element, properties = (element, properties + (words[:1] == [b"property"]))
         words = element.split()  # each of its properties takes a byte at least
         if words and (
             len(words) != 3

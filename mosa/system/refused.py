@@ -9,9 +9,11 @@ import re
 import sys
 import traceback
 from collections.abc import Iterator
+from contextlib import contextmanager
 from json import JSONDecodeError
 from pathlib import Path
 
+from mosa.errors import MosaError
 from mosa.system.caches import cache_home
 
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
@@ -47,11 +49,10 @@ def disk_message(error: OSError) -> str | None:
         return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
     if error.errno not in DISK:
         return None
-    keys = (
-        "XDG_CACHE_HOME"
-        if str(error.filename).startswith(cache_home())
-        else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
-    )
+    if str(error.filename).startswith(cache_home()):
+        keys = "XDG_CACHE_HOME"
+    else:
+        keys = "hydra.run.dir= and scene.cache= (eval.py: cache=)"
     return (
         f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
         f"{keys}"
@@ -145,6 +146,21 @@ def explained(error: Exception, folder: str | Path | None = None) -> str | None:
             f"; the fit is kept in {last}, and the same command with resume=auto goes on from there"
         )
     return f"MemoryError: {reason}"
+
+
+@contextmanager
+def one_message() -> Iterator[None]:
+    """What goes wrong within it by the user or the machine is one message and exit code 2."""
+    try:
+        yield
+    except Exception as error:
+        said = (
+            f"{type(error).__name__}: {error}" if isinstance(error, MosaError) else explained(error)
+        )
+        if said is None:
+            raise
+        print(f"\n{said}", file=sys.stderr)
+        sys.exit(2)
 
 
 def let_go() -> None:

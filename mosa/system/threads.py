@@ -27,12 +27,14 @@ def settle_threads() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
     """function(item) of each item, in their order, on as many threads as this process has cores."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    workers = min(len(items), cores)
+    workers = min(len(items), cores())
     if workers <= 1:
         yield from map(function, items)
         return

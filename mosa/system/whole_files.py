@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from mosa.errors import ConfigError
 
 
-def made_folder(folder: str | Path) -> Path:
-    """Of an export, made with its parents. Errors: ConfigError where it cannot be written."""
+def made_folder(folder: str | Path, where: str = "export") -> Path:
+    """A folder, made with its parents. Errors: ConfigError beginning with `where`, where it cannot be written."""
     try:
         made = Path(folder)
         made.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
+            f"{where}: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
         ) from error
     return made
 
@@ -52,6 +53,14 @@ def write_whole(path: str | Path, text: str) -> None:
     """A text, as `written_whole` writes; lines end as they are given."""
     with written_whole(path) as partial:
         partial.write_bytes(text.encode())
+
+
+def write_table(
+    path: str | Path, header: Sequence[object], rows: Iterable[Sequence[object]]
+) -> None:
+    """A csv file."""
+    with written_whole(path) as partial, open(partial, "w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
 
 
 def _runs(number: str) -> bool:

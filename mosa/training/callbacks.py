@@ -47,15 +47,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 class KeepLast(Checkpoint):
     """Saves `last.ckpt` after every step, so that an interruption costs no more than that."""
 
-    def __init__(self, folder: str | Path | None = None) -> None:
-        """folder: of the file; None: checkpoints/ in the trainer's default_root_dir."""
-        self.folder = folder
-
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        root = Path(trainer.default_root_dir)
-        self.path = (
-            root / "checkpoints" if self.folder is None else Path(self.folder)
-        ) / "last.ckpt"
+        self.path = Path(trainer.default_root_dir, "checkpoints", "last.ckpt")
 
     def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
         """The figures of an earlier run in this folder go: they would say that this one is complete."""
@@ -168,15 +161,14 @@ class Pace(L.Callback):
         self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
     ) -> None:
         self.began = time.perf_counter()
-        self.rates = (
-            {}
-            if module.stage is None or module.stage.newton
-            else {
+        if module.stage is None or module.stage.newton:
+            self.rates = {}
+        else:
+            self.rates = {
                 f"lr/{group['name']}": group["lr"]
                 for optimizer in trainer.optimizers
                 for group in optimizer.param_groups
             }
-        )
 
     def on_train_batch_end(
         self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int

@@ -41,7 +41,7 @@ from mosa.reconstruction.marker_body import (
     reconstruction_of_markers,
 )
 from mosa.reconstruction.motion.moved import SecondLook
-from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
+from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
 from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequence_start
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.rest_shape import RestShape
@@ -198,12 +198,6 @@ class SceneDataModule(L.LightningDataModule):
     def dx(self) -> float:
         """Grid spacing [m]."""
         return grid_spacing(self.spacing, self.settings.simulation.particles_per_cell)
-
-    def reconstructed(self) -> bool:
-        """Whether the training sequence's reconstruction lies in the cache."""
-        return stored(
-            self.scene, lambda: self.spacing, self.reconstruction_settings, cache_dir=self.cache, seed=self.settings.seed
-        )  # fmt: skip
 
     @property
     def _found_with(self) -> dict[str, Any]:

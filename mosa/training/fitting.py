@@ -17,13 +17,12 @@ from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
-from mosa.errors import ConfigError, DataError, SimulationDiverged
+from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa, check_trainer
-from mosa.training.loggers import DescribingLogger
 from mosa.training.run_folder import VALIDATION
 
 log = logging.getLogger(__name__)
@@ -56,22 +55,20 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
     try:
         return instantiate(entry, **arguments)
     except Exception as error:
-        cause = (
-            error.__cause__
-            if isinstance(error, InstantiationException) and error.__cause__ is not None
-            else error
-        )
+        if isinstance(error, InstantiationException) and error.__cause__ is not None:
+            cause = error.__cause__
+        else:
+            cause = error
         if str(error).startswith("Error locating target"):
             raise ConfigError(
                 f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found "
                 f"{entry.get('_target_')} ({cause.__cause__ or cause})"
             ) from error
         lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
-        way = (
-            f"; pip install {cause.name}"
-            if isinstance(cause, ModuleNotFoundError) and cause.name
-            else ""
-        )
+        if isinstance(cause, ModuleNotFoundError) and cause.name:
+            way = f"; pip install {cause.name}"
+        else:
+            way = ""
         if where == "trainer" and "gpu" in str(cause):
             way = "; trainer=cpu runs without one"
         raise ConfigError(
@@ -116,9 +113,6 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
         stored = read_checkpoint(ckpt_path)
         record = check_same(stored, module, ckpt_path)
         check_numbers(record, len(read_numbers(module.body)), ckpt_path)
-    for logger in trainer.loggers:
-        if isinstance(logger, DescribingLogger):
-            logger.law = module.body.material.law
     device = module.body.rest.device
     begun: list[bool] = []
     trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))
@@ -133,16 +127,8 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
             f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
             "check the checkpoint that it goes on from, or lower simulation.courant"
         ) from error
-    except (
-        ArithmeticError,
-        AttributeError,
-        FileNotFoundError,
-        LookupError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ) as error:
-        if begun or ckpt_path is None or lacks_memory(error):
+    except Exception as error:
+        if begun or ckpt_path is None or isinstance(error, MosaError) or lacks_memory(error):
             raise
         # Lightning takes its own entries as they are
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]

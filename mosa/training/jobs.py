@@ -13,12 +13,10 @@ import re
 import shutil
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import NoneType
 from typing import NoReturn
 
 from hydra.core.hydra_config import HydraConfig
@@ -27,21 +25,17 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from yaml import YAMLError
 
 from mosa.config.composition import configuration
 from mosa.errors import ConfigError, MosaError
-from mosa.settings import shown
 from mosa.system.console import fail, say_version
-from mosa.system.refused import explained, let_go
+from mosa.system.refused import causes, explained, let_go
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.training.sweep_table import FAILED, text_of, write_table
 
 log = logging.getLogger(__name__)
 
-WRITTEN = (".json", ".log", ".md", ".npz", ".ply", ".png", ".mp4")
-"""Endings of the files that a run writes into its folder."""
 LONGEST = 120
 """Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
 
@@ -74,33 +68,6 @@ def own_groups(command: str, conf: Path | None = None) -> str:
 OmegaConf.register_new_resolver("own_groups", own_groups, replace=True)
 
 
-def check_arguments(arguments: Sequence[str], conf: Path) -> None:
-    """Exit with 2 and a message for what Hydra answers with a traceback, or with thousands of digits: a group (a folder in conf)
-    that is given no name, and numbers that no float holds."""
-    for argument in arguments:
-        group, mark, value = argument.lstrip("+").partition("=")
-        expected = None
-        if re.search(r"\d{310}", value):
-            expected = "numbers within 1e308"
-        elif mark and "." not in group and group and (conf / group).is_dir() and unnamed(argument):
-            expected = "one of " + ", ".join(sorted(f.stem for f in (conf / group).glob("*.yaml")))
-        if expected is not None:
-            print(
-                f"\nConfigError: {group}: expected {expected}, found {shown(argument)}",
-                file=sys.stderr,
-            )
-            sys.exit(2)
-
-
-def unnamed(argument: str) -> bool:
-    """Whether an override has a number, a flag, a mapping or nothing as its value."""
-    try:
-        value = OverridesParser.create().parse_override(argument).value()
-    except HydraException:  # said by Hydra
-        return False
-    return value in ("", "~") or isinstance(value, (NoneType, int, float, dict))
-
-
 def quoted(argument: str) -> str:
     """An override as Hydra's grammar reads it: a value with letters beyond ASCII, or ~, &, = and the like, as paths have them, gets
     quotes. As it is where it can be read, and where it has a list, quotes or an escape, unless it begins as a path does."""
@@ -116,132 +83,51 @@ def quoted(argument: str) -> str:
 
 
 def check_folders(arguments: Sequence[str]) -> None:
-    """Exit with 2 and a message for a run folder that cannot be made, or a working one that is gone, to which Hydra answers with a
-    traceback."""
+    """Errors: ConfigError where runs would lie among other files, or those of a sweep in one folder."""
     try:
         os.getcwd()
-    except OSError:
-        print(
-            "\nConfigError: the folder that this was started in is no more; change to another one",
-            file=sys.stderr,
-        )
-        sys.exit(2)
+    except OSError as error:
+        raise ConfigError(
+            "the folder that this was started in is no more; change to another one"
+        ) from error
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if (
-            key == "hydra.sweep.subdir"
-            and "$" not in value
-            and {"-m", "--multirun"} & set(arguments)
-        ):
-            print(f"\nConfigError: {key}: expected a name that is another one for each job, as ${{hydra.job.num}} is: {value}: "
-                  "each would take the place of the one before", file=sys.stderr)  # fmt: skip
-            sys.exit(2)
-        if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:
-            continue
-        if not value.strip("'\" "):
-            print(
-                f"\nConfigError: {key}: expected a folder, found nothing; . is the one that this was started in",
-                file=sys.stderr,
+        if key in ("hydra.run.dir", "hydra.sweep.dir") and not value.strip("'\" "):
+            raise ConfigError(
+                f"{key}: expected a folder, found nothing; . is the one that this was started in"
             )
-            sys.exit(2)
-        place = Path(value.strip("'\"")).absolute()
-        there = next(folder for folder in (place, *place.parents) if os.path.lexists(folder))
-        if reason := no_place(there, there != place):
-            print(
-                f"\nConfigError: {key}: expected a folder that can be made, found {value}: {there}: {reason}",
-                file=sys.stderr,
+        many = {"-m", "--multirun"} & set(arguments)
+        if key == "hydra.sweep.subdir" and many and "$" not in value:
+            raise ConfigError(
+                f"{key}: expected a name that is another one for each job, as ${{hydra.job.num}} is: {value}: each would "
+                "take the place of the one before"
             )
-            sys.exit(2)
-        if key == "hydra.run.dir" and (foreign := no_file_of_a_run(place)) is not None:
-            print(f"\nConfigError: {key}: {foreign}: expected what a run has there, a file (of checkpoints and .hydra: a folder), "
-                  "found something else (a folder, a pipe, a device, a link to nothing); remove it", file=sys.stderr)  # fmt: skip
-            sys.exit(2)
 
 
-def no_place(folder: Path, new: bool) -> str | None:
-    """Why a run's files cannot be in a folder, or, new, a folder in it; None where they can."""
-    if not folder.is_dir():
-        return "it is none"
-    if not os.access(folder, os.W_OK):
-        return "it cannot be written to"
-    try:
-        if new:  # some file systems let nothing be made, whatever the rights say
-            os.rmdir(tempfile.mkdtemp(dir=folder))
-    except OSError as error:
-        return f"nothing can be made in it ({error.strerror})"
-    return None
-
-
-def no_file_of_a_run(folder: Path) -> Path | None:
-    """What has the name of a run's file and is none: a pipe would be waited for, a folder ends the run when it is written."""
-    found = [path for path in folder.glob("*") if path.suffix in WRITTEN and not path.is_file()]
-    found += [path for path in folder.glob("checkpoints/*.ckpt") if not path.is_file()]
-    found += [
-        path
-        for name in ("checkpoints", ".hydra")
-        if os.path.lexists(path := folder / name) and not path.is_dir()
-    ]
-    return min(found, default=None)
-
-
-def check_files(arguments: Sequence[str], conf: Path) -> None:
-    """Exit with 2 and a message for a YAML file among the arguments that cannot be read, to which Hydra answers with a traceback: a
-    tab, a key that stands twice, another encoding. conf: the folder of the groups; --config-dir adds one."""
-    folders, named = [conf], []
-    for word, following in zip(arguments, [*arguments[1:], ""]):
-        flag, mark, value = word.partition("=")
-        if flag in ("--config-dir", "-cd"):
-            folders.append(Path(value if mark else following))
-        elif flag in ("--config-name", "-cn"):
-            named.append((value if mark else following).removesuffix(".yaml"))
-        elif mark and not flag.startswith("-"):
-            group = flag.lstrip("+").partition("@")[0]
-            named += [
-                f"{group}/{each.strip()}"
-                for each in value.strip("'\"[]").removesuffix(".yaml").split(",")
-            ]
-    for file in (
-        folder / f"{name}.yaml"
-        for folder in folders
-        for name in named
-        if "\0" not in name and len(name) < LONGEST
-    ):
-        try:
-            if file.is_file():
-                OmegaConf.load(file)
-        except (YAMLError, UnicodeDecodeError, OSError) as error:
-            reason = " ".join(str(error).split())[:300]
-            print(
-                f"\nConfigError: {file}: expected YAML, found what cannot be read ({reason})",
-                file=sys.stderr,
-            )
-            sys.exit(2)
-
-
-def run_command(run: Callable[[], None], conf: str | Path) -> None:
-    """Run Hydra's `run` with what stands on the command line; conf: the folder of its groups.
-
-    Exit code 2 too for what Hydra refuses before any job begins: a mistake of the user like all others."""
+def run_command(run: Callable[[], None]) -> None:
+    """Run Hydra's `run` with what stands on the command line. What goes wrong before any job begins is a mistake of the user like
+    all others: one message and exit code 2."""
     say_version()
     settle_threads()
-    sys.argv[1:] = map(quoted, sys.argv[1:])
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function
     with tolerant_output():
-        check_arguments(sys.argv[1:], Path(conf))
-        check_folders(sys.argv[1:])
-        check_files(sys.argv[1:], Path(conf))
         try:
+            sys.argv[1:] = map(quoted, sys.argv[1:])
+            check_folders(sys.argv[1:])
             run()
-        except SystemExit as ended:
-            if ended.code == 1 and not begun:
-                print(
-                    "`+` adds parameters of laws and options of adapters alone; all keys: "
-                    "python -m mosa.config.reference <command> [KEY]",
-                    file=sys.stderr,
-                )
-                sys.exit(2)
-            raise
         except KeyboardInterrupt:  # between jobs, or before the first
             leave("stopped", 130)
+        except Exception as error:
+            if (message := explained(error)) is None:
+                if begun and not isinstance(error, HydraException):
+                    raise
+                said = dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error))
+                message = (
+                    f"ConfigError: {chr(10).join(said)[:2000]}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds parameters of laws "
+                    "and options of adapters alone; all keys: python -m mosa.config.reference <command> [KEY]"
+                )
+            print(f"\n{message}", file=sys.stderr)
+            sys.exit(2)
 
 
 begun: list[bool] = []
@@ -377,11 +263,10 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
     begun.append(True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
-    folder = (
-        OmegaConf.select(HydraConfig.get(), "runtime.output_dir")
-        if HydraConfig.initialized()
-        else None
-    )
+    if HydraConfig.initialized():
+        folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir")
+    else:
+        folder = None
     try:
         with (
             held(folder, wait=(cfg or {}).get("resume") == "auto")

@@ -78,6 +78,12 @@ OF_DATA = ("scene", "reconstruction", "rendering", "seed")
 """Sections of the configuration that the data module decides."""
 
 
+KEPT = (
+    "steps_done", "stage_over", "misfit", "compared", "grounds", "ground_gains", "law_gains", "parts",
+)  # fmt: skip
+"""What a checkpoint has of the fit under the same name (`FitRecord`)."""
+
+
 def body_of(shape: RestShape, record: BodyRecord) -> Body:
     """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
     body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
@@ -281,22 +287,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             cues = [take.cues.positions.cpu() for take in self.takes]
             responses = [take.response and take.response.written() for take in self.takes]
         fit = FitRecord(
-            stage=self.stage_index,
-            steps_done=self.steps_done,
-            losses=list(self.losses),
-            stage_over=self.stage_over,
-            particles=len(self.body.rest),
-            misfit=self.misfit,
-            compared=self.compared,
-            grounds=self.grounds,
-            ground_gains=self.ground_gains,
-            law_gains=self.law_gains,
-            parts=self.parts,
-            identification=self.identification.state() if self.identification else None,
-            retreat=self.retreat.written(),
-            cues=cues,
-            responses=responses,
-        )
+            **{name: getattr(self, name) for name in KEPT}, stage=self.stage_index, losses=list(self.losses),
+            particles=len(self.body.rest), identification=self.identification.state() if self.identification else None,
+            retreat=self.retreat.written(), cues=cues, responses=responses,
+        )  # fmt: skip
         record = RunRecord(
             **dict(self.record),
             start=self.start,
@@ -322,13 +316,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             )
         if self.record is not None:
             check_same_data(record, self.record.data, "the checkpoint")
-        self.stage_index, self.stage_over = saved.stage, saved.stage_over
-        self.losses, self.steps_done = list(saved.losses), saved.steps_done
+        for name in KEPT:
+            setattr(self, name, copy.copy(getattr(saved, name)))
+        self.stage_index, self.losses = saved.stage, list(saved.losses)
         self.start = record.start.plain()
-        self.misfit = saved.misfit
         self.saved_identification = saved.identification and saved.identification.plain()
         self.saved_retreat = saved.retreat and saved.retreat.plain()
-        self.compared = dict(saved.compared)
         if self.compared and (candidates := self.body.material.candidates):
             if (law := record.law) not in candidates:
                 raise ConfigError(
@@ -336,9 +329,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                     "the checkpoint: it belongs to another configuration"
                 )
             self.choose(law)
-        self.grounds, self.ground_gains = dict(saved.grounds), dict(saved.ground_gains)
-        self.law_gains = dict(saved.law_gains)
-        self.parts = dict(saved.parts)
         if self.ground_is_sought and record.ground is not None and not record.ground_is_sought:
             self.settle_ground(Ground(**record.ground.plain()))
         self.posterior = Posterior.read(record.posterior.plain()) if record.posterior else None

@@ -1,4 +1,4 @@
-"""Where the curves of a fit go: TensorBoard with descriptions, and the outcome of a run in the loggers that can show it.
+"""Pictures of a fit and the outcome of a run, in the loggers that can show them.
 
 Which loggers there are is said by conf/logger; any of Lightning's can be named there (`_target_`)."""
 
@@ -10,12 +10,7 @@ from typing import Any
 
 import numpy as np
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
-from lightning.pytorch.utilities import rank_zero_only
-from tensorboard.compat.proto.summary_pb2 import DATA_CLASS_SCALAR
 from torch import Tensor
-from torch.utils.tensorboard.summary import scalar
-
-from mosa.training.curves import described
 
 OUTCOME = (
     "train/rms_m",
@@ -27,32 +22,6 @@ OUTCOME = (
     "camera/psnr_crop",
     "test/mean_abs_C",
 )
-
-
-class DescribingLogger(TensorBoardLogger):
-    """TensorBoard's logger whose scalars carry descriptions (`curves.py`), which TensorBoard shows beside their titles."""
-
-    def __init__(
-        self, save_dir: str | Path, name: str = "tensorboard", version: str = "", **options: Any
-    ) -> None:
-        super().__init__(save_dir, name=name, version=version, default_hp_metric=False, **options)
-        self.law = ""  # of the prior, for the units of its parameters
-        self.written: set[str] = set()
-
-    @rank_zero_only
-    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """TensorBoard takes a description from the first point of a file, where torch's writer has no place for one."""
-        rest = dict(metrics)
-        for tag in [tag for tag in metrics if tag not in self.written]:
-            self.written.add(tag)
-            if (text := described(tag, self.law)) is not None:
-                point = scalar(tag, float(rest.pop(tag)))  # type: ignore[no-untyped-call]
-                about = point.value[0].metadata
-                about.summary_description, about.plugin_data.plugin_name = text, "scalars"
-                # without its class TensorBoard's fast reader takes the point for one of old programs and drops what is beside it
-                about.data_class = DATA_CLASS_SCALAR
-                self.experiment._get_file_writer().add_summary(point, step)
-        super().log_metrics(rest, step)
 
 
 PICTURED = (TensorBoardLogger, WandbLogger)

@@ -89,11 +89,9 @@ def posterior_figures(
 
 def true_geometry(body: Body, scene: Scene) -> dict[str, float]:
     """Figures of the body against the true shape, where that is known."""
-    return (
-        geometry_figures(body.rest, body.volume, scene)
-        if scene.synthetic and scene.truth is not None
-        else {}
-    )
+    if scene.synthetic and scene.truth is not None:
+        return geometry_figures(body.rest, body.volume, scene)
+    return {}
 
 
 def start_figures(start: Start) -> dict[str, float]:

@@ -12,19 +12,20 @@ from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
 from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
-from mosa.config.leaf_settings import CaptureSettings, EnvironmentsSettings, SplatsSettings
+from mosa.config.leaf_settings import CaptureSettings, SplatsSettings
 from mosa.config.record import RunRecord
-from mosa.data.checks.cameras import lines_of_sight, misses
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.modules.body.body import Body, Start, World
-from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.colliders import Collider, colliders_from_config
+from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.planes import ground_plane
 from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
 from mosa.system.limits import counted
+from mosa.training.memory import ball_of
 from mosa.twin.presets import preset
 from mosa.twin.twin import Twin
 from mosa.types import REST, Scene
@@ -76,11 +77,6 @@ def check_capture(values: Mapping[str, Any]) -> CaptureSettings:
     return CaptureSettings.read(values)
 
 
-def check_environments(values: Mapping[str, Any]) -> EnvironmentsSettings:
-    """All that the configuration of `python -m mosa.environments` says by itself. Errors: ConfigError naming the key."""
-    return EnvironmentsSettings.read(values)
-
-
 def check_particles(key: str, count: float) -> None:
     """Errors: ConfigError where the machine cannot hold as many."""
     counted(key, [count], "take as many as this machine has memory for", each=PARTICLE_BYTES / 2)
@@ -109,22 +105,15 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
     world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
-    turn_along(
-        [
-            *([ground_plane(world.ground, world.up)] if world.ground is not None else []),
-            *world.planes,
-        ]
-    )
-    chosen, origins, directions, radii = lines_of_sight(scene, 0)
-    if len(chosen) < 2:
+    ground = [] if world.ground is None else [ground_plane(world.ground, world.up)]
+    turn_along([*ground, *world.planes])
+    if (seen := ball_of(scene)) is None:
         return
-    place, _ = misses(origins, directions, radii)
+    place, radius = seen
     solids = colliders_from_config(plain(cfg.world)["colliders"] or ())
     check_clear(solids, place[None], "the object, as frame 0 shows it,")
-    dx, radius = cfg.simulation.dx, float((radii * ((place - origins) * directions).sum(1)).mean())
-    if dx is not None:
+    if (dx := cfg.simulation.dx) is not None:
         count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
-        check_particles("simulation.dx", count)
         if count < FEWEST:
             raise ConfigError(
                 f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
@@ -145,7 +134,7 @@ def warn_of_little(
     """A warning for a film that is learned from and ends when the object has hardly begun to deform, and for films of given motions
     alone, without a force. found: starts by prefix; scenes: theirs, in this order."""
     if world.colliders or world.planes or world.driven:
-        solids = (*world.colliders, *world.driven)
+        solids: list[Collider | Driven] = [*world.colliders, *world.driven]
         rests = all(
             scene.start == REST
             for prefix, scene in zip(found, scenes)

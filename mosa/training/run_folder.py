@@ -123,11 +123,16 @@ def device_label(name: str) -> str:
     return next(models, "") or platform.processor() or platform.machine()
 
 
+def peak_memory() -> float:
+    """GB that this process held at most."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
 def cost(device: str) -> dict[str, float | str]:
     """Device and peak memory of this process: `time/device`, `time/peak_memory_gb`, and of a GPU what torch took."""
     figures = {
         "time/device": device_label(device),
-        "time/peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "time/peak_memory_gb": peak_memory(),
     }
     if device != "cpu":
         figures["time/peak_gpu_memory_gb"] = torch.cuda.max_memory_allocated(device) / 1e9

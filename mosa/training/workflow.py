@@ -17,6 +17,7 @@ from mosa.config.build import measured, plain, world_of
 from mosa.config.checkpoints import check_same_data
 from mosa.config.composition import with_defaults
 from mosa.config.extensions import load_extensions
+from mosa.data.sequences import load_sequences
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
 from mosa.evaluation.same_body import warn_of_other_bodies
@@ -29,10 +30,11 @@ from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
-from mosa.training.assembly import Run, assemble, scenes
-from mosa.training.costs import before_data, estimate, estimate_text, peak_memory
+from mosa.training.datamodule import SceneDataModule
 from mosa.training.fitting import build_trainer, fit
+from mosa.training.lit_mosa import LitMosa
 from mosa.training.loggers import log_outcome
+from mosa.training.memory import check_before_data, check_with_data
 from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
 from mosa.training.preflight import (
     check_begin,
@@ -49,13 +51,14 @@ from mosa.training.run_folder import (
     cost,
     finished,
     most_particles,
+    peak_memory,
     quiet,
     run_folder,
 )  # fmt: skip
 from mosa.twin.drop_planning import plan, plan_text
 from mosa.twin.rollout_file import save_observed
 from mosa.twin.twin import Twin
-from mosa.types import AUTO, Scene
+from mosa.types import AUTO
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +80,7 @@ class StageTimes:
         yield
         took, name = time.perf_counter() - began, f"time/{stage}_s"
         self.figures[name] = self.figures.get(name, 0.0) + took
-        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory() / 1e9)
+        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory())
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -97,10 +100,9 @@ def train(cfg: DictConfig) -> float | None:
     begun = check_begin(cfg)
     trainer = build_trainer(cfg, folder)
     device = str(trainer.strategy.root_device)
-    run = assemble(cfg, device)
-    data = run.data
+    data = SceneDataModule(cfg, device=device)
     most = most_particles(device)
-    log.info(before_data(settings.plain(), most))
+    check_before_data(settings.plain(), most)
     with clock.measure("data"):
         scene, others = data.scenes
     if begun is not None:
@@ -108,11 +110,7 @@ def train(cfg: DictConfig) -> float | None:
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
-        parts, memory = estimate(
-            settings.plain(), scene, len(others), 1 + len(data.taught), device,
-            stored=data.reconstructed(), most=most,
-        )  # fmt: skip
-        log.info(estimate_text(parts, memory))
+        check_with_data(settings.plain(), scene, len(others), most)
     else:
         log.info(
             "tracked points only: no reconstruction from images, no figures of images, no video"
@@ -137,15 +135,19 @@ def train(cfg: DictConfig) -> float | None:
         velocity = ", ".join(f"{v:.3f}" for v in start.velocity.tolist())
         log.info("start of %s: velocity (%s) m/s", prefix, velocity)
     with clock.measure("fit"):
-        cut = learn(run, trainer, [scene, *others], starts, cfg.ckpt_path)
-    module, body = run.module, run.module.body
-    world = module.world  # where how the ground is touched was sought, it has been found
+        module = LitMosa(plain(cfg))
+        module.attach(data)
+        cut = learn(module, data, trainer, cfg.ckpt_path)
+    body, world = (
+        module.body,
+        module.world,
+    )  # where how the ground is touched was sought, it has been found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
     if filmed:
         seen = {prefix: take.cues for prefix, take in zip(learned_from, module.takes)}
         save_observed(folder / "observed.npz", seen)
     with clock.measure("evaluation"):
-        evaluated = run.sequences
+        evaluated = data.sequences
         figures, kept = figures_of(
             settings.evaluation, body, evaluated, world, module.posterior, folder
         )
@@ -161,19 +163,11 @@ def train(cfg: DictConfig) -> float | None:
     return optimized(figures, cfg.optimized_metric)
 
 
-def learn(
-    run: Run,
-    trainer: L.Trainer,
-    recordings: list[Scene],
-    starts: dict[str, Start],
-    ckpt_path: str | None,
-) -> str:
-    """The run's fit, from its checks to its warnings. Returns what `fit` does. recordings: the
-    run's sequences, the first of them taught. Errors: MosaError."""
-    module, world = run.module, run.world
-    body = module.body
-    check_starts(world, body, starts)
-    warn_of_little(world, body, starts, recordings)
+def learn(module: LitMosa, data: SceneDataModule, trainer: L.Trainer, ckpt_path: str | None) -> str:
+    """The run's fit, from its checks to its warnings. Returns what `fit` does. Errors: MosaError."""
+    body, starts, recordings = module.body, data.starts, [data.scene, *data.scenes[1]]
+    check_starts(module.world, body, starts)
+    warn_of_little(module.world, body, starts, recordings)
     warn_of_other_bodies(body, starts, recordings)
     if recordings[0].markers is not None and not all(stage.newton for stage in module.stages):
         raise ConfigError(
@@ -186,7 +180,7 @@ def learn(
         len(module.takes[0].cues.positions),
         sum(stage.iterations for stage in module.stages),
     )
-    cut = fit(trainer, module, run.data, ckpt_path)
+    cut = fit(trainer, module, data, ckpt_path)
     warn_of_ends(body.material)
     return cut
 
@@ -224,7 +218,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         written = twin.export(rollout, folder, colliders=world.solids, video=cfg.evaluation.video)
         log.info("simulated %d frames into %s", len(rollout.x), written)
         return None
-    scene, held_out = scenes(evaluated_scene(cfg, twin))
+    scene, held_out = load_sequences(plain(evaluated_scene(cfg, twin).scene))
     body, world = twin.body, twin.world
     if cfg.get("scene"):
         seen = appearance_of(body)

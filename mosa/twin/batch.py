@@ -44,12 +44,10 @@ class TwinWorlds:
             shape = (count, len(read_numbers(body)))
             said = f"one for each of {count} worlds, a tensor {shape} of finite numbers"
             laws = numbers("laws", laws, said, shape)
-        self.body, self.world, self.frame_dt, self.training_start = (
-            body,
-            world,
-            frame_dt,
-            training_start,
-        )
+        self.body = body
+        self.world = world
+        self.frame_dt = frame_dt
+        self.training_start = training_start
         self.count, self.laws = count, laws
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
@@ -97,11 +95,10 @@ class TwinWorlds:
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
         which, episode = list(which), self._going()
-        given = (
-            None
-            if starts is None
-            else [start for start, _ in self._found(starts, which, (), self._box, ())]
-        )
+        if starts is None:
+            given = None
+        else:
+            given = [start for start, _ in self._found(starts, which, (), self._box, ())]
         return episode.restart(which, given)
 
     def _found(
@@ -113,40 +110,24 @@ class TwinWorlds:
         driven: Any = None,
     ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
-        listed = isinstance(starts, (list, tuple)) and all(
-            isinstance(start, Mapping) for start in starts
-        )
-        if starts is not None and not isinstance(starts, Mapping) and not listed:
+        each = [starts or {}] * len(which) if isinstance(starts, Mapping | None) else starts
+        if not isinstance(each, (list, tuple)) or not all(isinstance(s, Mapping) for s in each):
             raise ConfigError(
                 f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}"
             )
-        each = (
-            [dict(starts or {})] * len(which)
-            if starts is None or isinstance(starts, Mapping)
-            else list(starts)
-        )
         if len(each) != len(which):
             raise ConfigError(
                 f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"
             )
         found: list[tuple[Start, World]] = []
+        more = {"colliders": colliders, "box": box, "driven": driven}
         for i, (b, given) in enumerate(zip(which, each)):
             StartArguments.read(given, f"starts[{b}]")
             if i and given is each[0]:
                 found.append(found[0])
                 continue
             try:
-                found.append(
-                    start_in(
-                        self.body,
-                        self.world,
-                        self.training_start,
-                        colliders=colliders,
-                        box=box,
-                        driven=driven,
-                        **given,
-                    )
-                )
+                found.append(start_in(self.body, self.world, self.training_start, **given, **more))
             except ConfigError as error:
                 raise ConfigError(f"starts[{b}]: {error}") from error
         return found

@@ -139,12 +139,10 @@ class Episode:
         frames: int = 30, substeps: int | None = None, laws: Tensor | None = None, gravity: Tensor | None = None,
         differentiable: bool = False, together: int | None = None,
     ) -> None:  # fmt: skip
-        self.world, self.colliders, self.frame_dt, self.differentiable = (
-            world,
-            world.solids,
-            frame_dt,
-            differentiable,
-        )
+        self.world = world
+        self.colliders = world.solids
+        self.frame_dt = frame_dt
+        self.differentiable = differentiable
         self.worlds = None if isinstance(starts, Start) else len(starts)
         self.names = [collider.name or str(i) for i, collider in enumerate(world.solids)]
         if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
@@ -276,10 +274,8 @@ class Episode:
             moved = chosen[:, None] & self._driven  # solids that are back
             poses = tuple(torch.where(moved.view(*moved.shape, *(1,) * (first.ndim - 2)), first, now)
                           for first, now in zip(self._first, self._poses))  # fmt: skip
-            now, spacing = (
-                moment.state.worlds(),
-                float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3),
-            )
+            now = moment.state.worlds()
+            spacing = float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3)
             for b in again:
                 begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
                 check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
@@ -353,14 +349,8 @@ class Episode:
             v, w, end = self._twist(commands.get(k, {}), x, R)
             turns = w.requires_grad or bool((w != 0).any())
             turned = exponential(times * w) @ R if turns else R.expand(count, *R.shape)
-            columns.append(
-                [
-                    x + times * v + self._raised,
-                    turned,
-                    v.expand(count, *x.shape),
-                    w.expand(count, *x.shape),
-                ]
-            )
+            speeds = v.expand(count, *x.shape), w.expand(count, *x.shape)
+            columns.append([x + times * v + self._raised, turned, *speeds])
             after = exponential(self.frame_dt * w) @ R if turns else R
             last.append([end.get("position", x + self.frame_dt * v), end.get("rotation", after)])
         axis = 1 + len(self._leading())
@@ -437,11 +427,8 @@ class Episode:
             if bool((said.detach().norm(dim=-1) > math.pi - 1e-6).any()):
                 # half a turn or more, from what was said last where that is where the solid is
                 R, last = self._poses[1].select(len(self._leading()), k), self._said.get(k)
-                last = (
-                    last
-                    if last is not None and torch.allclose(exponential(last).expand_as(R), R)
-                    else rotation_vector(R)
-                )
+                if last is None or not torch.allclose(exponential(last).expand_as(R), R):
+                    last = rotation_vector(R)
                 commands[k]["turn"] = turning(last, said)
             self._said[k] = said
         return commands
@@ -496,11 +483,10 @@ def _worlds(
             f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
             f"{'' if options['model'] == body.model() else ' of another variant'}"
         )
-    pulls = (
-        [world.gravity.to(body.rest)] * len(starts)
-        if gravity is None
-        else list(gravity.to(body.rest))
-    )
+    if gravity is None:
+        pulls = [world.gravity.to(body.rest)] * len(starts)
+    else:
+        pulls = list(gravity.to(body.rest))
     # the time step is one for all
     quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
     hardest = max(
@@ -525,10 +511,8 @@ def _worlds(
         state = replace(state, x=state.x + found[b % len(found)].lift)
         return state.to(simulator.dtype)
 
-    ready, states = (
-        found[0] if laws is None else Ready.stack(found),
-        [begin(b, start) for b, start in enumerate(starts)],
-    )
+    ready = found[0] if laws is None else Ready.stack(found)
+    states = [begin(b, start) for b, start in enumerate(starts)]
     arguments = ready.arguments
     if "held" in arguments:  # places of its own in each world, which may start elsewhere
         places = [state.x - found[b % len(found)].lift for b, state in enumerate(states)]

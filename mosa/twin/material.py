@@ -36,9 +36,13 @@ class TwinMaterial:
     known material."""
 
     __slots__ = ("_twin",)
+    _twin: Any
 
     def __init__(self, twin: Any) -> None:
-        self._twin = twin
+        object.__setattr__(self, "_twin", twin)
+
+    def __setattr__(self, name: str, value: float) -> None:
+        self.set(None, **{name: value})
 
     @property
     def _body(self) -> Body:
@@ -67,36 +71,20 @@ class TwinMaterial:
         mu, kappa = found.get("mu", 0.0), found["kappa"]
         return 9 * kappa * mu / (3 * kappa + mu) if law_named(self.law).sheared else 0.0
 
-    @E.setter
-    def E(self, value: float) -> None:
-        self.set(E=value)
-
     @property
     def nu(self) -> float:
         """Poisson's ratio at small strain."""
         return float(self._body.material.poisson())
-
-    @nu.setter
-    def nu(self, value: float) -> None:
-        self.set(nu=value)
 
     @property
     def density(self) -> float:
         """[kg/m^3] at rest. A film alone does not tell it: trained twins have the scene's."""
         return self._body.density
 
-    @density.setter
-    def density(self, value: float) -> None:
-        self.set(density=value)
-
     @property
     def damping(self) -> float:
         """Shear viscosity [Pa s] beside the law; 0 without."""
         return self.parameters.get("damping", 0.0)
-
-    @damping.setter
-    def damping(self, value: float) -> None:
-        self.set(damping=value)
 
     @property
     def field(self) -> Tensor:
@@ -194,13 +182,8 @@ class TwinMaterial:
         if settings:
             prior = {} if new else settings.get("prior", {})
             values, law = values_of(material), material.law.removesuffix(DAMPED)
-            settings["prior"] = {
-                **prior,
-                "law": law,
-                "parameters": values,
-                "candidates": None,
-                "frozen": None,
-            }
+            chosen = {"law": law, "parameters": values, "candidates": None, "frozen": None}
+            settings["prior"] = {**prior, **chosen}
             if body.adapter is None:
                 settings["adapter"] = {"name": None}
             if body.heterogeneity is None:

@@ -96,13 +96,8 @@ def pose(
 
 def save_observed(path: str | Path, parts: Mapping[str, MotionCues]) -> None:
     """npz with x [T, N, 3] and covariances [T, N, 3, 3] of the motions learned from, under `<name>/...` as `save_rollout`."""
-    save_parts(
-        path,
-        {
-            name: {"x": cues.positions, "covariances": cues.covariances}
-            for name, cues in parts.items()
-        },
-    )
+    kinds = {name: {"x": c.positions, "covariances": c.covariances} for name, c in parts.items()}
+    save_parts(path, kinds)
 
 
 def save_spread(path: str | Path, parts: Mapping[str, Tensor]) -> None:

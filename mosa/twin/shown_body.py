@@ -8,11 +8,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mosa.config.checkpoints import TENSORS, check_tensors, checked_splats
+from mosa.config.checkpoints import TENSORS, check_tensors
+from mosa.config.record import SplatsRecord
 from mosa.errors import DataError, MosaError
 from mosa.modules.body.body import Body, World
 from mosa.rendering.appearance.carried_splats import CarriedSplats
-from mosa.system.npz import read_npz, write_npz
+from mosa.system.npz import Arrays, read_npz, write_npz
 from mosa.types import Ground
 
 FILE = "body.npz"
@@ -45,39 +46,24 @@ class ShownBody:
     def read(cls, path: Path) -> ShownBody:
         """Of a file that `save_body` wrote, as plain numbers. Its world has a ground and a vertical, no solids and no pull.
         Errors: DataError naming file and part."""
-        found = {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
+        file = Arrays(path, read_npz(path))
+        found = {name: torch.from_numpy(array) for name, array in file.stored.items()}
+        written = {
+            name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)
+        }
         try:
-            check_tensors({name: found.get(name) for name in TENSORS}, path)
-            written = {
-                name.removeprefix(SPLATS): t for name, t in found.items() if name.startswith(SPLATS)
-            }
-            known = checked_splats(written or None, path)
-            splats = None if known is None else CarriedSplats.read(known, found["rest"])
+            check_tensors({name: found.get(name) for name in TENSORS})
+            known = SplatsRecord.read(written, "splats").plain() if written else None
         except MosaError as error:
-            raise DataError(str(error).removeprefix("ckpt_path: ")) from error
-        count = len(found["rest"])
-        for name, shape in (
-            ("factor", (count,)),
-            ("up", (3,)),
-            *([("ground", ())] if "ground" in found else []),
-        ):
-            part = found.get(name)
-            if (
-                part is None
-                or tuple(part.shape) != shape
-                or not part.is_floating_point()
-                or not bool(part.isfinite().all())
-            ):
-                raise DataError(
-                    f"{path}: {name}: expected finite numbers of shape {shape}, found "
-                    f"{'none' if part is None else f'{part.dtype} {tuple(part.shape)}'}"
-                )
-        if not float(found["up"].norm()) > 0:
-            raise DataError(f"{path}: up: expected a direction, found {found['up'].tolist()}")
-        up, ground = found["up"].float() / float(found["up"].norm()), found.get("ground")
-        world = World(
-            None if ground is None else Ground(float(ground)), torch.zeros(3), up, torch.zeros(2, 3)
-        )
+            raise DataError(f"{path}: {error}") from error
+        splats = None if known is None else CarriedSplats.read(known, found["rest"])
+        factor, up = file.entry("factor", len(found["rest"])), file.entry("up", 3)
+        ground = file.entry("ground")
+        if factor is None or up is None or not up.any():
+            raise DataError(f"{path}: factor, up: expected both, and a direction that is not 0")
+        vertical = torch.from_numpy(up).float()
+        met = None if ground is None else Ground(float(ground))
+        world = World(met, torch.zeros(3), vertical / vertical.norm(), torch.zeros(2, 3))
         parts = (
             found[name].float() for name in ("rest", "colors", "opacities", "covariances", "factor")
         )

@@ -138,11 +138,10 @@ def start_in(
     Q = first.rotation if rotation is None else rotation_matrix(rotation)
     Q = Q.to(body.rest)
     velocity_ = first.velocity if velocity is None else vector("velocity", velocity)
-    spin = (
-        first.angular_velocity
-        if angular_velocity is None
-        else vector("angular_velocity", angular_velocity)
-    )
+    if angular_velocity is None:
+        spin = first.angular_velocity
+    else:
+        spin = vector("angular_velocity", angular_velocity)
     center = first.center.to(body.rest)
     if position is not None:
         center = placed(position, center)

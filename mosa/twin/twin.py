@@ -133,10 +133,8 @@ class Twin:
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
                 "again), or its run kept none (a fit by Gauss-Newton does: fit.joint.optimizer=auto)"
             )
-        rollout, laws = (
-            self.simulate(**start),
-            self.posterior.draws(draws, torch.Generator().manual_seed(seed)),
-        )
+        rollout = self.simulate(**start)
+        laws = self.posterior.draws(draws, torch.Generator().manual_seed(seed))
         found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(
@@ -298,17 +296,14 @@ class Twin:
         # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
         for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
             if 0 < (far := reach(solid.shape)) < body.size:
-                low, high = (
-                    torch.minimum(low, at.amin(0).to(low) - far),
-                    torch.maximum(high, at.amax(0).to(high) + far),
-                )
+                low = torch.minimum(low, at.amin(0).to(low) - far)
+                high = torch.maximum(high, at.amax(0).to(high) + far)
         target = 0.5 * (low + high)
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
-        side = (
-            side - (side @ up) * up
-            if float((side - (side @ up) * up).norm()) > 1e-3
-            else torch.roll(up, 1)
-        )
+        if float((side - (side @ up) * up).norm()) > 1e-3:
+            side = side - (side @ up) * up
+        else:
+            side = torch.roll(up, 1)
         focal = 1.6 * size
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
         toward = side / side.norm() + 0.25 * up
@@ -321,38 +316,20 @@ class Twin:
             toward = float(toward.norm()) * given / given.norm()
         eye = target + distance * toward
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-        camera = Cameras(
-            K[None].to(body.rest),
-            look_at(eye, target, up)[None].to(body.rest),
-            size,
-            size,
-            ("view",),
-        )
+        K, w2c = (t[None].to(body.rest) for t in (K, look_at(eye, target, up)))
+        camera = Cameras(K, w2c, size, size, ("view",))
         alone = seen(body, rollout.x, rollout.F_tot)
         shown = with_solids(alone, solids, rollout.times, up, body.size / 30)
         images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
         lines = ground_lines(self.world, camera, body.size)
-        drawn = (
-            [
-                on_ground(
-                    to_uint8(image),
-                    lines,
-                    1,
-                    torch.ones(3),
-                    np.max(
-                        [
-                            ground_shadow(part, self.world, camera, body.size)
-                            for part in points.tensor_split([len(alone.opacities)])
-                        ],
-                        0,
-                    ),
-                )
-                for image, points in zip(images, shown.means)
-            ]
-            if lines
-            else []
-        )
-        return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
+        if not lines:
+            return images
+        drawn = []
+        for image, points in zip(images, shown.means):
+            parts = points.tensor_split([len(alone.opacities)])
+            shadow = np.max([ground_shadow(p, self.world, camera, body.size) for p in parts], 0)
+            drawn.append(on_ground(to_uint8(image), lines, 1, torch.ones(3), shadow))
+        return torch.from_numpy(np.stack(drawn)).float() / 255
 
     def _met(
         self,
@@ -446,19 +423,9 @@ def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
     """Binary PLY with x y z [m] and 8-bit colours."""
-    vertex = np.empty(
-        len(points),
-        dtype=[
-            ("x", "f4"),
-            ("y", "f4"),
-            ("z", "f4"),
-            ("red", "u1"),
-            ("green", "u1"),
-            ("blue", "u1"),
-        ],
-    )
-    for i, name in enumerate(("x", "y", "z")):
-        vertex[name] = points[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        vertex[name] = np.clip(colors[:, i] * 255 + 0.5, 0, 255).astype(np.uint8)
+    kinds = {"x": "f4", "y": "f4", "z": "f4", "red": "u1", "green": "u1", "blue": "u1"}
+    vertex = np.empty(len(points), dtype=list(kinds.items()))
+    numbers = np.concatenate([points, np.clip(colors * 255 + 0.5, 0, 255)], 1)
+    for i, name in enumerate(kinds):
+        vertex[name] = numbers[:, i]
     PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path))

@@ -22,7 +22,7 @@ from mosa.physics.contact.colliders import Shape
 from mosa.reconstruction.motion.cues import neighbourhood
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.rendering.observer import deformed_covariances
-from mosa.system.npz import read_npz
+from mosa.system.npz import Arrays
 from mosa.twin.rollout_file import shape_of
 from mosa.twin.shown_body import FILE, ShownBody
 from mosa.twin.twin import Twin
@@ -222,11 +222,9 @@ class Clip:
             )
         if by == "uncertainty":
             known = self.spread is not None and model == "learned"
-            return (
-                self.scales[by].paint(1e3 * self.spread[frame])
-                if known
-                else np.full_like(self.appearance, GRAY)
-            )
+            if known:
+                return self.scales[by].paint(1e3 * self.spread[frame])
+            return np.full_like(self.appearance, GRAY)
         far = self.deviation(frame, model)
         return (
             np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
@@ -243,12 +241,8 @@ class Clip:
         if motion.carried is None:
             return motion.centers[frame], motion.covariances[frame], colors, self.opacities
         colors = motion.carried.colors[frame] if plain else colors[self.splat_particles]
-        return (
-            motion.carried.centers[frame],
-            motion.carried.covariances[frame],
-            colors,
-            self.splat_opacities,
-        )
+        carried = motion.carried
+        return carried.centers[frame], carried.covariances[frame], colors, self.splat_opacities
 
     def caption(self, frame: int) -> str:
         """What a frame is, and what the scene leaves out."""
@@ -293,52 +287,45 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
             f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
             f"found no folder {folder}"
         )
-    rollouts = arrays(folder / "rollout.npz")  # first: it is what a run that has not ended lacks
+    learned = Arrays.of(folder / "rollout.npz")
+    if not learned.path.is_file():  # what a run that has not ended lacks
+        raise DataError(
+            f"{learned.path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
+            "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt"
+        )
     body = shown_body(folder, checkpoint)
-    paths = {kind: folder / f"{'rollout' if kind == 'learned' else kind}.npz" for kind in BODIES}
-    files = {
-        kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()
-    } | {"learned": rollouts}
-    spreads = arrays(folder / "uncertainty.npz") if (folder / "uncertainty.npz").is_file() else {}
-    tracked = arrays(folder / "markers.npz") if (folder / "markers.npz").is_file() else {}
-    clips = []
-    for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
-        check_motion(rollouts, name, paths["learned"], ("x",))
-        bodies, shape = {}, (len(rollouts[f"{name}/x"]), len(body.rest))
-        times = rollouts.get(f"{name}/times")
-        if (
-            times is None
-            or times.shape != shape[:1]
-            or not np.isfinite(times).all()
-            or (np.diff(times) <= 0).any()
-        ):
-            raise DataError(
-                f"{paths['learned']}: {name}/times: expected {shape[0]} increasing times, found "
-                f"{'none' if times is None else times.tolist()[:8]}"
-            )
-        for kind, stored in files.items():
-            if f"{name}/x" not in stored or (kind == "truth" and "observed" in bodies):
+    files = {kind: Arrays.of(folder / f"{kind}.npz") for kind in BODIES[:-1]} | {"learned": learned}
+    spreads, tracked = Arrays.of(folder / "uncertainty.npz"), Arrays.of(folder / "markers.npz")
+    clips, count = [], len(body.rest)
+    for name in (key.removesuffix("/x") for key in learned.stored if key.endswith("/x")):
+        x = learned.entry(f"{name}/x", None, count, 3)
+        frames, bodies = len(x), {}
+        times = learned.entry(f"{name}/times", frames)
+        if times is None or not frames or (np.diff(times) <= 0).any():
+            raise DataError(f"{learned.path}: {name}/times: expected {frames} increasing times")
+        for kind, file in files.items():
+            seen = kind == "observed"
+            x = file.entry(f"{name}/x", None if seen else frames, count, 3)
+            if x is None or (kind == "truth" and "observed" in bodies):
                 continue
-            check_motion(stored, name, paths[kind], ("x",))
-            frames, particles = stored[f"{name}/x"].shape[:2]
-            if (
-                particles != shape[1]
-                or frames > shape[0]
-                or (kind != "observed" and frames < shape[0])
-            ):
+            if len(x) > frames:
                 raise DataError(
-                    f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
-                    f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run"
+                    f"{file.path}: {name}/x: expected at most {frames} frames, found {len(x)}"
                 )
-            check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
-            x = stored[f"{name}/x"]
-            bodies[kind] = ShownMotion(x, covariances(stored, name, body), carried_by(body, x))
-        clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
-                          body.factor.numpy(), body.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
-                          points_of(tracked, name, shape[0], folder / "markers.npz"), **splat_keys(body),
-                          **solids_of(rollouts, name, shape[0], paths["learned"])))  # fmt: skip
+            bodies[kind] = ShownMotion(x, covariances(file, name, x, body), carried_by(body, x))
+        spread = spreads.entry(f"{name}/sd", frames, count)
+        if spread is not None and spread.min() < 0:
+            raise DataError(
+                f"{spreads.path}: {name}/sd: expected standard deviations of at least 0"
+            )
+        points = [tracked.entry(f"{name}/{kind}", frames, None, 3, holes=True)
+                  for kind in ("measured", "predicted")]  # fmt: skip
+        clips.append(Clip(
+            name, times, bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(), body.factor.numpy(), body.world, spread,
+            points_of(tracked.path, name, *points), **splat_keys(body), **solids_of(learned, name, frames),
+        ))  # fmt: skip
     if not clips:
-        raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
+        raise DataError(f"{learned.path}: expected the rollouts of a run, found none")
     return clips
 
 
@@ -356,20 +343,20 @@ def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
     return ShownBody.of(twin.body, twin.world)
 
 
-def solids_of(stored: dict[str, np.ndarray], name: str, frames: int, path: Path) -> dict[str, Any]:
+def solids_of(file: Arrays, name: str, frames: int) -> dict[str, Any]:
     """What a clip has of the colliders that the file has the shapes of. Errors: DataError naming file and entry."""
-    keys = [f"{name}/collider_{part}" for part in ("shape", "position", "rotation")]
-    if keys[0] not in stored:
+    shapes = file.entry(f"{name}/collider_shape", None, 4)
+    if shapes is None:
         return {}
-    found = [stored.get(key) for key in keys]
-    count = len(found[0])
-    expected = ((count, 4), (frames, count, 3), (frames, count, 3, 3))
-    for key, each, shape in zip(keys, found, expected):
-        if each is None or each.shape != shape or not np.isfinite(each).all():
-            raise DataError(f"{path}: {key}: expected finite numbers of shape {shape}")
-    solid = found[0][:, 0] >= 0
-    poses = found[1][:, solid], found[2][:, solid]
-    return {"solids": tuple(map(shape_of, found[0][solid])), "solid_poses": poses}
+    poses = [file.entry(f"{name}/collider_position", frames, len(shapes), 3),
+             file.entry(f"{name}/collider_rotation", frames, len(shapes), 3, 3)]  # fmt: skip
+    if any(pose is None for pose in poses):
+        raise DataError(f"{file.path}: {name}: expected collider_position and collider_rotation")
+    solid = shapes[:, 0] >= 0
+    return {
+        "solids": tuple(map(shape_of, shapes[solid])),
+        "solid_poses": tuple(pose[:, solid] for pose in poses),
+    }
 
 
 def carried_by(body: ShownBody, x: np.ndarray) -> ShownSplats | None:
@@ -390,82 +377,25 @@ def splat_keys(body: ShownBody) -> dict[str, np.ndarray]:
     return {"splat_opacities": body.splats.opacities.numpy(), "splat_particles": nearest}
 
 
-def spread_of(
-    stored: dict[str, np.ndarray], name: str, shape: tuple[int, int], path: Path
-) -> np.ndarray | None:
-    """(T, N) [m], None where the file has none for this sequence. Errors: DataError naming file and entry."""
-    found = stored.get(f"{name}/sd")
-    if found is None:
+def points_of(path: Path, name: str, measured: np.ndarray | None, predicted: np.ndarray | None) -> np.ndarray | None:  # fmt: skip
+    """(2, T, M, 3) [m] of points, None without any. Errors: DataError where one of both is missing, or of other points."""
+    if measured is None and predicted is None:
         return None
-    if (
-        found.shape != shape
-        or found.dtype.kind != "f"
-        or not np.isfinite(found).all()
-        or found.min() < 0
-    ):
-        raise DataError(
-            f"{path}: {name}/sd: expected {shape} finite standard deviations, found {found.dtype} {found.shape}"
-        )
-    return found
+    if measured is None or predicted is None or measured.shape != predicted.shape:
+        raise DataError(f"{path}: {name}/measured, {name}/predicted: expected the same points")
+    return np.stack([measured, predicted]).astype(np.float32)
 
 
-def points_of(
-    stored: dict[str, np.ndarray], name: str, frames: int, path: Path
-) -> np.ndarray | None:
-    """(2, T, M, 3) [m] measured and predicted points, None where the file has none of this
-    sequence. Errors: DataError naming file and entry."""
-    kinds = [stored.get(f"{name}/{kind}") for kind in ("measured", "predicted")]
-    if all(found is None for found in kinds):
-        return None
-    shapes = [None if found is None else found.shape for found in kinds]
-    if shapes[0] != shapes[1] or len(shapes[0]) != 3 or shapes[0][::2] != (frames, 3):
-        raise DataError(
-            f"{path}: {name}/measured, {name}/predicted: expected points of shape "
-            f"({frames}, M, 3) both, found {shapes[0]} and {shapes[1]}"
-        )
-    return np.stack(kinds).astype(np.float32)
-
-
-def check_motion(
-    stored: dict[str, np.ndarray], name: str, path: Path, keys: tuple[str, ...]
-) -> None:
-    """What there is of a motion is finite, and of the positions' frames and particles. Errors: DataError naming file and entry."""
-    frames = stored[f"{name}/x"].shape[:2]
-    for key in (key for key in keys if f"{name}/{key}" in stored):
-        found, each = stored[f"{name}/{key}"], (3,) if key == "x" else (3, 3)
-        if (
-            found.dtype.kind != "f"
-            or found.shape != (*frames, *each)
-            or len(frames) != 2
-            or 0 in frames
-        ):
-            raise DataError(
-                f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames "
-                f"and particles as {name}/x has, found {found.dtype} {found.shape}"
-            )
-        if not np.isfinite(found).all():
-            raise DataError(f"{path}: {name}/{key}: expected finite numbers")
-
-
-def covariances(stored: dict[str, np.ndarray], name: str, body: ShownBody) -> np.ndarray:
+def covariances(file: Arrays, name: str, x: np.ndarray, body: ShownBody) -> np.ndarray:
     """(T, N, 3, 3) [m^2] of a motion's splats: the stored ones; else those at rest, deformed by the stored F_tot, or where there
     are positions alone by a local fit to them."""
-    if f"{name}/covariances" in stored:
-        return stored[f"{name}/covariances"]
-    if f"{name}/F_tot" in stored:
-        F = torch.from_numpy(stored[f"{name}/F_tot"])
+    shape = (*x.shape, 3)
+    if (known := file.entry(f"{name}/covariances", *shape)) is not None:
+        return known
+    if (stored := file.entry(f"{name}/F_tot", *shape)) is not None:
+        F = torch.from_numpy(stored)
     else:
         around = neighbourhood(body.rest)
-        F = torch.stack([around.deformation(x) for x in torch.from_numpy(stored[f"{name}/x"])])
+        F = torch.stack([around.deformation(each) for each in torch.from_numpy(x)])
         F[:, around.weight == 0] = torch.eye(3)  # neighbours in a plane say nothing: as at rest
     return deformed_covariances(F, body.covariances).numpy()
-
-
-def arrays(path: Path) -> dict[str, np.ndarray]:
-    """Contents of an npz file. Errors: DataError naming it."""
-    if not path.is_file():
-        raise DataError(
-            f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
-            "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt"
-        )
-    return read_npz(path)

@@ -59,11 +59,9 @@ class Live:
         self.up = self.up / np.linalg.norm(self.up)
         self.across = horizontal(self.up)
         self.arms = (body.rest - body.center).double().cpu().numpy()
-        self.reach, self.size, self.dt = (
-            float(np.linalg.norm(self.arms, axis=1).max()),
-            body.size,
-            twin.frame_dt,
-        )
+        self.reach = float(np.linalg.norm(self.arms, axis=1).max())
+        self.size = body.size
+        self.dt = twin.frame_dt
         self.ground = 0.0 if world.ground is None else float(world.ground.height)
         # at least two cells thick, that no material on both sides of it touches
         self.radius = max(0.12 * self.size, 1.25 * body.settings.dx)
@@ -142,7 +140,7 @@ class Live:
 
     def soften(self, E: float) -> None:
         """Young's modulus [Pa] of the drops to come."""
-        self.twin.material.E = E
+        self.twin.material.set(E=E)
 
     def reset(self) -> bool:
         """Back to the beginning of the last drop, the ball at home, paused."""
@@ -191,11 +189,9 @@ class Live:
     @property
     def hand_position(self) -> np.ndarray:
         """(3,) [m] of the ball now."""
-        return (
-            np.asarray(self.target, np.float64)
-            if self.state is None
-            else self.state.position[self.column].numpy()
-        )
+        if self.state is None:
+            return np.asarray(self.target, np.float64)
+        return self.state.position[self.column].numpy()
 
     def poses(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """((3,) position [m], (3, 3) rotation) of the twin's own colliders now."""
@@ -234,11 +230,9 @@ class Live:
     def nearest(self) -> np.ndarray | None:
         """(M,) particle nearest to each carried splat at rest; None where the particles are what is shown."""
         body = self.twin.body
-        return (
-            None
-            if body.splats is None
-            else cKDTree(body.rest.cpu().numpy()).query(body.splats.means.cpu().numpy())[1]
-        )
+        if body.splats is None:
+            return None
+        return cKDTree(body.rest.cpu().numpy()).query(body.splats.means.cpu().numpy())[1]
 
     def stretch(self) -> np.ndarray:
         """(N,) [-] largest principal stretch less 1: by how much the material's longest fibre there is longer than at rest."""

@@ -12,15 +12,17 @@ import numpy as np
 from mosa.viewer.live import COLORS, Live
 from mosa.viewer.pages import (
     add_ground,
+    add_points,
     add_solid,
     aim,
     beside_panel,
     cell,
     offered,
     open_server,
+    splat_parts,
     turn,
     view_of,
-)
+)  # fmt: skip
 
 log = logging.getLogger(__name__)
 
@@ -67,12 +69,11 @@ class LiveViewer:
         scene, ball = self.server.scene, live.hand_position
         self.place()
         _, covariances, _, _ = live.splats("appearance", live.paint("appearance")[0])
-        # viser keeps covariances as float16: in units of the largest one they keep their shape
         self.unit = float(np.sqrt(np.linalg.eigvalsh(covariances).max()))
         self.splats = None
-        self.points = scene.add_point_cloud("/body", live.positions.cpu().numpy(), live.paint("appearance")[0].astype(np.float32),
-                                            point_size=0.5 * live.size / len(body.rest) ** (1 / 3), point_shape="circle",
-                                            precision="float32")  # fmt: skip
+        size = 0.5 * live.size / len(body.rest) ** (1 / 3)
+        painted = live.paint("appearance")[0].astype(np.float32)
+        self.points = add_points(scene, "/body", live.positions.cpu().numpy(), painted, size)
         self.solids = [
             add_solid(scene, f"/collider_{i}", c.shape)
             for i, c in enumerate(live.twin.world.colliders)
@@ -101,26 +102,13 @@ class LiveViewer:
         scene.set_up_direction(tuple(map(float, live.up)))
         x = live.positions.double().cpu().numpy()
         ground = live.twin.world.ground
-        around = np.concatenate(
-            [
-                x,
-                x + 1.5 * live.size * live.across,
-                x - 1.5 * live.size * live.across,
-                live.hand_position[None],
-            ]
-        )
+        side = 1.5 * live.size * live.across
+        around = np.concatenate([x, x + side, x - side, live.hand_position[None]])
         eye, target = view_of(around, live.up, live.across, None if ground is None else live.ground)
         aim(*beside_panel(eye, target, live.up), self.server.initial_camera)
         if ground is not None:
-            add_ground(
-                scene,
-                live.up,
-                live.across,
-                live.ground,
-                live.size,
-                target,
-                float(np.linalg.norm(eye - target)),
-            )
+            far = float(np.linalg.norm(eye - target))
+            add_ground(scene, live.up, live.across, live.ground, live.size, target, far)
 
     def drop(self) -> None:
         """Let the body go as the sliders say."""
@@ -178,13 +166,7 @@ class LiveViewer:
             live, by = self.live, offered(self.color)
             colors, scale = live.paint(by)
             if offered(self.geometry) == "splats":
-                means, covariances, painted, opacities = live.splats(by, colors)
-                parts = (
-                    (means / self.unit).astype(np.float32),
-                    covariances / self.unit**2,
-                    painted,
-                    opacities[:, None],
-                )
+                parts = splat_parts(self.unit, *live.splats(by, colors))
                 if self.splats is None:
                     self.splats = self.server.scene.add_gaussian_splats(
                         "/splats", *parts, scale=self.unit

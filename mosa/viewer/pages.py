@@ -151,21 +151,33 @@ def add_ground(
     # lines at multiples of the width
     at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ up])
     extent = 2 * width * math.ceil(far / width)
-    scene.add_grid(
-        "/ground",
-        extent,
-        extent,
-        plane="xy",
-        cell_size=width,
-        section_size=10 * width,
-        position=at,
-        wxyz=turn(axes),
-    )
+    look = {"plane": "xy", "cell_size": width, "section_size": 10 * width}
+    scene.add_grid("/ground", extent, extent, position=at, wxyz=turn(axes), **look)
 
 
 def turn(rotation: np.ndarray) -> np.ndarray:
     """(4,) quaternion as viser has it, real part first, of a (3, 3) rotation."""
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+
+
+def add_points(
+    scene: Any, name: str, points: np.ndarray, colors: Any, size: float, **options
+) -> Any:
+    """A node for points (N, 3) [m] of `size` [m]."""
+    look = {"point_size": size, "point_shape": "circle", "precision": "float32"}
+    return scene.add_point_cloud(name, points.astype(np.float32), colors, **look, **options)
+
+
+def splat_parts(
+    unit: float,
+    means: np.ndarray,
+    covariances: np.ndarray,
+    colors: np.ndarray,
+    opacities: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """What viser takes of splats, in units of `unit` [m]: it keeps covariances as float16, whose steps are 6e-8 below 6e-5, and in
+    m^2 a splat of 0.5 mm would lose its shape."""
+    return (means / unit).astype(np.float32), covariances / unit**2, colors, opacities[:, None]
 
 
 def add_solid(

@@ -10,31 +10,32 @@ from __future__ import annotations
 
 import logging
 import re
-import sys
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from mosa.errors import ConfigError, DataError, MosaError
+from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.marker_figures import MEASURED, PREDICTED
 from mosa.system.limits import named_device
-from mosa.system.refused import explained
+from mosa.system.refused import one_message
 from mosa.twin.twin import Twin
 from mosa.viewer.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.viewer.live import Live
 from mosa.viewer.live_viewer import LiveViewer
 from mosa.viewer.pages import (
     add_ground,
+    add_points,
     add_solid,
     aim,
     beside_panel,
     offered,
     open_server,
+    splat_parts,
     turn,
     view_of,
-)
+)  # fmt: skip
 
 GEOMETRY = ("splats", "particles")
 
@@ -49,11 +50,9 @@ def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
 
 def layouts(clip: Clip) -> tuple[str, ...]:
     """All bodies side by side, two of them over each other, or one alone."""
-    return (
-        ("side by side", *clip.overlays, *clip.bodies)
-        if len(clip.bodies) > 1
-        else tuple(clip.bodies)
-    )
+    if len(clip.bodies) > 1:
+        return ("side by side", *clip.overlays, *clip.bodies)
+    return tuple(clip.bodies)
 
 
 class Viewer:
@@ -61,11 +60,9 @@ class Viewer:
     Errors: ConfigError without viser, or for a host that is no address of this machine."""
 
     def __init__(self, clips: Sequence[Clip], *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.clips, self.ended, self.drawing = (
-            {clip.name: clip for clip in clips},
-            threading.Event(),
-            threading.RLock(),
-        )
+        self.clips = {clip.name: clip for clip in clips}
+        self.ended = threading.Event()
+        self.drawing = threading.RLock()
         self.server = open_server(host, port)
         first = clips[0]
         gui = self.server.gui
@@ -100,41 +97,17 @@ class Viewer:
             add_ground(
                 scene, clip.up, clip.across, clip.world.ground.height, clip.size, target, far
             )
-        # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
-        self.unit = float(
-            np.sqrt(np.linalg.eigvalsh(clip.splats("learned", 0, "appearance")[1]).max())
-        )
-        self.nodes = {}
+        whole = clip.splats("learned", 0, "appearance")
+        self.unit = float(np.sqrt(np.linalg.eigvalsh(whole[1]).max()))
+        self.nodes, centers = {}, clip.learned.centers[0]
         for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
-            centers, colors = (
-                clip.learned.centers[0].astype(np.float32),
-                clip.appearance.astype(np.float32),
-            )
-            means, covariances, painted, opacities = clip.splats("learned", 0, "appearance")
-            splats = scene.add_gaussian_splats(
-                f"/{name}/splats",
-                means.astype(np.float32),
-                covariances,
-                painted,
-                opacities[:, None],
-                scale=self.unit,
-                visible=False,
-            )
+            parts = splat_parts(1.0, *whole)
             spacing = 0.5 * clip.size / len(centers) ** (1 / 3)
-            points = scene.add_point_cloud(
-                f"/{name}/particles",
-                centers,
-                colors,
-                point_size=spacing,
-                point_shape="circle",
-                precision="float32",
-                visible=False,
-            )
             self.nodes[name] = (
-                splats,
-                points,
+                scene.add_gaussian_splats(f"/{name}/splats", *parts, scale=self.unit, visible=False),
+                add_points(scene, f"/{name}/particles", centers, clip.appearance.astype(np.float32), spacing, visible=False),
                 scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
-            )
+            )  # fmt: skip
 
         self.solids = {
             (each.name, place): [
@@ -144,18 +117,9 @@ class Viewer:
             for each in clips
             for place in range(len(each.bodies))
         }
-        self.points = [
-            scene.add_point_cloud(
-                f"/points/{kind}",
-                np.zeros((1, 3), np.float32),
-                color,
-                point_size=0.02 * clip.size,
-                point_shape="circle",
-                precision="float32",
-                visible=False,
-            )
-            for kind, color in (("measured", MEASURED), ("predicted", PREDICTED))
-        ]
+        none, size = np.zeros((1, 3)), 0.02 * clip.size
+        self.points = [add_points(scene, f"/points/{kind}", none, color, size, visible=False)
+                       for kind, color in (("measured", MEASURED), ("predicted", PREDICTED))]  # fmt: skip
 
     def look(self, *cameras) -> None:
         """The current sequence's first view, for what viser calls cameras."""
@@ -196,14 +160,8 @@ class Viewer:
             for name, nodes in self.nodes.items():
                 shown = name in clip.bodies and (layout == "side by side" or name in (above, below))
                 shown = shown and frame < len(clip.bodies[name].centers)
-                for node, wanted in zip(
-                    nodes,
-                    (
-                        offered(self.geometry) == "splats",
-                        offered(self.geometry) == "particles",
-                        True,
-                    ),
-                ):
+                kind = offered(self.geometry)
+                for node, wanted in zip(nodes, (kind == "splats", kind == "particles", True)):
                     node.visible = shown and wanted
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
@@ -233,26 +191,18 @@ class Viewer:
         centers = clip.bodies[name].centers[frame] + shift
         if splats.visible:
             means, covariances, colors, opacities = clip.splats(name, frame, offered(self.color))
-            colors, opacities = (
-                (np.full_like(colors, GRAY), FAINT * opacities) if under else (colors, opacities)
-            )
+            if under:
+                colors, opacities = np.full_like(colors, GRAY), FAINT * opacities
             splats.set_gaussians(
-                ((means + shift) / self.unit).astype(np.float32),
-                covariances / self.unit**2,
-                colors,
-                opacities[:, None],
+                *splat_parts(self.unit, means + shift, covariances, colors, opacities)
             )
         else:
-            colors = (
-                clip.appearance
-                if name == clip.reference
-                else clip.paint(frame, offered(self.color), name)
-            )
+            colors = clip.appearance
+            if name != clip.reference:
+                colors = clip.paint(frame, offered(self.color), name)
             colors = np.full_like(colors, GRAY) if under else colors
-            points.points, points.colors = (
-                centers.astype(np.float32),
-                (255 * colors).astype(np.uint8),
-            )
+            points.points = centers.astype(np.float32)
+            points.colors = (255 * colors).astype(np.uint8)
         label.text = f"{name} (gray)" if under else name
         top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size
         middle = 0.5 * (centers.min(0) + centers.max(0))
@@ -332,17 +282,9 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
 
 
 def main(arguments: Sequence[str]) -> None:
-    try:
+    with one_message():
         chosen = options(arguments)
         viewer = opened(chosen)
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        sys.exit(2)
-    except Exception as error:
-        if (reason := explained(error)) is None:
-            raise
-        print(f"\n{reason}", file=sys.stderr)
-        sys.exit(2)
     port = viewer.server.get_port()
     if port != int(chosen["port"]):
         print(f"port {chosen['port']} is taken; serving on {port}")

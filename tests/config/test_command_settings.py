@@ -2,8 +2,6 @@
 
 import copy
 import functools
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -128,15 +126,3 @@ def test_eval_has_its_own_keys():
 def test_a_new_start_of_the_wrong_kind_is_named(values, key):
     with pytest.raises(ConfigError, match=rf"simulate\.{key}: expected "):
         EvalSettings.read({"ckpt_path": "a", "simulate": values})
-
-
-def test_a_group_without_an_option_is_one_message():
-    found = subprocess.run(
-        [sys.executable, "train.py", "adapter=null"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert found.returncode == 2 and "ConfigError: adapter: expected one of direct" in found.stderr
-    assert "Traceback" not in found.stderr

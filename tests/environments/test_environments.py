@@ -27,7 +27,7 @@ from mosa.environments.arena import (
 )
 from mosa.environments.pictures import film
 from mosa.environments.policies import LinearPolicy, Search, by_gradient, by_model
-from mosa.environments.study import Bench, Setting
+from mosa.environments.study import Bench
 from mosa.environments.task import CLEARANCE, View
 from mosa.environments.tasks import TASKS, task_named
 from mosa.environments.truth import true_twin
@@ -329,16 +329,14 @@ def test_a_simulator_is_named_and_what_is_missing_is_said():
 def small_bench(tmp_path, monkeypatch, **changes):
     """A study of which no simulator comes from a file: the truth is softer than what was learned."""
     search = Search(iterations=1, batch=2, rate=0.1, every=1, validation=2)
-    values = {"task": "placement", "checkpoint": None, "scene": "tiny", "device": "cpu", "policy": "gradient", "search": search,
-              "trials": 3, "worlds": 2, "spacing": None,
-              "options": {"steps": 4}}  # fmt: skip
+    values = {"search": search, "trials": 3, "worlds": 2, "options": {"steps": 4}, "truth": {"scene": "tiny"}}  # fmt: skip
     made = {
         "learned": simulator(),
         "isotropic": simulator("isotropic", E=1.2e5),
         "truth": simulator("truth", E=3e4),
     }
     monkeypatch.setattr(study, "simulator_named", lambda name, *a, **k: made[name])
-    return Bench(Setting(**{**values, **changes}))
+    return Bench(EnvironmentsSettings.read({**values, **changes}))
 
 
 def test_the_table_is_made_once_and_resumed(tmp_path, monkeypatch):
@@ -438,7 +436,7 @@ def test_the_truths_jobs_do_not_wait_for_a_twin(tmp_path, monkeypatch):
     study.make_jobs(before, [("none", 0), ("truth", 0)], tmp_path)
     checkpoint = tmp_path / "last.ckpt"
     checkpoint.write_bytes(b"a twin")
-    bench = small_bench(tmp_path, monkeypatch, checkpoint=str(checkpoint), scene=None)
+    bench = small_bench(tmp_path, monkeypatch, checkpoint=str(checkpoint), truth={})
     settings = bench.simulator("learned").twin.record.settings
     settings["scene"] = {"format": "builtin", "name": "tiny"}
     made, record = [], study._record

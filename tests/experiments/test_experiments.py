@@ -100,11 +100,11 @@ def test_the_paper_s_figures_are_those_of_its_tables():
 
 @pytest.mark.parametrize(("text", "message"), [
     ("title: a\nrows: x\ncolumns: y\nfigures: []\n", "axes: expected this key"),
-    ("title: a\naxes: {x: {o: []}}\nrows: z\ncolumns: x\nfigures: []\n", "rows: expected one of x, found 'z'"),
+    ("title: a\naxes: {x: {o: []}}\nrows: z\ncolumns: x\nfigures: []\n", "rows, columns: expected two of x, found 'z'"),
     ("title: a\naxes: {x: nothing}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x: expected one of .*, found 'nothing'"),
     ("title: a\naxes: {x: {of: objects, only: [q]}}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x: expected some of .*'q'"),
-    ("title: a\naxes: {x: {o: {cots: 1}}}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x\.o: expected fields of name"),
-    ("title: a\nfoo: 1\n", "foo: unknown key"),
+    ("title: a\naxes: {x: {o: {cots: 1}}}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x\.o\.cots: unknown key"),
+    ("title: a\naxes: {x: {o: []}}\nrows: x\ncolumns: x\nfigures: []\nfoo: 1\n", "foo: unknown key"),
     ("[", "no readable YAML"),
 ])  # fmt: skip
 def test_a_mistake_in_a_file_names_its_key(tmp_path, text, message):
@@ -568,6 +568,7 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(
     cache, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(specimens, "ANGLES", 4)
+    monkeypatch.setattr(running, "PROGRAM", "starts_once:train")
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
              "--only", "method=ours"]  # fmt: skip
     more = [f"scene.cache={cache}", "evaluation.samples=500", "evaluation.assignment=100"]
@@ -634,7 +635,7 @@ def test_a_claim_of_a_figure_or_row_that_is_not_there_is_a_mistake_of_the_file()
     figures = (Figure("a", "x"),)
     for found, message in (({"text": "t", "figure": "b", "most": 1}, "expected one of a, found 'b'"),
                            ({"text": "t", "figure": "a"}, "row with against, or most"),
-                           ({"text": "t", "figure": "a", "rwo": "x"}, "expected fields of")):  # fmt: skip
+                           ({"text": "t", "figure": "a", "rwo": "x"}, "rwo: unknown key")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
             claim_of("f: claims[0]", found, figures)
     for name in NAMES:  # rows that the claims name are rows

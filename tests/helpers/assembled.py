@@ -1,16 +1,20 @@
 """A fit of the tiny scene, assembled as train.py does and not begun."""
 
 from collections.abc import Collection
+from functools import cached_property
 from pathlib import Path
 from unittest.mock import patch
 
 import lightning as L
+from omegaconf import DictConfig
 from starts_once import start_once
 
 from mosa import compose
+from mosa.config.build import plain
 from mosa.data.batches import SequenceBatch
 from mosa.training import datamodule
-from mosa.training.assembly import Run, assemble
+from mosa.training.datamodule import SceneDataModule
+from mosa.training.lit_mosa import LitMosa
 
 ROOT = Path(__file__).parents[2]
 ROUGHLY = ["reconstruction.resolution=40", "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30",
@@ -18,12 +22,23 @@ ROUGHLY = ["reconstruction.resolution=40", "reconstruction.static.iterations=30"
 """Overrides of a reconstruction in a third of the time, for tests that ask nothing of its accuracy."""
 
 
+class Run:
+    """Data and module of a configuration, put together as train.py does it."""
+
+    def __init__(self, cfg: DictConfig) -> None:
+        self.cfg, self.data = cfg, SceneDataModule(cfg, device="cpu", held_out=False)
+
+    @cached_property
+    def module(self) -> LitMosa:
+        module = LitMosa(plain(self.cfg))
+        module.attach(self.data)
+        return module
+
+
 def made(cache: Path, *overrides: str, taught: Collection[str] = ()) -> Run:
     """cache: folder of the scene and its reconstruction; taught: further sequences."""
     names = f"scene.also_train=[{','.join(taught)}]"
-    run = assemble(
-        compose("debug=default", f"scene.cache={cache}", names, *overrides), held_out=False
-    )
+    run = Run(compose("debug=default", f"scene.cache={cache}", names, *overrides))
     with patch.object(datamodule, "sequence_start", start_once):
         _ = run.data.starts
     return run
@@ -32,7 +47,7 @@ def made(cache: Path, *overrides: str, taught: Collection[str] = ()) -> Run:
 def assembled(cache: Path, *overrides: str, taught: Collection[str] = ()) -> tuple:
     """(cfg, training scene, module)."""
     run = made(cache, *overrides, taught=taught)
-    return run.cfg, run.scene, run.module
+    return run.cfg, run.data.scene, run.module
 
 
 def whole(take) -> SequenceBatch:

@@ -1,5 +1,5 @@
 """`sequence_start` once for all processes that share the tests: a start takes a second or two, and what most runs differ in comes
-after it. The first run of tests/integration/test_main_job.py is a process of its own, which finds its starts itself."""
+after it."""
 
 import hashlib
 import os
@@ -15,6 +15,15 @@ from mosa.types import Appearance, Scene
 
 FOLDER = "TESTS_STARTS"
 """Variable of the environment: where they are kept; tests/conftest.py sets it, and a fork has it too."""
+
+
+def train() -> None:
+    """train.py, which finds a start once."""
+    from mosa.cli.train import main
+    from mosa.training import datamodule
+
+    datamodule.sequence_start = start_once
+    main()
 
 
 def start_once(shape: RestShape, seen: Appearance, scene: Scene, **named: bool):

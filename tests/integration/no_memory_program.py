@@ -54,7 +54,8 @@ class Later:
 
 
 PLACES = [  # command, its words, where memory ends, what is raised there
-    ("train", FIRST, "mosa.training.workflow:estimate", MODULE), ("train", FIRST, "mosa.training.datamodule:reconstruct", TORCH),
+    ("train", FIRST, "mosa.training.workflow:check_with_data", MODULE),
+    ("train", FIRST, "mosa.training.datamodule:reconstruct", TORCH),
     ("train", FIRST, "mosa.training.datamodule:sequence_start", HANDLE),
     ("train", FIRST, "mosa.training.lit_mosa:LitMosa.training_step", WARP),
     ("train", AGAIN, "mosa.training.lit_mosa:LitMosa.on_load_checkpoint", TORCH),
@@ -65,7 +66,7 @@ PLACES = [  # command, its words, where memory ends, what is raised there
     ("splats", other("splats", f"ply={folder}/none.ply"), "mosa.splats.objects:check_splats", ALLOC),
     ("capture", other("capture", f"videos={folder}", f"poses={folder}", f"output={folder}/o"), "mosa.capture.making:check_capture",
      WARP),
-    ("environments", other("environments", "task=placement"), "mosa.environments.command:check_environments", TORCH),
+    ("environments", other("environments", "task=placement"), "mosa.environments.command:named_device", TORCH),
     ("view", [f"run={folder}"], "mosa.viewer.recorded:opened", HANDLE),
     ("experiment", ["table_time"], "mosa.cli.experiment:run", MODULE),
 ]  # fmt: skip

@@ -62,10 +62,8 @@ def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("run")
-    given = command(
-        "train.py", folder, cache, "logger=[tensorboard,csv]", "callbacks.pictures.every=2"
-    )  # as a user begins it
-    result = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, timeout=400)
+    words = ["logger=[tensorboard,csv]", "callbacks.pictures.every=2"]
+    result = call("train.py", folder, cache, *words)
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     (folder / "screen").write_text(result.stderr)
     return folder
@@ -174,12 +172,6 @@ def test_steps_times_and_pictures_are_logged(run):
     assert not any(
         tag.startswith("lr/") for tag in events.Tags()["scalars"]
     )  # no optimiser of torch has stepped
-    for tag in events.Tags()["scalars"]:  # also Lightning's own
-        assert events.summary_metadata[tag].summary_description, tag
-    assert (
-        events.summary_metadata["id/E"].summary_description
-        == "parameter E after the step, without eta [Pa]"
-    )
     pictures = events.Images("real_above_rendered_below")
     assert [p.step for p in pictures] == [2, 4] and all(p.height >= 320 for p in pictures)
 
@@ -439,12 +431,12 @@ def test_eval_puts_the_starts_where_the_body_is(run, tmp_path, monkeypatch):
 def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monkeypatch):
     raised = Ground(0.07, "separate", 0.3)
 
-    def scenes(run_config):
-        scene, others = load(run_config)
+    def scenes(keys):
+        scene, others = load(keys)
         return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), others
 
-    load = pipeline.scenes
-    monkeypatch.setattr(pipeline, "scenes", scenes)
+    load = pipeline.load_sequences
+    monkeypatch.setattr(pipeline, "load_sequences", scenes)
     monkeypatch.setattr(
         pipeline,
         "sequence_start",

@@ -37,7 +37,7 @@ def test_every_command_says_that_the_gpu_is_full_and_exits_with_2(outcomes):
 
 def test_a_fit_without_memory_keeps_its_checkpoint_and_names_it(outcomes):
     kept = {place.rpartition(":")[2]: (said, there) for _, place, _, said, there in outcomes[:7]}
-    for place in ("estimate", "reconstruct", "sequence_start"):
+    for place in ("check_with_data", "reconstruct", "sequence_start"):
         assert not kept[place][1] and "resume=auto" not in kept[place][0]
     for place in ("LitMosa.training_step", "LitMosa.on_load_checkpoint", "LitMosa.end", "rollouts"):
         said, there = kept[place]

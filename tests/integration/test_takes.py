@@ -10,7 +10,6 @@ from assembled import assembled, made, whole
 from mosa import SceneDataModule, compose
 from mosa.errors import ConfigError
 from mosa.modules.fitting import terms
-from mosa.training.assembly import assemble
 
 
 def test_a_step_descends_the_mean_over_the_sequences(cache):
@@ -109,7 +108,7 @@ def run(cache, folder, script, *overrides):
 def test_what_is_learned_from_is_not_held_out(cache):
     """Of a built-in scene, whose other sequences are held out where nobody says which."""
     chosen = compose("debug=default", f"scene.cache={cache}", "scene.also_train=[test_60]")
-    data = assemble(chosen, held_out=True).data
+    data = SceneDataModule(chosen)
     assert [data.prefix(scene) for scene in data.scenes[1]] == ["train/test_60", "test/test_40"]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
-from test_splat_objects import BALL, RADIUS, ball
+from test_splat_objects import BALL, RADIUS, ball, settings
 
 from mosa.data.io.gaussian_ply import load_ply, save_ply
 from mosa.errors import ConfigError, DataError
@@ -122,7 +122,7 @@ def test_the_volume_is_the_objects_whatever_lies_around_and_however_it_is_writte
     change = lambda d: plain_scales(strays([[30, 0, 0], [0, -9, 0]])(d))  # noqa: E731
     with pytest.warns(UserWarning, match="scales as lengths"):
         found = read_object(written(tmp_path / "a.ply", change), size=2 * RADIUS)
-    tensors, _, _ = fill_object(found, particles=400)
+    tensors, _, _ = fill_object(found, settings(400))
     assert float(tensors["volume"].sum()) == pytest.approx(BALL, rel=0.1)
 
 

@@ -57,7 +57,7 @@ def test_a_fit_goes_on_from_its_own_checkpoint_alone(tmp_path):
     cut, whole = tmp_path / "cut.ckpt", checkpoint(tmp_path / "whole.ckpt")
     cut.write_bytes(whole.read_bytes()[:3000])
     for path, message in (
-        (cut, "cut.ckpt is not a readable"),
+        (cut, "cut.ckpt: not a readable"),
         (whole, "expected the parts epoch, global_step"),
     ):
         with pytest.raises(DataError, match=message) as caught:

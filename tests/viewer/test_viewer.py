@@ -5,6 +5,7 @@ import socket
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
@@ -23,7 +24,7 @@ from mosa.twin.rollout_file import save_observed, save_rollout
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, MotionCues, Rollout, Splats
 from mosa.viewer import recorded as viewer
-from mosa.viewer.clips import GRAY, Scale, covariances, read_run
+from mosa.viewer.clips import GRAY, Arrays, Scale, covariances, read_run
 from mosa.viewer.pages import FIELD_OF_VIEW, beside_panel, own_page, view_of
 
 N, T, SEEN = 27, 5, 3
@@ -195,7 +196,7 @@ def test_tracked_points_are_read_and_said(run):
     assert said == ["5.0, 5.0", "5.0", "not seen in this frame"]
     np.savez(run / "markers.npz", **{"train/measured": measured[1:], "train/predicted": predicted})
     with pytest.raises(
-        DataError, match=r"markers\.npz: train/measured, .* expected points of shape"
+        DataError, match=r"markers\.npz: train/measured: expected .* of shape \(5, any, 3\)"
     ):
         read_run(run)
 
@@ -319,7 +320,7 @@ def test_flat_bodies_keep_the_truth_s_splats(run):
     clouds = rollout(0).x[0] * torch.tensor([1.0, 1.0, 0.0])
     body = SimpleNamespace(rest=clouds + torch.linspace(0, 1e-3, N)[:, None] * torch.tensor([1.0, 0.5, 0.0]),
                            covariances=1e-4 * torch.eye(3).expand(N, 3, 3))  # fmt: skip
-    found = covariances({"test/x": body.rest[None].numpy()}, "test", body)
+    found = covariances(Arrays(Path("a.npz"), {}), "test", body.rest[None].numpy(), body)
     assert np.allclose(found, body.covariances, atol=1e-9)
 
 
@@ -460,7 +461,7 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
     )
     with pytest.raises(
         DataError,
-        match=r"rollout\.npz: train: expected the checkpoint's 27 particles .*, found 9 in 5",
+        match=r"rollout\.npz: train/x: expected .* of shape \(any, 27, 3\), found float32 \(5, 9, 3\)",
     ):
         read_run(run)
     save_rollout(run / "rollout.npz", {"train": rollout(0)})
@@ -468,7 +469,8 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
         run / "prior.npz", {"train": Rollout(**{**vars(rollout(0)), "x": rollout(0).x[:4]})}
     )
     with pytest.raises(
-        DataError, match=r"prior\.npz: train: expected .* in the rollout's 5 frames, found 27 in 4"
+        DataError,
+        match=r"prior\.npz: train/x: expected .* of shape \(5, 27, 3\), found float32 \(4, 27",
     ):
         read_run(run)
     (run / "rollout.npz").write_bytes(b"no zip")
@@ -712,7 +714,7 @@ def test_the_solids_of_a_motion_move_beside_every_body(run):
     broken = dict(np.load(run / "rollout.npz"))
     broken["train/collider_position"] = broken["train/collider_position"][1:]
     np.savez(run / "rollout.npz", **broken)
-    with pytest.raises(DataError, match="train/collider_position: expected finite numbers"):
+    with pytest.raises(DataError, match="train/collider_position: expected finite"):
         read_run(run)
 
 

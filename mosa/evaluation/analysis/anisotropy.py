@@ -180,10 +180,8 @@ def directional_modulus(
 def directions_about(axis: Tensor, radius: float, count: int) -> Tensor:
     """(K, 3) unit vectors spread over the cap of `radius` [rad] about a unit vector (3,), itself the first (spiral of the golden
     angle). float64."""
-    turn, off = (
-        golden_turns(count),
-        math.tan(radius) * torch.linspace(0, 1, count, dtype=torch.float64).sqrt(),
-    )
+    turn = golden_turns(count)
+    off = math.tan(radius) * torch.linspace(0, 1, count, dtype=torch.float64).sqrt()
     across = torch.linalg.svd(axis.double()[None]).Vh[1:]
     return torch.nn.functional.normalize(
         axis.double() + off[:, None] * torch.stack([turn.cos(), turn.sin()], -1) @ across, dim=-1

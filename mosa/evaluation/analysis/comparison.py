@@ -137,17 +137,10 @@ def drawn(
     if colors is None:
         return seen(body, rollout.x, rollout.F_tot).images(cameras, background)[0].clamp(0, 1).cpu()
     covariances = deformed_covariances(rollout.F_tot, body.covariances)
-    parts = [
-        observe(
-            rollout.x[[t]],
-            covariances[[t]],
-            body.opacities,
-            colors[t].to(body.colors),
-            cameras,
-            background,
-        ).images[0]
-        for t in range(len(rollout.x))
-    ]
+    parts = []
+    for t in range(len(rollout.x)):
+        own = rollout.x[[t]], covariances[[t]], body.opacities, colors[t].to(body.colors)
+        parts.append(observe(*own, cameras, background).images[0])
     return torch.cat(parts).clamp(0, 1).cpu()
 
 
@@ -183,10 +176,8 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
     across = across / across.norm()
     along = torch.linalg.cross(up, across)
     cell, count = 0.5 * size, 12
-    steps, places = (
-        torch.linspace(-count, count, 8 * count + 1).double() * cell,
-        torch.arange(-count, count + 1) * cell,
-    )
+    steps = torch.linspace(-count, count, 8 * count + 1).double() * cell
+    places = torch.arange(-count, count + 1) * cell
     lines = []
     for one, other in ((across, along), (along, across)):
         for place in places.tolist():
@@ -199,11 +190,9 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
 
 
 def enlarge(image: np.ndarray, times: int) -> np.ndarray:
-    return (
-        image
-        if times == 1
-        else cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
-    )
+    if times == 1:
+        return image
+    return cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
 
 
 def ground_shadow(points: Tensor, world: World, cameras: Cameras, size: float) -> np.ndarray:

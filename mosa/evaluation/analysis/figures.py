@@ -30,11 +30,9 @@ def ffmpeg(key: str) -> str:
 
 def to_uint8(image: Tensor | np.ndarray) -> np.ndarray:
     """(H, W, 3) float in [0, 1] to uint8; what is that already stays."""
-    return (
-        image
-        if isinstance(image, np.ndarray)
-        else (image.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
-    )
+    if isinstance(image, np.ndarray):
+        return image
+    return (image.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
 
 
 FONT, SIZE, SMALLEST, LEFT = cv2.FONT_HERSHEY_SIMPLEX, 0.48, 0.3, 6

@@ -331,10 +331,5 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
     def line(cells) -> str:
         return "| " + " | ".join(str(c).ljust(w) for c, w in zip(cells, widths)) + " |"
 
-    return "\n".join(
-        [
-            line(header),
-            "|" + "|".join("-" * (w + 2) for w in widths) + "|",
-            *(line(r) for r in rows),
-        ]
-    )
+    ruler = "|" + "|".join("-" * (w + 2) for w in widths) + "|"
+    return "\n".join([line(header), ruler, *map(line, rows)])

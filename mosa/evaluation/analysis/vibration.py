@@ -63,10 +63,8 @@ def vibration_growth(
     n, length, speed = len(x), 2.0 * cells * dx, math.sqrt(E / density)
     k = math.pi / length
     v, C = torch.zeros(n, 3).double(), torch.zeros(n, 3, 3).double()
-    v[:, 0], C[:, 0, 0] = (
-        -amplitude * speed * torch.cos(k * x[:, 0]),
-        amplitude * speed * k * torch.sin(k * x[:, 0]),
-    )
+    v[:, 0] = -amplitude * speed * torch.cos(k * x[:, 0])
+    C[:, 0, 0] = amplitude * speed * k * torch.sin(k * x[:, 0])
     F = torch.eye(3).double().expand(n, 3, 3).contiguous()
     frame_dt = 2 * length / speed / FRAMES
     margin = ADAPTER_MARGIN if adapter is None else adapter.stiffening(material.poisson())

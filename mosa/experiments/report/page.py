@@ -105,13 +105,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             f"## Without images\n\nLaws learned from the true motion of a body: {', '.join(beside)}."
         )
     page = results.parent / "results.md"
-    header = [
-        "",
-        "jobs complete",
-        "commit (changes of the program since)",
-        "the paper's claims",
-        "claims about ours",
-    ]
+    header = ["", "jobs complete", "commit (changes of the program since)", "the paper's claims", "claims about ours"]  # fmt: skip
     whole = [INTRODUCTION, markdown(header, lines), *parts]
     write_whole(page, "\n\n".join(whole) + "\n")
     return page
@@ -161,24 +155,18 @@ def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
     """What the tables say of a claim, in words and figures."""
     figure = next(f for f in experiment.figures if f.label == claim.figure)
     rows = tables.get(claim.figure, {})
-    return (
-        within(experiment, claim, rows, tables)
-        if claim.most is not None
-        else ahead(figure, claim, rows)
-    )
+    if claim.most is not None:
+        return within(experiment, claim, rows, tables)
+    return ahead(figure, claim, rows)
 
 
 def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | None:
     """The cell of a column; of none the mean, or the only one."""
     if column is not None:
         return cells.get(column)
-    return (
-        cells["mean"]
-        if "mean" in cells
-        else next(iter(cells.values()))
-        if len(cells) == 1
-        else None
-    )
+    if "mean" in cells:
+        return cells["mean"]
+    return next(iter(cells.values())) if len(cells) == 1 else None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from mosa.experiments.report.drawing import BETTER, draw, save
 from mosa.experiments.report.page import listed, verdict, write_json
 from mosa.experiments.report.printed import printed_table
 from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
-from mosa.system.whole_files import write_whole, written_whole
+from mosa.system.whole_files import write_table, write_whole
 
 
 def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, command: str) -> Path:
@@ -98,13 +97,8 @@ def provenance(
 ) -> list[str]:
     """What the figures come from: commit, seeds, machine, time."""
     complete = [job for job in jobs if job.finished]
-    devices = sorted(
-        {
-            str(record.figures["time/device"])
-            for record in records
-            if record.figures and "time/device" in record.figures
-        }
-    )
+    figures = [record.figures for record in records if record.figures]
+    devices = sorted({str(each["time/device"]) for each in figures if "time/device" in each})
     minutes = [minutes_taken(job) or 0.0 for job in complete]
     return [
         f"command: `{command}`",
@@ -128,20 +122,11 @@ def made_by(jobs: Sequence[Job]) -> str:
 
 def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> None:
     """One line for each cell, seed and figure, in the unit of metrics.json times `scale`; empty where it is missing."""
-    with written_whole(path) as partial, open(partial, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([*experiment.axes, "seed", "label", "figure", "value", "run"])
-        for record in records:
-            for figure in experiment.figures:
-                found = record.value(figure)
-                places = [record.place[axis].name for axis in experiment.axes]
-                writer.writerow(
-                    [
-                        *places,
-                        record.seed,
-                        figure.label,
-                        figure.figure,
-                        "" if found is None else repr(found),
-                        record.job.folder.name,
-                    ]
-                )
+    rows = []
+    for record in records:
+        places = [record.place[axis].name for axis in experiment.axes]
+        for figure in experiment.figures:
+            value = "" if (found := record.value(figure)) is None else repr(found)
+            own = [figure.label, figure.figure, value, record.job.folder.name]
+            rows.append([*places, record.seed, *own])
+    write_table(path, [*experiment.axes, "seed", "label", "figure", "value", "run"], rows)

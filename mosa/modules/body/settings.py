@@ -19,25 +19,20 @@ class HeterogeneitySettings(Settings):
         "hidden frequencies": "enabled=true, kind=network",
     }
 
-    enabled: bool = Field(True, description="learn how the stiffness varies over the body")
-    amplitude: float = Field(
-        0.5, gt=0, lt=1, description="largest relative deviation; the paper's network: 0.2"
-    )
-    kind: Literal["modes", "network"] = Field(
-        "modes",
-        description=(
-            "modes: a sum of smooth waves, for Gauss-Newton; network: the paper's "
-            "coordinate network"
-        ),
-    )
-    wavelength: float = Field(
-        0.33, ge=0.02, le=2, description="modes: the shortest wave, over the body's longest side"
-    )
-    most: Width = Field(50, description="modes: number of waves, at most, the longest first")
-    hidden: Width = Field(32, description="network: width of its layers")
-    frequencies: int = Field(
-        2, ge=0, le=32, description="network: sines and cosines of pi 2^k x that it reads beside x"
-    )
+    enabled: bool = True
+    """learn how the stiffness varies over the body"""
+    amplitude: float = Field(0.5, gt=0, lt=1)
+    """largest relative deviation; the paper's network: 0.2"""
+    kind: Literal["modes", "network"] = "modes"
+    """modes: a sum of smooth waves, for Gauss-Newton; network: the paper's coordinate network"""
+    wavelength: float = Field(0.33, ge=0.02, le=2)
+    """modes: the shortest wave, over the body's longest side"""
+    most: Width = 50
+    """modes: number of waves, at most, the longest first"""
+    hidden: Width = 32
+    """network: width of its layers"""
+    frequencies: int = Field(2, ge=0, le=32)
+    """network: sines and cosines of pi 2^k x that it reads beside x"""
 
 
 class PriorSection(Settings):
@@ -45,24 +40,21 @@ class PriorSection(Settings):
 
     where: ClassVar[str] = "prior"
 
-    law: Text = Field(
-        description="name of the law, which prior=<law> sets (docs/choosing.md); auto: chosen among `candidates`"
-    )
-    parameters: Section = Field(
-        description="parameters of the law by name, in SI units: where a fit starts; the material of mosa-splats"
-    )
-    frozen: Names | None = Field(None, description="parameters that are not learned")
-    modulated: Names | None = Field(
-        None, description="parameters that the heterogeneity multiplies; null: the stiffness"
-    )
-    candidates: Names | None = Field(
-        None,
-        description=(
-            "with law=auto: the laws that are calibrated and compared; those that yield only "
-            "where the body stays deformed"
-        ),
-    )
-    options: Section | None = Field(None, description="options of the law (below)")
+    law: Text
+    """name of the law, which prior=<law> sets (docs/choosing.md); auto: chosen among
+    `candidates`"""
+    parameters: Section
+    """parameters of the law by name, in SI units: where a fit starts; the material of
+    mosa-splats"""
+    frozen: Names | None = None
+    """parameters that are not learned"""
+    modulated: Names | None = None
+    """parameters that the heterogeneity multiplies; null: the stiffness"""
+    candidates: Names | None = None
+    """with law=auto: the laws that are calibrated and compared; those that yield only
+    where the body stays deformed"""
+    options: Section | None = None
+    """options of the law (below)"""
 
 
 class WorldSection(Settings):
@@ -70,30 +62,17 @@ class WorldSection(Settings):
 
     where: ClassVar[str] = "world"
 
-    walls: Section | None = Field(
-        None, description="{mode: separate, friction: 0.1}, of the six sides of the box; null: none"
-    )
-    colliders: Entries | None = Field(
-        [],
-        description=(
-            "rigid solids, such as {type: sphere, radius: 0.1, position: [0, 0, 0], mode: "
-            "separate, friction: 0.3, motion: {velocity: [1, 0, 0]}} (docs/twin.md)"
-        ),
-    )
-    driven: Entries | None = Field(
-        [],
-        description=(
-            "sets of the body's particles that are held, moved or loaded, such as {name: clamp, "
-            "type: box, size: [0.1, 0.1, 0.1], position: [0, 0, 0]} (docs/driven.md)"
-        ),
-    )
-    forces: Entries | None = Field(
-        [],
-        description=(
-            "forces measured on colliders and driven sets, such as {of: clamp, "
-            "file: force.csv, sd: 0.02} (docs/driven.md)"
-        ),
-    )
+    walls: Section | None = None
+    """{mode: separate, friction: 0.1}, of the six sides of the box; null: none"""
+    colliders: Entries | None = []
+    """rigid solids, such as {type: sphere, radius: 0.1, position: [0, 0, 0], mode: separate,
+    friction: 0.3, motion: {velocity: [1, 0, 0]}} (docs/twin.md)"""
+    driven: Entries | None = []
+    """sets of the body's particles that are held, moved or loaded, such as {name: clamp, type: box,
+    size: [0.1, 0.1, 0.1], position: [0, 0, 0]} (docs/driven.md)"""
+    forces: Entries | None = []
+    """forces measured on colliders and driven sets, such as {of: clamp, file: force.csv, sd: 0.02}
+    (docs/driven.md)"""
 
 
 def names(values: Any) -> tuple[str, ...]:

@@ -19,34 +19,21 @@ class TimeStepping(Settings):
     where: ClassVar[str] = "simulation"
     needs: ClassVar[dict[str, str]] = {"min_substeps": "adaptive=true"}
 
-    stride: Substeps = Field(
-        8,
-        description=(
-            "substeps between evaluations of the adapter's networks (adapter=mosa, "
-            "direct); a frame has a multiple of it"
-        ),
-    )
-    max_substeps: Substeps = Field(400, description="substeps of a frame, at most")
-    courant: float = Field(
-        0.6,
-        gt=0,
-        le=1,
-        description="Courant number, wave speed times dt/dx; above 1 an explicit step is unstable",
-    )
-    adaptive: bool = Field(
-        False,
-        description=(
-            "choose the substeps of each frame from the state at its start: current "
-            "stiffness and speed"
-        ),
-    )
-    min_substeps: Substeps = Field(1, description="substeps of a frame, at least")
-    precision: Annotated[Literal[32, 64], Expected("32 or 64 (16 bits cannot carry an MPM)")] = (
-        Field(32, description="bits of the simulation's numbers")
-    )
-    contact_offset: bool = Field(
-        True, description="learn the height [m] above the ground at which the grid stops the body"
-    )
+    stride: Substeps = 8
+    """substeps between evaluations of the adapter's networks (adapter=mosa, direct); a frame has a
+    multiple of it"""
+    max_substeps: Substeps = 400
+    """substeps of a frame, at most"""
+    courant: float = Field(0.6, gt=0, le=1)
+    """Courant number, wave speed times dt/dx; above 1 an explicit step is unstable"""
+    adaptive: bool = False
+    """choose the substeps of each frame from the state at its start: current stiffness and speed"""
+    min_substeps: Substeps = 1
+    """substeps of a frame, at least"""
+    precision: Annotated[Literal[32, 64], Expected("32 or 64 (16 bits cannot carry an MPM)")] = 32
+    """bits of the simulation's numbers"""
+    contact_offset: bool = True
+    """learn the height [m] above the ground at which the grid stops the body"""
 
     def strides(self, least: int) -> int:
         """Substeps of the fewest whole strides that are at least `least`."""
@@ -64,17 +51,13 @@ class SimulationSection(TimeStepping):
 
     needs: ClassVar[dict[str, str]] = {"particles": "dx=null"}
 
-    particles: Annotated[int, Interval(ge=8, le=10**8)] | Literal["auto"] = Field(
-        "auto",
-        description=(
-            "particles of the body; auto: as many as its thin parts need, 4000 to 6000 "
-            "on a CPU and to 30000 on a GPU"
-        ),
-    )
-    particles_per_cell: float = Field(4, ge=1, le=64, description="particles per grid cell")
-    dx: Positive | None = Field(
-        None, description="grid spacing [m]; null: from particles and particles_per_cell"
-    )
+    particles: Annotated[int, Interval(ge=8, le=10**8)] | Literal["auto"] = "auto"
+    """particles of the body; auto: as many as its thin parts need, 4000 to 6000 on a CPU and to
+    30000 on a GPU"""
+    particles_per_cell: float = Field(4, ge=1, le=64)
+    """particles per grid cell"""
+    dx: Positive | None = None
+    """grid spacing [m]; null: from particles and particles_per_cell"""
 
     @model_validator(mode="after")
     def _whole_strides(self) -> SimulationSection:

@@ -16,23 +16,13 @@ class Criterion(Settings):
     where: ClassVar[str] = "criterion"
     needs: ClassVar[dict[str, str]] = {"gain": "name!=free"}
 
-    name: Literal["free", "corrected", "both"] = Field(
-        "corrected",
-        description=(
-            "corrected: after every frame the velocities are corrected towards what was"
-            " seen, and the next frame is predicted; free: rollouts from the start, as "
-            "the paper has it; both: each with half of the weight"
-        ),
-    )
-    gain: float = Field(
-        0.5,
-        gt=0,
-        le=1,
-        description=(
-            "corrected: share of the distance from the observation that the "
-            "corrected velocity closes in a frame"
-        ),
-    )
+    name: Literal["free", "corrected", "both"] = "corrected"
+    """corrected: after every frame the velocities are corrected towards what was seen, and the next
+    frame is predicted; free: rollouts from the start, as the paper has it; both: each with half of
+    the weight"""
+    gain: float = Field(0.5, gt=0, le=1)
+    """corrected: share of the distance from the observation that the corrected velocity closes in a
+    frame"""
 
     @property
     def gains(self) -> tuple[float, ...]:
@@ -46,56 +36,30 @@ class IdentificationSettings(Settings):
     where: ClassVar[str] = "identification"
     needs: ClassVar[dict[str, str]] = {"*": "newton"}
 
-    count: Positive = Field(
-        30.0,
-        description="independent data in a frame of the cues: neighbouring particles move alike",
-    )
-    grid_error: Annotated[float, Interval(ge=0, le=10)] = Field(
-        1.0,
-        description=(
-            "of the grid, in differences from one that is 1.25 times as coarse: no "
-            "frame is trusted beyond it, and a multiple of it is identified beside the "
-            "law; 0: none, and for the parts of the law an assumed one"
-        ),
-    )
-    model_error: float = Field(
-        0.02, ge=0, le=1, description="error of the simulation from other causes, in grid cells"
-    )
-    operator_sd: Positive = Field(
-        0.1,
-        description=(
-            "prior standard deviation of the adapter's numbers, before the evidence "
-            "finds their size"
-        ),
-    )
-    stiffness_sd: Positive = Field(
-        0.12,
-        description=(
-            "prior standard deviation of the stiffness modes; it falls with the "
-            "wave number k as (1 + (k/2)^2)^(-smoothness/2)"
-        ),
-    )
-    smoothness: Weight = Field(1.0, description="exponent of this fall")
-    evidence: bool = Field(
-        True, description="find both prior standard deviations from the data (MacKay)"
-    )
-    known: Text | None = Field(
-        None,
-        description=(
-            "checkpoint of another fit, or material.json of mosa-material: what it says "
-            "of the law's numbers is their prior (docs/several_recordings.md)"
-        ),
-    )
-    tolerance: Positive = Field(
-        0.3,
-        description="a stage ends when its last step is this small, in standard deviations of the posterior",
-    )
-    threads: int = Field(
-        0,
-        ge=0,
-        le=256,
-        description="rollouts side by side on a CPU; 0: one for each core, at most 8",
-    )
+    count: Positive = 30.0
+    """independent data in a frame of the cues: neighbouring particles move alike"""
+    grid_error: Annotated[float, Interval(ge=0, le=10)] = 1.0
+    """of the grid, in differences from one that is 1.25 times as coarse: no frame is trusted beyond
+    it, and a multiple of it is identified beside the law; 0: none, and for the parts of the law an
+    assumed one"""
+    model_error: float = Field(0.02, ge=0, le=1)
+    """error of the simulation from other causes, in grid cells"""
+    operator_sd: Positive = 0.1
+    """prior standard deviation of the adapter's numbers, before the evidence finds their size"""
+    stiffness_sd: Positive = 0.12
+    """prior standard deviation of the stiffness modes; it falls with the wave number k as (1 +
+    (k/2)^2)^(-smoothness/2)"""
+    smoothness: Weight = 1.0
+    """exponent of this fall"""
+    evidence: bool = True
+    """find both prior standard deviations from the data (MacKay)"""
+    known: Text | None = None
+    """checkpoint of another fit, or material.json of mosa-material: what it says of the law's
+    numbers is their prior (docs/several_recordings.md)"""
+    tolerance: Positive = 0.3
+    """a stage ends when its last step is this small, in standard deviations of the posterior"""
+    threads: int = Field(0, ge=0, le=256)
+    """rollouts side by side on a CPU; 0: one for each core, at most 8"""
 
 
 class LossWeights(Settings):
@@ -108,35 +72,28 @@ class LossWeights(Settings):
     }
     __pydantic_extra__: dict[str, Weight] = Field(init=False)
 
-    image: Weight = Field(1.0, description="rendered images")
-    mask: Weight = Field(1.0, description="rendered mattes")
-    flow: Weight = Field(1.0, description="optical flow")
-    rotation: Weight = Field(
-        0.1, description="cue of rotation; Gauss-Newton uses it if the weight is above 0"
-    )
-    stretch: Weight = Field(
-        0.1, description="cue of stretch; Gauss-Newton uses it if the weight is above 0"
-    )
-    heterogeneity: Weight = Field(0.1, description="size of the heterogeneity")
-    position: Weight = Field(
-        1.0,
-        description=(
-            "not in the paper: particle positions of the reconstruction, over "
-            "the object's size; Gauss-Newton uses it if the weight is above 0"
-        ),
-    )
-    operator: Weight = Field(
-        0.0,
-        description=(
-            "not in the paper: root mean square of the entries of C and of L_pre, L_post, as in a "
-            "group lasso. The weight applies if the calibrated prior misses the reconstruction by "
-            "1 % of the object's size, and falls as 1 / misfit^2 (misfit: of the model that the "
-            "joint stage starts from, at least 0.1 %)"
-        ),
-    )
-    operator_variance: Weight = Field(
-        0.0, description="not in the paper: variance of the operator over particles and states"
-    )
+    image: Weight = 1.0
+    """rendered images"""
+    mask: Weight = 1.0
+    """rendered mattes"""
+    flow: Weight = 1.0
+    """optical flow"""
+    rotation: Weight = 0.1
+    """cue of rotation; Gauss-Newton uses it if the weight is above 0"""
+    stretch: Weight = 0.1
+    """cue of stretch; Gauss-Newton uses it if the weight is above 0"""
+    heterogeneity: Weight = 0.1
+    """size of the heterogeneity"""
+    position: Weight = 1.0
+    """not in the paper: particle positions of the reconstruction, over the object's size;
+    Gauss-Newton uses it if the weight is above 0"""
+    operator: Weight = 0.0
+    """not in the paper: root mean square of the entries of C and of L_pre, L_post, as in a group
+    lasso. The weight applies if the calibrated prior misses the reconstruction by 1 % of the
+    object's size, and falls as 1 / misfit^2 (misfit: of the model that the joint stage starts from,
+    at least 0.1 %)"""
+    operator_variance: Weight = 0.0
+    """not in the paper: variance of the operator over particles and states"""
 
     def weights(self) -> dict[str, Any]:
         """By term."""

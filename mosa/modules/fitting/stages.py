@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Literal
 
-from pydantic import Field
-
 from mosa.errors import ConfigError
 from mosa.settings import Count, Positive, Settings, Weight, Whole
 
@@ -22,38 +20,28 @@ class StageSettings(Settings):
         "lr lr_networks lr_adapter lr_contact": "adam",
     }
 
-    optimizer: Literal["auto", "gauss_newton", "adam"] = Field(
-        "auto",
-        description=(
-            "auto: Gauss-Newton if the stage learns no network "
-            "(adapter=operator or none, heterogeneity.kind=modes), else Adam"
-        ),
-    )
-    newton_iterations: Count = Field(8, description="iterations of Gauss-Newton, at most")
-    looks: Whole = Field(
-        0,
-        description=(
-            "stage `prior` by Gauss-Newton: further calibrations, each after a "
-            "second fit of the motion"
-        ),
-    )
-    iterations: Whole = Field(description="steps of Adam; 0 leaves the stage out")
-    lr: Weight = Field(
-        description="Adam's rate, on the logarithms and logits of the global parameters"
-    )
-    lr_networks: Weight = Field(0.0, description="Adam's rate of the heterogeneity field")
-    lr_adapter: Weight = Field(0.0, description="Adam's rate of the adapter")
-    lr_contact: Weight = Field(0.0, description="Adam's rate of the contact offset [cells]")
-    converged: Weight = Field(
-        0.0,
-        description=(
-            "Adam: stop when the mean loss of 10 iterations differs by less, "
-            "relatively, from that of the 10 before; 0: never"
-        ),
-    )
-    start: Literal["prior", "prior_eta"] | None = Field(
-        None, description="stage `joint`: the stage from whose parameters and eta it starts"
-    )
+    optimizer: Literal["auto", "gauss_newton", "adam"] = "auto"
+    """auto: Gauss-Newton if the stage learns no network (adapter=operator or none,
+    heterogeneity.kind=modes), else Adam"""
+    newton_iterations: Count = 8
+    """iterations of Gauss-Newton, at most"""
+    looks: Whole = 0
+    """stage `prior` by Gauss-Newton: further calibrations, each after a second fit of the motion"""
+    iterations: Whole
+    """steps of Adam; 0 leaves the stage out"""
+    lr: Weight
+    """Adam's rate, on the logarithms and logits of the global parameters"""
+    lr_networks: Weight = 0.0
+    """Adam's rate of the heterogeneity field"""
+    lr_adapter: Weight = 0.0
+    """Adam's rate of the adapter"""
+    lr_contact: Weight = 0.0
+    """Adam's rate of the contact offset [cells]"""
+    converged: Weight = 0.0
+    """Adam: stop when the mean loss of 10 iterations differs by less, relatively, from that of the
+    10 before; 0: never"""
+    start: Literal["prior", "prior_eta"] | None = None
+    """stage `joint`: the stage from whose parameters and eta it starts"""
 
 
 class Stage(StageSettings):
@@ -156,29 +144,27 @@ class FitSection(Settings):
     where: ClassVar[str] = "fit"
     needs: ClassVar[dict[str, str]] = {"views clip": "adam"}
 
-    views: Count = Field(2, description="Adam: cameras that a step renders")
-    clip: Positive = Field(1.0, description="Adam: bound of the gradient norm of the networks")
-    prior: StageSettings = Field(
-        StageSettings(
-            newton_iterations=8, looks=3, iterations=40, lr=0.1, lr_contact=0.03, converged=1e-3
-        ),
-        description="first stage: the calibrated prior",
+    views: Count = 2
+    """Adam: cameras that a step renders"""
+    clip: Positive = 1.0
+    """Adam: bound of the gradient norm of the networks"""
+    prior: StageSettings = StageSettings(
+        newton_iterations=8, looks=3, iterations=40, lr=0.1, lr_contact=0.03, converged=1e-3
     )
-    prior_eta: StageSettings = Field(
-        StageSettings(newton_iterations=3, iterations=20, lr=0.02, lr_networks=5e-3),
-        description="second stage: with the stiffness over the body",
+    """first stage: the calibrated prior"""
+    prior_eta: StageSettings = StageSettings(
+        newton_iterations=3, iterations=20, lr=0.02, lr_networks=5e-3
     )
-    joint: StageSettings = Field(
-        StageSettings(
-            newton_iterations=8,
-            iterations=40,
-            lr=0.01,
-            lr_networks=2e-3,
-            lr_adapter=5e-3,
-            start="prior",
-        ),
-        description="last stage: with the adapter",
+    """second stage: with the stiffness over the body"""
+    joint: StageSettings = StageSettings(
+        newton_iterations=8,
+        iterations=40,
+        lr=0.01,
+        lr_networks=2e-3,
+        lr_adapter=5e-3,
+        start="prior",
     )
+    """last stage: with the adapter"""
 
     def stage(self, name: str) -> Stage:
         """Of this name. Errors: ConfigError."""
