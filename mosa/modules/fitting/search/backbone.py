@@ -71,17 +71,6 @@ def compass(
     return row
 
 
-def rollouts_of_search(learned: Sequence[str], offsets: int, each: float) -> float:
-    """About how many rollouts `search` takes for a law with these learned numbers.
-
-    offsets: of the contact on its grid; each: rollouts of an iteration."""
-    count = len(STIFFNESS_STEPS) * offsets + 2 * NEAREST * ("nu" in learned)
-    count += COMPASS * bool(set(learned) - {"E", "nu"})
-    if len(learned) < MANY:
-        return count
-    return count + len(WIDE) * len(moved(learned)) + ((BEGUN + 1) * FIRST + KEPT * LAST) * each
-
-
 def moved(learned: Sequence[str]) -> list[dict[str, float]]:
     """Steps of the numbers that are no stiffness and no Poisson number: none, or a first step of the compass up or down in one or
     in two of them. All combinations of many numbers were too many."""

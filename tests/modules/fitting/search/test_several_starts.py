@@ -10,7 +10,7 @@ from torch import nn
 from mosa.errors import SimulationDiverged
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.search import backbone as backbone_search
-from mosa.modules.fitting.search.backbone import FIRST, LAST, moved, nearest_end, rollouts_of_search
+from mosa.modules.fitting.search.backbone import FIRST, LAST, moved, nearest_end
 from tests.modules.fitting.test_identification import identification
 
 
@@ -68,18 +68,6 @@ def test_starts_that_cannot_be_simulated_are_an_error_only_where_all_are():
     found = Valleys()
     with pytest.raises(SimulationDiverged, match="too far"):
         nearest_end(found, found.start_at, [{"x": 5.0}, {"x": 6.0}])
-
-
-def test_the_estimate_counts_what_a_law_with_several_valleys_takes():
-    few, many = (
-        rollouts_of_search(["E", "nu"], 5, 10.0),
-        rollouts_of_search(["mu", "kappa", "yield_stress", "viscosity"], 1, 10.0),
-    )
-    assert (
-        few == 8 * 5 + 2 * 6
-        and many > 5 * few
-        and rollouts_of_search(["E", "nu", "yield_stress"], 1, 10.0) < 3 * few
-    )
 
 
 def yielding(**numbers):
