@@ -23,7 +23,7 @@ from mosa.reconstruction.gaussians.carried import fit_carried
 from mosa.reconstruction.gaussians.initial import inherited_colors, initial_splats
 from mosa.reconstruction.gaussians.static import fit_splats
 from mosa.reconstruction.geometry.behind import fill_behind
-from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry
+from mosa.reconstruction.geometry.body import Geometry, find_geometry
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.motion.observed import Windows, object_windows
@@ -79,7 +79,7 @@ def object_geometry(
         if settings.geometry.source == "gaussians":
             return geometry_of_gaussians(scene, settings, device).stored()
         found = find_geometry(
-            scene, object_hull(scene, settings), GeometrySettings.of(settings.geometry), ridge_passes=settings.ridge_passes,
+            scene, object_hull(scene, settings), settings.geometry, ridge_passes=settings.ridge_passes,
             sigma=settings.resolution / 40, margin=settings.margin, device=device,
         )  # fmt: skip
         return found.stored()
@@ -185,7 +185,7 @@ def _geometry_cache(
     return _open_cache(
         cache_dir,
         scene,
-        parts | {"geometry": GeometrySettings.of(settings.geometry).plain()},
+        parts | {"geometry": settings.geometry.plain()},
         0,
         free=scene.last_free_frame,
     )
@@ -216,8 +216,11 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 
 def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
     """What particles and their motion depend on."""
-    whole = settings.plain() | {"geometry": GeometrySettings.of(settings.geometry).plain()}
-    return {name: value for name, value in whole.items() if name not in ("carried", "informed")}
+    return {
+        name: value
+        for name, value in settings.plain().items()
+        if name not in ("carried", "informed")
+    }
 
 
 def imported_splats(path: str, scene: Scene) -> Appearance:

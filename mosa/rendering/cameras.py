@@ -24,17 +24,23 @@ def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     return pixels[..., :2] / pixels[..., 2:], seen[..., 2]
 
 
+def centers(cameras: Cameras) -> Tensor:
+    """Where the cameras are, (V, 3) [m]."""
+    return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
+
+
 def rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Origins (V, 3) [m] and unit directions (V, H, W, 3), in world axes, of the rays through all pixel centres."""
-    x = torch.arange(cameras.width, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
-    y = torch.arange(cameras.height, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
-    v, u = torch.meshgrid(y, x, indexing="ij")
-    pixels = torch.stack((u, v, torch.ones_like(u)), -1).view(1, -1, 3)
-    R = cameras.w2c[:, :3, :3]
-    directions = pixels @ torch.linalg.inv(cameras.K).transpose(1, 2) @ R  # rows: R^T K^-1 u
-    directions = directions / directions.norm(dim=-1, keepdim=True)
-    origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
-    return origins, directions.view(-1, cameras.height, cameras.width, 3)
+    x, y = (
+        torch.arange(size, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
+        for size in (cameras.width, cameras.height)
+    )
+    u, v = torch.meshgrid(x, y, indexing="xy")
+    inverse = torch.linalg.inv(cameras.K).transpose(1, 2)[:, None]
+    directions = (
+        torch.stack((u, v, torch.ones_like(u)), -1) @ inverse @ cameras.w2c[:, None, :3, :3]
+    )
+    return centers(cameras), F.normalize(directions, dim=-1)
 
 
 def sample_images(images: Tensor, pixels: Tensor, *, beyond: str = "zeros") -> Tensor:

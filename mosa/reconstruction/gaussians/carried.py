@@ -22,11 +22,11 @@ from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_basis
 from mosa.rendering.appearance.spherical_harmonics import (
     Y0,
-    camera_centers,
     colors_in,
     constant_coefficients,
     mean_colors,
 )
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Appearance, Splats
@@ -131,7 +131,7 @@ def fit_carried(
     """
     generator = torch.Generator().manual_seed(seed)
     gaussians = RestGaussians(static, surface_normals(static.means, particles), settings)
-    carried, eyes = bind(static.means, particles).carry(positions), camera_centers(windows.cameras)
+    carried, eyes = bind(static.means, particles).carry(positions), centers(windows.cameras)
     turns = turned_basis(gaussians.normals, carried.rotations)
     order = torch.empty(0, dtype=torch.long)
     for step in range(settings.iterations):

@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mosa.data.hull import Volume
-from mosa.reconstruction.geometry.field import camera_rays, first_crossing, gradient, sample
+from mosa.reconstruction.geometry.field import first_crossing, gradient, sample
 from mosa.reconstruction.geometry.refinement import blurred, pixel_width
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.pose.registration import matte_centres
 from mosa.reconstruction.pose.rigid import rotation_exp
-from mosa.rendering.cameras import sample_images
+from mosa.rendering.cameras import rays, sample_images
 from mosa.types import Scene
 
 BLURS = (3.0, 3.0, 1.5, 1.5, 0.7, 0.4, 0.4)
@@ -58,7 +58,7 @@ def _sampled(
 def visible_points(distance: Volume, views: Windows) -> list[Tensor]:
     """For each window the points (at most POINTS, 3) [m] where rays of its matte meet the surface."""
     found = []
-    centres, directions = camera_rays(views.cameras)
+    centres, directions = rays(views.cameras)
     slopes = gradient(distance.values, distance.pitch)
     for centre, direction, matte in zip(centres, directions, views.mattes):
         ray = direction[matte > 0.5]

@@ -13,11 +13,12 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from mosa.reconstruction.geometry.field import camera_rays, sample
+from mosa.reconstruction.geometry.field import sample
 from mosa.reconstruction.geometry.known import Solid
 from mosa.reconstruction.geometry.refinement import edges
 from mosa.reconstruction.pose.registration import choose
 from mosa.reconstruction.pose.rigid import damped, rotation_exp
+from mosa.rendering.cameras import rays as camera_rays
 from mosa.types import Cameras
 
 SAMPLES = 28

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from mosa.rendering.appearance.carrying import Binding, Carried, bind
 from mosa.rendering.appearance.lighting import LIGHT, shading
 from mosa.rendering.appearance.spherical_harmonics import (
-    camera_centers,
     colors_in,
     constant_coefficients,
     mean_colors,
 )
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.observer import deformed_covariances, repeat_cameras
 from mosa.rendering.rasterizer import rasterize
@@ -116,7 +116,7 @@ class Seen:
             if self.rotations is None:
                 colors = colors_in(self.harmonics, torch.ones_like(self.means[:1]))
             else:
-                lines = self.means - camera_centers(camera).to(self.means)
+                lines = self.means - centers(camera).to(self.means)
                 # R^T d
                 colors = colors_in(
                     self.harmonics, (lines[..., None, :] @ self.rotations)[..., 0, :]
