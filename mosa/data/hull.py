@@ -43,6 +43,12 @@ class Volume:
         return float((self.values > threshold).sum()) * self.pitch**3
 
 
+def at_border(mattes: Tensor) -> Tensor:
+    """Largest value (...) along the border of mattes (..., H, W)."""
+    rows, columns = mattes[..., [0, -1], :].amax((-2, -1)), mattes[..., [0, -1]].amax((-2, -1))
+    return torch.maximum(rows, columns)
+
+
 def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     """Bilinear matte at the projections of world points, (V, M) from (M, 3) and (V, H, W).
 
@@ -55,12 +61,10 @@ def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     pixel = pixel[..., :2] / depth.clamp(min=1e-6)[..., None]
     size = pixel.new_tensor([cameras.width, cameras.height])
     values = sample_images(mattes[:, None], pixel, beyond="border")[:, 0]
-    border = (
-        torch.cat([mattes[:, 0], mattes[:, -1], mattes[:, :, 0], mattes[:, :, -1]], 1).amax(1) > 0.5
-    )
+    border = at_border(mattes) > 0.5
     inside = ((pixel >= 0) & (pixel <= size)).all(-1)
     values = torch.where(inside, values, border[:, None].to(values))
-    return torch.where(depth > 1e-3, values, torch.zeros_like(values))
+    return torch.where(depth > 1e-3, values, 0.0)
 
 
 def occupancy(points: Tensor, mattes: Tensor, cameras: Cameras, *, chunk: int = 400_000) -> Tensor:
@@ -86,9 +90,8 @@ def _grow(mattes: Tensor, radius: int) -> Tensor:
     if radius <= 0:
         return mattes
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    return torch.as_tensor(
-        np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()]), device=mattes.device
-    )
+    grown = np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()])
+    return torch.as_tensor(grown, device=mattes.device)
 
 
 def _grown_views(mattes: Tensor, cameras: Cameras, radius: int) -> tuple[Tensor, Cameras]:

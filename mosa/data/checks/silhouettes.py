@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mosa.data.checks.free_fall import track_of
-from mosa.data.hull import hull_bounds, visual_hull
+from mosa.data.hull import at_border, hull_bounds, visual_hull
 from mosa.errors import DataError
 from mosa.types import Cameras, Scene
 
@@ -115,8 +115,8 @@ def uncovered_and_islands(
 def whole_views(scene: Scene, frame: int) -> list[int]:
     """Cameras whose matte shows something and does not touch the border."""
     shown = scene.mattes[:, frame] > 0.5
-    cut = torch.cat([shown[:, 0], shown[:, -1], shown[..., 0], shown[..., -1]], 1).any(1)
-    return [v for v in range(len(shown)) if bool(shown[v].any()) and not bool(cut[v])]
+    whole = shown.flatten(1).any(1) & ~(at_border(scene.mattes[:, frame]) > 0.5)
+    return whole.nonzero()[:, 0].tolist()
 
 
 def check_outlines(scene: Scene, label: str) -> None:

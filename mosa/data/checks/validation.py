@@ -16,6 +16,7 @@ from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
 from mosa.data.checks.tangents import check_pictures
 from mosa.data.formats.footage import TIME_JITTER, Footage
+from mosa.data.hull import at_border
 from mosa.errors import ConfigError, DataError
 from mosa.settings import Expected, Positive, Text, Whole, check_values, fits, such
 from mosa.types import FALLING, REST, Cameras, Ground, KnownBody, Markers, Scene, Truth, dense
@@ -349,11 +350,8 @@ def check_colors(scene: Scene, label: str) -> None:
 def check_borders(scene: Scene, label: str) -> None:
     """The first frame, which says where the object is, shows all of it to two learning cameras at least, to one of a body of known
     shape."""
-    covered = scene.mattes > 0.5
-    cut = torch.cat(
-        [covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2
-    ).any(2)
-    names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v, 0])]
+    cut = at_border(scene.mattes[:, 0]) > 0.5
+    names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v])]
     fewest = 2 if scene.body is None else 1
     if len(scene.training_cameras) - len(names) < fewest:
         raise DataError(
