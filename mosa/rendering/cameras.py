@@ -16,12 +16,12 @@ from mosa.types import Cameras
 def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Pixels (V, N, 2) and depths (V, N) [m] of world points (N, 3) or, one set a camera, (V, N, 3).
 
-    A point at depth 0 or behind the camera has a pixel without meaning: look at the depth first.
+    A point nearer than 1e-6 m or behind the camera has a pixel without meaning: look at the depth first.
     """
     w2c, K = cameras.w2c.to(points), cameras.K.to(points)
     seen = points @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]
     pixels = seen @ K.transpose(1, 2)
-    return pixels[..., :2] / pixels[..., 2:], seen[..., 2]
+    return pixels[..., :2] / pixels[..., 2:].clamp(min=1e-6), seen[..., 2]
 
 
 def centers(cameras: Cameras) -> Tensor:

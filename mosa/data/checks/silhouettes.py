@@ -17,6 +17,7 @@ from torch import Tensor
 from mosa.data.checks.free_fall import track_of
 from mosa.data.hull import at_border, hull_bounds, visual_hull
 from mosa.errors import DataError
+from mosa.rendering.cameras import project
 from mosa.types import Cameras, Scene
 
 RESOLUTION = 40
@@ -43,12 +44,8 @@ def check_particles(scene: Scene, label: str) -> None:
     track = None if scene.particles is None else track_of(scene)
     if track is None:
         return
-    far = torch.stack(
-        [
-            (cloud.double().mean(0) - point).norm()
-            for cloud, point in zip(scene.particles, track.points)
-        ]
-    )
+    middles = torch.stack([cloud.double().mean(0) for cloud in scene.particles])
+    far = (middles - track.points).norm(dim=1)
     frame = int(far.argmax())
     extent = float((scene.particles[0].amax(0) - scene.particles[0].amin(0)).max())
     said = (
@@ -85,26 +82,18 @@ def uncovered_and_islands(
 ) -> tuple[Tensor, list[int]]:
     """`uncovered_share`, and the pixels of each matte that are in wholly uncovered pieces."""
     shares, islands = [], []
-    for matte, K, w2c in zip(mattes, cameras.K, cameras.w2c):
-        seen = points @ w2c[:3, :3].T + w2c[:3, 3]
-        pixel = seen @ K.T
-        column, row = (pixel[:, :2] / pixel[:, 2:].clamp(min=1e-6)).floor().long().T
-        shown = (
-            (seen[:, 2] > 0)
-            & (column >= 0)
-            & (row >= 0)
-            & (column < cameras.width)
-            & (row < cameras.height)
-        )
+    size = torch.tensor([cameras.width, cameras.height])
+    for matte, K, pixels, depth in zip(mattes, cameras.K, *project(points, cameras)):
+        pixels = pixels.floor().long()
+        shown = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(1)
+        column, row = pixels.T
         covered = np.zeros(tuple(matte.shape), np.uint8)
         covered[row[shown].numpy(), column[shown].numpy()] = 1
-        reach = math.ceil(
-            pitch * float(K[[0, 1], [0, 1]].max()) / float(seen[:, 2].mean().clamp(min=1e-6))
-        )
+        focal = float(K[[0, 1], [0, 1]].max())
+        reach = math.ceil(pitch * focal / float(depth.mean().clamp(min=1e-6)))
         reach = min(max(reach, 1), max(tuple(matte.shape)))
-        covered = cv2.dilate(covered, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(
-            bool
-        )
+        box = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+        covered = cv2.dilate(covered, box).astype(bool)
         inside = (matte > 0.5).numpy()
         shares.append(float((inside & ~covered).sum() / max(inside.sum(), 1)))
         _, pieces = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
