@@ -82,18 +82,18 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     like = None if values["like"] is None else read_world(values["like"])
     knowledge = known(values, clips, like)
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
-    fall, phones = found_fall(given, tracks, knowledge, float(values["max_offset"]), flight)
+    ground = None if values["ground"] is None else np.array(values["ground"], float)
+    most, own = float(values["max_offset"]), None if like is not None else ground
+    fall, phones = found_fall(given, tracks, knowledge, most, flight, own)
     span = fall.window
     log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *span, phones[0].name, fall.frames)  # fmt: skip
     common = common_path(phones, tracks, fall, knowledge)
     exposures = [exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))]  # fmt: skip
     written = {key: values[key] for key in ("before", "after", "rate")}
     times = common_times(exposures, span, **written)
-    ground = None if values["ground"] is None else np.array(values["ground"], float)
     free = fall
     if knowledge.scale is not None or knowledge.up is not None:
         free = free_fall(phones, tracks, fall.offsets, knowledge, flight)
-    check_ground(fall, phones, None if like is not None else ground)
     world = world_of(fall, phones, ground) if like is None else like
     gains = gains_of(values, phones, clips, plates, world, tracks, fall)
     for v, phone in enumerate(tqdm(phones, desc="frames at common times", unit="phone")):
@@ -190,14 +190,17 @@ def check_ground(fall: Fall, phones: list[Phone], ground: np.ndarray | None) -> 
 
 def found_fall(
     phones: list[Phone], tracks: list[Track], knowledge: Knowledge, most: float, flight: tuple[float, float] | None = None,
+    ground: np.ndarray | None = None,
 ) -> tuple[Fall, list[Phone]]:  # fmt: skip
     """The fall from nothing but tracks, and the phones turned to where they see it: rough clocks, a parabola, and again with the
-    outlines that the hull has, the impact, and these phones. most [s]: of offsets; flight: first and last time [s], where they are
-    known. Errors: DataError; ConfigError, before the corrections, where what is known contradicts the fall."""
+    outlines that the hull has, the impact, and these phones. most [s]: of
+    offsets; flight: first and last time [s], ground: a point (3,) of the floor, where they are known. Errors: DataError;
+    ConfigError, before the corrections, where what is known contradicts the fall."""
     offsets = coarse_offsets(phones, tracks, most)
     if knowledge.scale is not None or knowledge.up is not None:
         free_fall(phones, tracks, offsets, knowledge, flight)
     fall = fit_fall(phones, tracks, offsets, knowledge, flight)
+    check_ground(fall, phones, ground)
     for _ in range(CORRECTIONS):
         better = corrected(phones, tracks, fall, knowledge)
         if better is None:

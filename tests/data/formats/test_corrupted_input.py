@@ -158,7 +158,7 @@ TRANSFORMS = {
     "size": (entries(lambda d: d.update(w=1920)), "intrinsics are for w = 1920 px"),
     "no matte": (
         lambda f: iio.imwrite(f / "images/0_000.png", np.array(iio.imread(f / "images/0_000.png"))[..., :3]),
-        "no matte: expected an alpha",
+        "expected RGBA with the matte as alpha or a mask_path in",
     ),
     "opaque": (
         lambda f: [iio.imwrite(p, iio.imread(p) | np.array([0, 0, 0, 255], np.uint8)) for p in (f / "images").glob("0_*")],
@@ -267,7 +267,7 @@ KEYS = [
         {"holdout_frames": "last"},
         "scene.holdout_frames: expected a list of frame numbers or how many",
     ),
-    ({"holdout_frames": -1}, "scene.holdout_frames: expected a number >= 0"),
+    ({"holdout_frames": -1}, "scene.holdout_frames: expected a whole number of at least 0"),
     ({"frames": [0, 1]}, "scene.frames: expected at least three frames"),
     (
         {"holdout_cameras": ["seven"]},
