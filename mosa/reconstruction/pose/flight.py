@@ -87,12 +87,8 @@ def follow_rigidly(
     radius = float(torch.cat(points).sub(start.centre).norm(dim=1).mean())
     for sigma in BLURS:
         before, after = _channels(first, sigma), _channels(other, sigma)
-        matrix, vector, total, count = (
-            torch.zeros(6, 6).to(start.centre),
-            torch.zeros(6).to(start.centre),
-            0.0,
-            0.0,
-        )
+        matrix, vector = torch.zeros(6, 6).to(start.centre), torch.zeros(6).to(start.centre)
+        total, count = 0.0, 0.0
         for b, own in enumerate(points):
             wanted = _sampled(before[b], own, first.cameras.K[b], first.cameras.w2c[b])[0][:, :4]
             moved = motion.points(own)
@@ -109,10 +105,8 @@ def follow_rigidly(
             weight = 1 / (1 + residual.square().sum(1) / 0.03)
             matrix += torch.einsum("n,nci,ncj->ij", weight, J, J)
             vector += torch.einsum("n,nci,nc->i", weight, J, residual)
-            total, count = (
-                total + float((weight * residual.square().mean(1)).sum()),
-                count + float(weight.sum()),
-            )
+            total += float((weight * residual.square().mean(1)).sum())
+            count += float(weight.sum())
         damping = 1e-4 * matrix.diagonal().mean() * torch.eye(6).to(matrix)
         step = -torch.linalg.solve((matrix + damping).double(), vector.double()).to(vector)
         turn = rotation_exp(step[3:] / radius)
@@ -134,19 +128,16 @@ def free_motions(scene: Scene, distance: Volume, frames: list[Windows]) -> list[
     centre, width = everywhere.mean(0), pixel_width(distance, frames[0])
     times = (scene.times - scene.times[0]).tolist()
     views = scene.training_cameras
-    centres = matte_centres(scene.mattes[views][:, : len(frames)], scene.cameras.select(views)).to(
-        device
-    )
-    motions, first_left = [], float("inf")
-    velocity = None
+    mattes, cameras = scene.mattes[views][:, : len(frames)], scene.cameras.select(views)
+    centres = matte_centres(mattes, cameras).to(device)
+    motions, first_left, velocity = [], float("inf"), None
     for t in range(1, len(frames)):
         if scene.last_free_frame is not None and t > scene.last_free_frame:
             break
         start = Motion(torch.eye(3, device=device), centres[t] - centres[0], centre)
         if velocity is not None:
-            start = Motion(
-                motions[-1].rotation, velocity * times[t] + 0.5 * gravity * times[t] ** 2, centre
-            )
+            shift = velocity * times[t] + 0.5 * gravity * times[t] ** 2
+            start = Motion(motions[-1].rotation, shift, centre)
         ground = scene.ground.height if scene.ground is not None else -float("inf")
         if float((start.points(everywhere) @ up).min()) < ground:
             break
