@@ -159,12 +159,9 @@ def worst_uncovered(
     shares: Tensor, names: tuple[str, ...], frame: int, label: str
 ) -> tuple[float, str]:
     """Largest uncovered share of a matte, and a message that names cameras and causes."""
-    order = shares.argsort(descending=True)[:4].tolist()
-    listed = ", ".join(
-        f"{names[v]} ({float(shares[v]):.0%})"
-        for v in order
-        if float(shares[v]) > 0.25 * float(shares.max())
-    )
+    large = [v for v in shares.argsort(descending=True)[:4].tolist()
+             if float(shares[v]) > 0.25 * float(shares.max())]  # fmt: skip
+    listed = ", ".join(f"{names[v]} ({float(shares[v]):.0%})" for v in large)
     return float(shares.max()), (
         f"{label}: the outlines of frame {frame} are not those of one solid: what all cameras see together should fill every "
         f"matte, and leaves open of the cameras {listed}: check focal lengths (fl_x, fl_y), principal points, lens distortion, "

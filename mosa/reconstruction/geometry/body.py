@@ -81,15 +81,10 @@ class Geometry:
     @classmethod
     def read(cls, stored: dict) -> Geometry:
         """The inverse of `stored`."""
-        return cls(
-            Volume(stored["values"], stored["origin"], stored["pitch"]),
-            stored["hull_volume"],
-            stored["deviation"],
-            stored["free_frames"],
-            Splats(**stored["static"]) if stored.get("static") else None,
-            stored.get("registered") or {},
-            stored.get("place") or {},
-        )
+        rest = dict(stored)
+        body = Volume(*(rest.pop(name) for name in ("values", "origin", "pitch")))
+        static = Splats(**rest["static"]) if rest["static"] else None
+        return cls(body, **rest | {"static": static})
 
 
 def surface_of(body: Volume) -> Tensor:
