@@ -117,6 +117,8 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                 # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
                 read_image(file)
                 picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
+                if picture is None:
+                    raise DataError(f"{file}: expected a readable picture, found a damaged one")
                 picture = fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file)
                 return picture.astype(np.float32) / 255
     if seconds is None:

@@ -32,9 +32,9 @@ class Observations:
         return Observations(images, mattes, flow, self.cameras.select(views), self.image_width)
 
     def to(self, device: torch.device | str) -> Observations:
-        parts = self.images, self.mattes, self.flow, self.cameras
-        moved = (None if part is None else part.to(device) for part in parts)
-        return Observations(*moved, self.image_width)
+        flow = None if self.flow is None else self.flow.to(device)
+        images, mattes = self.images.to(device), self.mattes.to(device)
+        return Observations(images, mattes, flow, self.cameras.to(device), self.image_width)
 
 
 def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: int) -> Observations:
@@ -63,14 +63,10 @@ def training_observations(
     found = cropped(scene, scene.training_cameras, frames, margin).to(device)
     cues, splats = reconstruction.cues, reconstruction.splats
     assert isinstance(cues, MotionCues)  # of a scene with images
-    parts = (
-        cues.positions[: len(frames)],
-        cues.covariances[: len(frames)],
-        splats.opacities,
-        splats.colors,
-    )
-    given, background = [part.to(device) for part in parts], scene.background.to(device)
-    flow = [observe(*given, found.cameras.select([v]), background, flow=True).flow
-            for v in range(len(found.cameras))]  # fmt: skip
+    x, shapes = (p[: len(frames)].to(device) for p in (cues.positions, cues.covariances))
+    opacities, colors = splats.opacities.to(device), splats.colors.to(device)
+    cameras, behind = found.cameras, scene.background.to(device)
+    flow = [observe(x, shapes, opacities, colors, cameras.select([v]), behind, flow=True).flow
+            for v in range(len(cameras))]  # fmt: skip
     flows = torch.cat(flow)  # type: ignore[arg-type]  # each is there, as it was asked for
     return Observations(found.images, found.mattes, flows, found.cameras, found.image_width)

@@ -35,7 +35,8 @@ class RestShape:
         carried = None
         if with_splats and reconstruction.appearance is not None:
             carried = CarriedSplats(reconstruction.appearance, seen.means).to(device)
-        return cls(*(tensor.to(device) for tensor in tensors), carried)
+        rest, volume, colors, opacities, covariances = (tensor.to(device) for tensor in tensors)
+        return cls(rest, volume, colors, opacities, covariances, carried)
 
     @property
     def center(self) -> Tensor:

@@ -110,8 +110,8 @@ def matrix_to_quaternion(R: Tensor) -> Tensor:
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
     # 4 w^2, 4 x^2, 4 y^2, 4 z^2
     signs = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
-    squares = [1 + a * m[0][0] + b * m[1][1] + c * m[2][2] for a, b, c in signs]
-    squares = torch.stack(squares, -1)
+    diagonal = [1 + a * m[0][0] + b * m[1][1] + c * m[2][2] for a, b, c in signs]
+    squares = torch.stack(diagonal, -1)
     wx, wy, wz = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     rows = (

@@ -74,14 +74,16 @@ class Splat(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_image: Tensor, grad_alpha: Tensor):
-        *given, features, K, w2c, records, transmittance, ends = ctx.saved_tensors[:9]
-        lists, g = ctx.saved_tensors[9:], ctx.geometry
+        means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists = (
+            ctx.saved_tensors
+        )
+        g = ctx.geometry
         with warp_stream(features.device):
-            gradients = grad_image.contiguous(), grad_alpha.contiguous()
+            incoming = grad_image.contiguous(), grad_alpha.contiguous()
             moments, grad_features = composite_backward(
-                lists, records, features, ends, transmittance, *gradients, g
+                lists, records, features, ends, transmittance, *incoming, g
             )
-            gradients = project_backward(*given, K, w2c, records, moments, g)
+            gradients = project_backward(means, covariances, opacities, K, w2c, records, moments, g)
         return *gradients, grad_features, None, None, None
 
 

@@ -91,7 +91,7 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     wp.utils.radix_sort_pairs(wp.from_torch(depths), wp.from_torch(order), number)
     numbers = torch.empty(number, dtype=torch.int32, device=records.device)
     flat = functools.partial(wp.from_torch, return_ctype=True)
-    given = [flat(order), flat(records.view(-1, 8), dtype=record_type(scalar))]
+    given: list = [flat(order), flat(records.view(-1, 8), dtype=record_type(scalar))]
     wp.launch(count, dim=number, inputs=given, outputs=[flat(numbers)], device=device)
     ends = numbers.cumsum(0, dtype=torch.int64)
     total = int(ends[-1])

@@ -242,9 +242,10 @@ def footage_of(
     K, stack, coverage = one_size(
         K, images, mattes, background=WHITE, names=list(calibration), where=where
     )
-    K, w2c = (torch.tensor(part, dtype=torch.float32) for part in (K, w2c))
+    intrinsics, poses = (torch.tensor(part, dtype=torch.float32) for part in (K, w2c))
     height, width = coverage.shape[2:]
-    cameras, moments = Cameras(K, w2c, width, height, tuple(calibration)), np.array(times)
+    cameras = Cameras(intrinsics, poses, width, height, tuple(calibration))
+    moments = np.array(times)
     digits = np.spacing(np.abs(moments).max(), dtype=np.float32)
     if digits > 0.1 * TIME_JITTER * np.diff(moments).min():
         moments -= moments[0]  # seconds of a clock, which single precision does not keep

@@ -128,8 +128,8 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         return torch.from_numpy(columns)
 
     read(AXES)  # all there, and finite
-    places = [np.asarray(vertices[name], np.float64) for name in AXES]
-    places = torch.from_numpy(np.stack(places, -1))
+    axes = [np.asarray(vertices[name], np.float64) for name in AXES]
+    places = torch.from_numpy(np.stack(axes, -1))
     if len(places) == 0:
         raise DataError(f"{path}: expected Gaussians, found none")
     middle, (low, high) = places.median(0).values, np.quantile(places.numpy(), [0.05, 0.95], axis=0)

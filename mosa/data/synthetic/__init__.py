@@ -61,7 +61,8 @@ def load_builtin(
     cameras, times = scale_cameras(cameras_of(body, seed), scale), torch.tensor(chosen) / film.fps
     footage = Footage(cameras, tuple(chosen), times, images, mattes, torch.ones(3))
     known = take.rest, take.positions[chosen], take.rotation, take.velocity
-    truth = Truth(*(torch.tensor(a, dtype=torch.float32) for a in known), hidden.summary())
+    rest, positions, rotation, velocity = (torch.tensor(a, dtype=torch.float32) for a in known)
+    truth = Truth(rest, positions, rotation, velocity, hidden.summary())
     reach, box = body.reach, BOX
     if reach is not None:
         box = ((-reach, BOX[0][1], -reach), (reach, BOX[1][1], reach))
