@@ -331,5 +331,7 @@ def test_uneven_times_can_be_overridden(pacnerf_folder, transforms_folder):
 
 @pytest.mark.parametrize("value", [-1, 2.5, True])
 def test_fill_holes_is_a_number_of_pixels(pacnerf_folder, value):
-    with pytest.raises(ConfigError, match=r"scene.fill_holes: expected a whole number of at least 0"):
+    with pytest.raises(
+        ConfigError, match=r"scene.fill_holes: expected a whole number of at least 0"
+    ):
         load_scene(format="pacnerf", path=str(pacnerf_folder), fill_holes=value, **WORLD)
