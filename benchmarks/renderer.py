@@ -191,7 +191,7 @@ def device_time(stage, repeats: int, calls: int = 5) -> float:
     for _ in range(repeats + 1):
         began, ended = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
         began.record()
-        with splatting.torch_stream(torch.device("cuda")):
+        with splatting.warp_stream(torch.device("cuda")):
             for _ in range(calls):
                 stage()
         ended.record()

@@ -84,20 +84,13 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
         for v in set(range(len(phones))) - set(placed):
             cost = np.zeros(len(grid))
             for u in placed:
-                cost += disagreement(
-                    (phones[u], phones[v]), (tracks[u], tracks[v]), grid - offsets[u]
-                )
-                cost += disagreement(
-                    (phones[v], phones[u]), (tracks[v], tracks[u]), offsets[u] - grid
-                )
+                pair, seen = (phones[u], phones[v]), (tracks[u], tracks[v])
+                cost += disagreement(pair, seen, grid - offsets[u])
+                cost += disagreement(pair[::-1], seen[::-1], offsets[u] - grid)
             costs[v] = cost / (2 * len(placed))
-        v = min(
-            costs,
-            key=lambda v: (
-                costs[v].min() > LOST,
-                int((costs[v] < costs[v].min() + COST_TOLERANCE).sum()),
-            ),
-        )
+        lost = {v: cost.min() > LOST for v, cost in costs.items()}
+        wide = {v: int((c < c.min() + COST_TOLERANCE).sum()) for v, c in costs.items()}
+        v = min(costs, key=lambda v: (lost[v], wide[v]))
         best = int(costs[v].argmin())
         if costs[v][best] > LOST:
             others = ", ".join(phones[u].name for u in placed)

@@ -123,14 +123,9 @@ def longest_parabola(times: np.ndarray, points: np.ndarray, tolerance: float) ->
 
 
 def rough_window(
-    phones: list[Phone],
-    tracks: list[Track],
-    offsets: np.ndarray,
-    flight: tuple[float, float] | None,
+    phones: list[Phone], tracks: list[Track], offsets: np.ndarray
 ) -> tuple[float, float]:
-    """First and last time [s] of free fall on the first phone's clock; flight: where it is known."""
-    if flight is not None:
-        return flight
+    """First and last time [s] of free fall on the first phone's clock."""
     times = tracks[0].times
     points = centres_at(phones, tracks, offsets, times)
     depth = np.nanmedian(np.linalg.norm(points - phones[0].camera.centre, axis=1))
@@ -150,14 +145,11 @@ class Problem:
         end = window[1] if until is None else until
         self.origin = 0.5 * (window[0] + window[1])
         self.start = offsets
-        self.times, self.pixels, self.shares, self.sigma, self.frames = [], [], [], [], []
+        self.times, self.pixels, self.shares, self.sigma = [], [], [], []
         for phone, track, offset in zip(phones, tracks, offsets):
-            inside = np.flatnonzero(
-                track.seen
-                & (track.times + offset >= window[0] - 1e-9)
-                & (track.times + offset <= end + 1e-9)
-            )
-            self.frames.append(inside)
+            when = track.times + offset
+            within = (when >= window[0] - 1e-9) & (when <= end + 1e-9)
+            inside = np.flatnonzero(track.seen & within)
             self.times.append(track.times[inside])
             self.pixels.append(track.centres[inside])
             self.shares.append(row_share(phone, track.centres[inside], knowledge))
@@ -169,21 +161,14 @@ class Problem:
         t = np.linspace(*window, 12)[good] - self.origin
         design = np.stack([np.ones_like(t), t, 0.5 * t * t], 1)
         self.rough = np.linalg.lstsq(design, points[good], rcond=None)[0]
-        self.depth = float(
-            np.mean([np.linalg.norm(self.rough[0] - phone.camera.centre) for phone in phones])
-        )
+        away = [np.linalg.norm(self.rough[0] - phone.camera.centre) for phone in phones]
+        self.depth = float(np.mean(away))
         self.readouts = [knowledge.readout_of(phone.name) for phone in phones]
 
     def begin(self) -> np.ndarray:
-        readouts = np.array([READOUT if known is None else known for known in self.readouts])
-        return np.concatenate(
-            [
-                (self.rough / self.depth).ravel(),
-                np.zeros(len(self.phones) - 1),
-                readouts,
-                np.zeros(2 * len(self.phones)),
-            ]
-        )
+        V, readouts = len(self.phones), [READOUT if r is None else r for r in self.readouts]
+        motion = (self.rough / self.depth).ravel()
+        return np.concatenate([motion, np.zeros(V - 1), readouts, np.zeros(2 * V)])
 
     def parts(self, numbers: np.ndarray):
         V = len(self.phones)
@@ -211,33 +196,19 @@ class Problem:
     def residuals(
         self, numbers: np.ndarray, noise: float, without: int | None = None
     ) -> np.ndarray:
-        motion, _, readouts, shifts = self.parts(numbers)
-        parts = [
-            miss.ravel() / noise for v, miss in enumerate(self.misses(numbers)) if v != without
-        ]
+        motion, offsets, readouts, shifts = self.parts(numbers)
+        size, scale, up = np.linalg.norm(motion[2]), self.knowledge.scale, self.knowledge.up
+        misses = enumerate(self.misses(numbers))
+        parts = [miss.ravel() / noise for v, miss in misses if v != without]
         parts += [(shifts / np.array(self.sigma)[:, None]).ravel()]
-        parts.append(
-            np.array(
-                [
-                    (r - READOUT) / READOUT_SD if known is None else (r - known) / 1e-5
-                    for r, known in zip(readouts, self.readouts)
-                ]
-            )
-        )
-        g = self.knowledge.gravity
-        if self.knowledge.scale is not None:
-            parts.append(
-                np.array([(np.linalg.norm(motion[2]) * self.knowledge.scale / g - 1) / 3e-3])
-            )
-        if self.knowledge.up is not None:
-            across = (
-                np.cross(motion[2], self.knowledge.up)
-                / np.linalg.norm(motion[2])
-                / np.linalg.norm(self.knowledge.up)
-            )
-            parts.append(across / 5e-3)
+        parts += [[(r - READOUT) / READOUT_SD if known is None else (r - known) / 1e-5]
+                  for r, known in zip(readouts, self.readouts)]  # fmt: skip
+        if scale is not None:
+            parts += [[(size * scale / self.knowledge.gravity - 1) / 3e-3]]
+        if up is not None:
+            parts += [np.cross(motion[2], up) / size / np.linalg.norm(up) / 5e-3]
         # the first clock is the others', and of a phone that is left out nothing is asked
-        parts.append(1e-3 * (self.parts(numbers)[1] - self.start) / 1e-2)
+        parts += [1e-3 * (offsets - self.start) / 1e-2]
         return np.concatenate(parts)
 
     def solve(self, numbers: np.ndarray, noise: float, without: int | None = None):
@@ -247,14 +218,11 @@ class Problem:
 
 
 def fit_fall(
-    phones: list[Phone],
-    tracks: list[Track],
-    offsets: np.ndarray,
-    knowledge: Knowledge,
+    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, knowledge: Knowledge,
     flight: tuple[float, float] | None = None,
-) -> Fall:
+) -> Fall:  # fmt: skip
     """The fall from rough offsets (V,) [s]. flight: first and last time of it, where they are known. Errors: DataError."""
-    window = rough_window(phones, tracks, offsets, flight)
+    window = flight or rough_window(phones, tracks, offsets)
     interval = max(track.clip.interval for track in tracks)
     noise, numbers = 1.0, None
     for attempt in range(8):
@@ -272,9 +240,8 @@ def fit_fall(
         every = np.concatenate([m.ravel() for m in misses])
         noise = max(NOISE, OUTLINE * problem.radius, 1.4826 * float(np.median(np.abs(every))))
         offsets = problem.parts(numbers)[1]
-        numbers = np.concatenate(
-            [numbers[:9], np.zeros(len(phones) - 1), numbers[8 + len(phones) :]]
-        )
+        clocks = slice(9, 8 + len(phones))
+        numbers[clocks] = 0
         if flight is not None:
             if attempt >= 2:
                 break
@@ -334,23 +301,13 @@ def described(problem: Problem, solution, noise: float, count: int) -> Fall:
     across = np.trace(covariance[6:9, 6:9]) * problem.depth**2 - slope
     scale_sd, up_sd = np.sqrt(slope) / size, np.degrees(np.sqrt(max(across, 0)) / size)
     sd = np.sqrt(np.diag(covariance))
-    others = (
-        [problem.parts(problem.solve(solution.x, noise, v).x) for v in range(V)] if V > 3 else []
-    )
-    if others:  # a phone's mistakes are in all of its frames: what the fit is without it says more than its residuals
-        sizes = np.array([np.linalg.norm(m[2]) for m, *_ in others])
-        turns = np.array(
-            [
-                np.degrees(
-                    np.arcsin(
-                        np.clip(
-                            np.linalg.norm(np.cross(m[2], direction)) / np.linalg.norm(m[2]), 0, 1
-                        )
-                    )
-                )
-                for m, *_ in others
-            ]
-        )
+    if (
+        V > 3
+    ):  # a phone's mistakes are in all of its frames: what the fit is without it says more than its residuals
+        others = [problem.parts(problem.solve(solution.x, noise, v).x)[0][2] for v in range(V)]
+        sizes = np.linalg.norm(others, axis=1)
+        sines = np.linalg.norm(np.cross(others, direction), axis=1) / sizes
+        turns = np.degrees(np.arcsin(np.clip(sines, 0, 1)))
         scale_sd = max(scale_sd, np.sqrt((V - 1) / V * np.square(sizes / sizes.mean() - 1).sum()))
         up_sd = max(up_sd, np.sqrt((V - 1) / V * np.square(turns).sum()))
     scale = knowledge.gravity / size if knowledge.scale is None else knowledge.scale

@@ -40,9 +40,8 @@ class Impact(Problem):
         self.begun = fall
         end = until - self.origin
         first = fall.window[1] - self.origin
-        self.knots = np.concatenate(
-            [[first] * 3, np.linspace(first, end, round(AFTER / STEP) + 1), [end] * 3]
-        )
+        inner = np.linspace(first, end, round(AFTER / STEP) + 1)
+        self.knots = np.concatenate([[first] * 3, inner, [end] * 3])
         count = len(self.knots) - 4
         # the first three vanish: the curve joins the parabola smoothly
         self.bend = np.diff(np.eye(count), 3, axis=0)[:, 3:]
@@ -65,33 +64,25 @@ class Impact(Problem):
         """At the fall, and a curve through where lines of sight meet after it."""
         fall = self.begun
         motion = np.stack([fall.position, fall.velocity, fall.acceleration]) / self.depth
-        numbers = np.concatenate(
-            [motion.ravel(), np.zeros(len(self.phones) - 1), fall.readouts, fall.shifts.ravel()]
-        )
+        own = motion.ravel(), np.zeros(len(self.phones) - 1), fall.readouts, fall.shifts.ravel()
         times = np.linspace(self.knots[0], self.knots[-1], 3 * self.bend.shape[1])
         tracks = [Track(None, t, p, np.ones(len(t))) for t, p in zip(self.times, self.pixels)]
-        beside = (
-            centres_at(self.phones, tracks, fall.offsets, times + self.origin)
-            - fall.at(times + self.origin)
-        ) / self.depth
+        seen = centres_at(self.phones, tracks, fall.offsets, times + self.origin)
+        beside = (seen - fall.at(times + self.origin)) / self.depth
         good = np.isfinite(beside[:, 0])
         matrix = np.concatenate([self.curve(times[good]) / OUTLINE, self.bend / BEND])
         right = np.concatenate([beside[good] / OUTLINE, np.zeros((len(self.bend), 3))])
-        return np.concatenate([numbers, np.linalg.lstsq(matrix, right, rcond=None)[0].ravel()])
+        return np.concatenate([*own, np.linalg.lstsq(matrix, right, rcond=None)[0].ravel()])
 
     def path(self, numbers: np.ndarray, times: np.ndarray) -> np.ndarray:
-        return super().path(numbers, times) + self.depth * self.curve(times) @ numbers[
-            self.base :
-        ].reshape(-1, 3)
+        beside = self.depth * self.curve(times) @ numbers[self.base :].reshape(-1, 3)
+        return super().path(numbers, times) + beside
 
     def misses(self, numbers: np.ndarray) -> list[np.ndarray]:
         """Per phone (n, 2): seen minus expected [px], after the fall in pixels of as many standard deviations in it."""
-        noise = self.begun.noise
-        share = min(1.0, noise / (OUTLINE * self.radius))
-        return [
-            np.where(late[:, None], share, 1.0) * miss
-            for late, miss in zip(self.late, super().misses(numbers))
-        ]
+        share = min(1.0, self.begun.noise / (OUTLINE * self.radius))
+        both = zip(self.late, super().misses(numbers))
+        return [np.where(late[:, None], share, 1.0) * miss for late, miss in both]
 
     def residuals(
         self, numbers: np.ndarray, noise: float, without: int | None = None
@@ -115,9 +106,8 @@ def through_impact(
     solution = problem.solve(problem.begin(), fall.noise)
     (position, velocity, acceleration), offsets, _, shifts = problem.parts(solution.x)
     data = np.concatenate([miss.ravel() for miss in problem.misses(solution.x)]) / fall.noise
-    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * max(
-        1.0, float(np.square(data).mean())
-    )
+    inflate = max(1.0, float(np.square(data).mean()))
+    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * inflate
     sd, V = np.sqrt(np.diag(covariance)), len(phones)
     return replace(
         fall, position=position, velocity=velocity, acceleration=acceleration, offsets=offsets, shifts=shifts,

@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.capture.alignment import centres_at, coarse_offsets
-from mosa.capture.fall import SCANS, Fall, Knowledge, fit_fall
+from mosa.capture.fall import Fall, Knowledge, fit_fall
 from mosa.capture.impact import through_impact
 from mosa.capture.mattes import Matting, Track, follow, matting_of
 from mosa.capture.outline import corrected, radius_of, shifted, without_common
@@ -46,8 +46,6 @@ log = logging.getLogger(__name__)
 
 READOUT_DIRECTIONS = {0: "down", 90: "left", 180: "up", 270: "right"}
 """Rotation of a video for display [degrees] -> direction of the sensor's readout in the displayed picture."""
-PHONE_KEYS = ("fps", "scan", "readout")
-"""Keys that may be set for one phone."""
 MAX_PHONE_OFFSET = 0.12
 """Disagreement with the other phones, in object radii, above which a phone is reported."""
 CORRECTIONS = 4
@@ -61,49 +59,41 @@ COARSE = 320
 
 def make(cfg: DictConfig) -> dict[str, Any]:
     """`python -m mosa.capture`: write the scene and its report; returns what capture.json says. Errors: ConfigError, DataError."""
-    for key, example in (
-        ("videos", "<folder>"),
-        ("poses", "<COLMAP model>"),
-        ("output", "<folder>"),
-    ):
+    for key in ("videos", "poses", "output"):
         if OmegaConf.is_missing(cfg, key):
-            raise ConfigError(
-                f"{key}: expected a folder, found none; python -m mosa.capture {key}={example} ..."
-            )
+            way = f"python -m mosa.capture {key}=<folder> ..."
+            raise ConfigError(f"{key}: expected a folder, found none; {way}")
     values = plain(cfg)
     check_capture(values)
     return capture(values)
 
 
 def capture(values: Mapping[str, Any]) -> dict[str, Any]:
-    """From the keys of conf/capture.yaml. Errors: ConfigError, DataError."""
+    """From the keys of conf/capture.yaml, which `check_capture` has looked at. Errors: ConfigError, DataError."""
     folder = output_folder(values)
     files = find_videos(values["videos"])
     clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in files]
     check_phone_names(values, [clip.path.stem for clip in clips])
     sizes = {clip.path.name: clip.size for clip in clips}
-    given = read_phones(values["videos"], values["poses"], sizes)
-    plates, masks = plates_folder(values), values["masks"]
-    how = {
-        "plates": plates,
-        "plate_seconds": values["plate_seconds"],
-        "masks": masks and Path(masks),
-    }
-    mattings = [matting_of(values["mattes"], clip, **how) for clip in clips]
+    given, plates = read_phones(values["videos"], values["poses"], sizes), plates_folder(values)
+    places = plates, values["plate_seconds"], values["masks"]
+    mattings = [matting_of(values["mattes"], clip, *places) for clip in clips]
     tracks = followed(clips, mattings)
     like = None if values["like"] is None else read_world(values["like"])
     knowledge = known(values, clips, like)
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
-    fall, phones = found_fall(given, tracks, knowledge, float(values["max_offset"]), flight)
+    ground = None if values["ground"] is None else np.array(values["ground"], float)
+    most, own = float(values["max_offset"]), None if like is not None else ground
+    fall, phones = found_fall(given, tracks, knowledge, most, flight, own)
     span = fall.window
     log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *span, phones[0].name, fall.frames)  # fmt: skip
     common = common_path(phones, tracks, fall, knowledge)
     exposures = [exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))]  # fmt: skip
     written = {key: values[key] for key in ("before", "after", "rate")}
     times = common_times(exposures, span, **written)
-    ground = None if values["ground"] is None else np.array(values["ground"], float)
-    own = None if like is not None else ground
-    free = check_known_world(fall, knowledge, phones, tracks, flight, own)
+    free = fall
+    if knowledge.scale is not None or knowledge.up is not None:
+        free = free_fall(phones, tracks, fall.offsets, knowledge, flight)
     world = world_of(fall, phones, ground) if like is None else like
     gains = gains_of(values, phones, clips, plates, world, tracks, fall)
     for v, phone in enumerate(tqdm(phones, desc="frames at common times", unit="phone")):
@@ -122,12 +112,8 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
         write_transforms(folder, phones, times, world)
     moved = [now.camera.K[:2, 2] - then.camera.K[:2, 2] for now, then in zip(phones, given)]
     told = replace(fall, shifts=fall.shifts + np.stack(moved))
-    found = {
-        "phones": [
-            phone_figures(v, *parts, told, knowledge, gains)
-            for v, parts in enumerate(zip(phones, clips, tracks))
-        ]
-    }
+    every = enumerate(zip(phones, clips, tracks))
+    found = {"phones": [phone_figures(v, *parts, told, knowledge, gains) for v, parts in every]}
     found |= figures(values, told, free, knowledge, world, times, centres, radius, floor)
     found["warnings"] = warnings_of(found, values, knowledge, phones)
     write_whole(folder / FILE, json.dumps(found, indent=1))
@@ -162,62 +148,59 @@ def output_folder(values: Mapping[str, Any]) -> Path:
     folder = Path(values["output"])
     for key in ("videos", "poses", "plates", "masks", "like"):
         if values[key] is not None and folder.resolve() == Path(values[key]).resolve():
-            raise ConfigError(
-                f"output: expected a folder of its own, found that of {key}={values[key]}"
-            )
+            found = f"found that of {key}={values[key]}"
+            raise ConfigError(f"output: expected a folder of its own, {found}")
     try:
         (folder / "images").mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
+        found = f"found none ({error.strerror})"
         raise DataError(
-            f"output: {folder}: expected a folder that can be written, found none ({error.strerror})"
+            f"output: {folder}: expected a folder that can be written, {found}"
         ) from error
     return folder
 
 
-def check_known_world(
-    fall: Fall,
-    knowledge: Knowledge,
-    phones: list[Phone],
-    tracks: list[Track],
-    flight: tuple[float, float] | None,
-    ground: np.ndarray | None,
-) -> Fall:
-    """What the keys say of scale, up and ground is possible. Returns the fall as it is where nobody knows scale and up: a known
-    scale pulls the acceleration to gravity's, so that of it a mistake cannot be told. Errors: ConfigError."""
-    given = knowledge.scale is not None or knowledge.up is not None
-    free = (
-        fit_fall(phones, tracks, fall.offsets, replace(knowledge, scale=None, up=None), flight)
-        if given
-        else fall
-    )
+def free_fall(
+    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, knowledge: Knowledge, flight: tuple[float, float] | None,
+) -> Fall:  # fmt: skip
+    """The fall as it is where nobody knows scale and up, of which what is known of them is checked: a known scale pulls the
+    acceleration to gravity's, so that a mistake cannot be told afterwards. Errors: ConfigError for an impossible scale or up."""
+    free = fit_fall(phones, tracks, offsets, replace(knowledge, scale=None, up=None), flight)
     if knowledge.scale is not None and not 1 / FAR_OFF < knowledge.scale / free.scale < FAR_OFF:
         raise ConfigError(f"scale: expected about {free.scale:.3g} m per unit of the poses, as the object then falls at "
                           f"{knowledge.gravity:g} m/s^2, found {knowledge.scale:g}; check like, fps and gravity too")  # fmt: skip
     if knowledge.up is not None and free.acceleration @ knowledge.up >= 0:
         raise ConfigError(f"up: expected a direction against the fall, found {list(map(float, knowledge.up))}, along which the "
                           "object falls upwards")  # fmt: skip
-    if ground is not None:
-        below = float((fall.at(np.array(fall.window[1])) - ground) @ fall.up)
-        extent = float(np.ptp([phone.camera.centre for phone in phones], axis=0).max())
-        if not 0 < below < extent:
-            raise ConfigError(f"ground: expected a point of the floor less than {extent:.3g} (units of the poses, the distance "
-                              f"between phones) below where the free fall ends, found one {below:.3g} below it")  # fmt: skip
     return free
 
 
+def check_ground(fall: Fall, phones: list[Phone], ground: np.ndarray | None) -> None:
+    """Errors: ConfigError for a point of the floor (3,) that the object does not fall towards."""
+    if ground is None:
+        return
+    below = float((fall.at(np.array(fall.window[1])) - ground) @ fall.up)
+    extent = float(np.ptp([phone.camera.centre for phone in phones], axis=0).max())
+    if not 0 < below < extent:
+        raise ConfigError(f"ground: expected a point of the floor less than {extent:.3g} (units of the poses, the distance "
+                          f"between phones) below where the free fall ends, found one {below:.3g} below it")  # fmt: skip
+
+
 def found_fall(
-    phones: list[Phone],
-    tracks: list[Track],
-    knowledge: Knowledge,
-    most: float,
-    flight: tuple[float, float] | None = None,
-) -> tuple[Fall, list[Phone]]:
+    phones: list[Phone], tracks: list[Track], knowledge: Knowledge, most: float, flight: tuple[float, float] | None = None,
+    ground: np.ndarray | None = None,
+) -> tuple[Fall, list[Phone]]:  # fmt: skip
     """The fall from nothing but tracks, and the phones turned to where they see it: rough clocks, a parabola, and again with the
-    outlines that the hull has, the impact, and these phones. most [s]: of offsets; flight: first and last time [s], where they are
-    known. Errors: DataError."""
-    fall = fit_fall(phones, tracks, coarse_offsets(phones, tracks, most), knowledge, flight)
+    outlines that the hull has, the impact, and these phones. most [s]: of
+    offsets; flight: first and last time [s], ground: a point (3,) of the floor, where they are known. Errors: DataError;
+    ConfigError, before the corrections, where what is known contradicts the fall."""
+    offsets = coarse_offsets(phones, tracks, most)
+    if knowledge.scale is not None or knowledge.up is not None:
+        free_fall(phones, tracks, offsets, knowledge, flight)
+    fall = fit_fall(phones, tracks, offsets, knowledge, flight)
+    check_ground(fall, phones, ground)
     for _ in range(CORRECTIONS):
         better = corrected(phones, tracks, fall, knowledge)
         if better is None:
@@ -225,9 +208,8 @@ def found_fall(
                 "warning: the mattes have no common hull in the free fall: poses, or mattes, are off"
             )
             break
-        fall = fit_fall(
-            phones, better, fall.offsets, knowledge, fall.window if flight is None else flight
-        )
+        window = fall.window if flight is None else flight
+        fall = fit_fall(phones, better, fall.offsets, knowledge, window)
         fall = through_impact(phones, better, fall, knowledge)
         shifts = without_common(phones, fall)
         phones = [shifted(phone, shift) for phone, shift in zip(phones, shifts)]
@@ -241,13 +223,9 @@ def of_phone(values: Mapping[str, Any], name: str, key: str):
 
 
 def check_phone_names(values: Mapping[str, Any], names: list[str]) -> None:
-    for name, section in (values["phones"] or {}).items():
+    for name in values["phones"] or {}:
         if name not in names:
             raise ConfigError(f"phones.{name}: no video of that name; there are {', '.join(names)}")
-        if unknown := sorted(set(section) - set(PHONE_KEYS)):
-            raise ConfigError(
-                f"phones.{name}.{unknown[0]}: expected the keys {', '.join(PHONE_KEYS)} only"
-            )
 
 
 def plates_folder(values: Mapping[str, Any]) -> Path | None:
@@ -257,10 +235,8 @@ def plates_folder(values: Mapping[str, Any]) -> Path | None:
             raise DataError(f"plates: folder {values['plates']} not found")
         return Path(values["plates"])
     videos = Path(values["videos"])
-    return next(
-        (folder for folder in (videos / "plates", videos.parent / "plates") if folder.is_dir()),
-        None,
-    )
+    places = videos / "plates", videos.parent / "plates"
+    return next((folder for folder in places if folder.is_dir()), None)
 
 
 def followed(clips: list[Clip], mattings: list[Matting]) -> list[Track]:
@@ -275,10 +251,6 @@ def known(values: Mapping[str, Any], clips: list[Clip], world: World | None) -> 
     for clip, name in zip(clips, names):
         scan = of_phone(values, name, "scan")
         scans[name] = READOUT_DIRECTIONS.get(clip.turned, "down") if scan == "auto" else scan
-        if scans[name] not in SCANS:
-            raise ConfigError(
-                f"phones.{name}.scan: expected auto, {', '.join(SCANS)}, found {scan!r}"
-            )
     readouts = {name: of_phone(values, name, "readout") for name in names}
     up = None if values["up"] is None else np.array(values["up"], float)
     knowledge = Knowledge(values["gravity"], values["scale"], up, readouts, scans)
@@ -313,16 +285,8 @@ def phone_figures(
 
 
 def figures(
-    values,
-    fall: Fall,
-    free: Fall,
-    knowledge: Knowledge,
-    world: World,
-    times,
-    centres,
-    radius,
-    floor,
-) -> dict[str, Any]:
+    values, fall: Fall, free: Fall, knowledge: Knowledge, world: World, times, centres, radius: float, floor,
+) -> dict[str, Any]:  # fmt: skip
     """What capture.json says beside the phones. free: the fall without what was known of scale and up, which it so checks."""
     box = box_of(centres, radius)
     size = float(np.linalg.norm(free.acceleration))
@@ -387,12 +351,10 @@ def warnings_of(
             f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; scene.ground "
             "is a level plane"
         )
-    if (
-        found["ground"]["from"] == "lowest contact"
-        and found["ground"]["sd"] > 0.05 * found["radius"]
-    ):
+    ground = found["ground"]
+    if ground["from"] == "lowest contact" and ground["sd"] > 0.05 * found["radius"]:
         said.append(
-            f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the "
+            f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: name a point of the "
             "floor with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
         )
     if not SIZES[0] <= found["radius"] <= SIZES[1]:

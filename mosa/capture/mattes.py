@@ -46,13 +46,12 @@ class Track:
         x0, y0, part = self.masks[frame]
         column, row = np.floor(pixels).astype(int).T - np.array([[x0], [y0]])
         inside = (column >= 0) & (column < part.shape[1]) & (row >= 0) & (row < part.shape[0])
-        return (
-            inside & part[np.clip(row, 0, part.shape[0] - 1), np.clip(column, 0, part.shape[1] - 1)]
-        )
+        row, column = np.clip(row, 0, part.shape[0] - 1), np.clip(column, 0, part.shape[1] - 1)
+        return inside & part[row, column]
 
 
 def matting_of(
-    kind: str, clip: Clip, *, plates: Path | None, plate_seconds, masks: Path | None
+    kind: str, clip: Clip, plates: Path | None, plate_seconds, masks: str | None
 ) -> Matting:
     """How the frames of a clip are matted. kind: plates | masks. Errors: ConfigError, DataError."""
     if kind == "plates":
@@ -62,21 +61,18 @@ def matting_of(
         raise ConfigError(
             "masks: expected the folder of mask videos (white: the object), found none; or choose mattes=plates"
         )
-    return from_videos(masks, clip)
+    return from_videos(Path(masks), clip)
 
 
 def same_exposure(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """A picture with the plate's exposure and white balance, which phones change as something comes into sight: each channel by
     the median of what it is over the plate's. That is the background's as long as it fills more than half of the picture."""
-    small, behind = picture[::4, ::4], plate[::4, ::4]
     gains = []
-    for channel in range(3):
-        bright = behind[..., channel] > DARK
-        gains.append(
-            float(np.median(small[..., channel][bright] / behind[..., channel][bright]))
-            if bright.any()
-            else 1.0
-        )
+    for small, behind in zip(
+        picture[::4, ::4].transpose(2, 0, 1), plate[::4, ::4].transpose(2, 0, 1)
+    ):
+        bright = behind > DARK
+        gains.append(float(np.median(small[bright] / behind[bright])) if bright.any() else 1.0)
     return np.clip(picture / np.maximum(gains, 0.1), 0, 1).astype(np.float32)
 
 
@@ -124,11 +120,8 @@ def whole_object(matte: np.ndarray, near: np.ndarray | None = None) -> np.ndarra
         candidates = np.flatnonzero(large >= 0.3 * large.max())
         best = int(candidates[np.linalg.norm(centroids[candidates] - near, axis=1).argmin()])
     reach = np.sqrt(area[best] / np.pi)
-    kept = (
-        inside
-        & (area >= SPECK * area[best])
-        & (np.linalg.norm(centroids - centroids[best], axis=1) < 2 * reach)
-    )
+    beside = np.linalg.norm(centroids - centroids[best], axis=1) < 2 * reach
+    kept = inside & (area >= SPECK * area[best]) & beside
     kept[best] = True
     around = cv2.dilate(kept[labels].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return fill_holes(np.where(around, matte, 0).astype(np.float32), int(HOLE * area[best]))

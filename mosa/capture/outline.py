@@ -29,16 +29,11 @@ MAX_CENTRE_OFFSET = 0.3
 
 def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:
     """Of the object, in units of the poses."""
-    return float(
-        np.median(
-            [
-                np.median(track.radii[track.seen])
-                / phone.camera.K[0, 0]
-                * np.linalg.norm(phone.camera.centre - fall.position)
-                for phone, track in zip(phones, tracks)
-            ]
-        )
-    )
+    found = []
+    for phone, track in zip(phones, tracks):
+        away = np.linalg.norm(phone.camera.centre - fall.position)
+        found.append(np.median(track.radii[track.seen]) / phone.camera.K[0, 0] * away)
+    return float(np.median(found))
 
 
 def hull_in_flight(
@@ -52,11 +47,8 @@ def hull_in_flight(
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         times = track.times + fall.offsets[v]
         inside = np.flatnonzero(track.seen & (times >= first) & (times <= last))
-        for k in (
-            np.unique(inside[np.linspace(0, len(inside) - 1, VIEWS + 2)[1:-1].round().astype(int)])
-            if len(inside)
-            else ()
-        ):
+        spread = np.linspace(0, len(inside) - 1, VIEWS + 2)[1:-1].round().astype(int)
+        for k in np.unique(inside[spread]) if len(inside) else ():
             own = times[k] + fall.readouts[v] * row_share(phone, track.centres[k], knowledge)
             pixels = phone.camera.project(points + fall.at(own))
             # each point when its row is read
@@ -72,10 +64,8 @@ def outline_centre(phone: Phone, points: np.ndarray, pitch: float) -> np.ndarray
     depth = np.linalg.norm(points.mean(0) - phone.camera.centre)
     cell = pitch / depth * phone.camera.K[0, 0]
     cells = np.floor((pixels - pixels.min(0)) / cell)[:, ::-1]
-    covered = np.zeros(
-        counted(f"{phone.name}: cells of an outline", cells.max(0) + 1, "look at the phone's pose"),
-        bool,
-    )
+    where, remedy = f"{phone.name}: cells of an outline", "look at the phone's pose"
+    covered = np.zeros(counted(where, cells.max(0) + 1, remedy), bool)
     covered[tuple(cells.astype(int).T)] = True
     rows, columns = np.nonzero(covered)
     return pixels.min(0) + cell * np.array([columns.mean() + 0.5, rows.mean() + 0.5])
@@ -96,20 +86,14 @@ def corrected(
     found = []
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         places = fall.at(times)
-        off = np.stack(
-            [outline_centre(phone, points + c, PITCH * radius) for c in places]
-        ) - phone.camera.project(places + middle)
+        seen = [outline_centre(phone, points + c, PITCH * radius) for c in places]
+        off = np.stack(seen) - phone.camera.project(places + middle)
         if np.abs(off).max() > MAX_CENTRE_OFFSET * float(np.median(track.radii[track.seen])):
             return None
         curve = np.polyfit(times - fall.origin, off, 2)
         t = np.clip(track.times + fall.offsets[v], *fall.window) - fall.origin
-        found.append(
-            replace(
-                track,
-                centres=track.centres
-                - (curve[0] * t[:, None] ** 2 + curve[1] * t[:, None] + curve[2]),
-            )
-        )
+        wandered = curve[0] * t[:, None] ** 2 + curve[1] * t[:, None] + curve[2]
+        found.append(replace(track, centres=track.centres - wandered))
     return found
 
 

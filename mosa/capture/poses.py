@@ -41,12 +41,9 @@ def read_phones(
     phones, stems = [], [Path(file).stem for file in sizes]
     for file, size in sizes.items():
         video = folder / file
-        mine = {
-            name: camera
-            for name, camera in cameras.items()
-            if belongs(name, video.stem)
-            and not any(belongs(name, s) for s in stems if len(s) > len(video.stem))
-        }
+        longer = [stem for stem in stems if len(stem) > len(video.stem)]
+        mine = {name: camera for name, camera in cameras.items()
+                if belongs(name, video.stem) and not any(belongs(name, s) for s in longer)}  # fmt: skip
         if not mine:
             raise DataError(
                 f"{poses}: no pose for {video}: expected an image named {video.stem}.<ending>, {video.stem}_<number>, or "
@@ -78,12 +75,8 @@ def read_poses(path: str | Path) -> dict[str, Camera]:
 def model_folder(place: Path) -> Path | None:
     """Where a COLMAP model lies, in the folder or as COLMAP nests it, of several the one with the most images, as COLMAP numbers
     parts that it could not join in no order; None where there is none."""
-    places = [
-        place,
-        place / "sparse",
-        *sorted(place.glob("[0-9]*")),
-        *sorted(place.glob("sparse/[0-9]*")),
-    ]
+    numbered = (*sorted(place.glob("[0-9]*")), *sorted(place.glob("sparse/[0-9]*")))
+    places = [place, place / "sparse", *numbered]
     return max(filter(is_model, places), key=lambda f: len(read_model(f)), default=None)
 
 
@@ -114,10 +107,8 @@ def belongs(image: str, phone: str) -> bool:
     path = Path(image)
     if phone in path.parts[:-1]:
         return True
-    return (
-        re.fullmatch(re.escape(phone) + r"([ _.-]+\d+|[ _.-]*frame[ _.-]*\d+)?", path.stem)
-        is not None
-    )
+    named = re.escape(phone) + r"([ _.-]+\d+|[ _.-]*frame[ _.-]*\d+)?"
+    return re.fullmatch(named, path.stem) is not None
 
 
 def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
@@ -132,10 +123,8 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
                 f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
                 f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each"
             )
-        if (
-            np.abs(camera.K / camera.size[0] - one.K / one.size[0]).max()
-            > FOCUS * one.K[0, 0] / one.size[0]
-        ):
+        other = np.abs(camera.K / camera.size[0] - one.K / one.size[0]).max()
+        if other > FOCUS * one.K[0, 0] / one.size[0]:
             raise DataError(
                 f"{camera.where}: phone {phone} has other intrinsics than in {name}, at the same place: expected one lens a phone; "
                 "give its images one camera (COLMAP: ImageReader.single_camera_per_folder), or use one image of each"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import matplotlib
 import numpy as np
 
@@ -18,25 +17,16 @@ from mosa.capture.resampling import Exposure
 from mosa.capture.world import World
 from mosa.system.whole_files import write_whole
 
-TILE = 180
-"""[px] height of a picture on the contact sheet."""
-COLUMNS = 8
+TILE, COLUMNS, SPARE = 1.8, 8, 10
+"""Inches of a picture on the contact sheet, pictures in a row, and pixels around the object."""
 
 
 def write_report(
-    folder: Path,
-    found: dict[str, Any],
-    phones: list[Phone],
-    fall: Fall,
-    exposures: list[Exposure],
-    world: World,
+    folder: Path, found: dict[str, Any], phones: list[Phone], fall: Fall, exposures: list[Exposure], world: World,
     times: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """capture.md, contact.png and fall.png into the folder."""
-    cv2.imwrite(
-        str(folder / "contact.png"),
-        contact_sheet(folder, [phone.name for phone in phones], len(times)),
-    )
+    draw_contact_sheet(folder, [phone.name for phone in phones], len(times))
     draw_fall(folder / "fall.png", phones, fall, exposures, world)
     write_whole(folder / "capture.md", page(found))
 
@@ -44,7 +34,7 @@ def write_report(
 def page(found: dict[str, Any]) -> str:
     """What was found, in Markdown."""
     fall, said = found["fall"], found["warnings"]
-    sure = lambda value, digits=2: "given" if value is None else f"{value:.{digits}g}"  # noqa: E731
+    sure = lambda value: "given" if value is None else f"{value:.2g}"  # noqa: E731
     lines = [
         f"# A capture by {len(found['phones'])} phones",
         "",
@@ -102,57 +92,25 @@ def page(found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def contact_sheet(folder: Path, names: list[str], frames: int) -> np.ndarray:
-    """A row of pictures per phone, at the same moments, around the object, with the matte's outline; BGR uint8."""
+def draw_contact_sheet(folder: Path, names: list[str], frames: int) -> None:
+    """contact.png: a row of pictures per phone, at the same moments, around the object, with the matte's outline."""
     chosen = np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
-    rows = []
-    for name in names:
-        pictures = [
-            cv2.imread(str(folder / "images" / f"{name}_{k:03d}.png"), cv2.IMREAD_UNCHANGED)
-            for k in chosen
-        ]
-        covered = np.max([p[..., 3] for p in pictures], 0) > 127
+    size = TILE * len(chosen), TILE * len(names)
+    figure, rows = plt.subplots(len(names), len(chosen), figsize=size, squeeze=False)
+    for name, row in zip(names, rows):
+        pictures = [plt.imread(folder / "images" / f"{name}_{k:03d}.png") for k in chosen]
+        covered = np.max([p[..., 3] for p in pictures], 0) > 0.5
         y, x = (np.flatnonzero(covered.any(axis)) for axis in (1, 0))
-        spare = 10
-        y0, y1, x0, x1 = max(0, y[0] - spare), y[-1] + spare, max(0, x[0] - spare), x[-1] + spare
-        tiles = []
-        for picture, k in zip(pictures, chosen):
-            part = picture[y0:y1, x0:x1]
-            alpha = part[..., 3:].astype(np.float32) / 255
-            shown = np.ascontiguousarray(
-                (part[..., :3] * alpha + 200 * (1 - alpha)).astype(np.uint8)
-            )
-            outline, _ = cv2.findContours(
-                (part[..., 3] > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
-            )
-            cv2.drawContours(shown, outline, -1, (0, 0, 220), 1)
-            factor = TILE / shown.shape[0]
-            shown = cv2.resize(
-                shown, (max(60, round(shown.shape[1] * factor)), TILE), interpolation=cv2.INTER_AREA
-            )
-            cv2.putText(
-                shown,
-                f"{name} {k}",
-                (4, 14),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.4,
-                (0, 0, 0),
-                1,
-                cv2.LINE_AA,
-            )
-            tiles.append(
-                cv2.copyMakeBorder(shown, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255, 255, 255))
-            )
-        rows.append(np.hstack(tiles))
-    width = max(row.shape[1] for row in rows)
-    return np.vstack(
-        [
-            cv2.copyMakeBorder(
-                row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)
-            )
-            for row in rows
-        ]
-    )
+        down, across = (slice(max(0, at[0] - SPARE), at[-1] + SPARE) for at in (y, x))
+        for axis, picture, k in zip(row, pictures, chosen):
+            part = picture[down, across]
+            axis.imshow(part)
+            axis.contour(part[..., 3], [0.5], colors="red", linewidths=0.7)
+            axis.set_title(f"{name} {k}", fontsize=8)
+            axis.set_axis_off()
+    figure.tight_layout(pad=0.3)
+    figure.savefig(folder / "contact.png", dpi=100, facecolor="0.8")
+    plt.close(figure)
 
 
 def draw_fall(

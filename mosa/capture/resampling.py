@@ -22,7 +22,6 @@ from mosa.data.images.reading import fill_holes
 from mosa.errors import DataError
 from mosa.system.limits import counted
 
-KINDS = ("flow", "shift", "none")
 NEAR = 0.02
 """Share of a frame within which a wanted time is that of a frame."""
 KNOTS = 2
@@ -72,11 +71,8 @@ def common_path(
     step = min(track.clip.interval for track in tracks) / KNOTS
     for v, (phone, track) in enumerate(zip(phones, tracks)):
         seen = track.seen
-        own = (
-            track.times[seen]
-            + fall.offsets[v]
-            + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
-        )
+        late = fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
+        own = track.times[seen] + fall.offsets[v] + late
         off = centre_shift(phone, own, track.centres[seen], fall)
         rays = phone.camera.rays(track.centres[seen] - off)
         across = np.eye(3) - rays[:, :, None] * rays[:, None]
@@ -87,12 +83,8 @@ def common_path(
     low, high = max(t.min() for t in times), min(t.max() for t in times)
     inside = (every >= low) & (every <= high)
     every, across, values = every[inside], across[inside], values[inside]
-    count, _ = counted(
-        "knots of the videos' path",
-        [max(4, (high - low) // step)] * 2,
-        "cut the videos, or set fps",
-        each=144,
-    )
+    sizes, remedy = [max(4, (high - low) // step)] * 2, "cut the videos, or set fps"
+    count, _ = counted("knots of the videos' path", sizes, remedy, each=144)
     knots = np.concatenate([[low] * 3, np.linspace(low, high, count), [high] * 3])
     basis = BSpline.design_matrix(np.clip(every, low, high), knots, 3).toarray()
     n = basis.shape[1]
@@ -110,13 +102,8 @@ def centre_shift(phone: Phone, times: np.ndarray, centres: np.ndarray, fall: Fal
 
 
 def exposure_of(
-    v: int,
-    phone: Phone,
-    track: Track,
-    fall: Fall,
-    knowledge: Knowledge,
-    common: tuple[BSpline, float, float],
-) -> Exposure:
+    v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowledge, common: tuple[BSpline, float, float],
+) -> Exposure:  # fmt: skip
     """Of phone v of a fall; common: of `common_path`. What of a phone's own centres lies beside that path is interpolated
     linearly."""
     spline, low, high = common
@@ -132,20 +119,13 @@ def exposure_of(
         found = phone.camera.project(spline(t)) + rest
         return found if np.ndim(time) else found[0]
 
-    axis, sign = knowledge.scan_of(phone.name)
-    return Exposure(
-        phone, times, float(fall.readouts[v]), axis, sign, track.centres, path, (low, high)
-    )
+    scan, readout = knowledge.scan_of(phone.name), float(fall.readouts[v])
+    return Exposure(phone, times, readout, *scan, track.centres, path, (low, high))
 
 
 def common_times(
-    exposures: list[Exposure],
-    window: tuple[float, float],
-    *,
-    before: float,
-    after: float,
-    rate: float | None,
-) -> np.ndarray:
+    exposures: list[Exposure], window: tuple[float, float], *, before: float, after: float, rate: float | None,
+) -> np.ndarray:  # fmt: skip
     """(T,) [s], evenly spaced, from `before` seconds before the free fall ends to `after` after it, as far as every phone has a
     whole object in the frames around. rate [1/s]: None for the slowest phone's. Errors: DataError where less than five are left."""
     slowest = max(float(np.median(np.diff(e.times))) for e in exposures)
@@ -154,10 +134,8 @@ def common_times(
     first = exposures[0].times[np.abs(exposures[0].times - window[1]).argmin()]
     low, high = int(np.floor(before / step)), int(np.floor(after / step))
     grid = first + step * np.arange(-low, high + 1)
-    good = np.array(
-        [all(between(e, t) is not None for e in exposures) and t > window[0] for t in grid]
-    )
-    bad = np.flatnonzero(~good)
+    good = [all(between(e, t) is not None for e in exposures) and t > window[0] for t in grid]
+    bad = np.flatnonzero(~np.array(good))
     begin, end = max(bad[bad <= low], default=-1) + 1, min(bad[bad > low], default=len(grid))
     if end - begin < 5 or low - begin < 1:
         raise DataError(
@@ -179,11 +157,9 @@ def between(exposure: Exposure, time: float) -> tuple[int, int] | None:
     for k in (after - 1, after):
         if abs(own[k] - time) < NEAR * gap and np.isfinite(exposure.centres[k, 0]):
             return k, k
-    if not np.isfinite(exposure.centres[after - 1 : after + 1, 0]).all() or gap > 2.5 * float(
-        np.median(np.diff(exposure.times))
-    ):
-        return None
-    return after - 1, after
+    usual = float(np.median(np.diff(exposure.times)))
+    whole = np.isfinite(exposure.centres[after - 1 : after + 1, 0]).all()
+    return (after - 1, after) if whole and gap <= 2.5 * usual else None
 
 
 def around(exposure: Exposure, pair: tuple[int, int]) -> list[int]:
@@ -193,11 +169,8 @@ def around(exposure: Exposure, pair: tuple[int, int]) -> list[int]:
     own, usual = exposure.own_times, float(np.median(np.diff(exposure.times)))
     found = sorted({k0, k1})
     for k, beside in ((k0 - 1, k0), (k1 + 1, k1)):
-        if (
-            0 <= k < len(own)
-            and np.isfinite(exposure.centres[k, 0])
-            and abs(own[k] - own[beside]) < 2.5 * usual
-        ):
+        there = 0 <= k < len(own) and np.isfinite(exposure.centres[k, 0])
+        if there and abs(own[k] - own[beside]) < 2.5 * usual:
             found.append(k)
     return sorted(found)
 
@@ -212,28 +185,16 @@ def moved(
     size = (width, height)[exposure.axis]
     line = np.arange(size) + 0.5
     source, shift, when = line, np.zeros((size, 2)), np.zeros(size)
-    for _ in range(
-        4
-    ):  # where a row comes from depends on when it was read: a contraction by velocity times readout over size
+    # where a row comes from depends on when it was read: a contraction by velocity times readout over size
+    for _ in range(4):
         when = exposure.times[frame] + exposure.readout * exposure.sign * (source / size - 0.5)
         shift = exposure.path(when) - wanted
         source = line + shift[:, exposure.axis]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    by = shift.astype(np.float32)
-    dx, dy = (
-        (by[:, 0][:, None], by[:, 1][:, None])
-        if exposure.axis == 1
-        else (by[:, 0][None], by[:, 1][None])
-    )
-    found = cv2.remap(
-        picture.astype(np.float32) / 255,
-        x + dx,
-        y + dy,
-        cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=0,
-    )
-    return found, when
+    dx, dy = np.expand_dims(shift.T.astype(np.float32), 2 if exposure.axis == 1 else 1)
+    around = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": 0}
+    source = picture.astype(np.float32) / 255
+    return cv2.remap(source, x + dx, y + dy, cv2.INTER_CUBIC, **around), when
 
 
 def lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
@@ -247,14 +208,9 @@ def lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
 
 
 def blended(
-    pictures: list[np.ndarray],
-    when: np.ndarray,
-    anchors: list[int],
-    time: float,
-    axis: int,
-    centre: np.ndarray,
+    pictures: list[np.ndarray], when: np.ndarray, anchors: list[int], time: float, axis: int, centre: np.ndarray,
     radius: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """What premultiplied RGBA pictures (H, W, 4) of n frames, moved along the path, would show at one time.
 
     when: (n, L) [s] at which their lines were read; anchors: numbers of the one or two pictures around that time, which are drawn
@@ -285,13 +241,8 @@ def blended(
         for k in range(len(parts)):
             if k != a:
                 by += weights[k][..., None] * flow_of.calc(greys[a], greys[k], None)
-        inside += share * cv2.remap(
-            parts[a],
-            x - by[..., 0],
-            y - by[..., 1],
-            cv2.INTER_CUBIC,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        places, border = (x - by[..., 0], y - by[..., 1]), cv2.BORDER_REPLICATE
+        inside += share * cv2.remap(parts[a], *places, cv2.INTER_CUBIC, borderMode=border)
     found = np.zeros_like(pictures[0])
     found[y0:y1, x0:x1] = inside
     return found
@@ -322,10 +273,9 @@ def resampled(
         else:
             pictures, when = zip(*(moved(frames[k], exposure, k, time) for k in near))
             anchors = [near.index(k) for k in sorted({k0, k1})]
-            centre = exposure.path(np.asarray(time))
-            picture = blended(
-                list(pictures), np.stack(when), anchors, time, exposure.axis, centre, radius
-            )
+            centre, shown = exposure.path(np.asarray(time)), list(pictures)
+            when = np.stack(when)
+            picture = blended(shown, when, anchors, time, exposure.axis, centre, radius)
         found.append(without_tunnels(straight(picture)))
     return np.stack(found)
 

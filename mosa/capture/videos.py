@@ -114,16 +114,13 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                 other = open_clip(file)
                 return median_of(other, 0, len(other.times) - 1, clip)
             if file.stem == stem and file.suffix.lower() in (".png", ".jpg", ".jpeg"):
-                read_image(
-                    file
-                )  # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
+                # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
+                read_image(file)
                 picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
                 if picture is None:
                     raise DataError(f"{file}: expected a readable picture, found a damaged one")
-                return (
-                    fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file).astype(np.float32)
-                    / 255
-                )
+                picture = fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file)
+                return picture.astype(np.float32) / 255
     if seconds is None:
         raise DataError(
             f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) of the empty scene in "

@@ -84,10 +84,8 @@ def read_world(folder: str | Path) -> World:
             "mosa-capture wrote"
         )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
-    scale, R = (
-        number(found["scale"], f"{file}, world.scale"),
-        matrix(found["rotation"], (3, 3), f"{file}, world.rotation"),
-    )
+    scale = number(found["scale"], f"{file}, world.scale")
+    R = matrix(found["rotation"], (3, 3), f"{file}, world.rotation")
     if not scale > 0:
         raise DataError(
             f"{file}, world.scale: expected metres per unit of the poses, above 0, found {scale:g}"
@@ -130,9 +128,7 @@ def lowest_points(folder: Path, centres: np.ndarray, radius: float, scale: float
     """(T, 2) [m] heights of `lowest_of_hull` in each frame of a written capture; centres: (T, 3), radius [m]; scale: of
     the images."""
     footage = read_transforms(folder, scale=scale)
-    return np.array(
-        [lowest_of_hull(footage, t, centre, radius) for t, centre in enumerate(centres)]
-    )
+    return np.array([lowest_of_hull(footage, t, c, radius) for t, c in enumerate(centres)])
 
 
 def lowest_of_hull(
@@ -170,10 +166,8 @@ def floor_of_points(
 ) -> tuple[float, float, float] | None:
     """(height [m], one standard deviation [m], tilt against level [degrees]) of the floor among points (N, 3) [m] of the
     surroundings, the densest level within `apart` of `near`, where the object was lowest; None where there are too few of them."""
-    around = points[
-        (np.hypot(points[:, 0], points[:, 2]) < AROUND * radius)
-        & (np.abs(points[:, 1] - near) < apart)
-    ]
+    beside = np.hypot(points[:, 0], points[:, 2]) < AROUND * radius
+    around = points[beside & (np.abs(points[:, 1] - near) < apart)]
     if len(around) < FEWEST:
         return None
     thick = LAYER * radius
@@ -183,24 +177,17 @@ def floor_of_points(
         return None
     height = float(np.median(layer[:, 1]))
     spread = 1.4826 * float(np.median(np.abs(layer[:, 1] - height)))
-    slope = np.linalg.lstsq(
-        np.concatenate([layer[:, [0, 2]], np.ones((len(layer), 1))], 1), layer[:, 1], rcond=None
-    )[0]
-    return (
-        height,
-        max(1e-4, 1.25 * spread / len(layer) ** 0.5),
-        float(np.degrees(np.arctan(np.hypot(slope[0], slope[1])))),
-    )
+    plane = np.concatenate([layer[:, [0, 2]], np.ones((len(layer), 1))], 1)
+    slope = np.linalg.lstsq(plane, layer[:, 1], rcond=None)[0]
+    tilt = float(np.degrees(np.arctan(np.hypot(slope[0], slope[1]))))
+    return height, max(1e-4, 1.25 * spread / len(layer) ** 0.5), tilt
 
 
 def box_of(centres: np.ndarray, radius: float) -> list[list[float]]:
     """Where the object may be [m], two corners, from its centres (T, 3)."""
     across = np.abs(centres[:, [0, 2]]).max() + 4.5 * radius
-    top = float(centres[:, 1].max()) + 3.5 * radius
-    return [
-        [-round(across, 2), -round(0.8 * radius, 2), -round(across, 2)],
-        [round(across, 2), round(top, 2), round(across, 2)],
-    ]
+    top, side = round(float(centres[:, 1].max()) + 3.5 * radius, 2), round(across, 2)
+    return [[-side, -round(0.8 * radius, 2), -side], [side, top, side]]
 
 
 def floor_gains(

@@ -49,14 +49,9 @@ class SequenceBatch(SimpleNamespace):
     extra: dict[str, Tensor]
 
     def to(self, device: torch.device | str) -> SequenceBatch:
-        moved = dict(
-            vars(self),
-            observations=self.observations.to(device),
-            extra=on_device(self.extra, device),
-        )
-        if self.cues is not None:
-            moved["cues"] = self.cues.to(device)
-        return SequenceBatch(**moved)
+        seen, extra = self.observations.to(device), on_device(self.extra, device)
+        cues = None if self.cues is None else self.cues.to(device)
+        return SequenceBatch(**vars(self) | {"observations": seen, "extra": extra, "cues": cues})
 
     def __repr__(self) -> str:
         parts = {**vars(self.observations), **(vars(self.cues) if self.cues else {}), **self.extra}

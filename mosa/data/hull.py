@@ -13,7 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from mosa.errors import DataError
-from mosa.rendering.cameras import sample_images
+from mosa.rendering.cameras import project, sample_images
 from mosa.system.limits import counted
 from mosa.types import Cameras
 
@@ -43,24 +43,25 @@ class Volume:
         return float((self.values > threshold).sum()) * self.pitch**3
 
 
+def at_border(mattes: Tensor) -> Tensor:
+    """Largest value (...) along the border of mattes (..., H, W)."""
+    rows, columns = mattes[..., [0, -1], :].amax((-2, -1)), mattes[..., [0, -1]].amax((-2, -1))
+    return torch.maximum(rows, columns)
+
+
 def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     """Bilinear matte at the projections of world points, (V, M) from (M, 3) and (V, H, W).
 
     Outside an image it is 0; where the matte itself runs over the image's border the view says nothing there: 1. Behind the
     camera: 0.
     """
-    seen = points @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, None, :3, 3]
-    depth = seen[..., 2]
-    pixel = seen @ cameras.K.transpose(1, 2)
-    pixel = pixel[..., :2] / depth.clamp(min=1e-6)[..., None]
+    pixel, depth = project(points, cameras)
     size = pixel.new_tensor([cameras.width, cameras.height])
     values = sample_images(mattes[:, None], pixel, beyond="border")[:, 0]
-    border = (
-        torch.cat([mattes[:, 0], mattes[:, -1], mattes[:, :, 0], mattes[:, :, -1]], 1).amax(1) > 0.5
-    )
+    border = at_border(mattes) > 0.5
     inside = ((pixel >= 0) & (pixel <= size)).all(-1)
     values = torch.where(inside, values, border[:, None].to(values))
-    return torch.where(depth > 1e-3, values, torch.zeros_like(values))
+    return torch.where(depth > 1e-3, values, 0.0)
 
 
 def occupancy(points: Tensor, mattes: Tensor, cameras: Cameras, *, chunk: int = 400_000) -> Tensor:
@@ -86,9 +87,8 @@ def _grow(mattes: Tensor, radius: int) -> Tensor:
     if radius <= 0:
         return mattes
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    return torch.as_tensor(
-        np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()]), device=mattes.device
-    )
+    grown = np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()])
+    return torch.as_tensor(grown, device=mattes.device)
 
 
 def _grown_views(mattes: Tensor, cameras: Cameras, radius: int) -> tuple[Tensor, Cameras]:
@@ -98,10 +98,8 @@ def _grown_views(mattes: Tensor, cameras: Cameras, radius: int) -> tuple[Tensor,
     wide = F.pad(mattes[:, None], (border,) * 4, mode="replicate")[:, 0]
     K = cameras.K.clone()
     K[:, :2, 2] += border
-    views = replace(
-        cameras, K=K, width=cameras.width + 2 * border, height=cameras.height + 2 * border
-    )
-    return _grow(wide, radius), views
+    size = {"width": cameras.width + 2 * border, "height": cameras.height + 2 * border}
+    return _grow(wide, radius), replace(cameras, K=K, **size)
 
 
 def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: int = 48) -> Tensor:
@@ -116,10 +114,7 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
         counts = (extent / pitch).ceil().long() + 1
         grid = Volume(torch.empty(tuple(counts.tolist()), device=mattes.device), bounds[0], pitch)
         points = grid.points()
-        depth = (
-            points.reshape(-1, 3).mean(0) @ cameras.w2c[:, :3, :3].transpose(1, 2)
-            + cameras.w2c[:, :3, 3]
-        )[:, 2]
+        depth = project(points.reshape(-1, 3).mean(0, keepdim=True), cameras)[1][:, 0]
         radius = float((0.9 * pitch * cameras.K[:, 0, 0] / depth.clamp(min=1e-3)).max())
         radius = max(1, min(int(radius + 1), min(cameras.width, cameras.height) // 4))
         inside = points[occupancy(points, *_grown_views(mattes, cameras, radius)) > 0.5]
@@ -144,11 +139,9 @@ def visual_hull(mattes: Tensor, cameras: Cameras, box: Tensor, *, pitch: float) 
 def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: int = 40) -> Tensor:
     """Centre of mass of the visual hull, (3,) [m]."""
     bounds = hull_bounds(mattes, cameras, box)
-    hull = visual_hull(
-        mattes, cameras, box, pitch=float((bounds[1] - bounds[0]).max()) / resolution
-    )
-    inside = hull.values > 0.5
-    return hull.points()[inside].mean(0)
+    pitch = float((bounds[1] - bounds[0]).max()) / resolution
+    hull = visual_hull(mattes, cameras, box, pitch=pitch)
+    return hull.points()[hull.values > 0.5].mean(0)
 
 
 def shave_ridges(
@@ -170,11 +163,8 @@ def shave_ridges(
         pixel = seen @ K.T
         # bins of 0.75 voxels: fine enough not to lose a skin of the silhouette, coarse enough that a column of voxels
         # leaves no hole
-        column, row = (
-            (pixel[:, :2] / pixel[:, 2:] / (0.75 * volume.pitch * K[0, 0] / seen[:, 2].mean()))
-            .long()
-            .unbind(1)
-        )
+        bin = 0.75 * volume.pitch * K[0, 0] / seen[:, 2].mean()
+        column, row = (pixel[:, :2] / pixel[:, 2:] / bin).long().unbind(1)
         rays.append(np.unique((row * (column.max() + 1) + column).numpy(), return_inverse=True)[1])
     current, flat = hull.astype(np.float32), np.ravel_multi_index(index.T, hull.shape)
     for _ in range(passes):
@@ -185,6 +175,4 @@ def shave_ridges(
             missing |= (np.bincount(ray[inside], minlength=ray.max() + 1) == 0)[ray]
         kept[flat[missing]] = True
         current = kept.reshape(hull.shape).astype(np.float32)
-    return Volume(
-        torch.as_tensor(current, device=volume.values.device), volume.origin, volume.pitch
-    )
+    return replace(volume, values=torch.as_tensor(current, device=volume.values.device))

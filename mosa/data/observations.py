@@ -26,29 +26,15 @@ class Observations:
 
     def select(self, views: Sequence[int], frames: int | None = None) -> Observations:
         """The given views and the first `frames` frames, all of them where None."""
-        views = list(views)
-        flow = (
-            None
-            if self.flow is None
-            else self.flow[views, : None if frames is None else frames - 1]
-        )
-        return Observations(
-            self.images[views, :frames],
-            self.mattes[views, :frames],
-            flow,
-            self.cameras.select(views),
-            self.image_width,
-        )
+        views, last = list(views), None if frames is None else frames - 1
+        flow = None if self.flow is None else self.flow[views, :last]
+        images, mattes = self.images[views, :frames], self.mattes[views, :frames]
+        return Observations(images, mattes, flow, self.cameras.select(views), self.image_width)
 
     def to(self, device: torch.device | str) -> Observations:
         flow = None if self.flow is None else self.flow.to(device)
-        return Observations(
-            self.images.to(device),
-            self.mattes.to(device),
-            flow,
-            self.cameras.to(device),
-            self.image_width,
-        )
+        images, mattes = self.images.to(device), self.mattes.to(device)
+        return Observations(images, mattes, flow, self.cameras.to(device), self.image_width)
 
 
 def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: int) -> Observations:
@@ -56,9 +42,7 @@ def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: i
     views, frames = list(views), list(frames)
     images, mattes = scene.images[views][:, frames], scene.mattes[views][:, frames]
     x0, y0, width, height = crop_boxes(mattes, margin=margin)
-    images, mattes = (
-        crop_images(stack, x0, y0, width, height, axis=2) for stack in (images, mattes)
-    )
+    images, mattes = (crop_images(s, x0, y0, width, height, axis=2) for s in (images, mattes))
     cameras = crop_cameras(scene.cameras.select(views), x0, y0, width, height)
     return Observations(images, mattes, None, cameras, scene.cameras.width)
 
@@ -74,23 +58,15 @@ def training_observations(
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
     if scene.markers is not None:
-        return Observations(
-            scene.images[:, frames], scene.mattes[:, frames], None, scene.cameras, 1
-        ).to(device)
+        none = scene.images[:, frames], scene.mattes[:, frames]
+        return Observations(*none, None, scene.cameras, 1).to(device)
     found = cropped(scene, scene.training_cameras, frames, margin).to(device)
     cues, splats = reconstruction.cues, reconstruction.splats
     assert isinstance(cues, MotionCues)  # of a scene with images
-    flow = [
-        observe(
-            cues.positions[: len(frames)].to(device),
-            cues.covariances[: len(frames)].to(device),
-            splats.opacities.to(device),
-            splats.colors.to(device),
-            found.cameras.select([v]),
-            scene.background.to(device),
-            flow=True,
-        ).flow
-        for v in range(len(found.cameras))
-    ]
+    x, shapes = (p[: len(frames)].to(device) for p in (cues.positions, cues.covariances))
+    opacities, colors = splats.opacities.to(device), splats.colors.to(device)
+    cameras, behind = found.cameras, scene.background.to(device)
+    flow = [observe(x, shapes, opacities, colors, cameras.select([v]), behind, flow=True).flow
+            for v in range(len(cameras))]  # fmt: skip
     flows = torch.cat(flow)  # type: ignore[arg-type]  # each is there, as it was asked for
     return Observations(found.images, found.mattes, flows, found.cameras, found.image_width)

@@ -64,23 +64,17 @@ def load_scene(
         )
     loader = imported(f"scene.format: {format!r}", FORMATS[format])
     if format == "builtin":
-        if given := [
-            key for key, value in (("path", path), ("ground", ground)) if value is not None
-        ]:
-            raise ConfigError(
-                f"scene.{given[0]}: not a key of built-in scenes, which have their own; scene=transforms reads one"
-            )
-        return validate(
-            call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}})
-        )
+        for key, value in (("path", path), ("ground", ground)):
+            if value is not None:
+                raise ConfigError(
+                    f"scene.{key}: not a key of built-in scenes, which have their own; scene=transforms reads one"
+                )
+        own = {key: value for key, value in keys.items() if value is not None}
+        return validate(call(loader, {"cache": cache, **own}))
     check("scene.fps", keys.get("fps"), Positive | None)
     check_names(name=keys.get("name"), sequence=keys.get("sequence"))
-    for key, text in (
-        ("root", root),
-        ("path", path),
-        ("cache", cache),
-        ("particles", keys.get("particles")),
-    ):
+    places = {"root": root, "path": path, "cache": cache, "particles": keys.get("particles")}
+    for key, text in places.items():
         if text is not None and (not isinstance(text, (str, Path)) or "\0" in str(text)):
             raise ConfigError(f"scene.{key}: expected a folder, found {text!r}")
     if path is None:
@@ -157,24 +151,16 @@ def call(loader: Callable, arguments: dict) -> Scene:
     """loader(**arguments). Errors: ConfigError where it does not know a key that is set."""
     takes = dict(inspect.signature(loader).parameters)
     if "world" in takes:
-        takes |= {
-            k: p
-            for k, p in inspect.signature(scene_from_footage).parameters.items()
-            if k not in MADE
-        }
-    known = set(takes)
-    for key, parameter in takes.items():
-        if (
-            parameter.default is parameter.empty
-            and parameter.kind is parameter.KEYWORD_ONLY
-            and key not in arguments
-        ):
+        further = inspect.signature(scene_from_footage).parameters
+        takes |= {key: p for key, p in further.items() if key not in MADE}
+    for key, p in takes.items():
+        needed = p.default is p.empty and p.kind is p.KEYWORD_ONLY
+        if needed and key not in arguments:
             raise ConfigError(f"scene.{key}: expected a value, found none")
     for key in arguments:
-        if key not in known:
-            raise ConfigError(
-                f"scene.{key}: not a key of this format; it takes {', '.join(sorted(known - {'world', 'footage'}))}"
-            )
+        if key not in takes:
+            listed = ", ".join(sorted(set(takes) - {"world", "footage"}))
+            raise ConfigError(f"scene.{key}: not a key of this format; it takes {listed}")
     return loader(**arguments)
 
 

@@ -18,20 +18,9 @@ from mosa.errors import ConfigError, DataError
 from mosa.types import Scene
 
 OWN = (
-    "path",
-    "name",
-    "frames",
-    "fps",
-    "start",
-    "last_free_frame",
-    "holdout_cameras",
-    "particles",
-    "scale",
-    "fill_holes",
-    "start",
-    "duration",
-    "loads",
-)
+    "path", "name", "frames", "fps", "start", "last_free_frame", "holdout_cameras", "particles", "scale", "fill_holes",
+    "duration", "loads",
+)  # fmt: skip
 """What a sequence may have otherwise than the training one: not the world, of which there is one for all."""
 FILES = (".json", ".c3d", ".csv")
 """Endings of a sequence that is a file, which are no part of its name."""
@@ -82,12 +71,9 @@ def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:
     """No recording is another's copy: what is learned from says nothing as a held-out sequence. Errors: DataError."""
     pictures: dict[bytes, int] = {}
     for k, scene in enumerate(scenes):
-        own = {
-            hashlib.sha256(picture.numpy().tobytes()).digest()
-            for views, mattes in zip(scene.images, scene.mattes)
-            for picture, matte in zip(views, mattes)
-            if bool(matte.any())
-        }
+        both = zip(scene.images.flatten(0, 1), scene.mattes.flatten(0, 1))
+        own = {hashlib.sha256(picture.numpy().tobytes()).digest()
+               for picture, matte in both if bool(matte.any())}  # fmt: skip
         same = [pictures[each] for each in own if each in pictures]
         if len(same) > SHARED * len(own):
             raise DataError(
@@ -103,9 +89,8 @@ def taught_names(keys: Mapping[str, Any]) -> list[str]:
     also_train = keys.get("also_train") or []
     if keys.get("format") == "builtin":
         return list(also_train)
-    entries = [("also_train", entry) for entry in also_train] + [
-        ("test", entry) for entry in keys.get("test") or []
-    ]
+    entries = [("also_train", each) for each in also_train]
+    entries += [("test", each) for each in keys.get("test") or []]
     return sequence_names(keys, entries)[: len(also_train)]
 
 
@@ -131,17 +116,10 @@ def keys_of(keys: Mapping[str, Any], where: str, entry: str | Mapping[str, Any])
     relative scene.particles counts where such a folder lies beside the images.
     """
     own = section(where, entry)
-    inherited = {
-        k: v
-        for k, v in keys.items()
-        if k not in ("name", "sequence", "last_free_frame", "holdout_frames", "particles")
-    }
-    shared = keys.get("particles")
-    if (
-        shared
-        and not Path(shared).is_absolute()
-        and beside(under(keys.get("root"), own["path"]), shared)
-    ):
+    apart = ("name", "sequence", "last_free_frame", "holdout_frames", "particles")
+    inherited = {k: v for k, v in keys.items() if k not in apart}
+    shared, place = keys.get("particles"), under(keys.get("root"), own["path"])
+    if shared and not Path(shared).is_absolute() and beside(place, shared):
         inherited["particles"] = shared
     return inherited | {k: v for k, v in own.items() if k != "name"}
 
@@ -174,11 +152,8 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
     depth = [1] * len(parts)
     while True:
         names = ["_".join(each[-d:]) for each, d in zip(parts, depth)]
-        twice = {
-            k
-            for k, name in enumerate(names)
-            if [n.casefold() for n in names].count(name.casefold()) > 1
-        }
+        folded = [name.casefold() for name in names]
+        twice = {k for k, name in enumerate(folded) if folded.count(name) > 1}
         if not (deeper := [k for k in twice if depth[k] < min(len(parts[k]), DEPTH)]):
             break
         for k in deeper:
@@ -187,10 +162,9 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
         raise ConfigError(
             f"scene.{entries[0][0]}: name: expected a name once, found {named[0]!r} again"
         )
-    return [
-        f"{name}_{1 + sorted(twice).index(k)}" if k in twice else name
-        for k, name in enumerate(names)
-    ]
+    for number, k in enumerate(sorted(twice), 1):
+        names[k] = f"{names[k]}_{number}"
+    return names
 
 
 def place(root: str | None, path: str) -> Path:
@@ -203,16 +177,12 @@ def pieces(path: Path) -> list[str]:
     """The parts of a path that a name can be made of, without the ending of a file."""
     *above, last = path.parts
     parts = [*above, Path(last).stem if last.endswith(FILES) else last]
-    return [safe for part in parts if (safe := re.sub(r"[^\w.-]+", "_", part).strip("._"))] or [
-        "sequence"
-    ]
+    safe = [re.sub(r"[^\w.-]+", "_", part).strip("._") for part in parts]
+    return [part for part in safe if part] or ["sequence"]
 
 
 def overlap(a, b) -> bool:
     """Whether two ranges [first, last] of frames share one; anything else stands for all frames."""
-    ranges = [
-        r
-        for r in (a, b)
-        if isinstance(r, (list, tuple)) and len(r) == 2 and all(isinstance(f, int) for f in r)
-    ]
+    is_range = lambda r: isinstance(r, (list, tuple)) and [type(f) for f in r] == [int, int]  # noqa: E731
+    ranges = [r for r in (a, b) if is_range(r)]
     return len(ranges) < 2 or (ranges[0][0] <= ranges[1][1] and ranges[1][0] <= ranges[0][1])

@@ -35,26 +35,17 @@ LEADING = {"static": 1, "particles": 1, "motion": 2, "carried": 1}
 
 def check_result(name: str, result: Any, leading: tuple[int, ...] | None) -> None:
     """Errors: ValueError where a stored result is not one of that stage; names that are not in the table are not looked at."""
-    if name == "hull":
-        if not (
-            result["values"].ndim == 3 and result["origin"].shape == (3,) and result["pitch"] > 0
-        ):
-            raise ValueError("not a hull")
     for key, last in RESULTS.get(name, {}).items():
         found = tuple(result[key].shape)
         leading = found[: LEADING[name]] if leading is None else leading
         if found != (*leading, *last) or 0 in found or not bool(torch.isfinite(result[key]).all()):
             raise ValueError(f"{key} of shape {found}, expected {(*leading, *last)} finite numbers")
     if name == "carried":
-        degree_of(result["harmonics"])
-        if result["light"].shape != (LIGHT,) or not bool(torch.isfinite(result["light"]).all()):
-            raise ValueError("not a light")
-        if len(result["harmonics"]) != leading[0] or not bool(
-            torch.isfinite(result["harmonics"]).all()
-        ):
-            raise ValueError(
-                f"harmonics of shape {tuple(result['harmonics'].shape)}, expected {leading[0]} splats' finite numbers"
-            )
+        light, harmonics = result["light"], result["harmonics"]
+        degree_of(harmonics)
+        finite = bool(torch.isfinite(light).all() and torch.isfinite(harmonics).all())
+        if not finite or light.shape != (LIGHT,) or len(harmonics) != leading[0]:
+            raise ValueError(f"expected a light and {leading[0]} splats' harmonics, finite numbers")
 
 
 class StageCache:
@@ -64,9 +55,8 @@ class StageCache:
         self.folder = None
         if root is not None:
             digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
-            self.folder = (
-                Path(root) / "reconstruction" / f"{key['scene'].replace('/', '_')[:80]}-{digest}"
-            )
+            name = f"{key['scene'].replace('/', '_')[:80]}-{digest}"
+            self.folder = Path(root) / "reconstruction" / name
             self.folder.mkdir(parents=True, exist_ok=True)
             file, text = self.folder / "key.json", json.dumps(key, indent=1, sort_keys=True)
             # a cache that has all may be one that is only read

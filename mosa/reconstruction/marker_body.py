@@ -13,7 +13,8 @@ from mosa.errors import DataError
 from mosa.physics.contact.colliders import Box
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.world import Start
-from mosa.types import MarkerCues, Markers, Reconstruction, Scene, Splats
+from mosa.reconstruction.gaussians.initial import isotropic_splats
+from mosa.types import MarkerCues, Markers, Reconstruction, Scene
 
 NEIGHBOURS = 32
 """Particles that tell where a tracked point is."""
@@ -63,9 +64,8 @@ def cues_of_markers(scene: Scene, rest: Tensor) -> MarkerCues:
     field nearest to their positions (weights fall off as a Gaussian): exact for every affine
     motion, and for points beside the body, which go with its surface. Errors: DataError."""
     markers, x = points_of(scene), rest.detach().double().cpu()
-    distance, index = torch.cdist(markers.rest.double(), x).topk(
-        min(NEIGHBOURS, len(x)), largest=False
-    )
+    apart, count = torch.cdist(markers.rest.double(), x), min(NEIGHBOURS, len(x))
+    distance, index = apart.topk(count, largest=False)
     size = float((x.amax(0) - x.amin(0)).max())
     if bool((far := distance[:, 0] > FARTHEST * size).any()):
         worst = int(far.nonzero()[0])
@@ -84,10 +84,7 @@ def cues_of_markers(scene: Scene, rest: Tensor) -> MarkerCues:
 def reconstruction_of_markers(scene: Scene, spacing: float) -> Reconstruction:
     """Particles of the given shape, in grey, with the training recording as cues."""
     x, volume = filled(points_of(scene).body, spacing)
-    n = len(x)
-    turns = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
-    scales = torch.full((n, 3), 0.35 * spacing)
-    splats = Splats(x, scales, turns, torch.full((n,), 0.9), torch.full((n, 3), GREY))
+    splats = isotropic_splats(x, 0.35 * spacing, 0.9, torch.full_like(x, GREY))
     return Reconstruction(splats, spacing, volume, cues_of_markers(scene, x))
 
 

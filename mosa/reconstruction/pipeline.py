@@ -20,10 +20,10 @@ from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.gaussians.carried import fit_carried
-from mosa.reconstruction.gaussians.initial import inherited_colors, initial_splats
+from mosa.reconstruction.gaussians.initial import inherited_colors, initial_splats, isotropic_splats
 from mosa.reconstruction.gaussians.static import fit_splats
 from mosa.reconstruction.geometry.behind import fill_behind
-from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry
+from mosa.reconstruction.geometry.body import Geometry, find_geometry
 from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
 from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.motion.observed import Windows, object_windows
@@ -31,7 +31,8 @@ from mosa.reconstruction.pose.known import register_known
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.pose.registration import light_of
 from mosa.reconstruction.resolution import PER_CELL, particles_for
-from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.reconstruction.settings import FitSettings, ReconstructionSettings
+from mosa.rendering.appearance.carried_splats import COLORED
 from mosa.rendering.appearance.lighting import shading, surface_normals
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
@@ -71,42 +72,37 @@ def object_geometry(
 
     Errors: DataError (empty mattes, empty hull).
     """
-    cache = _geometry_cache(scene, settings, cache_dir)
 
-    def stage() -> dict[str, Any]:
+    def found() -> Geometry:
         if scene.body is not None:
-            return known_geometry(scene, settings).stored()
+            return known_geometry(scene, settings)
         if settings.geometry.source == "gaussians":
-            return geometry_of_gaussians(scene, settings, device).stored()
-        found = find_geometry(
-            scene, object_hull(scene, settings), GeometrySettings.of(settings.geometry), ridge_passes=settings.ridge_passes,
+            return geometry_of_gaussians(scene, settings, device)
+        return find_geometry(
+            scene, object_hull(scene, settings), settings.geometry, ridge_passes=settings.ridge_passes,
             sigma=settings.resolution / 40, margin=settings.margin, device=device,
         )  # fmt: skip
-        return found.stored()
 
-    return Geometry.read(cache.stage("geometry", stage))
+    cache = _geometry_cache(scene, settings, cache_dir)
+    return Geometry.read(cache.stage("geometry", lambda: found().stored()))
 
 
 def known_geometry(scene: Scene, settings: ReconstructionSettings) -> Geometry:
     """The body of `scene.body` where frame 0 shows it. Errors: DataError."""
     found = register_known(scene)
-    body = found.body(settings.resolution)
-    empty = torch.empty(0)
-    return Geometry(
-        body, body.occupied_volume(), empty, found.frames, None, found.figures(), vars(found.place)
-    )
+    body, empty = found.body(settings.resolution), torch.empty(0)
+    told = found.frames, None, found.figures(), vars(found.place)
+    return Geometry(body, body.occupied_volume(), empty, *told)
 
 
 def geometry_of_gaussians(
     scene: Scene, settings: ReconstructionSettings, device: torch.device | str
 ) -> Geometry:
     """The body behind static Gaussians, which are kept for the static stage. Errors: DataError."""
-    hull = object_hull(scene, settings)
+    hull, background = object_hull(scene, settings), scene.background.to(device)
     windows = object_windows(scene, scene.training_cameras, [0], margin=settings.margin).to(device)
     start = initial_splats(hull, windows, count=settings.points, seed=0)
-    static = fit_splats(
-        start, windows, scene.background.to(device), settings.static, move=True, seed=0
-    )
+    static = fit_splats(start, windows, background, settings.static, move=True, seed=0)
     body = fill_behind(static, windows, hull)
     return Geometry(body, hull.occupied_volume(), torch.empty(0), 1, static)
 
@@ -131,25 +127,19 @@ def spacing_for(
     `most`."""
     if particles is not None and particles < 8:
         raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
-    body = object_geometry(
-        scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device
-    ).body
-    return filling_spacing(body, particles, per_cell=per_cell, most=most)
+    settings = settings or ReconstructionSettings()
+    found = object_geometry(scene, settings, cache_dir=cache_dir, device=device)
+    return filling_spacing(found.body, particles, per_cell=per_cell, most=most)
 
 
 def filling_spacing(
     body: Volume, particles: int | None, *, per_cell: float = PER_CELL, most: int = FEW
 ) -> float:
     """Particle spacing [m] that fills a solid; arguments as of `spacing_for`."""
-    volume = body_volume(body)
+    volume, limits = body_volume(body), {"least": FEW, "most": max(most, FEW)}
     if particles is None:
-        particles = particles_for(
-            lambda spacing: fill(body, spacing=spacing).positions,
-            volume,
-            per_cell=per_cell,
-            least=FEW,
-            most=max(most, FEW),
-        )
+        filled = lambda spacing: fill(body, spacing=spacing).positions  # noqa: E731
+        particles = particles_for(filled, volume, per_cell=per_cell, **limits)
     return (volume / particles) ** (1 / 3)
 
 
@@ -166,29 +156,19 @@ def stored(
     folder = _geometry_cache(scene, settings, cache_dir).folder
     if folder is None or settings.splats is not None or not (folder / "geometry.pt").is_file():
         return False
-    folder = _open_cache(
-        cache_dir, scene, _motion_settings(settings), seed, spacing=spacing()
-    ).folder
+    what = _motion_settings(settings)
+    folder = _open_cache(cache_dir, scene, what, seed, spacing=spacing()).folder
     return folder is not None and (folder / "motion.pt").is_file()
 
 
 def _geometry_cache(
     scene: Scene, settings: ReconstructionSettings, cache_dir: str | Path | None
 ) -> StageCache:
-    parts = {
-        "resolution": settings.resolution,
-        "ridge_passes": settings.ridge_passes,
-        "margin": settings.margin,
-    }
+    kept = {"resolution", "ridge_passes", "margin", "geometry"}
     if settings.geometry.source == "gaussians":
-        parts |= {"points": settings.points, "static": settings.static.plain()}
-    return _open_cache(
-        cache_dir,
-        scene,
-        parts | {"geometry": GeometrySettings.of(settings.geometry).plain()},
-        0,
-        free=scene.last_free_frame,
-    )
+        kept |= {"points", "static"}
+    what = settings.model_dump(include=kept)
+    return _open_cache(cache_dir, scene, what, 0, free=scene.last_free_frame)
 
 
 def _open_cache(
@@ -216,8 +196,11 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 
 def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
     """What particles and their motion depend on."""
-    whole = settings.plain() | {"geometry": GeometrySettings.of(settings.geometry).plain()}
-    return {name: value for name, value in whole.items() if name not in ("carried", "informed")}
+    return {
+        name: value
+        for name, value in settings.plain().items()
+        if name not in ("carried", "informed")
+    }
 
 
 def imported_splats(path: str, scene: Scene) -> Appearance:
@@ -250,13 +233,10 @@ def check_place(path: str, splats: Splats, scene: Scene) -> None:
     if len(views) < 2:
         return
     mattes, cameras = scene.mattes[views, 0], scene.cameras.select(views)
-    within = float(
-        (splats.opacities * (occupancy(splats.means, mattes, cameras) > 0.25)).sum()
-        / splats.opacities.sum()
-    )
-    filled = 1 - float(
-        uncovered_share(splats.means, 2 * float(splats.scales.mean()), mattes, cameras).median()
-    )
+    inside = occupancy(splats.means, mattes, cameras) > 0.25
+    within = float((splats.opacities * inside).sum() / splats.opacities.sum())
+    reach = 2 * float(splats.scales.mean())
+    filled = 1 - float(uncovered_share(splats.means, reach, mattes, cameras).median())
     said = (
         f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "
         f"and {filled:.0%} of the mattes filled: check the file's unit, axes and place in the scene's world"
@@ -269,15 +249,11 @@ def check_place(path: str, splats: Splats, scene: Scene) -> None:
 
 def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tensor:
     state = torch.zeros(len(windows), dtype=torch.long, device=background.device)
+    shapes = covariance_from(splats.scales, splats.rotations)[None]
+    means, colors = splats.means[None], splats.colors[None]
     with torch.no_grad():
         return rasterize(
-            splats.means[None],
-            covariance_from(splats.scales, splats.rotations)[None],
-            splats.opacities,
-            splats.colors[None],
-            windows.cameras,
-            state,
-            background,
+            means, shapes, splats.opacities, colors, windows.cameras, state, background
         )[0]
 
 
@@ -314,45 +290,37 @@ def reconstruct(
     def bar(name: str, total: int) -> tqdm:
         return tqdm(total=total, desc=f"reconstruction: {name}", disable=not progress, leave=False)
 
+    def fitted(start: Splats, how: FitSettings, name: str, title: str) -> dict[str, Tensor]:
+        with bar(title, how.iterations) as steps:
+            found = fit_splats(
+                start,
+                still,
+                background,
+                how,
+                move=name == "static",
+                seed=seed,
+                progress=steps.update,
+            )
+        cache.strip(name, still, _render_still(found, still, background))
+        return _tensors(found)
+
     @functools.cache  # more than one stage reads it, also where there is no cache folder
     def static_stage() -> dict[str, Tensor]:
         if settings.splats is not None:
-            cache.strip(
-                "static", still, _render_still(imported.splats.to(device), still, background)
-            )
+            picture = _render_still(imported.splats.to(device), still, background)
+            cache.strip("static", still, picture)
             return _tensors(imported.splats)
         if geometry.static is not None:
             return _tensors(geometry.static)
         start = initial_splats(geometry.body, still, count=settings.points, seed=seed)
-        with bar("static Gaussians", settings.static.iterations) as steps:
-            fitted = fit_splats(
-                start,
-                still,
-                background,
-                settings.static,
-                move=True,
-                seed=seed,
-                progress=steps.update,
-            )
-        cache.strip("static", still, _render_still(fitted, still, background))
-        return _tensors(fitted)
+        return fitted(start, settings.static, "static", "static Gaussians")
 
     def appearance_stage() -> dict[str, Tensor]:
         static = Splats(**cache.stage("static", static_stage)).to(device)
-        particles = fill(geometry.body, spacing=spacing)
-        start = scaffold_splats(particles, static, device)
-        with bar("appearance of the particles", settings.appearance.iterations) as steps:
-            fitted = fit_splats(
-                start,
-                still,
-                background,
-                settings.appearance,
-                move=False,
-                seed=seed,
-                progress=steps.update,
-            )
-        cache.strip("particles", still, _render_still(fitted, still, background))
-        return _tensors(fitted) | {"volume": particles.volume}
+        filled = fill(geometry.body, spacing=spacing)
+        start = scaffold_splats(filled, static, device)
+        title = "appearance of the particles"
+        return fitted(start, settings.appearance, "particles", title) | {"volume": filled.volume}
 
     particles = cache.stage("particles", appearance_stage)
     volume = particles.pop("volume")
@@ -368,59 +336,34 @@ def reconstruct(
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
 
     def carried_stage() -> dict[str, Tensor]:
+        means, positions = splats.means.to(device), motion["positions"].to(device)
         with bar("carried Gaussians", settings.carried.iterations) as steps:
             found = fit_carried(
-                static.to(device),
-                splats.means.to(device),
-                motion["positions"].to(device),
-                windows,
-                background,
-                settings.carried,
-                seed=seed,
+                static.to(device), means, positions, windows, background, settings.carried, seed=seed,
                 progress=steps.update,
-            ).to("cpu")
-        return _tensors(found.splats) | {
-            "harmonics": found.harmonics,
-            "normals": found.normals,
-            "light": found.light,
-        }
+            ).to("cpu")  # fmt: skip
+        return _tensors(found.splats) | {name: getattr(found, name) for name in COLORED}
 
     if settings.splats is not None:
         appearance = imported
     elif settings.carried.iterations == 0:
         appearance = Appearance(static, constant_coefficients(static.colors))
     else:  # a folder of its own: nothing else depends on its settings
-        apart = _open_cache(
-            cache_dir,
-            scene,
-            _motion_settings(settings) | {"carried": settings.carried.plain()},
-            seed,
-            **more,
-        )
+        what = _motion_settings(settings) | {"carried": settings.carried.plain()}
+        apart = _open_cache(cache_dir, scene, what, seed, **more)
         found = apart.stage("carried", carried_stage)
-        colored = {name: found.pop(name) for name in ("harmonics", "normals", "light")}
+        colored = {name: found.pop(name) for name in COLORED}
         appearance = Appearance(Splats(**found), **colored)
-    return Reconstruction(
-        splats,
-        spacing,
-        volume,
-        cues_of(motion, splats, settings),
-        static,
-        geometry.figures(spacing),
-        appearance,
-        parts,
-    )
+    cues, figures = cues_of(motion, splats, settings), geometry.figures(spacing)
+    return Reconstruction(splats, spacing, volume, cues, static, figures, appearance, parts)
 
 
 def posed(splats: Splats, rotation: Tensor, center: Tensor, rest_center: Tensor) -> Splats:
     """Splats turned by `rotation` (3, 3) about `rest_center` (3,), which comes to lie at `center` (3,) [m]."""
     Q = rotation.to(splats.means)
     means = (splats.means - rest_center.to(splats.means)) @ Q.T + center.to(splats.means)
-    return replace(
-        splats,
-        means=means,
-        rotations=quaternion_multiply(matrix_to_quaternion(Q), splats.rotations),
-    )
+    rotations = quaternion_multiply(matrix_to_quaternion(Q), splats.rotations)
+    return replace(splats, means=means, rotations=rotations)
 
 
 def follow(
@@ -453,44 +396,28 @@ def follow(
     )  # fmt: skip
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
 
+    def in_pose(rest: Splats) -> Splats:
+        return posed(rest.to("cpu"), *(p.cpu() for p in pose))
+
     def turned(rest: Splats) -> Splats:
         """In the pose, in the light that falls on it there: the one that frame 0 shows."""
         normals = surface_normals(rest.means, reconstruction.splats.means)
         still = [c for c in views if bool((scene.mattes[c, 0] > 0.5).any())]
         light = light_of(
-            rest.to(device),
-            normals.to(device),
-            (rotation, center),
-            scene.images[still, 0],
-            scene.mattes[still, 0],
-            scene.cameras.select(still),
-            background=scene.background,
-            rest_center=rest_center,
-        ).cpu()
-        moved = posed(rest.to("cpu"), *(p.cpu() for p in pose))
-        return replace(
-            moved,
-            colors=moved.colors
-            * shading(light, normals.cpu(), rotation.cpu().to(normals))[:, None],
-        )
+            rest.to(device), normals.to(device), (rotation, center), scene.images[still, 0], scene.mattes[still, 0],
+            scene.cameras.select(still), background=scene.background, rest_center=rest_center,
+        ).cpu()  # fmt: skip
+        moved = in_pose(rest)
+        shades = shading(light, normals.cpu(), rotation.cpu().to(normals))
+        return replace(moved, colors=moved.colors * shades[:, None])
 
-    carried = settings.dynamic.carriers == "static"
-    splats = (
-        posed(reconstruction.splats.to("cpu"), *(p.cpu() for p in pose))
-        if carried
-        else turned(reconstruction.splats)
-    )
-    static = turned(
-        reconstruction.splats if reconstruction.static is None else reconstruction.static
-    )
+    rest = reconstruction.splats
+    splats = (in_pose if settings.dynamic.carriers == "static" else turned)(rest)
+    static = turned(rest if reconstruction.static is None else reconstruction.static)
 
     def bar(name: str, total: int) -> tqdm:
-        return tqdm(
-            total=total,
-            desc=f"reconstruction of {scene.sequence}: {name}",
-            disable=not progress,
-            leave=False,
-        )
+        title = f"reconstruction of {scene.sequence}: {name}"
+        return tqdm(total=total, desc=title, disable=not progress, leave=False)
 
     known = reconstruction.moving.place if reconstruction.moving is not None else None
     place = None if known is None else known.turned(*(p.cpu() for p in pose))
@@ -500,27 +427,13 @@ def follow(
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
-    return Reconstruction(
-        splats,
-        reconstruction.spacing,
-        reconstruction.volume,
-        cues_of(motion, splats, settings),
-        static,
-        moving=parts,
-    )
+    cues, volume = cues_of(motion, splats, settings), reconstruction.volume
+    return Reconstruction(splats, reconstruction.spacing, volume, cues, static, moving=parts)
 
 
 def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:
     """First guess of the particles' appearance: isotropic, 0.35 spacings wide (half a cell below the surface the alpha of an
     opaque one is then about one half at the surface), coloured by the static Gaussians nearby."""
-    n = len(particles.positions)
     positions = particles.positions.to(device)
-    rotations = torch.zeros(n, 4, device=device)
-    rotations[:, 0] = 1
-    return Splats(
-        positions,
-        torch.full((n, 3), 0.35 * particles.spacing, device=device),
-        rotations,
-        torch.full((n,), 0.8, device=device),
-        inherited_colors(positions, static),
-    )
+    colors = inherited_colors(positions, static)
+    return isotropic_splats(positions, 0.35 * particles.spacing, 0.8, colors)

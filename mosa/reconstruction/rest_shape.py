@@ -30,13 +30,8 @@ class RestShape:
     ) -> RestShape:
         """with_splats: whether images show the reconstruction's Gaussians, where it has some."""
         seen = reconstruction.splats
-        tensors = (
-            seen.means,
-            reconstruction.volume,
-            seen.colors,
-            seen.opacities,
-            covariance_from(seen.scales, seen.rotations),
-        )
+        shapes = covariance_from(seen.scales, seen.rotations)
+        tensors = seen.means, reconstruction.volume, seen.colors, seen.opacities, shapes
         carried = None
         if with_splats and reconstruction.appearance is not None:
             carried = CarriedSplats(reconstruction.appearance, seen.means).to(device)

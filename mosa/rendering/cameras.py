@@ -16,33 +16,38 @@ from mosa.types import Cameras
 def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Pixels (V, N, 2) and depths (V, N) [m] of world points (N, 3) or, one set a camera, (V, N, 3).
 
-    A point at depth 0 or behind the camera has a pixel without meaning: look at the depth first.
+    A point nearer than 1e-6 m or behind the camera has a pixel without meaning: look at the depth first.
     """
     w2c, K = cameras.w2c.to(points), cameras.K.to(points)
     seen = points @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]
     pixels = seen @ K.transpose(1, 2)
-    return pixels[..., :2] / pixels[..., 2:], seen[..., 2]
+    return pixels[..., :2] / pixels[..., 2:].clamp(min=1e-6), seen[..., 2]
+
+
+def centers(cameras: Cameras) -> Tensor:
+    """Where the cameras are, (V, 3) [m]."""
+    return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
 
 
 def rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Origins (V, 3) [m] and unit directions (V, H, W, 3), in world axes, of the rays through all pixel centres."""
-    x = torch.arange(cameras.width, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
-    y = torch.arange(cameras.height, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
-    v, u = torch.meshgrid(y, x, indexing="ij")
-    pixels = torch.stack((u, v, torch.ones_like(u)), -1).view(1, -1, 3)
-    R = cameras.w2c[:, :3, :3]
-    directions = pixels @ torch.linalg.inv(cameras.K).transpose(1, 2) @ R  # rows: R^T K^-1 u
-    directions = directions / directions.norm(dim=-1, keepdim=True)
-    origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
-    return origins, directions.view(-1, cameras.height, cameras.width, 3)
+    x, y = (
+        torch.arange(size, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
+        for size in (cameras.width, cameras.height)
+    )
+    u, v = torch.meshgrid(x, y, indexing="xy")
+    inverse = torch.linalg.inv(cameras.K).transpose(1, 2)[:, None]
+    directions = (
+        torch.stack((u, v, torch.ones_like(u)), -1) @ inverse @ cameras.w2c[:, None, :3, :3]
+    )
+    return centers(cameras), F.normalize(directions, dim=-1)
 
 
 def sample_images(images: Tensor, pixels: Tensor, *, beyond: str = "zeros") -> Tensor:
     """Bilinear values (V, C, N) of images (V, C, H, W) at pixels (V, N, 2). beyond: an image: zeros | border (its values)."""
     size = pixels.new_tensor([images.shape[3], images.shape[2]])
-    return F.grid_sample(
-        images, (2 * pixels / size - 1)[:, None], padding_mode=beyond, align_corners=False
-    )[:, :, 0]
+    grid = (2 * pixels / size - 1)[:, None]
+    return F.grid_sample(images, grid, padding_mode=beyond, align_corners=False)[:, :, 0]
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
@@ -53,19 +58,16 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """
     forward = target - eye
     right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
-    if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()) or bool(
-        (forward.norm(dim=-1) == 0).any()
-    ):
+    if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()):
         raise ConfigError(
             "look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up"
         )
     forward = forward / forward.norm(dim=-1, keepdim=True)
     right = right / right.norm(dim=-1, keepdim=True)
     R = torch.stack((right, torch.linalg.cross(forward, right), forward), -2)
-    w2c = torch.zeros(*R.shape[:-2], 4, 4, dtype=R.dtype, device=R.device)
+    w2c = torch.eye(4).to(R).repeat(*R.shape[:-2], 1, 1)
     w2c[..., :3, :3] = R
     w2c[..., :3, 3] = -(R @ eye[..., None])[..., 0]
-    w2c[..., 3, 3] = 1
     return w2c
 
 
@@ -96,44 +98,33 @@ def crop_images(
 ) -> Tensor:
     """The windows of `crop_cameras` cut from images (V, ..., H, W, ...) whose rows are dimension `axis` and columns
     the next."""
-    return torch.stack(
-        [
-            image.narrow(axis - 1, y, height).narrow(axis, x, width)
-            for image, x, y in zip(images, x0.tolist(), y0.tolist())
-        ]
-    )
+    places = zip(images, x0.tolist(), y0.tolist())
+    cut = [image.narrow(axis - 1, y, height).narrow(axis, x, width) for image, x, y in places]
+    return torch.stack(cut)
 
 
 def crop_boxes(
-    mattes: Tensor, margin: int = 8, multiple: int = 1, *, threshold: float = 0.0
+    mattes: Tensor, margin: int = 8, multiple: int = 1
 ) -> tuple[Tensor, Tensor, int, int]:
     """Windows around the object: x0, y0 (V,) and one width and height [px] for all views.
 
-    mattes: (V, T, H, W). The size is the largest over the views of the box of all pixels above `threshold` in any
+    mattes: (V, T, H, W). The size is the largest over the views of the box of all pixels above 0 in any
     frame, plus `margin` on each side, rounded up to `multiple`, at most the image; windows are centred on their box
     and moved inside the image. A view that never sees the object gets a window in the middle.
     Raises DataError where no view sees it.
     """
     views, _, H, W = mattes.shape
-    seen = (mattes > threshold).any(1)
-    lows, highs = [], []
-    for axis, size in (
-        (1, W),
-        (2, H),
-    ):  # columns are occupied where any row is, and the other way round
-        occupied = seen.any(axis)
-        index = torch.arange(size, device=mattes.device)
-        low = torch.where(occupied, index, size).amin(1)
-        high = torch.where(occupied, index + 1, 0).amax(1)
-        lows.append(low)
-        highs.append(high)
-    empty = highs[0] <= lows[0]
+    seen = (mattes > 0).any(1)
+    empty = ~seen.flatten(1).any(1)
     if bool(empty.all()):
         raise DataError(
-            f"crop_boxes: none of the {views} mattes has a pixel above {threshold}; the object is not seen at all"
+            f"crop_boxes: none of the {views} mattes has a pixel above 0; the object is not seen at all"
         )
     starts, sizes = [], []
-    for low, high, limit in zip(lows, highs, (W, H)):
+    for axis, limit in ((1, W), (2, H)):  # columns are occupied where any row is, and so on
+        occupied, index = seen.any(axis), torch.arange(limit, device=mattes.device)
+        low = torch.where(occupied, index, limit).amin(1)
+        high = torch.where(occupied, index + 1, 0).amax(1)
         size = int((high - low)[~empty].max()) + 2 * margin
         size = min(multiple * math.ceil(size / multiple), limit)
         middle = torch.where(empty, torch.full_like(low, limit), low + high)

@@ -73,18 +73,12 @@ def project_gaussians(
     fx, skew, fy, cx, cy = (K[:, None, i, j] for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2)))
     sx, sy = x / z, y / z
     half_x, half_y = 0.5 * cameras.width / fx, 0.5 * cameras.height / fy
-    jx = sx.clamp(
-        -cx / fx - CLAMP_MARGIN * half_x, (cameras.width - cx) / fx + CLAMP_MARGIN * half_x
-    )
-    jy = sy.clamp(
-        -cy / fy - CLAMP_MARGIN * half_y, (cameras.height - cy) / fy + CLAMP_MARGIN * half_y
-    )
+    beyond_x, beyond_y = CLAMP_MARGIN * half_x, CLAMP_MARGIN * half_y
+    jx = sx.clamp(-cx / fx - beyond_x, (cameras.width - cx) / fx + beyond_x)
+    jy = sy.clamp(-cy / fy - beyond_y, (cameras.height - cy) / fy + beyond_y)
     rows = R.unbind(-2)
-    first = (
-        (fx / z)[..., None] * rows[0]
-        + (skew / z)[..., None] * rows[1]
-        - ((fx * jx + skew * jy) / z)[..., None] * rows[2]
-    )
+    first = (fx / z)[..., None] * rows[0] + (skew / z)[..., None] * rows[1]
+    first = first - ((fx * jx + skew * jy) / z)[..., None] * rows[2]
     second = (fy / z)[..., None] * rows[1] - (fy * jy / z)[..., None] * rows[2]
     half_first = (covariances * first[..., None, :]).sum(-1)
     half_second = (covariances * second[..., None, :]).sum(-1)
@@ -115,15 +109,9 @@ def matrix_to_quaternion(R: Tensor) -> Tensor:
     """
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
     # 4 w^2, 4 x^2, 4 y^2, 4 z^2
-    squares = torch.stack(
-        (
-            1 + m[0][0] + m[1][1] + m[2][2],
-            1 + m[0][0] - m[1][1] - m[2][2],
-            1 - m[0][0] + m[1][1] - m[2][2],
-            1 - m[0][0] - m[1][1] + m[2][2],
-        ),
-        -1,
-    )
+    signs = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+    diagonal = [1 + a * m[0][0] + b * m[1][1] + c * m[2][2] for a, b, c in signs]
+    squares = torch.stack(diagonal, -1)
     wx, wy, wz = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     rows = (

@@ -42,19 +42,17 @@ def flow_features(
     A10, A11 = (bxy * ayy - byy * axy) / det, (byy * axx - bxy * axy) / det
     x, y = (center_a - middle).unbind(-1)
     u, v = (center_b - middle).unbind(-1)
-    return torch.stack(
-        (A00 - 1, A01, A10, A11 - 1, u - A00 * x - A01 * y, v - A10 * x - A11 * y), -1
-    )
+    rest = u - A00 * x - A01 * y, v - A10 * x - A11 * y
+    return torch.stack((A00 - 1, A01, A10, A11 - 1, *rest), -1)
 
 
 def flow_from_features(image: Tensor, cameras: Cameras) -> Tensor:
     """Flow map (B, H, W, 2) [px] from the composited channels (B, H, W, 6) of `flow_features`. Not divided by
     alpha."""
-    x = torch.arange(cameras.width, dtype=image.dtype, device=image.device) + (
-        0.5 - cameras.width / 2
+    x, y = (
+        torch.arange(side, dtype=image.dtype, device=image.device) + (0.5 - side / 2)
+        for side in (cameras.width, cameras.height)
     )
-    y = torch.arange(cameras.height, dtype=image.dtype, device=image.device)[:, None] + (
-        0.5 - cameras.height / 2
-    )
+    y = y[:, None]
     a, b, c, d, e, f = image.unbind(-1)
     return torch.stack((a * x + b * y + e, c * x + d * y + f), -1)

@@ -53,9 +53,8 @@ def observe(
     backdrop = background
     if flow:
         following = (index + 1).clamp(max=frames - 1)
-        motion = flow_features(
-            means[index], covariances[index], means[following], covariances[following], batch
-        )
+        states = means[index], covariances[index], means[following], covariances[following]
+        motion = flow_features(*states, batch)
         features = torch.cat([colors[None].expand(len(index), -1, -1), motion], -1)
         backdrop = torch.cat([background, background.new_zeros(6)])
     image, alpha = rasterize(means, covariances, opacities, features, batch, index, backdrop)

@@ -42,16 +42,8 @@ def projection_kernels(dtype: type):
     @wp.func
     def rotation(w2c: mat44):
         return mat33(
-            w2c[0, 0],
-            w2c[0, 1],
-            w2c[0, 2],
-            w2c[1, 0],
-            w2c[1, 1],
-            w2c[1, 2],
-            w2c[2, 0],
-            w2c[2, 1],
-            w2c[2, 2],
-        )
+            w2c[0, 0], w2c[0, 1], w2c[0, 2], w2c[1, 0], w2c[1, 1], w2c[1, 2], w2c[2, 0], w2c[2, 1], w2c[2, 2]
+        )  # fmt: skip
 
     @wp.func
     def to_camera(w2c: mat44, m: vec3):
@@ -77,14 +69,9 @@ def projection_kernels(dtype: type):
         z = p[2]
         tx = z * wp.clamp(p[0] / z, limits[0], limits[1])
         ty = z * wp.clamp(p[1] / z, limits[2], limits[3])
-        return mat23(
-            K[0, 0] / z,
-            K[0, 1] / z,
-            -(K[0, 0] * tx + K[0, 1] * ty) / (z * z),
-            dtype(0.0),
-            K[1, 1] / z,
-            -K[1, 1] * ty / (z * z),
-        )
+        across = -(K[0, 0] * tx + K[0, 1] * ty) / (z * z)
+        down = -K[1, 1] * ty / (z * z)
+        return mat23(K[0, 0] / z, K[0, 1] / z, across, dtype(0.0), K[1, 1] / z, down)
 
     @wp.func
     def symmetric(A: mat33):
@@ -211,13 +198,8 @@ def projection_kernels(dtype: type):
                 limits = slope_limits(K[b], width, height, settings[1])
                 T = jacobian(K[b], p, limits) * R
                 G = covariance_gradient(conic(r), conic_gradient(m))
-                gJ = (
-                    dtype(2.0)
-                    * G
-                    * T
-                    * symmetric(covariances[state_index[b] * count + n])
-                    * wp.transpose(R)
-                )
+                S = symmetric(covariances[state_index[b] * count + n])
+                gJ = dtype(2.0) * G * T * S * wp.transpose(R)
                 gA += wp.transpose(T) * G * T
                 gm += wp.transpose(R) * point_gradient(K[b], p, limits, center_gradient(r, m), gJ)
                 go += opacity_gradient(r, m)

@@ -39,12 +39,10 @@ def raster_kernels(dtype: type, channels: int):
             root = wp.sqrt(disc)
             a = (-conic[1] * dy - root) / conic[0] + center[0]
             b = (-conic[1] * dy + root) / conic[0] + center[0]
-            first = wp.max(
-                rect[0], int(wp.clamp(wp.floor(a - dtype(1.0)), dtype(rect[0]), dtype(rect[1])))
-            )
-            last = wp.min(
-                rect[1], int(wp.clamp(wp.ceil(b + dtype(1.0)), dtype(rect[0]), dtype(rect[1])))
-            )
+            left = dtype(rect[0])
+            right = dtype(rect[1])
+            first = int(wp.clamp(wp.floor(a - dtype(1.0)), left, right))
+            last = int(wp.clamp(wp.ceil(b + dtype(1.0)), left, right))
         return wp.vec2i(first, last)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.physics.launching import SCALARS
 from mosa.rendering.records import SIDE_MAX
-from mosa.rendering.splatting import SCALARS, Geometry, Splat
+from mosa.rendering.splatting import Geometry, Splat
 from mosa.system.limits import counted
 from mosa.system.warp_start import start_warp
 from mosa.types import Cameras

@@ -5,7 +5,6 @@ Gaussians (records.py), the final transmittance and the place in its list where 
 one entry per (tile, Gaussian) pair that is visible. Nothing grows with Gaussians times pixels.
 """
 
-import contextlib
 import functools
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mosa.physics.exact_sums import COLUMNS, needed, sum_functions
+from mosa.physics.launching import SCALARS, warp_stream
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
@@ -24,29 +24,20 @@ from mosa.rendering.tile_lists import tile_lists
 NEAR, EXTENT, ALPHA_MAX = 0.01, 3.33, 0.999
 """Nearest depth [m], extent of a Gaussian in standard deviations, cap of alpha: gsplat's."""
 
-SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
-
 
 @functools.cache
-def _vector(length: int, scalar: type) -> type:
-    return wp.types.vector(length=length, dtype=scalar)
+def _kind(scalar: type, *shape: int) -> type:
+    if len(shape) == 2:
+        return wp.types.matrix(shape=shape, dtype=scalar)
+    return wp.types.vector(length=shape[0], dtype=scalar) if shape else scalar
 
 
-@functools.cache
-def _matrix(rows: int, columns: int, scalar: type) -> type:
-    return wp.types.matrix(shape=(rows, columns), dtype=scalar)
-
-
-@functools.cache
-def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    return wp.stream_from_torch(stream)
-
-
-def torch_stream(device: torch.device):
-    """Context in which Warp launches where torch does: in order with its work, without waiting at every change between them."""
-    if device.type == "cpu":
-        return contextlib.nullcontext()
-    return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+def _flat(x: Tensor, axes: int = 0):
+    """Warp descriptor of a contiguous tensor, flat but for its last 0 to 2 `axes`, those of numbers, vectors or matrices."""
+    shape = x.shape[x.dim() - axes :]
+    return wp.from_torch(
+        x.view(-1, *shape), dtype=_kind(wp.dtype_from_torch(x.dtype), *shape), return_ctype=True
+    )
 
 
 @dataclass(frozen=True)
@@ -57,30 +48,6 @@ class Geometry:
     width: int
     height: int
     scan: str
-
-
-class _Arrays:
-    """Flat Warp descriptors of contiguous torch tensors of one scalar type."""
-
-    def __init__(self, dtype: torch.dtype):
-        self.scalar = SCALARS[dtype]
-
-    def scalars(self, x: Tensor):
-        return wp.from_torch(x.view(-1), dtype=self.scalar, return_ctype=True)
-
-    def vectors(self, x: Tensor):
-        return wp.from_torch(
-            x.view(-1, x.shape[-1]), dtype=_vector(x.shape[-1], self.scalar), return_ctype=True
-        )
-
-    def matrices(self, x: Tensor):
-        return wp.from_torch(
-            x.view(-1, *x.shape[-2:]), dtype=_matrix(*x.shape[-2:], self.scalar), return_ctype=True
-        )
-
-
-def _integers(x: Tensor):
-    return wp.from_torch(x.view(-1), dtype=wp.int32, return_ctype=True)
 
 
 class Splat(torch.autograd.Function):
@@ -94,7 +61,7 @@ class Splat(torch.autograd.Function):
         means, covariances, opacities, features, K, w2c = (
             x.detach().contiguous() for x in (means, covariances, opacities, features, K, w2c)
         )
-        with torch_stream(means.device):
+        with warp_stream(means.device):
             records, depths = project(means, covariances, opacities, K, w2c, geometry)
             lists = depth_lists(depths, records, geometry)
             image, transmittance, ends = composite(lists, records, features, geometry)
@@ -110,19 +77,13 @@ class Splat(torch.autograd.Function):
         means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists = (
             ctx.saved_tensors
         )
-        with torch_stream(means.device):
+        g = ctx.geometry
+        with warp_stream(features.device):
+            incoming = grad_image.contiguous(), grad_alpha.contiguous()
             moments, grad_features = composite_backward(
-                lists,
-                records,
-                features,
-                ends,
-                transmittance,
-                grad_image.contiguous(),
-                grad_alpha.contiguous(),
-                ctx.geometry,
+                lists, records, features, ends, transmittance, *incoming, g
             )
-            projected = (means, covariances, opacities, K, w2c, records, moments, ctx.geometry)
-            gradients = project_backward(*projected)
+            gradients = project_backward(means, covariances, opacities, K, w2c, records, moments, g)
         return *gradients, grad_features, None, None, None
 
 
@@ -131,22 +92,12 @@ def project(
 ) -> tuple[Tensor, Tensor]:
     """Records (B, N, 8) and depths (2 B N,), infinite where nothing is seen; the second half is room to sort them."""
     images, count = len(g.state_index), means.shape[1]
-    arrays = _Arrays(means.dtype)
     records, depths = means.new_empty(images, count, 8), means.new_empty(2 * images * count)
-    kernel, _ = projection_kernels(arrays.scalar)
-    wp.launch(
-        kernel,
-        dim=(images, count),
-        inputs=[
-            arrays.vectors(means),
-            arrays.matrices(covariances),
-            arrays.scalars(opacities),
-            count if opacities.dim() == 2 else 0,
-            *_projection(arrays, K, w2c, count, g),
-        ],
-        outputs=[arrays.vectors(records), arrays.scalars(depths)],
-        device=wp.device_from_torch(means.device),
-    )
+    kernel, _ = projection_kernels(SCALARS[means.dtype])
+    stride = count if opacities.dim() == 2 else 0
+    given = [_flat(means, 1), _flat(covariances, 2), _flat(opacities), stride]
+    given += _projection(K, w2c, count, g)
+    _launch(kernel, (images, count), given, [_flat(records, 1), _flat(depths)], means)
     return records, depths
 
 
@@ -165,145 +116,77 @@ def composite(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image (B, H, W, C), final transmittance (B, H, W) and the place in its list where each pixel ended (B, H, W)."""
     images, count, _ = records.shape
-    arrays, shape = _Arrays(records.dtype), (images, g.height, g.width)
-    if g.scan == "tile":
-        kernel, _ = tile_kernels(arrays.scalar, features.shape[-1])
-        threads = tile_threads(images, g.width, g.height)
-        transmittance, image = (
-            records.new_empty(shape),
-            records.new_empty(*shape, features.shape[-1]),
-        )
-        ends = torch.empty(shape, dtype=torch.int32, device=records.device)
-    else:
-        kernel, _ = raster_kernels(arrays.scalar, features.shape[-1])
-        threads = images
-        transmittance, image = (
-            records.new_ones(shape),
-            records.new_zeros(*shape, features.shape[-1]),
-        )
-        ends = torch.full(shape, count, dtype=torch.int32, device=records.device)
-    wp.launch(
-        kernel,
-        dim=threads,
-        inputs=[*map(_integers, lists), *_splats(arrays, records, features, g)],
-        outputs=[arrays.scalars(transmittance), arrays.vectors(image), _integers(ends)],
-        device=wp.device_from_torch(records.device),
+    channels, scalar, shape = (
+        features.shape[-1],
+        SCALARS[records.dtype],
+        (images, g.height, g.width),
     )
+    transmittance, image = records.new_ones(shape), records.new_zeros(*shape, channels)
+    ends = torch.full(shape, count, dtype=torch.int32, device=records.device)
+    if g.scan == "tile":
+        kernel, threads = tile_kernels(scalar, channels)[0], tile_threads(images, g.width, g.height)
+    else:
+        kernel, threads = raster_kernels(scalar, channels)[0], images
+    given = [*map(_flat, lists), *_splats(records, features, g)]
+    _launch(kernel, threads, given, [_flat(transmittance), _flat(image, 1), _flat(ends)], records)
     return image, transmittance, ends
 
 
 def composite_backward(
-    lists: tuple[Tensor, ...],
-    records: Tensor,
-    features: Tensor,
-    ends: Tensor,
-    transmittance: Tensor,
-    grad_image: Tensor,
-    grad_alpha: Tensor,
-    g: Geometry,
-) -> tuple[Tensor, Tensor]:
+    lists: tuple[Tensor, ...], records: Tensor, features: Tensor, ends: Tensor, transmittance: Tensor,
+    grad_image: Tensor, grad_alpha: Tensor, g: Geometry,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Moments (B, N, 8) of the records (records.py) and the gradient of the features."""
-    arrays = _Arrays(records.dtype)
-    moments, grad_features = torch.zeros_like(records), torch.zeros_like(features)
-    found, exact = (moments, grad_features), g.scan == "tile" and needed(records.device)
+    scalar, channels = SCALARS[records.dtype], features.shape[-1]
+    found, exact = (torch.zeros_like(records), torch.zeros_like(features)), False
     if g.scan == "tile":
-        _, kernel = tile_kernels(arrays.scalar, features.shape[-1], exact)
+        exact = needed(records.device)
+        _, kernel = tile_kernels(scalar, channels, exact)
         threads, state = tile_threads(len(records), g.width, g.height), (transmittance, grad_alpha)
     else:
-        _, kernel = raster_kernels(arrays.scalar, features.shape[-1])
+        _, kernel = raster_kernels(scalar, channels)
         threads, state = len(records), (transmittance.clone(), -grad_alpha * transmittance)
-    sums = (
-        [torch.zeros(t.numel(), COLUMNS, dtype=torch.int64, device=t.device) for t in found]
-        if exact
-        else []
-    )
-    wp.launch(
-        kernel,
-        dim=threads,
-        inputs=[
-            *map(_integers, lists),
-            *_splats(arrays, records, features, g),
-            _integers(ends),
-            arrays.vectors(grad_image),
-            *map(arrays.scalars, state),
-        ],
-        outputs=[wp.from_torch(t) for t in sums] if exact else [arrays.vectors(t) for t in found],
-        device=wp.device_from_torch(records.device),
-    )
+    given = [*map(_flat, lists), *_splats(records, features, g), _flat(ends), _flat(grad_image, 1)]
+    given += map(_flat, state)
+    if not exact:
+        _launch(kernel, threads, given, [_flat(t, 1) for t in found], records)
+        return found
+    sums = [torch.zeros(t.numel(), COLUMNS, dtype=torch.int64, device=t.device) for t in found]
+    _launch(kernel, threads, given, [wp.from_torch(t) for t in sums], records)
     for target, added in zip(found, sums):
-        given = [wp.from_torch(added), arrays.scalars(target)]
-        wp.launch(
-            sum_functions(arrays.scalar).settle,
-            target.numel(),
-            given,
-            device=wp.device_from_torch(records.device),
-        )
+        settle = sum_functions(scalar).settle
+        _launch(settle, target.numel(), [wp.from_torch(added), _flat(target)], [], records)
     return found
 
 
 def project_backward(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    K: Tensor,
-    w2c: Tensor,
-    records: Tensor,
-    moments: Tensor,
-    g: Geometry,
-) -> tuple[Tensor, Tensor, Tensor]:
+    means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, records: Tensor,
+    moments: Tensor, g: Geometry,
+) -> tuple[Tensor, ...]:  # fmt: skip
     """Gradients of means, covariances and opacities."""
-    arrays, count = _Arrays(means.dtype), means.shape[1]
-    grad_means, grad_covariances, grad_opacities = (
-        torch.zeros_like(x) for x in (means, covariances, opacities)
-    )
-    _, kernel = projection_kernels(arrays.scalar)
-    wp.launch(
-        kernel,
-        dim=count,
-        inputs=[
-            arrays.vectors(means),
-            arrays.matrices(covariances),
-            count if opacities.dim() == 2 else 0,
-            *_projection(arrays, K, w2c, count, g),
-            len(records),
-            arrays.vectors(records),
-            arrays.vectors(moments),
-        ],
-        outputs=[
-            arrays.vectors(grad_means),
-            arrays.matrices(grad_covariances),
-            arrays.scalars(grad_opacities),
-        ],
-        device=wp.device_from_torch(means.device),
-    )
-    return grad_means, grad_covariances, grad_opacities
+    found = tuple(torch.zeros_like(x) for x in (means, covariances, opacities))
+    count = means.shape[1]
+    _, kernel = projection_kernels(SCALARS[means.dtype])
+    given = [_flat(means, 1), _flat(covariances, 2), count if opacities.dim() == 2 else 0]
+    given += [*_projection(K, w2c, count, g), len(records), _flat(records, 1), _flat(moments, 1)]
+    _launch(kernel, count, given, [_flat(t, axes) for t, axes in zip(found, (1, 2, 0))], means)
+    return found
 
 
-def _splats(arrays: _Arrays, records: Tensor, features: Tensor, g: Geometry) -> list:
+def _launch(kernel, dim, inputs: list, outputs: list, like: Tensor) -> None:
+    device = wp.device_from_torch(like.device)
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
+
+
+def _splats(records: Tensor, features: Tensor, g: Geometry) -> list:
     """What all compositing kernels take after their lists."""
     count = records.shape[1]
     stride = count if features.shape[0] > 1 else 0
-    cap = arrays.scalar(ALPHA_MAX)
-    return [
-        arrays.vectors(records),
-        arrays.vectors(features),
-        stride,
-        cap,
-        count,
-        g.width,
-        g.height,
-    ]
+    cap = SCALARS[records.dtype](ALPHA_MAX)
+    return [_flat(records, 1), _flat(features, 1), stride, cap, count, g.width, g.height]
 
 
-def _projection(arrays: _Arrays, K: Tensor, w2c: Tensor, count: int, g: Geometry) -> list:
+def _projection(K: Tensor, w2c: Tensor, count: int, g: Geometry) -> list:
     """What all projection kernels take after the Gaussians."""
-    settings = _vector(3, arrays.scalar)(NEAR, CLAMP_MARGIN, EXTENT)
-    return [
-        arrays.matrices(K),
-        arrays.matrices(w2c),
-        _integers(g.state_index),
-        settings,
-        count,
-        g.width,
-        g.height,
-    ]
+    settings = _kind(SCALARS[K.dtype], 3)(NEAR, CLAMP_MARGIN, EXTENT)
+    return [_flat(K, 2), _flat(w2c, 2), _flat(g.state_index), settings, count, g.width, g.height]

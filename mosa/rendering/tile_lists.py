@@ -15,6 +15,7 @@ from mosa.rendering.records import record_functions, record_type
 from mosa.system.limits import counted
 
 ENTRIES_MAX = 2**30
+"""Places are counted in int32."""
 
 
 @functools.cache
@@ -29,11 +30,9 @@ def list_kernels(dtype: type):
         rect = pixels(r)
         result = wp.vec4i(0, 0, 0, 0)
         if rect[1] > rect[0] and rect[3] > rect[2]:
+            end = TILE - 1
             result = wp.vec4i(
-                rect[0] // TILE,
-                (rect[1] - 1) // TILE + 1,
-                rect[2] // TILE,
-                (rect[3] - 1) // TILE + 1,
+                rect[0] // TILE, (rect[1] + end) // TILE, rect[2] // TILE, (rect[3] + end) // TILE
             )
         return result
 
@@ -82,48 +81,27 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     """
     images, gaussians, _ = records.shape
     number, columns, rows = images * gaussians, -(-width // TILE), -(-height // TILE)
-    last = images * rows * columns
-    # int32
-    counted(
-        "rasterize: Gaussians, or tiles, of all images",
-        [max(number, last)],
-        "render fewer at once",
-        most=ENTRIES_MAX,
-    )
+    last, remedy = images * rows * columns, "render fewer images at once"
+    larger = max(number, last)
+    counted("rasterize: Gaussians, or tiles, of all images", [larger], remedy, most=ENTRIES_MAX)
     device = wp.device_from_torch(records.device)
     scalar = wp.dtype_from_torch(records.dtype)
     count, emit = list_kernels(scalar)
     order = torch.arange(2 * number, dtype=torch.int32, device=records.device)
     wp.utils.radix_sort_pairs(wp.from_torch(depths), wp.from_torch(order), number)
     numbers = torch.empty(number, dtype=torch.int32, device=records.device)
-    given = [
-        _descriptor(order),
-        wp.from_torch(records.view(-1, 8), dtype=record_type(scalar), return_ctype=True),
-    ]
-    wp.launch(count, dim=number, inputs=given, outputs=[_descriptor(numbers)], device=device)
+    flat = functools.partial(wp.from_torch, return_ctype=True)
+    given: list = [flat(order), flat(records.view(-1, 8), dtype=record_type(scalar))]
+    wp.launch(count, dim=number, inputs=given, outputs=[flat(numbers)], device=device)
     ends = numbers.cumsum(0, dtype=torch.int64)
     total = int(ends[-1])
-    counted(
-        "rasterize: pairs of a Gaussian and a tile",
-        [total],
-        "render fewer images at once",
-        most=ENTRIES_MAX,
-    )
+    counted("rasterize: pairs of a Gaussian and a tile", [total], remedy, most=ENTRIES_MAX)
     tiles, entries = torch.empty(2, 2 * total, dtype=torch.int32, device=records.device)
-    wp.launch(
-        emit,
-        dim=number,
-        inputs=[*given, _descriptor(numbers), _descriptor(ends), gaussians, columns, rows],
-        outputs=[_descriptor(tiles), _descriptor(entries)],
-        device=device,
-    )
+    given += [flat(numbers), flat(ends), gaussians, columns, rows]
+    wp.launch(emit, number, inputs=given, outputs=[flat(tiles), flat(entries)], device=device)
     wp.utils.radix_sort_pairs(
         wp.from_torch(tiles), wp.from_torch(entries), total, end_bit=last.bit_length()
     )
     marks = torch.arange(last + 1, dtype=torch.int32, device=records.device)
     starts = torch.searchsorted(tiles[:total], marks, out_int32=True)
     return entries[:total].clone(), starts  # half as long as what sorting needed
-
-
-def _descriptor(x: Tensor):
-    return wp.from_torch(x, return_ctype=True)

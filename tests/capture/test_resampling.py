@@ -59,7 +59,7 @@ def test_frames_are_brought_to_common_times(made):
     film, track, exposure = made
     times = CONTACT - np.array([0.11, 0.0957, 0.0721, 0.05, 0.0333])
     overlap = {}
-    for kind in resampling.KINDS:
+    for kind in ("flow", "shift", "none"):
         found = resampled(exposure, track, None, times, kind)[..., 3] > 127
         wanted = [right(film, t) for t in times]
         overlap[kind] = np.mean([(a & b).sum() / (a | b).sum() for a, b in zip(found, wanted)])

@@ -6,7 +6,8 @@ import torch
 from depth import expected_depth, rasterize_with_depth
 from drawn_splats import draw, objective, render, slopes
 
-from mosa.rendering.appearance.spherical_harmonics import camera_centers, colors_in
+from mosa.rendering.appearance.spherical_harmonics import colors_in
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
 
@@ -56,7 +57,7 @@ def test_spherical_harmonics(degree):
     }
 
     def picture(coefficients, means):
-        lines = means[scene.state_index] - camera_centers(cameras).to(means)[:, None]
+        lines = means[scene.state_index] - centers(cameras).to(means)[:, None]
         colors = colors_in(coefficients, lines)
         return objective(
             *rasterize(

@@ -66,11 +66,8 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
         suspects = []
         for v in range(len(chosen)):
             keep[v] = False
-            if (
-                len(chosen) > 3
-                and float(misses(origins[keep], directions[keep], radii[keep])[1].max())
-                <= AGREEMENT
-            ):
+            off_others = misses(origins[keep], directions[keep], radii[keep])[1]
+            if len(chosen) > 3 and float(off_others.max()) <= AGREEMENT:
                 suspects.append(v)
             keep[v] = True
         if len(suspects) == 1:

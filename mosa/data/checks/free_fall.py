@@ -69,13 +69,8 @@ def track_of(scene: Scene) -> Track | None:
         radius = max(radius, float((radii * depth).mean()))
         noise = max(noise, float((depth / scene.cameras.K[chosen, 0, 0].double()).mean()))
     dt = float(scene.times.double().diff().median())
-    return Track(
-        torch.stack(points),
-        torch.tensor(low).double(),
-        max(PIXELS * noise, RADII * radius),
-        radius,
-        dt,
-    )
+    noise = max(PIXELS * noise, RADII * radius)
+    return Track(torch.stack(points), torch.tensor(low).double(), noise, radius, dt)
 
 
 def lowest_seen(scene: Scene, camera: int, frame: int, depth: float) -> float:
@@ -102,9 +97,8 @@ def parabola(track: Track, frames: int) -> tuple[Tensor, float]:
         return solution[2] / track.dt**2, 3 * track.noise * spread / track.dt**2
     free = 3 * (frames - 3)
     scatter = float((x - design @ solution).square().sum() / free) ** 0.5
-    return solution[2] / track.dt**2, max(
-        3 * FINE * track.noise, float(student.ppf(0.9987, free)) * scatter
-    ) * spread / track.dt**2
+    error = max(3 * FINE * track.noise, float(student.ppf(0.9987, free)) * scatter)
+    return solution[2] / track.dt**2, error * spread / track.dt**2
 
 
 def check_fall(scene: Scene, label: str) -> None:
@@ -137,16 +131,10 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
     """The pictures go on while the object moves. Of a body at rest they may be alike to the bit: what counts is that those of all
     cameras stop, or go on, from one frame to the next. Errors: DataError naming the frames."""
     step = math.ceil(max(scene.mattes.shape[2:]) / COARSE)
-    frames = [
-        (scene.images[:, t, ::step, ::step], scene.mattes[:, t, ::step, ::step] > 0.5)
-        for t in range(scene.frames)
-    ]
-    change = torch.stack(
-        [
-            ((b - a).abs().mean(3) * (m | n)).sum() / (m | n).sum()
-            for (a, m), (b, n) in pairwise(frames)
-        ]
-    )
+    frames = [(scene.images[:, t, ::step, ::step], scene.mattes[:, t, ::step, ::step] > 0.5)
+              for t in range(scene.frames)]  # fmt: skip
+    change = torch.stack([((b - a).abs().mean(3) * (m | n)).sum() / (m | n).sum()
+                          for (a, m), (b, n) in pairwise(frames)])  # fmt: skip
     if not bool(change.any()):
         raise DataError(
             f"{label}: all {scene.frames} frames are identical: expected a film of a moving object"
@@ -208,12 +196,9 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
                 f"a stated gravity of {g:.3g}: check {keys}"
             )
     ground = -math.inf if scene.ground is None else scene.ground.height
-    clear = (track.low > ground + 0.3 * track.radius).int().cumprod(0)
-    free = (
-        int(clear.sum())
-        if scene.last_free_frame is None
-        else min(int(clear.sum()), scene.last_free_frame + 1)
-    )
+    free = int((track.low > ground + 0.3 * track.radius).int().cumprod(0).sum())
+    if scene.last_free_frame is not None:
+        free = min(free, scene.last_free_frame + 1)
     if free < 3:
         return
     a, error = parabola(track, free)
@@ -269,19 +254,12 @@ def check_order(scene: Scene, track: Track, label: str) -> None:
     for i, j in combinations(range(scene.frames), 2):
         swapped, reverse = track.points.clone(), track.points.clone()
         swapped[[i, j]] = track.points[[j, i]]
-        best, pair = min(
-            (best, pair),
-            (
-                rough(swapped),
-                (i, j, f"frames {i} and {j} seem to be in each other's place: swapping"),
-            ),
-        )
+        said = f"frames {i} and {j} seem to be in each other's place: swapping"
+        best, pair = min((best, pair), (rough(swapped), (i, j, said)))
         if 3 <= j - i < scene.frames - 1:
             reverse[i : j + 1] = track.points[i : j + 1].flip(0)
-            best, pair = min(
-                (best, pair),
-                (rough(reverse), (i, j, f"frames {i} to {j} seem to be in reverse order: turning")),
-            )
+            said = f"frames {i} to {j} seem to be in reverse order: turning"
+            best, pair = min((best, pair), (rough(reverse), (i, j, said)))
     floor = 6 * scene.frames * track.noise**2  # of second differences of noise
     if now > SWAPPED * (best + floor):
         raise DataError(

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from mosa.data.checks.free_fall import track_of
-from mosa.data.hull import hull_bounds, visual_hull
+from mosa.data.hull import at_border, hull_bounds, visual_hull
 from mosa.errors import DataError
+from mosa.rendering.cameras import project
 from mosa.types import Cameras, Scene
 
 RESOLUTION = 40
@@ -43,12 +44,8 @@ def check_particles(scene: Scene, label: str) -> None:
     track = None if scene.particles is None else track_of(scene)
     if track is None:
         return
-    far = torch.stack(
-        [
-            (cloud.double().mean(0) - point).norm()
-            for cloud, point in zip(scene.particles, track.points)
-        ]
-    )
+    middles = torch.stack([cloud.double().mean(0) for cloud in scene.particles])
+    far = (middles - track.points).norm(dim=1)
     frame = int(far.argmax())
     extent = float((scene.particles[0].amax(0) - scene.particles[0].amin(0)).max())
     said = (
@@ -85,26 +82,18 @@ def uncovered_and_islands(
 ) -> tuple[Tensor, list[int]]:
     """`uncovered_share`, and the pixels of each matte that are in wholly uncovered pieces."""
     shares, islands = [], []
-    for matte, K, w2c in zip(mattes, cameras.K, cameras.w2c):
-        seen = points @ w2c[:3, :3].T + w2c[:3, 3]
-        pixel = seen @ K.T
-        column, row = (pixel[:, :2] / pixel[:, 2:].clamp(min=1e-6)).floor().long().T
-        shown = (
-            (seen[:, 2] > 0)
-            & (column >= 0)
-            & (row >= 0)
-            & (column < cameras.width)
-            & (row < cameras.height)
-        )
+    size = torch.tensor([cameras.width, cameras.height])
+    for matte, K, pixels, depth in zip(mattes, cameras.K, *project(points, cameras)):
+        pixels = pixels.floor().long()
+        shown = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(1)
+        column, row = pixels.T
         covered = np.zeros(tuple(matte.shape), np.uint8)
         covered[row[shown].numpy(), column[shown].numpy()] = 1
-        reach = math.ceil(
-            pitch * float(K[[0, 1], [0, 1]].max()) / float(seen[:, 2].mean().clamp(min=1e-6))
-        )
+        focal = float(K[[0, 1], [0, 1]].max())
+        reach = math.ceil(pitch * focal / float(depth.mean().clamp(min=1e-6)))
         reach = min(max(reach, 1), max(tuple(matte.shape)))
-        covered = cv2.dilate(covered, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(
-            bool
-        )
+        box = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+        covered = cv2.dilate(covered, box).astype(bool)
         inside = (matte > 0.5).numpy()
         shares.append(float((inside & ~covered).sum() / max(inside.sum(), 1)))
         _, pieces = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
@@ -115,8 +104,8 @@ def uncovered_and_islands(
 def whole_views(scene: Scene, frame: int) -> list[int]:
     """Cameras whose matte shows something and does not touch the border."""
     shown = scene.mattes[:, frame] > 0.5
-    cut = torch.cat([shown[:, 0], shown[:, -1], shown[..., 0], shown[..., -1]], 1).any(1)
-    return [v for v in range(len(shown)) if bool(shown[v].any()) and not bool(cut[v])]
+    whole = shown.flatten(1).any(1) & ~(at_border(scene.mattes[:, frame]) > 0.5)
+    return whole.nonzero()[:, 0].tolist()
 
 
 def check_outlines(scene: Scene, label: str) -> None:
@@ -170,12 +159,9 @@ def worst_uncovered(
     shares: Tensor, names: tuple[str, ...], frame: int, label: str
 ) -> tuple[float, str]:
     """Largest uncovered share of a matte, and a message that names cameras and causes."""
-    order = shares.argsort(descending=True)[:4].tolist()
-    listed = ", ".join(
-        f"{names[v]} ({float(shares[v]):.0%})"
-        for v in order
-        if float(shares[v]) > 0.25 * float(shares.max())
-    )
+    large = [v for v in shares.argsort(descending=True)[:4].tolist()
+             if float(shares[v]) > 0.25 * float(shares.max())]  # fmt: skip
+    listed = ", ".join(f"{names[v]} ({float(shares[v]):.0%})" for v in large)
     return float(shares.max()), (
         f"{label}: the outlines of frame {frame} are not those of one solid: what all cameras see together should fill every "
         f"matte, and leaves open of the cameras {listed}: check focal lengths (fl_x, fl_y), principal points, lens distortion, "

@@ -44,10 +44,8 @@ class Tangents:
         # one direction for both cameras of a pair
         axis = torch.where(torch.ones(V, V).triu()[..., None] > 0, axis, -axis)
         self.outlines = [[outline_of(matte) for matte in mattes] for mattes in scene.mattes]
-        self.angles, self.reach = (
-            torch.full((V, V, T, 2), torch.nan).double(),
-            torch.full((V, V, T), torch.nan).double(),
-        )
+        self.angles = torch.full((V, V, T, 2), torch.nan).double()
+        self.reach = torch.full((V, V, T), torch.nan).double()
         self.ahead = None
         for t in range(T):
             chosen, origins, directions, radii = lines_of_sight(scene, t)
@@ -60,19 +58,15 @@ class Tangents:
                 self.ahead = normalize(arm, dim=2)
                 self.aside = torch.linalg.cross(axis, self.ahead)
             reach = arm.norm(dim=2) / (radii * (point - origins).norm(dim=1)).median()
-            self.reach[..., t] = torch.where(
-                (reach > NEAR) & ~torch.eye(V, dtype=torch.bool), reach, torch.nan
-            )
+            apart = (reach > NEAR) & ~torch.eye(V, dtype=torch.bool)
+            self.reach[..., t] = torch.where(apart, reach, torch.nan)
             for v in chosen:
                 self.angles[v, :, t] = self.touching(self.outlines[v][t], v)
 
     def touching(self, outline: Tensor, camera: int) -> Tensor:
         """Angles (V, 2) of an outline (n, 2), were it that camera's."""
-        rays = (
-            pad(outline, (0, 1), value=1.0)
-            @ torch.linalg.inv(self.K[camera]).T
-            @ self.rotation[camera]
-        )
+        rays = pad(outline, (0, 1), value=1.0) @ torch.linalg.inv(self.K[camera]).T
+        rays = rays @ self.rotation[camera]
         angle = torch.atan2(rays @ self.aside[camera].T, rays @ self.ahead[camera].T)
         span = torch.stack([angle.amin(0), angle.amax(0)], 1)
         return torch.where(span.diff(dim=1) < WIDE, span, torch.nan)
@@ -84,9 +78,8 @@ class Tangents:
 
     def misfit(self, outline: Tensor, camera: int, frame: int) -> float:
         """The same of an outline (n, 2), were it that camera's in that frame; infinite where nothing compares."""
-        off = (self.touching(outline, camera) - self.angles[:, camera, frame]).abs().amax(
-            1
-        ) * self.reach[camera, :, frame]
+        away = (self.touching(outline, camera) - self.angles[:, camera, frame]).abs()
+        off = away.amax(1) * self.reach[camera, :, frame]
         known = sorted(off[off.isfinite()].tolist())
         # of two the larger: either may fit by chance
         return known[len(known) // 2] if known else torch.inf
@@ -100,16 +93,10 @@ class Tangents:
         mirrored = [torch.stack([self.width - outline[:, 0], outline[:, 1]], 1) for outline in own]
         tried = [([self.misfit(each, camera, t) for each, t in zip(mirrored, frames)], "mirrored")]
         for other in others:
-            tried.append(
-                (
-                    [self.misfit(each, other, t) for each, t in zip(own, frames)],
-                    f"as pictures of camera {names[other]}",
-                )
-            )
-        best = [
-            min((self.misfit(each, camera, s), s) for s in range(self.angles.shape[2]))
-            for each in own
-        ]
+            off = [self.misfit(each, other, t) for each, t in zip(own, frames)]
+            tried.append((off, f"as pictures of camera {names[other]}"))
+        every = range(self.angles.shape[2])
+        best = [min((self.misfit(each, camera, s), s) for s in every) for each in own]
         tried.append(([off for off, _ in best], f"as pictures of {listed([s for _, s in best])}"))
         return min((float(np.median(off)), said) for off, said in tried)
 
@@ -119,31 +106,20 @@ class Tangents:
         for percent in FOCAL:
             off = [torch.inf if outline is None else self.misfit(middle + (1 + percent / 100) * (outline - middle), camera, t)
                    for t, outline in enumerate(self.outlines[camera])]  # fmt: skip
-            tried.append(
-                (
-                    max(
-                        np.median(np.array(off)[frames]),
-                        np.median([miss for miss in off if miss < torch.inf]),
-                    ),
-                    percent,
-                )
-            )
+            every = np.median([miss for miss in off if miss < torch.inf])
+            tried.append((max(np.median(np.array(off)[frames]), every), percent))
         best, percent = min(tried)
-        return (
-            float(best),
-            f"a focal length that is {abs(percent)} % {('larger', 'smaller')[percent > 0]} they fit to {best:.2g}",
-        )
+        other = f"{abs(percent)} % {('larger', 'smaller')[percent > 0]}"
+        return float(best), f"a focal length that is {other} they fit to {best:.2g}"
 
 
 def outline_of(matte: Tensor) -> Tensor | None:
     """Corners (n, 2) [px] of the convex hull of a matte (H, W); None where it is empty."""
     row, column = np.nonzero((matte > 0.5).numpy())
-    return (
-        torch.from_numpy(cv2.convexHull(np.stack([column, row], 1).astype(np.int32))[:, 0]).double()
-        + 0.5
-        if len(row)
-        else None
-    )
+    if not len(row):
+        return None
+    corners = cv2.convexHull(np.stack([column, row], 1).astype(np.int32))[:, 0]
+    return torch.from_numpy(corners).double() + 0.5
 
 
 def listed(frames: list[int]) -> str:

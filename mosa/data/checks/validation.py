@@ -16,7 +16,9 @@ from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
 from mosa.data.checks.tangents import check_pictures
 from mosa.data.formats.footage import TIME_JITTER, Footage
+from mosa.data.hull import at_border
 from mosa.errors import ConfigError, DataError
+from mosa.rendering.cameras import centers
 from mosa.settings import Expected, Positive, Text, Whole, check_values, fits, such
 from mosa.types import FALLING, REST, Cameras, Ground, KnownBody, Markers, Scene, Truth, dense
 
@@ -175,7 +177,7 @@ def check_film(scene: Scene, label: str) -> None:
 def check_cameras(scene: Scene, label: str) -> None:
     """Proper poses, near the origin, and positive focal lengths."""
     cameras = scene.cameras
-    places = -torch.einsum("vji,vj->vi", cameras.w2c[:, :3, :3], cameras.w2c[:, :3, 3]).double()
+    places = centers(cameras).double()
     spread = float((places - places.mean(0)).norm(dim=1).max())
     for v, name in enumerate(cameras.names):
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
@@ -192,10 +194,8 @@ def check_cameras(scene: Scene, label: str) -> None:
             )
         check_pixels(cameras.K[v], f"{label}: camera {name}")
         R = cameras.w2c[v, :3, :3].double()
-        if (
-            float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3
-            or float(torch.linalg.det(R)) < 0
-        ):
+        bent = float((R @ R.T - torch.eye(3).double()).abs().max())
+        if bent > 2e-3 or float(torch.linalg.det(R)) < 0:
             raise DataError(
                 f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}"
             )
@@ -220,10 +220,8 @@ def check_cameras(scene: Scene, label: str) -> None:
 def check_pixels(K: torch.Tensor, label: str) -> None:
     """A pinhole camera's matrix, and both focal lengths nearly one. Errors: DataError where one is twice the other; a warning where
     they differ visibly."""
-    if (
-        float((K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max())
-        > 1e-6
-    ):
+    fixed = K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])
+    if float(fixed.abs().max()) > 1e-6:
         raise DataError(
             f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
         )
@@ -306,13 +304,11 @@ def check_colors(scene: Scene, label: str) -> None:
     """A warning where the object's mean colour jumps in one frame of a camera and comes back: a frame that was not exposed, or
     dropped and filled with black. And one where all cameras' changes over the film: another exposure, or a light that changes."""
     inside = (scene.mattes > CLEAR).float()
-    means = (scene.images * inside[..., None]).sum((2, 3)) / inside.sum((2, 3))[..., None].clamp(
-        min=1
-    )
-    seen = inside.sum((2, 3)) > 0
-    jump = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2).abs().amax(2) * (
-        seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
-    )
+    count = inside.sum((2, 3))
+    sums, seen = (scene.images * inside[..., None]).sum((2, 3)), count > 0
+    means = sums / count[..., None].clamp(min=1)
+    jump = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2).abs().amax(2)
+    jump = jump * (seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:])
     if jump.numel() and float(jump.max()) > FLASH:
         v, t = divmod(int(jump.argmax()), jump.shape[1])
         warnings.warn(
@@ -323,20 +319,16 @@ def check_colors(scene: Scene, label: str) -> None:
         )
         return
     chosen = scene.training_cameras
-    weight = inside[chosen]
-    together = (scene.images[chosen] * weight[..., None]).sum((0, 2, 3)) / weight.sum((0, 2, 3))[
-        :, None
-    ].clamp(min=1)
-    shown = weight.sum((0, 2, 3)) > 0
+    every = count[chosen].sum(0)
+    together, shown = sums[chosen].sum(0) / every[:, None].clamp(min=1), every > 0
     if int(shown.sum()) < 2:
         return
     change = together[shown].amax(0) - together[shown].amin(0)
     if float(change.max()) > DRIFT:
         channel = int(change.argmax())
         values = torch.where(shown, together[:, channel], torch.nan)
-        first, last = (
-            int(i) for i in (values.nan_to_num(2.0).argmin(), values.nan_to_num(-1.0).argmax())
-        )
+        first = int(values.nan_to_num(2.0).argmin())
+        last = int(values.nan_to_num(-1.0).argmax())
         name = ("red", "green", "blue")[channel]
         warnings.warn(
             f"{label}: the object's mean {name} over all cameras is {float(values[first]):.2f} in frame {first} and "
@@ -349,11 +341,8 @@ def check_colors(scene: Scene, label: str) -> None:
 def check_borders(scene: Scene, label: str) -> None:
     """The first frame, which says where the object is, shows all of it to two learning cameras at least, to one of a body of known
     shape."""
-    covered = scene.mattes > 0.5
-    cut = torch.cat(
-        [covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2
-    ).any(2)
-    names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v, 0])]
+    cut = at_border(scene.mattes[:, 0]) > 0.5
+    names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v])]
     fewest = 2 if scene.body is None else 1
     if len(scene.training_cameras) - len(names) < fewest:
         raise DataError(
@@ -371,10 +360,8 @@ def check_borders(scene: Scene, label: str) -> None:
 def fingerprint(scene: Scene) -> str:
     """Hash of everything that learning can depend on: images, mattes, cameras, times, world, and what is held out."""
     digest = hashlib.sha256()
-    for tensor in (
-        scene.images, scene.mattes, scene.cameras.K, scene.cameras.w2c, scene.times, scene.gravity,
-        scene.up, scene.box, scene.background,
-    ):  # fmt: skip
+    own = scene.times, scene.gravity, scene.up, scene.box, scene.background
+    for tensor in (scene.images, scene.mattes, scene.cameras.K, scene.cameras.w2c, *own):
         digest.update(str(tuple(tensor.shape)).encode())
         digest.update(tensor.detach().cpu().contiguous().numpy())
     facts = (

@@ -6,6 +6,7 @@ import json
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -13,12 +14,14 @@ from torch import Tensor
 
 from mosa.data.images.one_size import one_size
 from mosa.errors import ConfigError, DataError
+from mosa.settings import Expected, check, such
 from mosa.types import Cameras
 
 WHITE = np.ones(3, np.float32)
 # columns 1 and 2 of a pose with OpenGL axes (y up, looks along -z) point against those of OpenCV (y down, z forward)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
+FirstLast = Annotated[list[int], Expected("[first, last]"), such(lambda v: len(v) == 2)]
 LARGEST = 1e30
 """Of a number in a file: single precision holds it."""
 
@@ -143,10 +146,7 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
     """
     if wanted is not None:
         wanted = list(wanted) if isinstance(wanted, (list, tuple)) else [wanted]
-        if len(wanted) != 2 or not all(
-            isinstance(f, int) and not isinstance(f, bool) for f in wanted
-        ):
-            raise ConfigError(f"scene.frames: expected [first, last], found {wanted}")
+        check("scene.frames", wanted, FirstLast)
         for end in wanted:
             if end not in present:
                 raise ConfigError(
@@ -164,11 +164,7 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
 
 
 def merge_time(
-    times: dict[int, tuple[float, str]],
-    frame: int,
-    time: float,
-    where: str,
-    fps: float | None = None,
+    times: dict[int, tuple[float, str]], frame: int, time: float, where: str, fps: float | None
 ) -> None:
     """Note the time of a frame, the first that is given. Errors: DataError where another camera gave the same frame a time that
     is another by more than a quarter of a frame, or, without frames per second, at all."""
@@ -181,8 +177,18 @@ def merge_time(
         )
 
 
-def even_times(times: list[float], frames: list[int], where: str, remedy: str) -> None:
+def check_rate(times: list[float], frames: list[int], fps: float | None, where: str) -> None:
+    """The times [s] of the chosen frames increase at one rate; where scene.fps takes their place, a warning if they say another.
+    Errors: DataError with the times, beginning with `where`."""
+    if fps is None:
+        even_times(times, frames, where)
+    else:
+        warn_of_other_rate(times, fps, where)
+
+
+def even_times(times: list[float], frames: list[int], where: str) -> None:
     """The times [s] of the chosen frames increase at one rate. Errors: DataError with the times, beginning with `where`."""
+    remedy = "correct them, restrict scene.frames, or set scene.fps"
     steps = np.diff(np.asarray(times, dtype=np.float64))
     listed = ", ".join(f"{t:.6g}" for t in times[:8]) + (" ..." if len(times) > 8 else "")
     if not (steps > 0).all():
@@ -210,9 +216,8 @@ def warn_of_other_rate(times: list[float], fps: float, where: str) -> None:
 
 def scaled(K: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
     """K (3, 3) [px] of images that were brought from `full` to `size`, (width, height) [px] each."""
-    K = K.astype(
-        np.float32
-    )  # as a scene keeps it: what was read before has the same bits, and so the same place in the cache
+    # as a scene keeps it: what was read before has the same bits, and so the same place in the cache
+    K = K.astype(np.float32)
     K[0] *= size[0] / full[0]
     K[1] *= size[1] / full[1]
     return K
@@ -233,33 +238,16 @@ def footage_of(
             raise DataError(
                 f"{where}: expected names of cameras of at most 100 printable characters, found {name[:60]!r}"
             )
+    K, w2c = (np.stack(part) for part in zip(*calibration.values()))
     K, stack, coverage = one_size(
-        np.stack([k for k, _ in calibration.values()]),
-        images,
-        mattes,
-        background=WHITE,
-        names=list(calibration),
-        where=where,
+        K, images, mattes, background=WHITE, names=list(calibration), where=where
     )
-    w2c = np.stack([w for _, w in calibration.values()])
-    cameras = Cameras(
-        torch.tensor(K, dtype=torch.float32),
-        torch.tensor(w2c, dtype=torch.float32),
-        coverage.shape[3],
-        coverage.shape[2],
-        tuple(calibration),
-    )
+    intrinsics, poses = (torch.tensor(part, dtype=torch.float32) for part in (K, w2c))
+    height, width = coverage.shape[2:]
+    cameras = Cameras(intrinsics, poses, width, height, tuple(calibration))
     moments = np.array(times)
-    if (
-        np.spacing(np.abs(moments).max(), dtype=np.float32)
-        > 0.1 * TIME_JITTER * np.diff(moments).min()
-    ):
+    digits = np.spacing(np.abs(moments).max(), dtype=np.float32)
+    if digits > 0.1 * TIME_JITTER * np.diff(moments).min():
         moments -= moments[0]  # seconds of a clock, which single precision does not keep
-    return Footage(
-        cameras,
-        tuple(frames),
-        torch.from_numpy(moments).float(),
-        torch.from_numpy(stack),
-        torch.from_numpy(coverage),
-        torch.ones(3),
-    )
+    seconds, pictures, shown = map(torch.from_numpy, (moments, stack, coverage))
+    return Footage(cameras, tuple(frames), seconds.float(), pictures, shown, torch.ones(3))

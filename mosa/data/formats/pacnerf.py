@@ -11,7 +11,7 @@ import numpy as np
 
 from mosa.data.formats.footage import (
     Footage,
-    even_times,
+    check_rate,
     footage_of,
     frame_range,
     matrix,
@@ -19,11 +19,10 @@ from mosa.data.formats.footage import (
     number,
     read_json,
     same_camera,
-    warn_of_other_rate,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.formats.scene_from_footage import scene_from_footage
-from mosa.data.formats.views import read_views, split_alpha
+from mosa.data.formats.views import read_views, split_alpha, three_channels
 from mosa.data.images.matting import matte_from_plate
 from mosa.data.images.reading import expect_size, read_image
 from mosa.errors import DataError
@@ -67,16 +66,10 @@ def read_pacnerf(
     calibration, times = read_listing(listing, fps)
     prefix, present = usable_frames(folder, calibration)
     numbers = frame_range([f for f in present if f in times], frames, str(folder / "data"))
-    if fps is None:
-        remedy = "correct them, restrict scene.frames, or set scene.fps"
-        even_times([times[f][0] for f in numbers], numbers, str(listing), remedy)
-    else:
-        warn_of_other_rate([times[f][0] for f in numbers], fps, str(listing))
+    moments = [times[f][0] for f in numbers]
+    check_rate(moments, numbers, fps, str(listing))
     if prefix == "r":
-        log.info(
-            "%s: raw images without mattes; matted from the background plates r_<camera>_-1.png",
-            folder,
-        )
+        log.info("%s: raw images, matted from the background plates r_<camera>_-1.png", folder)
 
     @lru_cache(maxsize=1)  # one at a time: cameras come one after the other
     def plate(camera: str) -> np.ndarray | None:
@@ -85,9 +78,7 @@ def read_pacnerf(
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / "data" / f"{prefix}_{camera}_{frame}.png",
         lambda camera, file, pixels: split(file, pixels, plate(camera)), listing.name, scale=scale, fill=fill)  # fmt: skip
-    return footage_of(
-        scaled_calibration, images, mattes, numbers, [times[f][0] for f in numbers], str(listing)
-    )
+    return footage_of(scaled_calibration, images, mattes, numbers, moments, str(listing))
 
 
 def read_listing(
@@ -140,11 +131,8 @@ def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
         if present[kind]:
             return kind, sorted(present[kind])
     if present["r"]:
-        bare = [
-            camera
-            for camera in calibration
-            if not (folder / "data" / f"r_{camera}_-1.png").is_file()
-        ]
+        plates = {camera: folder / "data" / f"r_{camera}_-1.png" for camera in calibration}
+        bare = [camera for camera, plate in plates.items() if not plate.is_file()]
         if bare:
             raise DataError(
                 f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png "
@@ -157,8 +145,7 @@ def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
 
 def read_plate(file: Path) -> np.ndarray:
     """Colour (H, W, 3) of an image without the object."""
-    pixels = read_image(file)
-    return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+    return three_channels(read_image(file))
 
 
 def split(
@@ -168,11 +155,10 @@ def split(
     plate in an r_ file."""
     if file.name.startswith("a_"):
         return split_alpha(file, pixels)
-    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+    color = three_channels(pixels)
     if plate is not None:
-        expect_size(
-            file, pixels, *plate.shape[1::-1], reason="as the background plate of its camera"
-        )
+        reason = "as the background plate of its camera"
+        expect_size(file, pixels, *plate.shape[1::-1], reason=reason)
         return matte_from_plate(color, plate)
     return color, (color.min(-1) < WHITE_LEVEL).astype(np.float32)
 

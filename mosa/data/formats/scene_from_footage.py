@@ -19,7 +19,7 @@ from mosa.data.checks.validation import check_types, fingerprint
 from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
 from mosa.errors import ConfigError, DataError
-from mosa.settings import Positive, Settings, Text, check
+from mosa.settings import Positive, Settings, Text, Three, Whole, check
 from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth
 
 DENSITIES = 0.1, 1e5
@@ -108,13 +108,9 @@ def scene_from_footage(
     """
     check_types(footage, f"scene {name} ({sequence})")
     up, pull = directions(up, gravity, ground)
-    try:
-        low, high = box
-    except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}"
-        ) from error
-    box = torch.stack([vector(low, "box"), vector(high, "box")])
+    if not isinstance(box, (list, tuple, torch.Tensor)) or len(box) != 2:
+        raise ConfigError(f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}")
+    box = torch.stack([vector(corner, "box") for corner in box])
     if not bool((box[1] > box[0]).all()):
         raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
     if float(box.abs().max()) > WIDEST:
@@ -194,17 +190,11 @@ def directions(up, gravity, ground: Ground | None) -> tuple[torch.Tensor, torch.
 
 def vector(value, key: str) -> torch.Tensor:
     """(3,) float32. Errors: ConfigError naming the key."""
-    if isinstance(value, (str, Mapping)) or (
-        isinstance(value, (list, tuple)) and any(isinstance(v, (bool, str)) for v in value)
-    ):
-        raise ConfigError(f"scene.{key}: expected three numbers, found {value!r}")
-    try:
-        result = torch.tensor([float(v) for v in value], dtype=torch.float32)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"scene.{key}: expected three numbers, found {value!r}") from error
-    if result.shape != (3,) or not bool(torch.isfinite(result).all()):
-        raise ConfigError(f"scene.{key}: expected three finite numbers, found {value!r}")
-    return result
+    value = list(value) if isinstance(value, tuple) else value
+    if isinstance(value, torch.Tensor):
+        value = value.tolist()
+    check(f"scene.{key}", value, Three)
+    return torch.tensor(value, dtype=torch.float32)
 
 
 def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> tuple[int, ...]:
@@ -213,23 +203,23 @@ def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> 
         raise ConfigError(
             f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}"
         )
-    indices = []
+    indices = set()
     for name in names or ():
         if str(name) not in footage_names:
             raise ConfigError(
                 f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}"
             )
-        indices.append(footage_names.index(str(name)))
+        indices.add(footage_names.index(str(name)))
     if len(footage_names) < fewest:
         raise ConfigError(
             f"scene: expected at least two cameras, found {len(footage_names)}; of one, say the rest shape (scene.body.shape)"
         )
-    if len(footage_names) - len(set(indices)) < fewest:
+    if len(footage_names) - len(indices) < fewest:
         raise ConfigError(
-            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from, or one "
+            f"scene.holdout_cameras: {len(indices)} of {len(footage_names)} held out; two must be left to learn from, or one "
             "of a body whose rest shape is given (scene.body.shape)"
         )
-    return tuple(sorted(set(indices)))
+    return tuple(sorted(indices))
 
 
 def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
@@ -242,9 +232,8 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
             f"scene.holdout_frames: expected a list of frame numbers or how many are held out, found {numbers!r}"
         )
     if isinstance(numbers, int):
-        if numbers < 0:
-            raise ConfigError(f"scene.holdout_frames: expected a number >= 0, found {numbers}")
-        numbers = frames[len(frames) - numbers :] if 0 <= numbers <= len(frames) else frames
+        check("scene.holdout_frames", numbers, Whole)
+        numbers = frames[max(0, len(frames) - numbers) :]
     indices = set()
     for number in numbers or ():
         if number not in frames:

@@ -9,13 +9,12 @@ import numpy as np
 
 from mosa.data.formats.footage import (
     Footage,
-    even_times,
+    check_rate,
     footage_of,
     frame_range,
     matrix,
     number,
     read_json,
-    warn_of_other_rate,
     world_to_camera,
 )
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -54,18 +53,12 @@ def read_spring_gaus(
             "scene.frames"
         )
     chosen = [times[frame] for frame in numbers]
-    if fps is None:
-        even_times(
-            chosen, numbers, listing, "correct them, restrict scene.frames, or set scene.fps"
-        )
-    else:
-        warn_of_other_rate(chosen, fps, listing)
+    check_rate(chosen, numbers, fps, listing)
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / camera / f"{frame:03}.png",
         lambda _, file, pixels: split_alpha(file, pixels), "camera.json", scale=scale, fill=fill)  # fmt: skip
-    return footage_of(
-        scaled_calibration, images, mattes, numbers, chosen, str(folder / "camera.json")
-    )
+    where = str(folder / "camera.json")
+    return footage_of(scaled_calibration, images, mattes, numbers, chosen, where)
 
 
 def pictures(folder: Path) -> list[Path]:

@@ -41,6 +41,7 @@ from mosa.types import Scene
 
 LONGEST = 1000
 """Characters of a path: a file system takes 4096 bytes, of names of 255 each."""
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 JITTER = 0.01
 """By how much poses of a camera that stands still may differ: radians, and shares of the cameras' distance from their middle. Where
@@ -62,6 +63,11 @@ class Shot:
     w2c: np.ndarray
     camera: str | None
     fisheye: bool = False
+
+    @property
+    def place(self) -> np.ndarray:
+        """(3,) in the world."""
+        return -self.w2c[:3, :3].T @ self.w2c[:3, 3]
 
 
 def read_transforms(
@@ -86,8 +92,7 @@ def read_transforms(
     if fps is not None and all(entry.get("time") is not None for entry in document["frames"]):
         warn_of_other_rate([times[f] for f in wanted], fps, str(file))
         times = [i / fps for i in range(len(times))]
-    remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
-    even_times([times[f] for f in wanted], wanted, str(file), remedy)
+    even_times([times[f] for f in wanted], wanted, str(file))
     images, mattes, calibration = [], [], {}
     for (name, shot), row in zip(cameras.items(), table):
         pictures, lens, cut, full = [], None, 0.0, None
@@ -139,9 +144,8 @@ def shot_of(where: str, entry: dict, document: dict) -> Shot:
             f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
             "rational or thin prism model; undistort the images first"
         )
-    intrinsics = {
-        k: number(both[k], f"{where}, {k}") for k in intrinsic_keys() if both.get(k) is not None
-    }
+    given = {key: both[key] for key in INTRINSICS if both.get(key) is not None}
+    intrinsics = {key: number(value, f"{where}, {key}") for key, value in given.items()}
     fisheye = is_fisheye(both.get("camera_model"), both.get("is_fisheye"), where)
     pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
     time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
@@ -163,10 +167,6 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
         time = counted_time(image, fps, where, counting) if shot.time is None else shot.time
         shots.append(replace(shot, image=image, mask=mask, time=time))
     return shots
-
-
-def intrinsic_keys() -> tuple[str, ...]:
-    return ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
 
 
 def locate(folder: Path, name: str, where: str) -> Path:
@@ -212,18 +212,14 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
             for n, (s, *_) in members.items()
             if s.camera is None and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
         )
-        members.setdefault(
-            next(same, str(len(members))) if shot.camera is None else shot.camera, []
-        ).append(shot)
-    places = np.array([-s.w2c[:3, :3].T @ s.w2c[:3, 3] for s in shots])
+        name = next(same, str(len(members))) if shot.camera is None else shot.camera
+        members.setdefault(name, []).append(shot)
+    places = np.array([shot.place for shot in shots])
     spread = float(np.linalg.norm(places - places.mean(0), axis=1).max()) or 1.0
 
     def apart(a: Shot, b: Shot) -> float:
-        turn, way = (
-            a.w2c[:3, :3] - b.w2c[:3, :3],
-            a.w2c[:3, :3].T @ a.w2c[:3, 3] - b.w2c[:3, :3].T @ b.w2c[:3, 3],
-        )
-        return max(float(np.abs(turn).max()), float(np.linalg.norm(way)) / spread)
+        turn = float(np.abs(a.w2c[:3, :3] - b.w2c[:3, :3]).max())
+        return max(turn, float(np.linalg.norm(a.place - b.place)) / spread)
 
     if len(shots) > 2 and len(members) == len(shots):
         close = sum(any(apart(a, b) < JITTER for b in shots if b is not a) for a in shots)
@@ -239,13 +235,11 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
         )
     for name, (known, *others) in members.items():
         for shot in others:
-            if key := next(
-                (k for k in intrinsic_keys() if known.intrinsics.get(k) != shot.intrinsics.get(k)),
-                None,
-            ):
+            a, b = known.intrinsics, shot.intrinsics
+            for key in (k for k in INTRINSICS if a.get(k) != b.get(k)):
                 raise DataError(
-                    f"{shot.where}: camera {name} has {key} = {shot.intrinsics.get(key)}, {known.intrinsics.get(key)} "
-                    f"in {known.where}: expected one lens, focus and zoom a camera; write one set in all its entries"
+                    f"{shot.where}: camera {name} has {key} = {b.get(key)}, {a.get(key)} in {known.where}: expected one "
+                    "lens, focus and zoom a camera; write one set in all its entries"
                 )
         off, where = max(((apart(known, shot), shot.where) for shot in others), default=(0.0, ""))
         found = (
@@ -259,11 +253,12 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
                 f"{found}: solved for each image? The pose nearest to the mean is taken for all",
                 stacklevel=4,
             )
-    middle = {name: np.mean([shot.w2c for shot in own], 0) for name, own in members.items()}
-    return {
-        name: min(own, key=lambda shot: float(np.abs(shot.w2c - middle[name]).sum()))
-        for name, own in members.items()
-    }, members
+    chosen = {}
+    for name, own in members.items():
+        middle = np.mean([shot.w2c for shot in own], 0)
+        off = [float(np.abs(shot.w2c - middle).sum()) for shot in own]
+        chosen[name] = own[int(np.argmin(off))]
+    return chosen, members
 
 
 def synchronise(
@@ -316,11 +311,7 @@ def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     pixels = read_image(shot.image)
     if shot.mask is not None:
         return split_mask(shot.image, pixels, shot.mask)
-    if pixels.shape[2] != 4:
-        raise DataError(
-            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
-        )
-    return split_alpha(shot.image, pixels)
+    return split_alpha(shot.image, pixels, f" or a mask_path in {shot.where}")
 
 
 def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
@@ -343,13 +334,9 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
         raise DataError(
             f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither"
         )
-    return np.array(
-        [
-            [focal[0], 0, known.get("cx", width / 2)],
-            [0, focal[1], known.get("cy", height / 2)],
-            [0, 0, 1],
-        ]
-    )
+    K = np.diag([*focal, 1.0])
+    K[:2, 2] = known.get("cx", width / 2), known.get("cy", height / 2)
+    return K
 
 
 def load_transforms(

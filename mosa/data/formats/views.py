@@ -65,11 +65,12 @@ def read_views(
     return scaled_calibration, images, mattes
 
 
-def split_alpha(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour (H, W, 3) and matte (H, W) of RGBA with the matte as alpha. Errors: DataError for other channels, a faint matte."""
+def split_alpha(path: Path, pixels: np.ndarray, more: str = "") -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W) of RGBA with the matte as alpha; more: what else would do. Errors: DataError for other
+    channels, a faint matte."""
     if pixels.shape[2] != 4:
         raise DataError(
-            f"{path}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels"
+            f"{path}: expected RGBA with the matte as alpha{more}, found {pixels.shape[2]} channels"
         )
     return pixels[..., :3], faintless(path, np.ascontiguousarray(pixels[..., 3]))
 
@@ -78,5 +79,9 @@ def split_mask(picture: Path, pixels: np.ndarray, mask: Path) -> tuple[np.ndarra
     """Colour (H, W, 3) of a picture's pixels and matte (H, W) of its mask, white = object. Errors: DataError."""
     found = read_image(mask)
     expect_size(mask, found, *pixels.shape[1::-1], reason=f"as {picture.name}")
-    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
-    return color, matte_of(mask, found)
+    return three_channels(pixels), matte_of(mask, found)
+
+
+def three_channels(pixels: np.ndarray) -> np.ndarray:
+    """Colour (H, W, 3) of a picture of 1, 3 or 4 channels."""
+    return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))

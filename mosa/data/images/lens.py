@@ -47,13 +47,12 @@ class Lens:
         cut off; they would leave 2 % of a colour where there is no matte.
         """
         x, y = self.places[..., 0], self.places[..., 1]
-        behind = tuple(float(c) for c in background)
-        seen = cv2.remap(
-            picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=behind
-        ).clip(0, 1)
-        matte = cv2.remap(
-            matte, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0
-        ).clip(0, 1)
+
+        def seen_by(image: np.ndarray, behind) -> np.ndarray:
+            around = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": behind}
+            return cv2.remap(image, x, y, cv2.INTER_CUBIC, **around).clip(0, 1)
+
+        seen, matte = seen_by(picture, tuple(map(float, background))), seen_by(matte, 0.0)
         return np.where(matte[..., None] > 0, seen, background), matte
 
     def lost(self, matte: np.ndarray) -> float:

@@ -43,31 +43,21 @@ def one_size(
         for v, (images_, mattes_) in enumerate(zip(images, mattes)):
             height, width = sizes[v]
             factor = (fewest / (height * width)) ** 0.5
-            size = (
-                (round(width * factor), round(height * factor))
-                if factor**2 < 1 / FINER
-                else (width, height)
-            )
+            factor = factor if factor**2 < 1 / FINER else 1.0
+            size = round(width * factor), round(height * factor)
             images[v] = np.stack([resize(image, *size) for image in images_])
             mattes[v] = np.stack([resize(matte, *size) for matte in mattes_])
             K[v, 0] *= size[0] / width
             K[v, 1] *= size[1] / height
         height, width = (max(matte.shape[axis] for matte in mattes) for axis in (1, 2))
         for v, name in enumerate(names):
-            down, right = place(mattes[v], (height, width), f"{where}: camera {name}")
-            images[v], mattes[v] = surround(
-                images[v], mattes[v], (height, width), (down, right), background
-            )
+            size = height, width
+            down, right = start = place(mattes[v], size, f"{where}: camera {name}")
+            images[v], mattes[v] = surround(images[v], mattes[v], size, start, background)
             K[v, 0, 2] += right
             K[v, 1, 2] += down
         said = ", ".join(f"{name} {w}x{h}" for name, (h, w) in zip(names, sizes))
-        log.info(
-            "%s: cameras of different image sizes (px: %s), brought to %dx%d px",
-            where,
-            said,
-            width,
-            height,
-        )
+        log.info("%s: images of %s px, brought to %dx%d px", where, said, width, height)
     return K, np.stack(images), np.stack(mattes)
 
 
@@ -92,12 +82,8 @@ def place(mattes: np.ndarray, size: tuple[int, int], label: str) -> tuple[int, i
 
 
 def surround(
-    images: np.ndarray,
-    mattes: np.ndarray,
-    size: tuple[int, int],
-    start: tuple[int, int],
-    background: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    images: np.ndarray, mattes: np.ndarray, size: tuple[int, int], start: tuple[int, int], background: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Images (T, h, w, 3) and mattes (T, h, w) as parts, from row and column `start`, of (height, width) `size` images."""
     frames, height, width = mattes.shape
     if (height, width) == size:

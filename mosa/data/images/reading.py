@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Gt, Le
 from PIL import Image
 
 from mosa.errors import ConfigError, DataError
+from mosa.settings import Whole, check
 from mosa.system.limits import counted
 from mosa.system.ply import named
 
@@ -74,10 +77,8 @@ def matte_of(path: Path, pixels: np.ndarray) -> np.ndarray:
             f"{path}: expected a grey mask, white = object, found an alpha channel that differs over the picture; "
             "write it as the mask, or leave mask_path out where the image itself has that alpha"
         )
-    if (
-        pixels.shape[2] >= 3
-        and float((pixels[..., :3].max(-1) - pixels[..., :3].min(-1)).max()) > GREY
-    ):
+    channels = pixels[..., : min(3, pixels.shape[2])]
+    if float(np.ptp(channels, axis=-1).max()) > GREY:
         raise DataError(
             f"{path}: expected a grey mask, white = object, found colours (a label's palette, or the picture itself); "
             "write white where the object is"
@@ -115,12 +116,8 @@ def check_pixels(path: Path) -> None:
 def check_amount(pictures: int, width: int, height: int) -> None:
     """Errors: ConfigError where that many pictures with mattes, of that size, do not fit into this machine's memory."""
     # colours and matte in single precision, and once more while they are put together
-    counted(
-        "scene.scale: pixels of all pictures",
-        (pictures, width, height),
-        "lower it, or restrict scene.frames",
-        each=16,
-    )
+    where, remedy = "scene.scale: pixels of all pictures", "lower it, or restrict scene.frames"
+    counted(where, (pictures, width, height), remedy, each=16)
 
 
 def plain_mode(picture: Image.Image) -> str:
@@ -134,12 +131,7 @@ def deep_png(path: Path) -> np.ndarray | None:
     """Pixels of a colour PNG with 16 bits per channel, which Pillow would cut to 8; None for any other file."""
     with path.open("rb") as file:
         header = file.read(26)
-    if (
-        header[:8] != b"\x89PNG\r\n\x1a\n"
-        or len(header) < 26
-        or header[24] != 16
-        or header[25] not in (2, 6)
-    ):
+    if header[:8] != b"\x89PNG\r\n\x1a\n" or header[24:26] not in (b"\x10\x02", b"\x10\x06"):
         return None
     with Image.open(path) as picture:
         picture.load()  # OpenCV fills the rest of a truncated file with black, Pillow says so
@@ -154,10 +146,7 @@ def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
 
     Errors: ConfigError for a size that is none.
     """
-    if isinstance(largest, bool) or not isinstance(largest, int) or largest < 0:
-        raise ConfigError(
-            f"scene.fill_holes: expected a number of pixels, 0 or more, found {largest!r}"
-        )
+    check("scene.fill_holes", largest, Whole)
     if largest == 0:
         return matte
     labels, areas = enclosed_holes(matte)
@@ -192,8 +181,7 @@ def composite(color: np.ndarray, matte: np.ndarray, background: np.ndarray) -> n
 
 def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
     """Size [px] of a scaled image. Errors: ConfigError for a scale outside (0, 1] or one that leaves under 16 px."""
-    if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale <= 1:
-        raise ConfigError(f"scene.scale: expected a number in (0, 1], found {scale!r}")
+    check("scene.scale", scale, Annotated[float, Gt(0), Le(1)])
     size = round(width * scale), round(height * scale)
     if min(size) < 16:
         raise ConfigError(

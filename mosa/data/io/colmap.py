@@ -67,24 +67,15 @@ class Camera:
         seen = points @ self.w2c[:3, :3].T + self.w2c[:3, 3]
         if not self.fisheye and not any(self.coefficients.values()):
             return (seen @ self.K.T)[:, :2] / seen[:, 2:]
-        none, K, shape = np.zeros(3), self.opencv_K(), (-1, 1, 3)
-        found = (
-            cv2.fisheye.projectPoints(seen.reshape(shape), none, none, K, self.lens())
-            if self.fisheye
-            else cv2.projectPoints(seen.reshape(shape), none, none, K, self.lens())
-        )[0]
-        return found.reshape(-1, 2) + HALF
+        none, lens = np.zeros(3), cv2.fisheye if self.fisheye else cv2
+        found = lens.projectPoints(seen.reshape(-1, 1, 3), none, none, self.opencv_K(), self.lens())
+        return found[0].reshape(-1, 2) + HALF
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions (N, 3) in the world of what pixels (N, 2) show."""
-        K, shape = self.opencv_K(), (-1, 1, 2)
-        flat = np.asarray(pixels, np.float64).reshape(shape) - HALF
-        flat = (
-            cv2.fisheye.undistortPoints(flat, K, self.lens())
-            if self.fisheye
-            else cv2.undistortPoints(flat, K, self.lens())
-        )
-        flat = flat.reshape(-1, 2)
+        flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2) - HALF
+        lens = cv2.fisheye if self.fisheye else cv2
+        flat = lens.undistortPoints(flat, self.opencv_K(), self.lens()).reshape(-1, 2)
         rays = np.concatenate([flat, np.ones((len(flat), 1))], 1) @ self.w2c[:3, :3]
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
@@ -153,9 +144,8 @@ def intrinsics(model: str, width: int, height: int, values: list[float], where: 
         )
     given = dict(zip(names, values))
     fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
-    if not (
-        np.isfinite(values).all() and fx > 0 and fy > 0 and 0 < width < 1e5 and 0 < height < 1e5
-    ):
+    sized = 0 < width < 1e5 and 0 < height < 1e5
+    if not (np.isfinite(values).all() and fx > 0 and fy > 0 and sized):
         raise DataError(
             f"{where}: expected positive focal lengths and sizes, found {given} for {width}x{height} px"
         )
@@ -270,9 +260,8 @@ def read_points(folder: Path) -> np.ndarray:
                 f"{binary}: expected points of a COLMAP model, found a damaged file ({error}); export it again"
             ) from error
     elif text.is_file():
-        found = [
-            point(line.split(maxsplit=4), f"{text}, line {i}") for i, line in lines_of(text) if line
-        ]
+        lines = [(line.split(maxsplit=4), i) for i, line in lines_of(text) if line]
+        found = [point(words, f"{text}, line {i}") for words, i in lines]
     else:
         return np.zeros((0, 3))
     points = np.array(found, float).reshape(-1, 3)

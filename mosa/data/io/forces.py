@@ -65,9 +65,7 @@ class ForceCurve:
         place = ends.clamp(float(self.times[0]), float(self.times[-1]))
         at = torch.searchsorted(self.times, place, right=True).clamp(1, len(self.times) - 1)
         since = (place - self.times[at - 1])[:, None]
-        slope = (self.forces[at] - self.forces[at - 1]) / (self.times[at] - self.times[at - 1])[
-            :, None
-        ]
+        slope = (self.forces.diff(dim=0) / self.times.diff()[:, None])[at - 1]
         impulse = passed[at - 1] + since * (self.forces[at - 1] + 0.5 * since * slope)
         mean = impulse.diff(dim=0) / frame_dt
         slack = 1e-6 * frame_dt
@@ -82,15 +80,15 @@ class ForceCurve:
 
 
 def forces_from_config(
-    items: Sequence[Mapping[str, Any]] | None, field_name: str = "world.forces"
+    items: Sequence[Mapping[str, Any]] | None,
 ) -> tuple[ForceCurve, ...]:
     """Of entries {of: name of a collider or driven set, file: csv, sd [N]}.
 
     Columns of the file: time [s], fx, fy, fz [N].
     A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
     entry, DataError the file."""
-    check(field_name, items, Entries | None)
-    read = [Measured.read(item, f"{field_name}[{i}]") for i, item in enumerate(items or ())]
+    check("world.forces", items, Entries | None)
+    read = [Measured.read(item, f"world.forces[{i}]") for i, item in enumerate(items or ())]
     return tuple(read_forces(Path(each.file), each.of, each.sd) for each in read)
 
 

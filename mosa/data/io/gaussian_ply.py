@@ -53,14 +53,13 @@ def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = Non
         coefficients = constant_coefficients(splats.colors)
     degree_of(coefficients)
     rest = coefficients[:, 1:].transpose(1, 2).flatten(1)
+    opacities = splats.opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     columns = {
         AXES: splats.means,
         ("nx", "ny", "nz"): torch.zeros_like(splats.means),
         CONSTANT: coefficients[:, 0],
         tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
-        ("opacity",): torch.logit(splats.opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))[
-            :, None
-        ],
+        ("opacity",): torch.logit(opacities)[:, None],
         SCALES: splats.scales.clamp(min=SMALLEST).log(),
         ROTATIONS: splats.rotations,
     }
@@ -123,20 +122,14 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
                     f"{'a point cloud or mesh' if 'scale_0' not in vertices else 'another layout'} cannot be used; "
                     "train 3DGS on its images and give the PLY that it writes"
                 )
-        columns = [
-            _finite(np.asarray(vertices[name], dtype=np.float32), name, path, "found")
-            for name in fields
-        ]
-        return (
-            torch.from_numpy(np.stack(columns, -1))
-            if columns
-            else torch.empty(len(vertices["x"]), 0)
-        )
+        columns = np.empty((len(vertices["x"]), len(fields)), np.float32)
+        for column, name in zip(columns.T, fields):
+            column[:] = _finite(np.asarray(vertices[name], np.float32), name, path, "found")
+        return torch.from_numpy(columns)
 
     read(AXES)  # all there, and finite
-    places = torch.from_numpy(
-        np.stack([np.asarray(vertices[name], np.float64) for name in AXES], -1)
-    )
+    axes = [np.asarray(vertices[name], np.float64) for name in AXES]
+    places = torch.from_numpy(np.stack(axes, -1))
     if len(places) == 0:
         raise DataError(f"{path}: expected Gaussians, found none")
     middle, (low, high) = places.median(0).values, np.quantile(places.numpy(), [0.05, 0.95], axis=0)
@@ -149,12 +142,8 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) or extent or 1.0
         if abs(math.log(logs.median() / apart)) < abs(logs.median() - math.log(apart)):
             odd, scales = ["scales as lengths, not their logarithms"], logs
-    opacities, span = torch.sigmoid(opacity), float(opacity.max() - opacity.min())
-    if (
-        float(opacity.min()) >= 0
-        and float(opacity.max()) <= 1
-        and (span > SPREAD or float(opacity.max()) == 1)
-    ):
+    opacities, least, most = torch.sigmoid(opacity), float(opacity.min()), float(opacity.max())
+    if least >= 0 and most <= 1 and (float(opacity.max() - opacity.min()) > SPREAD or most == 1):
         odd, opacities = [*odd, "opacities as they are, not their logits"], opacity
     if odd:
         warnings.warn(f"{path}: read with {' and '.join(odd)}, as its numbers are", stacklevel=3)
@@ -170,11 +159,8 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         raise DataError(
             f"{path}: field rot_*: expected quaternions, found zero at vertex {int(length.argmin())}"
         )
-    higher = (
-        read(tuple(f"f_rest_{i}" for i in range(len(rest))))
-        .view(len(means), 3, per_channel)
-        .transpose(1, 2)
-    )
+    higher = read(tuple(f"f_rest_{i}" for i in range(len(rest))))
+    higher = higher.view(len(means), 3, per_channel).transpose(1, 2)
     coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)
     colors = mean_colors(coefficients)
     said = " ".join(document.comments).lower().partition("vertical axis:")[2].split()[:1]

@@ -246,9 +246,8 @@ def swung(times: np.ndarray, positions: np.ndarray, where: str) -> float:
             f"{where}: expected two periods and more of an oscillation after the release at "
             f"{begin:.3f} s, found fewer; set scene.start=auto, or [s]"
         )
-    fit = least_squares(
-        lambda p: model(p, t[kept]) - y[kept], [y.mean(), omega, 0.03, -y.mean(), 0.0]
-    ).x
+    start = [y.mean(), omega, 0.03, -y.mean(), 0.0]
+    fit = least_squares(lambda p: model(p, t[kept]) - y[kept], start).x
     # the slope vanishes where tan(phase) = (b - ratio a)/(a + ratio b)
     a, b, ratio = fit[3], fit[4], fit[2]
     turn = np.arctan((b - ratio * a) / (a + ratio * b)) / fit[1]

@@ -65,11 +65,9 @@ def splats_at(shown: Seen, frame: int, turn: Tensor | None = None) -> Appearance
     """The Gaussians of a frame in the world's axes, or turned from them by `turn` (3, 3), in that
     frame's light, on the CPU."""
     turn = torch.eye(3).to(shown.means) if turn is None else turn.to(shown.means)
-    harmonics = (
-        shown.harmonics
-        if shown.rotations is None
-        else rotated(shown.harmonics, turn @ shown.rotations[frame])
-    )
+    harmonics = shown.harmonics
+    if shown.rotations is not None:
+        harmonics = rotated(harmonics, turn @ shown.rotations[frame])
     if shown.shades is not None:
         shade = shown.shades[frame][:, None, None]
         harmonics = harmonics * shade
@@ -116,9 +114,8 @@ def save_usd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
     unfinished = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
     unfinished.unlink(missing_ok=True)
     stage = Usd.Stage.CreateNew(str(unfinished))
-    UsdGeom.SetStageUpAxis(
-        stage, UsdGeom.Tokens.z if int(up.abs().argmax()) == 2 else UsdGeom.Tokens.y
-    )
+    z_up, axes = int(up.abs().argmax()) == 2, UsdGeom.Tokens
+    UsdGeom.SetStageUpAxis(stage, axes.z if z_up else axes.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)
@@ -133,20 +130,17 @@ def save_usd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
         splats = frame.splats
         if t == 0:
             field.GetRadianceSphericalHarmonicsDegreeAttr().Set(degree_of(frame.harmonics))
-            field.GetOpacitiesAttr().Set(
-                Vt.FloatArray.FromNumpy(splats.opacities.contiguous().numpy())
-            )
+            opacities = splats.opacities.contiguous().numpy()
+            field.GetOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(opacities))
         stage.SetEndTimeCode(t)
         field.GetPositionsAttr().Set(vectors(splats.means), t)
         field.GetScalesAttr().Set(vectors(splats.scales), t)
-        field.GetOrientationsAttr().Set(
-            Vt.QuatfArray([Gf.Quatf(*q) for q in splats.rotations.tolist()]), t
-        )
+        turns = [Gf.Quatf(*q) for q in splats.rotations.tolist()]
+        field.GetOrientationsAttr().Set(Vt.QuatfArray(turns), t)
         field.GetRadianceSphericalHarmonicsCoefficientsAttr().Set(vectors(frame.harmonics), t)
         reach = 3 * splats.scales.amax()
-        field.GetExtentAttr().Set(
-            vectors(torch.stack([splats.means.amin(0) - reach, splats.means.amax(0) + reach])), t
-        )
+        corners = splats.means.amin(0) - reach, splats.means.amax(0) + reach
+        field.GetExtentAttr().Set(vectors(torch.stack(corners)), t)
     stage.Save()
     with written_whole(path) as partial:
         os.replace(unfinished, partial)
@@ -225,10 +219,6 @@ def save_frames(
             pass
     for name, write in (("usdc", save_usd), ("rrd", save_rrd)):
         if name[:3] in formats:
-            write(
-                folder / f"splats.{name}",
-                (splats_at(shown, t) for t in range(count)),
-                rate=rate,
-                up=up,
-            )
+            frames = (splats_at(shown, t) for t in range(count))
+            write(folder / f"splats.{name}", frames, rate=rate, up=up)
     return folder

@@ -14,6 +14,7 @@ from mosa.data.synthetic.drop import GRAVITY
 from mosa.data.synthetic.films import cameras_of, make, pictures_to_footage
 from mosa.errors import ConfigError
 from mosa.rendering.cameras import scale_cameras
+from mosa.settings import Whole, check
 from mosa.types import Ground, Scene, Truth
 
 BOX = ((-0.7, -0.1, -0.7), (0.7, 1.0, 0.7))
@@ -46,8 +47,7 @@ def load_builtin(
 
     Errors: ConfigError naming the key.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigError(f"scene.seed: expected an integer >= 0, found {seed!r}")
+    check("scene.seed", seed, Whole)
     body = object_named(name)
     film, hidden = body.footage, body.material.variant(material)
     size = scaled_size(film.size, film.size, scale)
@@ -58,27 +58,14 @@ def load_builtin(
         raise ConfigError(
             f"scene.frames: built-in sequences start at frame 0, where their pose is known; found {list(frames)}"
         )
-    footage = Footage(
-        scale_cameras(cameras_of(body, seed), scale),
-        tuple(chosen),
-        torch.tensor(chosen) / film.fps,
-        images,
-        mattes,
-        torch.ones(3),
-    )
-    tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
-    truth = Truth(
-        tensor(take.rest),
-        tensor(take.positions[chosen]),
-        tensor(take.rotation),
-        tensor(take.velocity),
-        hidden.summary(),
-    )
-    box = (
-        BOX
-        if body.reach is None
-        else ((-body.reach, BOX[0][1], -body.reach), (body.reach, BOX[1][1], body.reach))
-    )
+    cameras, times = scale_cameras(cameras_of(body, seed), scale), torch.tensor(chosen) / film.fps
+    footage = Footage(cameras, tuple(chosen), times, images, mattes, torch.ones(3))
+    known = take.rest, take.positions[chosen], take.rotation, take.velocity
+    rest, positions, rotation, velocity = (torch.tensor(a, dtype=torch.float32) for a in known)
+    truth = Truth(rest, positions, rotation, velocity, hidden.summary())
+    reach, box = body.reach, BOX
+    if reach is not None:
+        box = ((-reach, BOX[0][1], -reach), (reach, BOX[1][1], reach))
     meeting = body.meeting
     ground = Ground(meeting.stated, meeting.mode, meeting.friction)
     return scene_from_footage(

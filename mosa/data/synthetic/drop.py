@@ -49,33 +49,19 @@ def simulate(
 ) -> Fall:  # fmt: skip
     """Particles (N, 3) of the shape's frame through a drop; surface: (M, 3) points of the shape's frame."""
     center = particles.mean(0)
-    center[[0, 2]] = (
-        0.0  # turned about an axis through the shape's own origin: offsets stay what the drop says
-    )
+    center[[0, 2]] = 0.0  # turned about an axis through the shape's own origin: offsets stay
     rest, _ = place(particles, center, training, surface)
     start, _ = place(particles, center, drop, surface)
     frame_dt, dx = 1 / body.footage.fps, body.dx
     reach = drop.speed + 9.8 * frame_dt * body.footage.frames
     substeps = required_substeps(
-        material.wave_modulus(),
-        material.density,
-        frame_dt,
-        dx,
-        v_max=reach,
-        courant=COURANT,
-        limit=5000,
+        material.wave_modulus(), material.density, frame_dt, dx, v_max=reach, courant=COURANT, limit=5000,
         viscosity=material.viscosity(),
-    )
+    )  # fmt: skip
     simulator = Simulator(
-        material.law,
-        dx=dx,
-        substeps=substeps,
-        frame_dt=frame_dt,
-        gravity=GRAVITY,
-        ground=Ground(0.0, body.meeting.mode, body.meeting.friction),
-        up=(0.0, 1.0, 0.0),
-        options=material.options,
-    )
+        material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, up=(0.0, 1.0, 0.0),
+        ground=Ground(0.0, body.meeting.mode, body.meeting.friction), options=material.options,
+    )  # fmt: skip
     velocity = np.array([0.0, -drop.speed, 0.0])
     n = len(particles)
     lift = np.array([0.0, body.meeting.lift * dx, 0.0])
@@ -83,17 +69,12 @@ def simulate(
     F = tensor(drop.rotation).expand(n, 3, 3).contiguous()
     # velocities half a substep early: symplectic Euler then follows the parabola exactly
     early = tensor(velocity) - 0.5 * frame_dt / substeps * tensor(GRAVITY)
-    state = ParticleState(
-        tensor(start + lift), early.expand(n, 3).contiguous(), torch.zeros(n, 3, 3), F, F
+    x, v = tensor(start + lift), early.expand(n, 3).contiguous()
+    state, volume = (
+        ParticleState(x, v, torch.zeros(n, 3, 3), F, F),
+        torch.full((n,), body.spacing**3),
     )
-    volume = torch.full((n,), body.spacing**3)
+    given = material.parameters(tensor(rest)), volume, material.density, body.footage.frames
     with torch.no_grad():
-        rollout = simulator.rollout(
-            state,
-            material.parameters(tensor(rest)),
-            volume,
-            material.density,
-            body.footage.frames,
-            progress=progress,
-        )
+        rollout = simulator.rollout(state, *given, progress=progress)
     return Fall(rest, rollout.x.double().numpy() - lift, drop.rotation, velocity, substeps)

@@ -129,48 +129,28 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
     film = body.footage
     surface, particles, skin = built(body.shape, body.pitch, body.spacing, seed)
     label = f"{name}/{sequence} (synthetic, {material})"
-    with tqdm(
-        total=film.frames - 1,
-        desc=f"{label}: simulate",
-        unit="frame",
-        disable=not progress,
-        dynamic_ncols=True,
-    ) as bar:
+    how = {"unit": "frame", "disable": not progress, "dynamic_ncols": True}
+    with tqdm(total=film.frames - 1, desc=f"{label}: simulate", **how) as bar:
         fall = simulate(
             body, body.material.variant(material), particles, surface.vertices, drop, body.drops["train"],
             progress=lambda frame: bar.update(),
         )  # fmt: skip
     cameras = cameras_of(body, seed)
-    # as the surface's
-    paint = (
-        SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1]))
-        if body.remesh
-        else None
-    )
 
     def film_at(x: np.ndarray) -> np.ndarray:
         if not body.remesh:
             return render_surface(surface, skin.follow(x), cameras)
+        # painted as the surface
+        paint = SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1]))
         found = flowing_surface(x, paint, body.spacing, body.pitch)
         return render_surface(found, found.vertices, cameras)
 
-    film_frame = threaded(film_at, fall.positions)
-    with tqdm(
-        total=film.frames,
-        desc=f"{label}: film",
-        unit="frame",
-        disable=not progress,
-        dynamic_ncols=True,
-    ) as bar:
-        pictures = []
-        for picture in film_frame:
-            pictures.append(picture)
-            bar.update()
+    films = threaded(film_at, fall.positions)
+    pictures = list(tqdm(films, total=film.frames, desc=f"{label}: film", **how))
     chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])
     return Film(
         np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32),
-        fall.rotation,
-        fall.velocity,
+        fall.rotation, fall.velocity,
     )  # fmt: skip
 
 
@@ -181,13 +161,9 @@ def read_film(file: Path) -> Film | None:
     try:
         stored = read_npz(file)
         take = Film(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
-        shapes = take.pictures.shape[1:2] + take.rest.shape, take.positions.shape
-        if (
-            take.pictures.ndim != 5
-            or shapes[0] != shapes[1]
-            or take.rotation.shape != (3, 3)
-            or take.velocity.shape != (3,)
-        ):
+        points = take.pictures.shape[1:2] + take.rest.shape
+        found = take.pictures.ndim, take.positions.shape, take.rotation.shape, take.velocity.shape
+        if found != (5, points, (3, 3), (3,)):
             raise DataError(f"{file}: not a film of a built-in scene")
         return take
     except (DataError, KeyError) as error:
@@ -207,10 +183,8 @@ def pictures_to_footage(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
     V, T, H, W = pictures.shape[:4]
-    images, mattes = (
-        np.empty((V, T, size[1], size[0], 3), np.float32),
-        np.empty((V, T, size[1], size[0]), np.float32),
-    )
+    mattes = np.empty((V, T, size[1], size[0]), np.float32)
+    images = np.empty((*mattes.shape, 3), np.float32)
 
     def convert(index: tuple[int, int]) -> None:
         alpha = pictures[*index, ..., 3]

@@ -51,27 +51,15 @@ def window(
 
 
 def ring_of_cameras(
-    count: int,
-    size: int,
-    *,
-    target,
-    distance: float,
-    elevations: tuple[float, ...],
-    field: float,
-    turn: float,
-) -> Cameras:
+    count: int, size: int, *, target, distance: float, elevations: tuple[float, ...], field: float, turn: float,
+) -> Cameras:  # fmt: skip
     """Cameras around a target, looking at it, at elevations [rad] that take turns. field: half width seen at the target [m];
     turn: azimuth of the first one [rad]."""
     K, w2c = [], []
     for i in range(count):
         azimuth, elevation = turn + 2 * np.pi * i / count, elevations[i % len(elevations)]
-        back = np.array(
-            [
-                np.cos(azimuth) * np.cos(elevation),
-                np.sin(elevation),
-                np.sin(azimuth) * np.cos(elevation),
-            ]
-        )
+        flat = np.cos(elevation)
+        back = np.array([np.cos(azimuth) * flat, np.sin(elevation), np.sin(azimuth) * flat])
         right = np.cross(-back, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         pose = np.eye(4)

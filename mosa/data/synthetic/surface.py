@@ -13,6 +13,8 @@ from mosa.data.synthetic.bodies.parts import Shape
 from mosa.system.warp_start import start_warp
 
 start_warp()
+NEIGHBOURS = 32
+"""Particles that a point of the surface follows."""
 
 
 @dataclass(frozen=True)
@@ -35,37 +37,32 @@ def extract_surface(shape: Shape, pitch: float, rng: np.random.Generator) -> Sur
     )
     vertices = vertices.numpy().astype(np.float64) * pitch + low
     gradient = level_gradient(shape, vertices)
-    vertices -= (
-        shape.distance(vertices)[:, None]
-        * gradient
-        / np.maximum((gradient**2).sum(-1, keepdims=True), 0.25)
-    )
+    squared = np.maximum((gradient**2).sum(-1, keepdims=True), 0.25)
+    vertices -= shape.distance(vertices)[:, None] * gradient / squared
     triangles = indices.numpy().reshape(-1, 3).astype(np.int32)
-    corner = vertices[triangles]
-    facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    facing = areas(vertices, triangles)
     if (facing * gradient[triangles[:, 0]]).sum() < 0:
         triangles = np.ascontiguousarray(triangles[:, ::-1])
     return Surface(vertices, triangles, shape.color(vertices, rng))
 
 
-def level_gradient(shape: Shape, points: np.ndarray, h: float = 1e-4) -> np.ndarray:
-    """Gradient (M, 3) of the distance by central differences."""
-    return np.stack(
-        [
-            (shape.distance(points + e) - shape.distance(points - e)) / (2 * h)
-            for e in h * np.eye(3)
-        ],
-        -1,
-    )
+def areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(K, 3) [m^2] along the triangles' normals, twice their areas long."""
+    corner = vertices[triangles]
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+
+
+def level_gradient(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """Gradient (M, 3) of the distance by central differences of 0.1 mm."""
+    sides = [shape.distance(points + e) - shape.distance(points - e) for e in 1e-4 * np.eye(3)]
+    return np.stack(sides, -1) / 2e-4
 
 
 def fill(shape: Shape, spacing: float, rng: np.random.Generator) -> np.ndarray:
     """Particles (N, 3) [m] on a lattice of `spacing` inside the shape, the lattice shifted at random."""
     offset = rng.uniform(0, spacing, 3)
-    axes = [
-        np.arange(a, b + spacing, spacing)
-        for a, b in zip(shape.bounds[0] - spacing + offset, shape.bounds[1])
-    ]
+    corners = zip(shape.bounds[0] - spacing + offset, shape.bounds[1])
+    axes = [np.arange(a, b + spacing, spacing) for a, b in corners]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return points[shape.distance(points) < 0]
 
@@ -82,12 +79,12 @@ class Skin:
         return np.einsum("mk,mkd->md", self.weights, positions[self.neighbours])
 
 
-def bind(points: np.ndarray, particles: np.ndarray, spacing: float, neighbours: int = 32) -> Skin:
+def bind(points: np.ndarray, particles: np.ndarray, spacing: float) -> Skin:
     """Skin by moving least squares with an affine basis: it reproduces every affine motion of the particles exactly.
 
     x = sum_i w_i (1 + (X - X_w)^T M^-1 (X_i - X_w)) x_i / sum w, with M the weighted second moment about the weighted mean X_w.
     """
-    distance, index = cKDTree(particles).query(points, k=min(neighbours, len(particles)))
+    distance, index = cKDTree(particles).query(points, k=min(NEIGHBOURS, len(particles)))
     weights = np.exp(-0.5 * (distance / (1.5 * spacing)) ** 2) + 1e-9
     weights /= weights.sum(-1, keepdims=True)
     near = particles[index]
@@ -104,15 +101,9 @@ def bind(points: np.ndarray, particles: np.ndarray, spacing: float, neighbours: 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Unit normals (M, 3), area-weighted means over the triangles around each vertex."""
-    corner = vertices[triangles]
-    facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normals = np.stack(
-        [
-            np.bincount(triangles.ravel(), np.repeat(facing[:, d], 3), len(vertices))
-            for d in range(3)
-        ],
-        -1,
-    )
+    facing, place = np.repeat(areas(vertices, triangles), 3, axis=0), triangles.ravel()
+    sums = [np.bincount(place, facing[:, d], len(vertices)) for d in range(3)]
+    normals = np.stack(sums, -1)
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
 
 
@@ -135,17 +126,10 @@ def flowing_surface(
     def around(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(weights (M, k) with a column of sums at least 1e-12, indices (M, k), whether any particle is near (M,))."""
         distance, index = tree.query(points, k=min(24, len(positions)), distance_upper_bound=reach)
-        near = np.isfinite(distance[:, 0])
-        weight = np.where(
-            np.isfinite(distance),
-            np.maximum(1 - (np.minimum(distance, reach) / reach) ** 2, 0) ** 3,
-            0.0,
-        )
-        return (
-            weight / np.maximum(weight.sum(1, keepdims=True), 1e-12),
-            np.minimum(index, len(positions) - 1),
-            near,
-        )
+        # a particle beyond the reach is infinitely far away
+        weight = np.maximum(1 - (np.minimum(distance, reach) / reach) ** 2, 0) ** 3
+        weight = weight / np.maximum(weight.sum(1, keepdims=True), 1e-12)
+        return weight, np.minimum(index, len(positions) - 1), np.isfinite(distance[:, 0])
 
     def distance(points: np.ndarray) -> np.ndarray:
         weight, index, near = around(points)
@@ -157,6 +141,5 @@ def flowing_surface(
         return np.einsum("mk,mkd->md", weight, colors[index])
 
     bounds = np.stack([positions.min(0) - 2 * spacing, positions.max(0) + 2 * spacing])
-    return extract_surface(
-        Shape(distance, color, bounds), max(pitch, 0.8 * spacing), np.random.default_rng(0)
-    )
+    shape, pitch = Shape(distance, color, bounds), max(pitch, 0.8 * spacing)
+    return extract_surface(shape, pitch, np.random.default_rng(0))

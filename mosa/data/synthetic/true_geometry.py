@@ -25,13 +25,8 @@ def origin(name: str) -> np.ndarray:
     body = object_named(name)
     drop, shape = body.drops["train"], SHAPES[body.shape]
     lowest = extract_surface(shape, body.pitch, np.random.default_rng(0)).vertices[:, 1].min()
-    return np.array(
-        [
-            drop.offset[0],
-            drop.speed * drop.contact + 0.5 * 9.8 * drop.contact**2 - lowest,
-            drop.offset[1],
-        ]
-    )
+    fallen = drop.speed * drop.contact + 0.5 * 9.8 * drop.contact**2
+    return np.array([drop.offset[0], fallen - lowest, drop.offset[1]])
 
 
 def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, float]:
@@ -45,10 +40,8 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
         raise ConfigError(f"scene {scene.name}: the true shape is known for built-in scenes only")
     shape = SHAPES[object_named(scene.name).shape]
     shift = origin(scene.name)
-    points, held = (
-        rest.detach().double().cpu().numpy() - shift,
-        volume.detach().double().cpu().numpy(),
-    )
+    points, held = (t.detach().double().cpu().numpy() for t in (rest, volume))
+    points = points - shift
     lattice = min(LATTICE, object_named(scene.name).spacing)
     axes = [np.arange(a, b + lattice, lattice) for a, b in zip(*shape.bounds)]
     true = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

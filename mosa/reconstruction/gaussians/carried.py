@@ -22,11 +22,11 @@ from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_basis
 from mosa.rendering.appearance.spherical_harmonics import (
     Y0,
-    camera_centers,
     colors_in,
     constant_coefficients,
     mean_colors,
 )
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Appearance, Splats
@@ -46,10 +46,8 @@ class RestGaussians:
         self.log_scale, self.quaternion = splats.scales.log(), splats.rotations.clone()
         self.logit = torch.logit(splats.opacities.clamp(0.01, 0.99))
         self.first = constant_coefficients(splats.colors)
-        self.constant, self.higher = (
-            self.first.clone(),
-            splats.means.new_zeros(len(splats.means), extra, 3),
-        )
+        self.constant = self.first.clone()
+        self.higher = splats.means.new_zeros(len(splats.means), extra, 3)
         self.light = splats.means.new_zeros(LIGHT)
         rates = {"shift": settings.lr_positions * unit, "log_scale": settings.lr_scales, "logit": OPACITY_RATE,
                  "constant": CONSTANT_RATE, "higher": HIGHER_RATE}  # fmt: skip
@@ -76,10 +74,8 @@ class RestGaussians:
     def change(self) -> Tensor:
         """Sum over the splats of the squares by which their colours, in the mean over directions and channels, left the first ones,
         each weighted by what it counts for."""
-        constant, higher = (
-            (Y0 * moved).square().mean(2).sum()
-            for moved in (self.constant - self.first, self.higher)
-        )
+        both = self.constant - self.first, self.higher
+        constant, higher = ((Y0 * moved).square().mean(2).sum() for moved in both)
         return self.settings.keep * constant + self.settings.keep_harmonics * higher
 
     def step(self, loss: Tensor, factor: float) -> None:
@@ -131,7 +127,7 @@ def fit_carried(
     """
     generator = torch.Generator().manual_seed(seed)
     gaussians = RestGaussians(static, surface_normals(static.means, particles), settings)
-    carried, eyes = bind(static.means, particles).carry(positions), camera_centers(windows.cameras)
+    carried, eyes = bind(static.means, particles).carry(positions), centers(windows.cameras)
     turns = turned_basis(gaussians.normals, carried.rotations)
     order = torch.empty(0, dtype=torch.long)
     for step in range(settings.iterations):
@@ -143,10 +139,8 @@ def fit_carried(
         means = carried.means[batch.frame] + (A @ gaussians.shift[..., None])[..., 0]
         # seen from the body: R^T d
         directions = (means.detach() - eyes[chosen][:, None])[..., None, :] @ turn
-        colors = (
-            colors_in(gaussians.harmonics, directions[..., 0, :])
-            * (turns[batch.frame] @ gaussians.light).exp()[..., None]
-        )
+        shades = (turns[batch.frame] @ gaussians.light).exp()[..., None]
+        colors = colors_in(gaussians.harmonics, directions[..., 0, :]) * shades
         image, alpha = rasterize(
             means, A @ gaussians.covariances @ A.mT, torch.sigmoid(gaussians.logit), colors, batch.cameras,
             torch.arange(len(batch), device=means.device), background,
@@ -155,9 +149,8 @@ def fit_carried(
             image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
         )
         loss = loss + gaussians.change() / alpha.numel()
-        gaussians.step(
-            loss, 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * step / settings.iterations))
-        )
+        cosine = math.cos(math.pi * step / settings.iterations)
+        gaussians.step(loss, 0.03 + 0.97 * 0.5 * (1 + cosine))
         if progress is not None:
             progress(1)
     return gaussians.appearance()

@@ -59,15 +59,8 @@ class FreeGaussians:
         self.fixed = {"lower": (scale * smallest).log(), "upper": (scale * largest).log(), "rotations": splats.rotations,
                       "first_colors": splats.colors}  # fmt: skip
         self.anisotropic, self.axis_ratio = anisotropic, axis_ratio
-        learned = {
-            name: p.requires_grad_(True)
-            for name, p in self.parameters.items()
-            if move or name != "means"
-        }
-        groups = [
-            {"params": [p], "start": getattr(rates, name), "name": name}
-            for name, p in learned.items()
-        ]
+        groups = [{"params": [p.requires_grad_(True)], "start": getattr(rates, name), "name": name}
+                  for name, p in self.parameters.items() if move or name != "means"]  # fmt: skip
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
 
     def __len__(self) -> int:
@@ -90,11 +83,9 @@ class FreeGaussians:
     def covariances(self) -> Tensor:
         """(N, 3, 3) [m^2]."""
         scale = self.parameters["log_scale"].exp()
-        return (
-            covariance_from(scale, self.parameters["rotation"])
-            if self.anisotropic
-            else isotropic_covariances(scale)
-        )
+        if not self.anisotropic:
+            return isotropic_covariances(scale)
+        return covariance_from(scale, self.parameters["rotation"])
 
     def anneal(self, factor: float) -> None:
         """Steps at `factor` of their start."""
@@ -142,6 +133,5 @@ class FreeGaussians:
         rotations = self.fixed["rotations"]
         if self.anisotropic:
             rotations = torch.nn.functional.normalize(self.parameters["rotation"].detach(), dim=-1)
-        return Splats(
-            self.parameters["means"].detach(), self.scales, rotations, self.opacities, self.colors
-        )
+        means = self.parameters["means"].detach()
+        return Splats(means, self.scales, rotations, self.opacities, self.colors)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mosa.data.hull import Volume
 from mosa.reconstruction.motion.observed import Windows
-from mosa.rendering.cameras import sample_images
+from mosa.rendering.cameras import centers, project, sample_images
 from mosa.types import Splats
 
 
@@ -35,14 +35,8 @@ def surface_points(volume: Volume, *, count: int, seed: int) -> tuple[Tensor, Te
 
 def sampled_windows(points: Tensor, windows: Windows) -> Tensor:
     """Colour times matte, and matte, (V, N, 4) at the projections of points (N, 3) [m]."""
-    cameras = windows.cameras
-    seen = points @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, None, :3, 3]
-    pixel = seen @ cameras.K.transpose(1, 2)
-    pixel = pixel[..., :2] / pixel[..., 2:].clamp(min=1e-6)
-    stacked = torch.cat(
-        [windows.images * windows.mattes[..., None], windows.mattes[..., None]], -1
-    ).permute(0, 3, 1, 2)
-    return sample_images(stacked, pixel).transpose(1, 2)
+    pixels, _ = project(points, windows.cameras)
+    return sample_images(windows.masked(), pixels).transpose(1, 2)
 
 
 def projected_colors(points: Tensor, normals: Tensor, windows: Windows) -> Tensor:
@@ -50,8 +44,7 @@ def projected_colors(points: Tensor, normals: Tensor, windows: Windows) -> Tenso
 
     Occlusion by other parts is not looked at; the fit corrects it.
     """
-    cameras, sampled = windows.cameras, sampled_windows(points, windows)
-    centre = -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
+    sampled, centre = sampled_windows(points, windows), centers(windows.cameras)
     cosine = (F.normalize(centre[:, None] - points, dim=-1) * normals).sum(-1).clamp(min=0)
     weight = (cosine + 0.02) ** 4
     total = (weight[..., None] * sampled).sum(0)
@@ -64,16 +57,15 @@ def initial_splats(volume: Volume, windows: Windows, *, count: int, seed: int) -
     points, normals, spacing = surface_points(volume, count=count, seed=seed)
     device = windows.images.device
     points, normals = points.to(device), normals.to(device)
-    n = len(points)
-    rotations = torch.zeros(n, 4, device=device)
-    rotations[:, 0] = 1
-    return Splats(
-        points,
-        torch.full((n, 3), 0.6 * spacing, device=device),
-        rotations,
-        torch.full((n,), 0.7, device=device),
-        projected_colors(points, normals, windows),
-    )
+    colors = projected_colors(points, normals, windows)
+    return isotropic_splats(points, 0.6 * spacing, 0.7, colors)
+
+
+def isotropic_splats(means: Tensor, scale: float, opacity: float, colors: Tensor) -> Splats:
+    """Balls of one standard deviation [m] and opacity at means (N, 3) [m], in colours (N, 3)."""
+    turns = means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1)
+    opacities = torch.full_like(means[:, 0], opacity)
+    return Splats(means, torch.full_like(means, scale), turns, opacities, colors)
 
 
 def inherited_colors(points: Tensor, splats: Splats, *, neighbours: int = 4) -> Tensor:

@@ -22,15 +22,11 @@ def relocate(gaussians: FreeGaussians, generator: torch.Generator) -> None:
     if len(dead) == 0 or len(dead) == len(opacity):
         return
     # seen area: of the two larger axes
-    area = (
-        scale.square()[:, 0] if not gaussians.anisotropic else scale.sort(1).values[:, 1:].prod(1)
-    )
-    chance = torch.where(vanished, torch.zeros_like(opacity), opacity * area)
-    target = torch.multinomial(chance.cpu(), len(dead), replacement=True, generator=generator).to(
-        dead.device
-    )
+    area = scale.sort(1).values[:, 1:].prod(1)
+    chance = torch.where(vanished, 0.0, opacity * area).cpu()
+    target = torch.multinomial(chance, len(dead), replacement=True, generator=generator)
     source = torch.arange(len(opacity), device=dead.device)
-    source[dead] = target
+    source[dead] = target.to(dead.device)
     gaussians.take(source, vanished)
     noise = torch.randn(len(dead), 3, generator=generator).to(dead.device)
     gaussians.shift(dead, (noise * SPREAD * gaussians.scales.detach()[dead])[..., None])

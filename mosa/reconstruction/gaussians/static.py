@@ -40,36 +40,21 @@ def fit_splats(
     generator = torch.Generator().manual_seed(seed)
     every = settings.relocate_every if move and isinstance(settings, StaticSettings) else 0
     unit = float(splats.scales.mean(1).mean())
-    rates = Rates(
-        settings.lr_positions * unit,
-        settings.lr_scales,
-        opacity=OPACITY_RATE,
-        color=COLOR_RATE,
-        rotation=ROTATION_RATE,
-    )
+    rates = Rates(settings.lr_positions * unit, settings.lr_scales, OPACITY_RATE, COLOR_RATE, ROTATION_RATE)  # fmt: skip
     gaussians = FreeGaussians(
-        splats,
-        rates,
-        move=move,
-        anisotropic=settings.shape == "anisotropic",
-        smallest=SMALLEST,
-        largest=settings.largest,
+        splats, rates, move=move, anisotropic=settings.shape == "anisotropic", smallest=SMALLEST, largest=settings.largest,
         axis_ratio=settings.axis_ratio,
-    )
+    )  # fmt: skip
     order = torch.empty(0, dtype=torch.long)
     for step in range(settings.iterations):
         while len(order) < settings.views:
             order = torch.cat([order, torch.randperm(len(windows), generator=generator)])
         batch, order = windows.select(order[: settings.views]), order[settings.views :]
         gaussians.anneal(0.55 + 0.45 * math.cos(math.pi * step / settings.iterations))
+        means, shapes = gaussians.parameters["means"][None], gaussians.covariances()[None]
+        colors, state = gaussians.colors[None], torch.zeros_like(batch.frame)
         image, alpha = rasterize(
-            gaussians.parameters["means"][None],
-            gaussians.covariances()[None],
-            gaussians.opacities,
-            gaussians.colors[None],
-            batch.cameras,
-            torch.zeros(len(batch), dtype=torch.long, device=background.device),
-            background,
+            means, shapes, gaussians.opacities, colors, batch.cameras, state, background
         )
         loss = image_loss(
             image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte

@@ -30,9 +30,7 @@ class UniformAdam(torch.optim.Optimizer):
         axes = tuple(range(1, p.dim()))
         if not state:
             state["step"], state["mean"] = 0, torch.zeros_like(p)
-            state["square"] = torch.zeros(
-                [len(p)] + [1] * len(axes), dtype=p.dtype, device=p.device
-            )
+            state["square"] = p.new_zeros([len(p)] + [1] * len(axes))
         state["step"] += 1
         state["mean"].lerp_(p.grad, 1 - first)
         state["square"].lerp_(
@@ -40,9 +38,6 @@ class UniformAdam(torch.optim.Optimizer):
         )
         scale = (state["square"] / (1 - second ** state["step"])).sqrt()
         # a frame without any gradient (all its views look away) stays where it is
-        move = torch.where(
-            scale > 0,
-            state["mean"] / scale.clamp(min=torch.finfo(p.dtype).tiny),
-            torch.zeros_like(p),
-        )
+        tiny = torch.finfo(p.dtype).tiny
+        move = torch.where(scale > 0, state["mean"] / scale.clamp(min=tiny), 0.0)
         p.add_(move, alpha=-lr / (1 - first ** state["step"]))

@@ -56,12 +56,8 @@ def fill_behind(splats: Splats, views: Windows, hull: Volume) -> Volume:
     shape = hull.values.shape
     origin = hull.origin.to(splats.means)
     grid = replace(hull, values=hull.values.to(splats.means), origin=origin)
-    marked = torch.cat(
-        [
-            splats.means[splats.opacities > OPAQUE],
-            behind(grid.points().reshape(-1, 3), splats, views),
-        ]
-    )
+    filled = behind(grid.points().reshape(-1, 3), splats, views)
+    marked = torch.cat([splats.means[splats.opacities > OPAQUE], filled])
     place = (marked - origin) / hull.pitch
     size = [-(-(n - 1) // 2**LEVELS) + 1 for n in shape]
     density = splats.means.new_zeros(size)

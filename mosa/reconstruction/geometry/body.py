@@ -15,10 +15,9 @@ from torch import Tensor
 
 from mosa.data.hull import Volume, shave_ridges
 from mosa.errors import DataError
-from mosa.reconstruction.geometry.carving import CarvingSettings, carve, keep_silhouettes
+from mosa.reconstruction.geometry.carving import carve, keep_silhouettes
 from mosa.reconstruction.geometry.refinement import (
     BORDER,
-    RefinementSettings,
     refine,
     signed_distance,
     surface_information,
@@ -34,18 +33,8 @@ OPTIMISM = 1.3
 independent, and a neighbourhood does not move as one. Measured on the gorilla and the bowl."""
 
 
-class GeometrySettings(GeometrySection):
-    """With what no configuration says. first: rounds and blur [px] of the refinement on frame 0, from which the flight is followed;
-    then: on all free frames."""
-
-    first: tuple[tuple[int, float], ...] = ((4, 2.0), (4, 1.0))
-    then: tuple[tuple[int, float], ...] = ((3, 1.0), (9, 0.4))
-    carving: CarvingSettings = CarvingSettings()
-    refinement: RefinementSettings = RefinementSettings()
-
-    @classmethod
-    def of(cls, section: GeometrySection) -> GeometrySettings:
-        return section if isinstance(section, cls) else cls(**dict(section))
+FIRST, THEN = ((4, 2.0), (4, 1.0)), ((3, 1.0), (9, 0.4))
+"""Rounds and blur [px] of the refinement on frame 0, from which the flight is followed, and then on all free frames."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +64,8 @@ class Geometry:
         }  # fmt: skip
         if self.deviation.numel():
             on_surface = self.deviation[surface_of(self.body)]
-            figures["geometry/uncertain_share"] = float(
-                (2 * on_surface > 0.7 * spacing).double().mean()
-            )
+            uncertain = 2 * on_surface > 0.7 * spacing
+            figures["geometry/uncertain_share"] = float(uncertain.double().mean())
             figures["geometry/deviation_m"] = float(on_surface.median())
         return figures
 
@@ -93,15 +81,10 @@ class Geometry:
     @classmethod
     def read(cls, stored: dict) -> Geometry:
         """The inverse of `stored`."""
-        return cls(
-            Volume(stored["values"], stored["origin"], stored["pitch"]),
-            stored["hull_volume"],
-            stored["deviation"],
-            stored["free_frames"],
-            Splats(**stored["static"]) if stored.get("static") else None,
-            stored.get("registered") or {},
-            stored.get("place") or {},
-        )
+        rest = dict(stored)
+        body = Volume(*(rest.pop(name) for name in ("values", "origin", "pitch")))
+        static = Splats(**rest["static"]) if rest["static"] else None
+        return cls(body, **rest | {"static": static})
 
 
 def surface_of(body: Volume) -> Tensor:
@@ -139,7 +122,7 @@ def nothing_left(scene: Scene, hull: Geometry) -> Geometry:
 def find_geometry(
     scene: Scene,
     hull: Volume,
-    settings: GeometrySettings,
+    settings: GeometrySection,
     *,
     ridge_passes: int,
     sigma: float,
@@ -156,11 +139,7 @@ def find_geometry(
     cameras = scene.cameras.select(scene.training_cameras)
 
     def of_hull() -> Geometry:
-        body = (
-            shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma)
-            if ridge_passes
-            else whole
-        )
+        body = shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma)
         return Geometry(body, volume, torch.empty(0), 1)
 
     if not holds_matter(signed_distance(whole)):
@@ -176,21 +155,19 @@ def find_geometry(
     seen = [windows.of_frame(t) for t in frames]
     solid = Volume(whole.values.to(device), whole.origin.to(device), whole.pitch)
     bound = signed_distance(solid)
-    start = carve(solid, seen[0], settings.carving)
-    if ridge_passes:
-        # of the whole hull: rounding would widen what was carved by mistake
-        rounded = shave_ridges(solid, cameras, passes=ridge_passes, sigma=sigma)
-        start = replace(start, values=torch.minimum(start.values, rounded.values))
-    distance = signed_distance(start)
-    distance = refine(distance, bound, seen[:1], settings.refinement, settings.first)
+    start = carve(solid, seen[0])
+    # of the whole hull: rounding would widen what was carved by mistake
+    rounded = shave_ridges(solid, cameras, passes=ridge_passes, sigma=sigma)
+    start = replace(start, values=torch.minimum(start.values, rounded.values))
+    distance = refine(signed_distance(start), bound, seen[:1], FIRST)
     if not holds_matter(distance):
         return nothing_left(scene, of_hull())
     motions = free_motions(scene, distance, seen)
     moved = [seen[0], *(motion.windows(views) for motion, views in zip(motions, seen[1:]))]
-    distance = refine(distance, bound, moved, settings.refinement, settings.then)
+    distance = refine(distance, bound, moved, THEN)
     if not holds_matter(distance):
         return nothing_left(scene, of_hull())
-    information = surface_information(distance, moved, settings.refinement, settings.then[-1][1])
+    information = surface_information(distance, moved, THEN[-1][1])
     inner = slice(BORDER, -BORDER)
     kept = keep_silhouettes(voxels(distance, solid).values > 0.5, solid, seen[0])
     deviation = OPTIMISM * information[inner, inner, inner].rsqrt()

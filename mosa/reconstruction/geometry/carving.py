@@ -10,7 +10,7 @@ Kutulakos and Seitz, A theory of shape by space carving (IJCV 2000), with votes 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -18,30 +18,23 @@ from kornia.morphology import dilation
 from torch import Tensor
 
 from mosa.data.hull import Volume
-from mosa.reconstruction.geometry.field import at, camera_rays, first_crossing, smooth
+from mosa.reconstruction.geometry.field import at, first_crossing, smooth
 from mosa.reconstruction.motion.observed import Windows
-from mosa.rendering.cameras import sample_images
+from mosa.rendering.cameras import rays, sample_images
 
 UNSEEN = 9.0
-
-
-@dataclass(frozen=True)
-class CarvingSettings:
-    """passes: rounds at most, each from the surface that the one before left (0: none); neighbours: cameras that a camera is
-    compared with, the nearest by direction within `degrees`, of which the best `agreeing` count (others may not see the point);
-    depth: steps of 0.75 voxels a ray is followed; noise: difference of colours (of 1) that says nothing; good: what the best depth
-    of a ray may have at most to have a vote; ratio: how much worse (squared) than the best a depth may be that is taken for the
-    surface; votes: how many cameras more must see air than matter, as a mean over a voxel's neighbourhood."""
-
-    passes: int = 3
-    neighbours: int = 4
-    agreeing: int = 2
-    degrees: float = 70.0
-    depth: int = 40
-    noise: float = 0.025
-    good: float = 0.09
-    ratio: float = 2.0
-    votes: float = 0.8
+PASSES = 3
+"""Rounds at most, each from the surface that the one before left."""
+NEIGHBOURS, DEGREES, AGREEING = 4, 70.0, 2
+"""Cameras that a camera is compared with, the nearest by direction within an angle, and how many of them count: the best, as others
+may not see the point."""
+DEPTH, STEP = 40, 0.75
+"""Steps that a ray is followed, and their length in voxels."""
+NOISE, GOOD, RATIO = 0.025, 0.09, 2.0
+"""Difference of colours (of 1) that says nothing; what the best depth of a ray may have at most to have a vote; how much worse
+(squared) than the best a depth may be that is taken for the surface."""
+VOTES = 0.8
+"""How many cameras more must see air than matter, as a mean over a voxel's neighbourhood."""
 
 
 def _at_pixels(image: Tensor, pixel: Tensor) -> Tensor:
@@ -62,79 +55,66 @@ def _pixels(points: Tensor, K: Tensor, w2c: Tensor) -> Tensor:
 
 
 def _disagreement(
-    body: Volume,
-    views: Windows,
-    v: int,
-    others: list[int],
-    points: Tensor,
-    met: Tensor,
-    settings: CarvingSettings,
+    body: Volume, views: Windows, v: int, others: list[int], points: Tensor, met: Tensor
 ) -> Tensor:
     """Mean squared difference of colours (K, H, W) between view v and the others that agree best, at points (K, H, W, 3) along its
     rays, the first where they meet the body. met: (H, W) rays that do."""
     inside = (at(body, points) > 0.5) & met
     inside[0] = met
     own = views.images[v].permute(2, 0, 1)[:, None]
-    costs = []
+    costs, masked = [], views.masked()
     for u in others:
-        seen = torch.cat(
-            [views.images[u] * views.mattes[u][..., None], views.mattes[u][..., None]], -1
-        ).permute(2, 0, 1)
-        found = _at_pixels(seen, _pixels(points, views.cameras.K[u], views.cameras.w2c[u]))
+        pixels = _pixels(points, views.cameras.K[u], views.cameras.w2c[u])
+        found = _at_pixels(masked[u], pixels)
         difference = (found[:3] / found[3:].clamp(min=0.05) - own).square().mean(0).clamp(max=0.09)
         weight = ((found[3] > 0.9) & inside & (views.mattes[v] > 0.95)).to(own)
         share = _window_mean(weight)
         cost = _window_mean(difference * weight) / share.clamp(min=1e-6)
-        costs.append(torch.where(share > 0.35, cost, torch.full_like(cost, UNSEEN)))
-    best = torch.stack(costs).sort(0).values[: settings.agreeing].mean(0)
-    return torch.where(inside, best, torch.full_like(best, UNSEEN))
+        costs.append(torch.where(share > 0.35, cost, UNSEEN))
+    best = torch.stack(costs).sort(0).values[:AGREEING].mean(0)
+    return torch.where(inside, best, UNSEEN)
 
 
-def _partners(centres: Tensor, middle: Tensor, settings: CarvingSettings) -> list[list[int]]:
-    """For each camera the nearest others by direction from the body, none farther than settings.degrees."""
+def _partners(centres: Tensor, middle: Tensor) -> list[list[int]]:
+    """For each camera the nearest others by direction from the body, none farther than `DEGREES`."""
     towards = F.normalize(centres - middle, dim=-1)
     cosine = (towards @ towards.T).fill_diagonal_(-2.0)
-    value, index = cosine.topk(min(settings.neighbours, len(cosine) - 1), 1)
-    near = value > math.cos(math.radians(settings.degrees))
-    return [
-        [u for u, ok in zip(row, good) if ok] for row, good in zip(index.tolist(), near.tolist())
-    ]
+    value, index = cosine.topk(min(NEIGHBOURS, len(cosine) - 1), 1)
+    near = value > math.cos(math.radians(DEGREES))
+    return [row[good].tolist() for row, good in zip(index, near)]
 
 
-def votes(body: Volume, views: Windows, settings: CarvingSettings) -> Tensor:
+def votes(body: Volume, views: Windows) -> Tensor:
     """Cameras that see air minus cameras that see matter, for each voxel of a body (values 0 or 1); 0 outside of it."""
-    centres, directions = camera_rays(views.cameras)
+    centres, directions = rays(views.cameras)
     inside = body.values > 0.5
     points = body.points()[inside]
-    partners = _partners(centres, points.mean(0), settings)
+    partners = _partners(centres, points.mean(0))
     signed = replace(body, values=0.5 - body.values)
-    steps = 0.75 * body.pitch * torch.arange(settings.depth, device=points.device)
+    steps = STEP * body.pitch * torch.arange(DEPTH, device=points.device)
     tally = torch.zeros(len(points), device=points.device)
     height, width = views.mattes.shape[1:]
     for v, others in enumerate(partners):
-        if len(others) < settings.agreeing:
+        if len(others) < AGREEING:
             continue
         seen = views.mattes[v] > 0.5
         begin = torch.full_like(views.mattes[v], float("inf"))
         ray = directions[v][seen]
         begin[seen] = first_crossing(signed, centres[v].expand_as(ray), ray)
         met = begin.isfinite()
-        begin = torch.where(met, begin, torch.zeros_like(begin))
+        begin = torch.where(met, begin, 0.0)
         along = centres[v] + (begin + steps[:, None, None])[..., None] * directions[v]
-        cost = _disagreement(body, views, v, others, along, met, settings)
+        cost = _disagreement(body, views, v, others, along, met)
         least, best = cost.min(0)
-        first = (cost <= settings.ratio * least + settings.noise**2).to(torch.uint8).argmax(0)
-        sure = (least < settings.good**2) & met
+        first = (cost <= RATIO * least + NOISE**2).to(torch.uint8).argmax(0)
+        sure = (least < GOOD**2) & met
         pixel = _pixels(points, views.cameras.K[v], views.cameras.w2c[v]).long()
         column, row = pixel[:, 0].clamp(0, width - 1), pixel[:, 1].clamp(0, height - 1)
         way, margin = (points - centres[v]).norm(dim=-1), 0.5 * body.pitch
-        surface, end = (
-            (begin + steps[first])[row, column] - margin,
-            (begin + steps[best])[row, column] + 1.5 * body.pitch,
-        )
-        tally += (sure[row, column] & (way < surface)).to(tally) - (
-            sure[row, column] & (way >= surface) & (way < end)
-        ).to(tally)
+        surface = (begin + steps[first])[row, column] - margin
+        end = (begin + steps[best])[row, column] + 1.5 * body.pitch
+        told = sure[row, column].to(tally)
+        tally += told * (way < surface) - told * ((way >= surface) & (way < end))
     grid = torch.zeros_like(body.values)
     grid[inside] = tally
     return grid
@@ -150,9 +130,8 @@ def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
     missing = torch.zeros_like(held)
     for K, w2c, matte in zip(views.cameras.K, views.cameras.w2c, views.mattes):
         # bins as wide as a voxel and a half is seen: a column of voxels leaves no hole
-        size = max(
-            1.0, 1.5 * body.pitch * float(K[0, 0]) / float((points @ w2c[2, :3] + w2c[2, 3]).mean())
-        )
+        depth = float((points @ w2c[2, :3] + w2c[2, 3]).mean())
+        size = max(1.0, 1.5 * body.pitch * float(K[0, 0]) / depth)
         columns, rows = int(views.cameras.width / size) + 1, int(views.cameras.height / size) + 1
         pixel = _pixels(points, K, w2c)
         seen = _at_pixels(matte[None], pixel)[0] > 0.5
@@ -160,23 +139,21 @@ def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
         ray = row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)
         covered = torch.zeros(rows * columns, device=kept.device)
         covered[ray[held]] = 1.0
-        covered = (
-            dilation(covered.reshape(1, 1, rows, columns), covered.new_ones(3, 3)).reshape(-1) > 0.5
-        )
-        missing |= seen & ~covered[ray]
+        beside = dilation(covered.reshape(1, 1, rows, columns), covered.new_ones(3, 3))
+        missing |= seen & (beside.reshape(-1) < 0.5)[ray]
     result = kept.clone()
     result[inside] = held | missing
     return result
 
 
-def carve(body: Volume, views: Windows, settings: CarvingSettings) -> Volume:
+def carve(body: Volume, views: Windows) -> Volume:
     """The body (values 0 or 1) without the voxels that the colours show to be air; views: windows of one pose of the body.
 
-    Ends before settings.passes rounds where one changes less than a thousandth of the body.
+    Ends before `PASSES` rounds where one changes less than a thousandth of the body.
     """
-    for _ in range(settings.passes):
+    for _ in range(PASSES):
         inside = body.values > 0.5
-        air = smooth(votes(body, views, settings), 1.0) >= settings.votes
+        air = smooth(votes(body, views), 1.0) >= VOTES
         kept = keep_silhouettes(inside & ~air, body, views)
         body = replace(body, values=kept.to(body.values))
         if int(kept.sum()) > 0.999 * int(inside.sum()):

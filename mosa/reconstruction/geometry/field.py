@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mosa.data.hull import Volume
-from mosa.types import Cameras
 
 FIXED_POINT = 2.0**24
 
@@ -31,9 +30,8 @@ def at(volume: Volume, points: Tensor) -> Tensor:
 def bell(sigma: float, like: Tensor) -> Tensor:
     """Weights of a Gaussian of `sigma` cells to three of them either side, with sum 1."""
     reach = max(1, round(3 * sigma))
-    weights = torch.exp(
-        -0.5 * (torch.arange(-reach, reach + 1, device=like.device, dtype=like.dtype) / sigma) ** 2
-    )
+    cells = torch.arange(-reach, reach + 1, device=like.device, dtype=like.dtype)
+    weights = torch.exp(-0.5 * (cells / sigma) ** 2)
     return weights / weights.sum()
 
 
@@ -78,20 +76,6 @@ def gradient(values: Tensor, pitch: float) -> Tensor:
     return torch.stack(torch.gradient(values, spacing=pitch))
 
 
-def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Centres (V, 3) [m] and unit directions (V, H, W, 3) through the middles of the pixels."""
-    y = torch.arange(cameras.height, device=cameras.K.device) + 0.5
-    x = torch.arange(cameras.width, device=cameras.K.device) + 0.5
-    pixel = torch.stack(
-        (*torch.meshgrid(x, y, indexing="xy"), torch.ones(len(y), len(x), device=x.device)), -1
-    )
-    directions = (
-        pixel @ torch.linalg.inv(cameras.K).transpose(1, 2)[:, None] @ cameras.w2c[:, None, :3, :3]
-    )
-    centres = -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
-    return centres, F.normalize(directions, dim=-1)
-
-
 def span(volume: Volume) -> tuple[Tensor, float]:
     """Centre (3,) and radius [m] of the ball around a volume's grid."""
     size = volume.pitch * (torch.tensor(volume.values.shape, device=volume.values.device) - 1)
@@ -116,11 +100,8 @@ def first_crossing(
     for _ in range(int(2 * radius / step) + 2):
         now = at(distance, origin[left] + way[left, None] * direction[left])
         inside = now < 0
-        share = torch.where(
-            before[left].isinf(),
-            torch.ones_like(now),
-            before[left] / (before[left] - now).clamp(min=1e-9),
-        )
+        passed = before[left] / (before[left] - now).clamp(min=1e-9)
+        share = torch.where(before[left].isinf(), 1.0, passed)
         hit[left[inside]] = (way[left] + (share - 1) * step)[inside]
         before[left] = now
         left = left[~inside]

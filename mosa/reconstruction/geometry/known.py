@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from mosa.data.hull import Volume
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.mesh import field_of_triangles, read_mesh
+from mosa.reconstruction.gaussians.initial import isotropic_splats
 from mosa.reconstruction.geometry.field import at, gradient
 from mosa.reconstruction.geometry.refinement import signed_distance
 from mosa.reconstruction.geometry.shell import solid_of, together
@@ -129,10 +130,7 @@ def solid_of_gaussians(splats: Splats, path: Path) -> Solid:
     unit = float((kept.means.amax(0) - kept.means.amin(0)).max())
     if not NEAR * float(middle.abs().max()) < unit < np.inf:
         raise DataError(f"scene.body.shape: {path}: expected an extent near 0, found {unit:.3g}")
-    kept = Splats(
-        (kept.means - middle) / unit, kept.scales / unit, kept.rotations, kept.opacities,
-        kept.colors,
-    )  # fmt: skip
+    kept = replace(kept, means=(kept.means - middle) / unit, scales=kept.scales / unit)
     try:
         solid = solid_of(kept, resolution=VOXELS)
     except DataError as error:
@@ -148,10 +146,7 @@ def solid_of_points(points: Tensor, path: Path) -> Solid:
     n = len(points)
     places = points.double().numpy()
     gap = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if n > 1 else 0.0
-    turns = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
-    grey = torch.full((n, 3), 0.5)
-    sizes = torch.full((n, 3), max(THIN * gap, 1e-12))
-    cloud = Splats(points, sizes, turns, torch.full((n,), 0.95), grey)
+    cloud = isotropic_splats(points, max(THIN * gap, 1e-12), 0.95, torch.full_like(points, 0.5))
     found = solid_of_gaussians(cloud, path)
     gap, grid = gap / found.unit, found.distance
     depth = -found.at((points - found.centre) / found.unit)

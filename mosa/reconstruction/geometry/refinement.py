@@ -16,6 +16,7 @@ by mean curvature.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,7 +28,6 @@ from torch import Tensor
 from mosa.data.hull import Volume
 from mosa.reconstruction.geometry.field import (
     at,
-    camera_rays,
     first_crossing,
     gradient,
     nearest_passing,
@@ -37,7 +37,7 @@ from mosa.reconstruction.geometry.field import (
     span,
 )
 from mosa.reconstruction.motion.observed import Windows
-from mosa.rendering.cameras import sample_images
+from mosa.rendering.cameras import centers, rays, sample_images
 
 LOCAL = 0.3
 """Length on which a ray may touch a surface that it is to place, in radii of the grid: a ball's outline touches on 0.25 of them."""
@@ -45,31 +45,28 @@ BORDER = 4
 """Cells added around a hull, so that its surface is nowhere at the grid's border."""
 
 
-@dataclass(frozen=True)
-class RefinementSettings:
-    """patch: standard deviation of a neighbourhood [voxels]; noise: of a colour (of 1), with `misplaced` px times its slope;
-    outline: of an outline [px]; step: of the surface per round [mm]; facing: smallest cosine between a surface and the direction
-    to a camera that counts; bend: how much smoothness counts against information of 1 per (0.5 mm)^2; slack: how far beyond the
-    hull's surface the body may reach [px]."""
-
-    patch: float = 2.0
-    noise: float = 0.03
-    misplaced: float = 0.3
-    outline: float = 0.2
-    step: float = 1.0
-    facing: float = 0.3
-    bend: float = 1.0
-    slack: float = 0.25
+PATCH = 2.0
+"""Standard deviation of a neighbourhood [voxels]."""
+NOISE, MISPLACED = 0.03, 0.3
+"""Noise of a colour (of 1), and the pixels times its slope that it may be misplaced by."""
+OUTLINE = 0.2
+"""[px] noise of an outline."""
+STEP = 1.0
+"""[mm] of the surface per round."""
+FACING = 0.3
+"""Smallest cosine between a surface and the direction to a camera that counts."""
+BEND = 1.0
+"""How much smoothness counts against information of 1 per (0.5 mm)^2."""
+SLACK = 0.25
+"""[px] that the body may reach beyond the hull's surface."""
 
 
 def signed_distance(inside: Volume) -> Volume:
     """Distance [m] to the surface of voxels (values 0 or 1), negative inside, on a grid wider by BORDER cells."""
     solid = F.pad(inside.values > 0.5, (BORDER,) * 6).cpu().numpy()
     cells = ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)
-    values = smooth(
-        torch.as_tensor(cells, dtype=torch.float32, device=inside.values.device) * inside.pitch, 0.7
-    )
-    return Volume(values, inside.origin - BORDER * inside.pitch, inside.pitch)
+    values = inside.pitch * torch.as_tensor(cells, dtype=torch.float32, device=inside.values.device)
+    return Volume(smooth(values, 0.7), inside.origin - BORDER * inside.pitch, inside.pitch)
 
 
 def voxels(distance: Volume, like: Volume) -> Volume:
@@ -80,10 +77,7 @@ def voxels(distance: Volume, like: Volume) -> Volume:
 
 def blurred(views: Windows, sigma: float) -> Tensor:
     """Colour, its slopes along columns and rows [1/px] and matte, (B, 10, h, w); colours are means inside of the matte alone."""
-    stacked = torch.cat(
-        [views.images * views.mattes[..., None], views.mattes[..., None]], -1
-    ).permute(0, 3, 1, 2)
-    stacked = smooth(stacked, sigma, (-2, -1))
+    stacked = smooth(views.masked(), sigma, (-2, -1))
     color = stacked[:, :3] / stacked[:, 3:].clamp(min=0.05)
     rows, columns = torch.gradient(color, dim=(2, 3))
     return torch.cat([color, columns, rows, stacked[:, 3:]], 1)
@@ -108,7 +102,7 @@ def edges(mattes: Tensor) -> Tensor:
 
 def _group(views: Windows) -> _Group:
     start = torch.full_like(views.mattes, float("nan"))
-    return _Group(views, *camera_rays(views.cameras), edges(views.mattes), start)
+    return _Group(views, *rays(views.cameras), edges(views.mattes), start)
 
 
 def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:
@@ -116,20 +110,16 @@ def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:
     seen = group.views.mattes > 0.5
     window = seen.nonzero()[:, 0]
     way = torch.full_like(group.views.mattes, float("inf"))
-    way[seen] = first_crossing(
-        distance, group.centres[window], group.directions[seen], group.start[seen]
-    )
-    # the next round looks from a little before this one's surface: it moves by less than a voxel
-    group.start = torch.where(
-        way.isfinite(), way - 3 * distance.pitch, torch.full_like(way, float("nan"))
-    )
+    centres, directions = group.centres[window], group.directions[seen]
+    way[seen] = first_crossing(distance, centres, directions, group.start[seen])
     met = way.isfinite()
+    # the next round looks from a little before this one's surface: it moves by less than a voxel
+    group.start = torch.where(met, way - 3 * distance.pitch, float("nan"))
     return way, group.centres[met.nonzero()[:, 0]] + way[met][:, None] * group.directions[met]
 
 
 def color_information(
-    distance: Volume, group: _Group, images: Tensor, points: Tensor, ways: Tensor, settings: RefinementSettings, *,
-    doubt: bool = False,
+    distance: Volume, group: _Group, images: Tensor, points: Tensor, ways: Tensor, *, doubt: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Information [1/m^2] and information times displacement [1/m] along the outward normal, (N,) each, of surface points (N, 3).
 
@@ -139,9 +129,7 @@ def color_information(
     slopes = gradient(distance.values, distance.pitch)
     normal = F.normalize(sample(slopes, (points - distance.origin) / distance.pitch), dim=-1)
     height, width = ways.shape[1:]
-    reach = F.max_pool2d(
-        torch.where(ways.isfinite(), ways, torch.zeros_like(ways))[:, None], 3, 1, 1
-    )[:, 0]
+    reach = F.max_pool2d(torch.where(ways.isfinite(), ways, 0.0)[:, None], 3, 1, 1)[:, 0]
     weights, colors, changes, variances = [], [], [], []
     for u in range(len(cameras)):
         R, focal = cameras.w2c[u, :3, :3], cameras.K[u].diagonal()[:2]
@@ -157,20 +145,17 @@ def color_information(
         )
         arm = points - group.centres[u]
         facing = -(normal * F.normalize(arm, dim=-1)).sum(-1)
-        visible = (arm.norm(dim=-1) <= reach[u, row, column] + 0.5 * distance.pitch) & (
-            facing > settings.facing
-        )
+        visible = arm.norm(dim=-1) <= reach[u, row, column] + 0.5 * distance.pitch
+        visible &= facing > FACING
         weights.append((visible & (found[:, 9] > 0.9)) * facing.clamp(min=0).square())
         colors.append(found[:, :3])
         changes.append(found[:, 3:6] * moved[:, :1] + found[:, 6:9] * moved[:, 1:])
-        variances.append(
-            settings.noise**2 + settings.misplaced**2 * (found[:, 3:9].square().sum(1) / 3)
-        )
+        variances.append(NOISE**2 + MISPLACED**2 * (found[:, 3:9].square().sum(1) / 3))
     weight, color, change = torch.stack(weights), torch.stack(colors), torch.stack(changes)
     robust = weight
     for _ in range(2):
         mean = (robust[..., None] * color).sum(0) / robust.sum(0).clamp(min=1e-6)[:, None]
-        robust = weight / (1 + (color - mean).square().sum(-1) / (27 * settings.noise**2))
+        robust = weight / (1 + (color - mean).square().sum(-1) / (27 * NOISE**2))
     total = robust.sum(0).clamp(min=1e-6)[:, None]
     residual = color - (robust[..., None] * color).sum(0) / total
     change = change - (robust[..., None] * change).sum(0) / total
@@ -178,50 +163,36 @@ def color_information(
     each = (robust / torch.stack(variances) / (weight > 0).sum(0).clamp(min=1))[..., None]
     if doubt:
         mean = (weight[..., None] * color).sum(0) / weight.sum(0).clamp(min=1e-6)[:, None]
-        squares = (weight * (color - mean).square().mean(-1) / torch.stack(variances)).sum(
-            0
-        ) / weight.sum(0).clamp(min=1e-6)
+        squares = weight * (color - mean).square().mean(-1) / torch.stack(variances)
+        squares = squares.sum(0) / weight.sum(0).clamp(min=1e-6)
         each = each / squares.clamp(min=1).square()[:, None]
     return (each * change.square()).sum((0, 2)), -(each * change * residual).sum((0, 2))
 
 
 def outline_information(
-    distance: Volume, group: _Group, width: float, settings: RefinementSettings
+    distance: Volume, group: _Group, width: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Points (M, 3) where rays of an outline's pixels pass nearest, information [1/m^2], information times displacement [1/m].
 
     width: of a pixel at the body [m].
     """
-    window = group.outline.nonzero()[:, 0]
-    origin, direction, matte = (
-        group.centres[window],
-        group.directions[group.outline],
-        group.views.mattes[group.outline],
-    )
+    origin = group.centres[group.outline.nonzero()[:, 0]]
+    direction, matte = group.directions[group.outline], group.views.mattes[group.outline]
     best, way = nearest_passing(distance, origin, direction)
     share = (0.5 - best / width).clamp(0, 1)
-    told = (
-        ((share > 0) | (matte > 0.02))
-        & ((share < 1) | (matte < 0.98))
-        & (best < 4 * distance.pitch)
-    )
-    information = told / (settings.outline * width) ** 2
+    told = ((share > 0) | (matte > 0.02)) & ((share < 1) | (matte < 0.98))
+    information = (told & (best < 4 * distance.pitch)) / (OUTLINE * width) ** 2
     return origin + way[:, None] * direction, information, information * (matte - share) * width
 
 
 def pixel_width(distance: Volume, views: Windows) -> float:
     """Width [m] of a pixel at the middle of a grid, mean over the cameras."""
     middle, _ = span(distance)
-    centres, _ = camera_rays(views.cameras)
-    return float(((middle - centres).norm(dim=1) / views.cameras.K[:, 0, 0]).mean())
+    return float(((middle - centers(views.cameras)).norm(dim=1) / views.cameras.K[:, 0, 0]).mean())
 
 
 def refine(
-    distance: Volume,
-    hull: Volume,
-    frames: list[Windows],
-    settings: RefinementSettings,
-    schedule: list[tuple[int, float]],
+    distance: Volume, hull: Volume, frames: list[Windows], schedule: Sequence[tuple[int, float]]
 ) -> Volume:
     """The refined distance [m].
 
@@ -230,31 +201,27 @@ def refine(
     """
     pitch, groups = distance.pitch, [_group(views) for views in frames]
     width = pixel_width(distance, frames[0])
-    floor = hull.values - settings.slack * width
-    shape, area = tuple(distance.values.shape), 2 * math.pi * settings.patch**2
+    floor = hull.values - SLACK * width
+    shape, area = tuple(distance.values.shape), 2 * math.pi * PATCH**2
     turn = 0
     for rounds, sigma in schedule:
         images = [blurred(views, sigma) for views in frames]
         for _ in range(rounds):
-            which = turn % len(groups)
-            ways, points = _surface(distance, groups[which])
-            about, pull = color_information(
-                distance, groups[which], images[which], points, ways, settings
-            )
-            edges, edge_about, edge_pull = outline_information(
-                distance, groups[which], width, settings
-            )
+            group, image = groups[turn % len(groups)], images[turn % len(groups)]
+            ways, points = _surface(distance, group)
+            about, pull = color_information(distance, group, image, points, ways)
+            edges, edge_about, edge_pull = outline_information(distance, group, width)
             # in units of voxels
             values = torch.stack(
                 [torch.cat([about, edge_about]) * pitch**2, torch.cat([pull, edge_pull]) * pitch], 1
             )
             index = (torch.cat([points, edges]) - distance.origin) / pitch
-            known, pulled = area * smooth(scatter(shape, index, values), settings.patch)
-            step = pulled / (known + (pitch / (1e-3 * settings.step)) ** 2)
+            known, pulled = area * smooth(scatter(shape, index, values), PATCH)
+            step = pulled / (known + (pitch / (1e-3 * STEP)) ** 2)
             values = distance.values - pitch * step.clamp(-0.6, 0.6)
             once = smooth(values, 1.5)
             flat = 2 * once - smooth(once, 1.5)
-            share = settings.bend / (settings.bend + known * (0.5e-3 / pitch) ** 2)
+            share = BEND / (BEND + known * (0.5e-3 / pitch) ** 2)
             values = torch.maximum(values + share * (flat - values), floor)
             turn += 1
             if turn % 3 == 0:  # keep it a distance near the surface
@@ -264,9 +231,7 @@ def refine(
     return distance
 
 
-def surface_information(
-    distance: Volume, frames: list[Windows], settings: RefinementSettings, blur: float
-) -> Tensor:
+def surface_information(distance: Volume, frames: list[Windows], blur: float) -> Tensor:
     """Information [1/m^2] on the place of the surface, (X, Y, Z), of all frames together: what is not told is 0.
 
     Colours that do not agree at the surface tell little, by the square of their chi^2. A ray of an outline tells where the
@@ -275,19 +240,17 @@ def surface_information(
     width, total = pixel_width(distance, frames[0]), torch.zeros_like(distance.values)
     _, radius = span(distance)
     # half: nothing is said of what lies far from a rim
-    patch, shape = (0.5 * settings.patch, tuple(distance.values.shape))
+    patch, shape = 0.5 * PATCH, tuple(distance.values.shape)
     area = 2 * math.pi * patch**2
     for views in frames:
         group = _group(views)
         ways, points = _surface(distance, group)
-        about, _ = color_information(
-            distance, group, blurred(views, blur), points, ways, settings, doubt=True
-        )
-        edges, edge_about, _ = outline_information(distance, group, width, settings)
-        window = group.outline.nonzero()[:, 0]
-        touching = _touching(
-            distance, group.centres[window], group.directions[group.outline], edges, 0.5 * width
-        )
+        images = blurred(views, blur)
+        about, _ = color_information(distance, group, images, points, ways, doubt=True)
+        edges, edge_about, _ = outline_information(distance, group, width)
+        origin = group.centres[group.outline.nonzero()[:, 0]]
+        direction = group.directions[group.outline]
+        touching = _touching(distance, origin, direction, edges, 0.5 * width)
         edge_about = edge_about * (touching < LOCAL * radius)
         index = (torch.cat([points, edges]) - distance.origin) / distance.pitch
         values = torch.cat([about, edge_about])[:, None] * distance.pitch**2
@@ -304,8 +267,6 @@ def _touching(
     middle = ((centre - origin) * direction).sum(-1)
     count = torch.zeros_like(limit)
     for k in range(int(2 * radius / distance.pitch) + 1):
-        count += (
-            at(distance, origin + (middle - radius + k * distance.pitch)[:, None] * direction)
-            < limit
-        )
+        here = middle - radius + k * distance.pitch
+        count += at(distance, origin + here[:, None] * direction) < limit
     return count * distance.pitch

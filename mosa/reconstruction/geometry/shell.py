@@ -47,9 +47,8 @@ def opacity_field(
     splats: Splats, origin: Tensor, shape: tuple[int, int, int], pitch: float, wider: float
 ) -> np.ndarray:
     """1 - prod_i (1 - o_i exp(-q_i / 2)) on a grid of voxels, of Gaussians whose variances are larger by wider^2 [m^2]."""
-    covariances = (
-        covariance_from(splats.scales, splats.rotations).double() + wider**2 * torch.eye(3).double()
-    )
+    covariances = covariance_from(splats.scales, splats.rotations).double()
+    covariances = covariances + wider**2 * torch.eye(3).double()
     places = (splats.means.double() - origin.double()) / pitch
     widest = REACH * covariances.diagonal(dim1=1, dim2=2).amax(1).sqrt() / pitch
     inverse, reach = torch.linalg.inv(covariances / pitch**2), widest.ceil()
@@ -105,22 +104,16 @@ def solid_of(
     origin = low - room
     shape = voxel_counts(((high - low + 2 * room) / pitch).ceil() + 1)
     shell = opacity_field(splats, origin, shape, pitch, wider) > LEVEL
-    closed, count = np.zeros(shape, np.int32), 0
-    for direction in product((-1, 0, 1), repeat=3):
-        if not any(direction):
-            continue
-        count += 1
-        falls = (
-            up is not None
-            and float(torch.tensor(direction, dtype=torch.float32) @ up.float().cpu()) < -0.3
+    closed, directions = np.zeros(shape, np.int32), list(filter(any, product((-1, 0, 1), repeat=3)))
+    for direction in directions:
+        along = (
+            torch.zeros(()) if up is None else torch.tensor(direction).float() @ up.float().cpu()
         )
-        closed += 1 if falls else blocked(shell, direction)
-    inside = ndimage.binary_fill_holes(shell | (closed >= share * count))
+        closed += 1 if float(along) < -0.3 else blocked(shell, direction)
+    inside = ndimage.binary_fill_holes(shell | (closed >= share * len(directions)))
     if up is not None:  # what lies below the lowest of the shell is the ground, not the object
-        height = (
-            np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
-            @ up.cpu().double().numpy()
-        )
+        cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+        height = cells @ up.cpu().double().numpy()
         inside &= height >= height[shell].min() if shell.any() else False
     if not inside.any():
         raise DataError(
@@ -129,9 +122,8 @@ def solid_of(
         )
     # the surface lies half a voxel outside of the outermost centres
     depth = (ndimage.distance_transform_edt(inside) - 0.5) * pitch
-    centres = ndimage.map_coordinates(
-        depth, ((splats.means - origin) / pitch).T.double().numpy(), order=1
-    )
+    places = ((splats.means - origin) / pitch).T.double().numpy()
+    centres = ndimage.map_coordinates(depth, places, order=1)
     beneath = float(np.quantile(centres, OUTERMOST)) - HALF * float(splats.scales.amin(1).median())
     values = np.clip(0.5 + (depth - max(beneath, 0.0)) / pitch, 0, 1).astype(np.float32)
     return Volume(torch.from_numpy(values), origin, pitch)

@@ -40,19 +40,12 @@ class Neighbourhood:
         difference = positions[..., self.index, :] - positions[..., None, :]
         return torch.einsum("...nki,nkj->...nij", difference, self.gradient)
 
-    def to(self, device: torch.device | str) -> Neighbourhood:
-        return Neighbourhood(
-            *(getattr(self, name).to(device) for name in self.__dataclass_fields__)
-        )
 
-
-def neighbourhood(
-    rest: Tensor, *, neighbours: int = 20, condition_limit: float = CONDITION_LIMIT
-) -> Neighbourhood:
+def neighbourhood(rest: Tensor, *, neighbours: int = 20) -> Neighbourhood:
     """Weighted least squares over the `neighbours` nearest rest particles. rest: (N, 3) [m].
 
     Minimises sum_k w_k |d_k - F D_k|^2, D rest vector, d deformed vector, w = (1 - r^2/r_max^2)^2 with r_max 1.2 times the
-    distance of the farthest neighbour. Where the moment matrix has a condition number above `condition_limit` (neighbours in a
+    distance of the farthest neighbour. Where the moment matrix has a condition number above `CONDITION_LIMIT` (neighbours in a
     plane or on a line) the weight is 0 and the gradient that of F = 0: such particles must not be used.
     Raises DataError for fewer than 5 particles.
     """
@@ -71,18 +64,13 @@ def neighbourhood(
     scale = radius[..., None] ** 2
     moment = np.einsum("nk,nki,nkj->nij", kernel, offset, offset) / scale
     values = np.linalg.eigvalsh(moment)
-    good = values[:, 0] * condition_limit > values[:, 2].clip(1e-300)
+    good = values[:, 0] * CONDITION_LIMIT > values[:, 2].clip(1e-300)
     safe = np.where(good[:, None, None], moment, np.eye(3))
     gradient = np.einsum("nk,nki,nij->nkj", kernel, offset, np.linalg.inv(safe)) / scale
     gradient = np.where(good[:, None, None], gradient, 0.0)
-    as_tensor = lambda a: torch.as_tensor(a, dtype=rest.dtype, device=rest.device)  # noqa: E731
-    return Neighbourhood(
-        torch.as_tensor(index, device=rest.device),
-        as_tensor(gradient),
-        as_tensor(good.astype(float)),
-        as_tensor(kernel),
-        as_tensor(offset),
-    )
+    parts = gradient, good.astype(float), kernel, offset
+    index = torch.as_tensor(index, device=rest.device)
+    return Neighbourhood(index, *(torch.as_tensor(part).to(rest) for part in parts))
 
 
 def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
@@ -101,10 +89,9 @@ def neighbourhood_cues(positions: Tensor, covariances: Tensor, around: Neighbour
     """Cues from displacements alone. positions: (T, N, 3) [m], frame 0 at rest; covariances: (T, N, 3, 3) [m^2]."""
     rotation, stretch = polar(around.deformation(positions))
     weight = around.weight.expand(len(positions), -1) * (stretch[..., 2] > 0.05)
-    identity = torch.eye(3, dtype=positions.dtype, device=positions.device)
     known = weight > 0
-    rotation = torch.where(known[..., None, None], rotation, identity)
-    stretch = torch.where(known[..., None], stretch, torch.ones_like(stretch))
+    rotation = torch.where(known[..., None, None], rotation, torch.eye(3).to(positions))
+    stretch = torch.where(known[..., None], stretch, 1.0)
     return MotionCues(
         positions.contiguous(), rotation, stretch, weight.contiguous(), covariances.contiguous()
     )

@@ -28,6 +28,8 @@ Motion = ModalMotion | MotionBasisNetwork
 
 TRACK_RATE = 0.03
 """Step of the first pass, in units of the object's radius."""
+NETWORK = {"bases", "hidden", "basis_layers", "coefficient_layers", "space_frequencies", "time_frequencies"}  # fmt: skip
+"""Settings that are the network's own."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +67,32 @@ def _round_robin(
         chosen = []
         for t in frames:
             while len(queue[t]) < count:
-                queue[t] = torch.cat(
-                    [queue[t], by_frame[t][torch.randperm(len(by_frame[t]), generator=generator)]]
-                )
+                order = torch.randperm(len(by_frame[t]), generator=generator)
+                queue[t] = torch.cat([queue[t], by_frame[t][order]])
             chosen.append(queue[t][:count])
             queue[t] = queue[t][count:]
         return torch.cat(chosen)
 
     return draw
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a motion is fitted to. scaffold: the N filled particles; carried: the Gaussians that are rendered, the particles
+    themselves or others; windows: of all frames; offsets: (T, 3) [m] first guess of the object's centre per frame; background:
+    (3,); reach [m]: radius of the object, the unit of displacements."""
+
+    scaffold: Scaffold
+    carried: Scaffold
+    windows: Windows
+    offsets: Tensor
+    background: Tensor
+    reach: float
+
+    def modal(self, *, free_shape: bool = False) -> ModalMotion:
+        """A motion by the scaffold's modes that only shifts, by the offsets."""
+        energy = self.scaffold.modes.energy
+        return ModalMotion(self.offsets, energy, reach=self.reach, free_shape=free_shape)
 
 
 @dataclass(frozen=True)
@@ -92,45 +112,33 @@ class Objective:
     def __init__(
         self,
         motion: Motion,
-        carried: Scaffold,
-        scaffold: Scaffold,
-        background: Tensor,
+        target: Target,
         settings: DynamicSettings,
         predicted: Predicted | None = None,
     ):
-        self.motion, self.carried, self.scaffold = motion, carried, scaffold
-        self.background, self.settings, self.predicted = background, settings, predicted
-        self.refining = False
+        self.motion, self.target, self.settings = motion, target, settings
+        self.predicted, self.refining = predicted, False
 
     def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
         """frames: (S,) long; state: (B,) which of them each window shows."""
-        carried, settings = self.carried, self.settings
-        sample, colors = (
-            self.motion(frames, carried.splats, carried.modes, carried.around),
-            carried.colors(frames),
-        )
+        carried, settings = self.target.carried, self.settings
+        splats, colors = carried.splats, carried.colors(frames)
+        sample = self.motion(frames, splats, carried.modes, carried.around)
+        shown = colors if len(colors) == 1 else colors[state]
         image, alpha = rasterize(
-            sample.positions,
-            sample.covariances,
-            carried.splats.opacities,
-            colors if len(colors) == 1 else colors[state],
-            batch.cameras,
-            state,
-            self.background,
-        )
+            sample.positions, sample.covariances, splats.opacities, shown, batch.cameras, state, self.target.background,
+        )  # fmt: skip
         loss = image_loss(
             image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
         )
         if settings.elastic > 0:
-            loss = loss + settings.elastic * elastic_energy(
-                self._deformation(frames, sample), settings.poisson
-            )
+            energy = elastic_energy(self._deformation(frames, sample), settings.poisson)
+            loss = loss + settings.elastic * energy
         if settings.bending > 0 and isinstance(self.motion, ModalMotion):
             c = self.motion.coefficients(frames)
-            c = (
-                c if self.predicted is None else c - self.predicted.coefficients[frames]
-            ) / self.motion.reach
-            curvature = (self.scaffold.modes.energy[:, None] * c**2).sum((-2, -1))
+            c = c if self.predicted is None else c - self.predicted.coefficients[frames]
+            energy = self.target.scaffold.modes.energy[:, None]
+            curvature = (energy * (c / self.motion.reach) ** 2).sum((-2, -1))
             # what a frame shows sets its own weight
             if self.refining and settings.bending_scale > 0:
                 curvature = settings.bending_scale * torch.log1p(curvature / settings.bending_scale)
@@ -138,113 +146,65 @@ class Objective:
         return loss
 
     def _deformation(self, frames: Tensor, sample: MotionSample) -> Tensor:
-        if self.carried is self.scaffold and self.predicted is None:
+        scaffold = self.target.scaffold
+        if self.target.carried is scaffold and self.predicted is None:
             return sample.deformation
-        if isinstance(self.motion, ModalMotion):
-            deformation = self.motion.displacement(frames, self.scaffold.modes)[1]
-            return (
-                deformation
-                if self.predicted is None
-                else deformation @ self.predicted.inverse[frames]
-            )
-        return self.motion(frames, self.scaffold.splats, None, self.scaffold.around).deformation
+        if isinstance(self.motion, MotionBasisNetwork):
+            return self.motion(frames, scaffold.splats, None, scaffold.around).deformation
+        found = self.motion.displacement(frames, scaffold.modes)[1]
+        return found if self.predicted is None else found @ self.predicted.inverse[frames]
 
-
-def minimise(
-    objective: Objective,
-    optimizer: torch.optim.Optimizer,
-    frames: list[int],
-    windows: Windows,
-    steps: int,
-    views: int,
-    rate: float,
-    generator: torch.Generator,
-    progress: Callable[[int], None] | None,
-) -> None:
-    """`steps` steps, each on `views` random windows of every frame in `frames`."""
-    draw = _round_robin(windows, frames, generator)
-    device = windows.images.device
-    every = torch.tensor(frames, device=device)
-    state = torch.arange(len(frames), device=device).repeat_interleave(views)
-    for step in range(steps):
-        optimizer.param_groups[0]["lr"] = rate * (0.51 + 0.49 * math.cos(math.pi * step / steps))
-        loss = objective(every, windows.select(draw(views)), state)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        if progress is not None:
-            progress(1)
+    def minimise(
+        self, optimizer: torch.optim.Optimizer, frames: list[int], steps: int, views: int, generator: torch.Generator,
+        progress: Callable[[int], None] | None,
+    ) -> None:  # fmt: skip
+        """`steps` steps, each on `views` random windows of every frame in `frames`, from the optimizer's rate on."""
+        windows, rate = self.target.windows, optimizer.param_groups[0]["lr"]
+        draw = _round_robin(windows, frames, generator)
+        device = windows.images.device
+        every = torch.tensor(frames, device=device)
+        state = torch.arange(len(frames), device=device).repeat_interleave(views)
+        for step in range(steps):
+            factor = 0.51 + 0.49 * math.cos(math.pi * step / steps)
+            optimizer.param_groups[0]["lr"] = rate * factor
+            loss = self(every, windows.select(draw(views)), state)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            if progress is not None:
+                progress(1)
 
 
 def fit_motion(
-    scaffold: Scaffold,
-    carried: Scaffold,
-    windows: Windows,
-    offsets: Tensor,
-    background: Tensor,
+    target: Target,
     settings: DynamicSettings,
     *,
-    reach: float,
     seed: int,
     progress: Callable[[int], None] | None = None,
 ) -> Motion:
-    """Motion through all frames of `windows`.
-
-    scaffold: the N filled particles; carried: the Gaussians that are rendered, the particles themselves or the static
-    Gaussians; offsets: (T, 3) [m] first guess of the object's centre per frame; reach [m]: radius of the object, the unit
-    of displacements.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    moving = list(range(1, len(offsets)))
+    """Motion through all frames of the target's windows."""
+    draws = torch.Generator().manual_seed(seed), progress
+    moving = list(range(1, len(target.offsets)))
     if settings.model == "modes":
-        motion = ModalMotion(
-            offsets, scaffold.modes.energy, reach=reach, free_shape=settings.free_shape
-        )
-        objective = Objective(motion, carried, scaffold, background, settings)
+        motion = target.modal(free_shape=settings.free_shape)
+        objective = Objective(motion, target, settings)
         for t in moving:
             with torch.no_grad():
                 motion.amplitude[t] = motion.amplitude[t - 1]
             # a fresh optimiser per frame: frames without a gradient and without momentum stay where they are
             optimizer = UniformAdam(motion.parameters(), lr=TRACK_RATE, betas=(0.8, 0.95))
-            minimise(
-                objective,
-                optimizer,
-                [t],
-                windows,
-                settings.track_iterations,
-                settings.track_views,
-                TRACK_RATE,
-                generator,
-                progress,
-            )
-        rate, optimizer = settings.lr, UniformAdam(motion.parameters(), lr=settings.lr)
+            steps, views = settings.track_iterations, settings.track_views
+            objective.minimise(optimizer, [t], steps, views, *draws)
+        optimizer = UniformAdam(motion.parameters(), lr=settings.lr)
     else:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            motion = MotionBasisNetwork(
-                offsets,
-                centre=scaffold.splats.means.mean(0),
-                reach=reach,
-                bases=settings.bases,
-                hidden=settings.hidden,
-                basis_layers=settings.basis_layers,
-                coefficient_layers=settings.coefficient_layers,
-                space_frequencies=settings.space_frequencies,
-                time_frequencies=settings.time_frequencies,
-            ).to(background.device)
-        objective = Objective(motion, carried, scaffold, background, settings)
-        rate = settings.lr_network
+            centre = target.scaffold.splats.means.mean(0)
+            sizes = settings.model_dump(include=NETWORK)
+            motion = MotionBasisNetwork(target.offsets, centre=centre, reach=target.reach, **sizes)
+        motion = motion.to(target.background.device)
+        objective, rate = Objective(motion, target, settings), settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    minimise(
-        objective,
-        optimizer,
-        moving,
-        windows,
-        settings.iterations,
-        settings.views,
-        rate,
-        generator,
-        progress,
-    )
+    objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws)
     return motion

@@ -11,17 +11,18 @@ motion where no image is: then the first motion stays.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
 from mosa.reconstruction.motion.cues import polar
-from mosa.reconstruction.motion.dynamic import Objective, Predicted, Scaffold, minimise
+from mosa.reconstruction.motion.dynamic import Objective, Predicted, Scaffold, Target
 from mosa.reconstruction.motion.modes import coefficients_of
 from mosa.reconstruction.motion.motion import ModalMotion
-from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import DynamicSettings, InformedSettings
+from mosa.rendering.cameras import centers
 
 WORSE, SLACK = 1.2, 0.005
 """A prediction has misled the fit where the loss of images is more than so many times the first motion's, and so much beside. On
@@ -39,10 +40,8 @@ def laid_onto(predicted: Tensor, seen: Tensor, eye: Tensor | None = None) -> Ten
     eye: (3,) [m] of the only camera, which does not tell how far the body is: it stays as far as predicted."""
     centre, target = predicted.mean(1, keepdim=True), seen.mean(1, keepdim=True)
     if eye is not None:
-        sight = target - eye
-        target = eye + sight * (centre - eye).norm(dim=-1, keepdim=True) / sight.norm(
-            dim=-1, keepdim=True
-        )
+        sight, away = target - eye, (centre - eye).norm(dim=-1, keepdim=True)
+        target = eye + sight * away / sight.norm(dim=-1, keepdim=True)
     rotation, _ = polar((seen - target).mT @ (predicted - centre))
     return (predicted - centre) @ rotation.mT + target
 
@@ -56,29 +55,18 @@ def project(motion: ModalMotion, scaffold: Scaffold, positions: Tensor) -> None:
 
 
 def informed_motion(
-    scaffold: Scaffold,
-    carried: Scaffold,
-    windows: Windows,
-    offsets: Tensor,
-    background: Tensor,
-    predicted: Tensor,
-    seen: Tensor,
-    settings: InformedSettings,
-    dynamic: DynamicSettings,
-    *,
-    reach: float,
-    seed: int,
-    judging: Scaffold | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> tuple[ModalMotion, Tensor] | None:
-    """(motion through all frames of `windows`, about predicted shapes of the body; those shapes (T, N, 3) [m] where it began); else
-    as `fit_motion`. None where it follows the images much worse than `seen` does.
+    target: Target, predicted: Tensor, seen: Tensor, settings: InformedSettings, dynamic: DynamicSettings, *, seed: int,
+    judging: Scaffold | None = None, progress: Callable[[int], None] | None = None,
+) -> tuple[ModalMotion, Tensor] | None:  # fmt: skip
+    """(motion through all frames of the target's windows, about predicted shapes of the body; those shapes (T, N, 3) [m] where it
+    began); else as `fit_motion`. None where it follows the images much worse than `seen` does.
 
     predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one; judging: the
     Gaussians by which the two motions are compared in the end, those that were not fitted as `seen` carried them: it would win by
-    that alone. None: `carried`.
+    that alone. None: those of the target.
     """
-    motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
+    scaffold, windows, offsets = target.scaffold, target.windows, target.offsets
+    motion = target.modal()
     every = torch.arange(len(offsets), device=offsets.device)
     chosen = torch.cat([(windows.frame == t).nonzero()[:COMPARED, 0] for t in every[1:].tolist()])
     compared, alone = windows.select(chosen), dynamic.but(elastic=0.0, bending=0.0)
@@ -87,16 +75,14 @@ def informed_motion(
     def losses(positions: Tensor) -> Tensor:
         """(T,) of images, 0 for the first frame, with the particles near `positions`."""
         project(motion, scaffold, positions)
-        objective = Objective(motion, carried, scaffold, background, alone)
-        found = [
-            objective(t[None], each := compared.of_frame(int(t)), torch.zeros_like(each.frame))
-            for t in every[1:]
-        ]
-        return torch.stack([torch.zeros_like(found[0]), *found])
+        objective, found = Objective(motion, target, alone), [torch.zeros_like(positions[0, 0, 0])]
+        for t in every[1:]:
+            own = compared.of_frame(int(t))
+            found.append(objective(t[None], own, torch.zeros_like(own.frame)))
+        return torch.stack(found)
 
-    w2c = windows.cameras.w2c
     single = len(windows.view.unique()) == 1
-    laid = laid_onto(predicted, seen, -w2c[0, :3, :3].T @ w2c[0, :3, 3] if single else None)
+    laid = laid_onto(predicted, seen, centers(windows.cameras)[0] if single else None)
     better = losses(predicted) < AS_IT_IS * losses(laid)
     begun = torch.where(better[:, None, None], predicted, laid)
     project(motion, scaffold, begun)
@@ -104,29 +90,16 @@ def informed_motion(
         deformation = motion.displacement(every, scaffold.modes)[1]
         about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
     weights = dynamic.but(elastic=settings.elastic, bending=settings.bending, bending_scale=0.0)
-    objective = Objective(motion, carried, scaffold, background, weights, about)
     optimizer = UniformAdam(motion.parameters(), lr=settings.lr)
-    generator = torch.Generator().manual_seed(seed)
-    minimise(
-        objective,
-        optimizer,
-        every[1:].tolist(),
-        windows,
-        settings.iterations,
-        settings.views,
-        settings.lr,
-        generator,
-        progress,
-    )
-    first = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
+    Objective(motion, target, weights, about).minimise(
+        optimizer, every[1:].tolist(), settings.iterations, settings.views, torch.Generator().manual_seed(seed), progress,
+    )  # fmt: skip
+    first = target.modal()
     project(first, scaffold, seen)
+    judged = replace(target, carried=judging or target.carried)
 
     @torch.no_grad()
     def loss(of: ModalMotion) -> float:
-        return float(
-            Objective(of, judging or carried, scaffold, background, alone)(
-                every, compared, compared.frame
-            )
-        )
+        return float(Objective(of, judged, alone)(every, compared, compared.frame))
 
     return (motion, begun) if loss(motion) < WORSE * loss(first) + SLACK else None

@@ -19,6 +19,8 @@ from torch import Tensor
 from mosa.reconstruction.motion.cues import Neighbourhood
 from mosa.reconstruction.motion.softest import softest_vectors
 
+NEAREST = 8
+"""Particles from which modes are continued to another point."""
 FILTERED_FROM = 6000
 """Number of particles above which the modes are found by filtering: 31,000 take 17 CPU-seconds, and 84 by a factorisation."""
 
@@ -38,23 +40,18 @@ class Modes:
         N = len(self.values)
         columns = coefficients.permute(1, 0, 2).reshape(K, S * 3)
         shift = (self.values @ columns).reshape(N, S, 3).transpose(0, 1)
-        gradient = (
-            (self.gradient.reshape(N * 3, K) @ columns).reshape(N, 3, S, 3).permute(2, 0, 3, 1)
-        )
-        return shift, gradient
+        gradient = (self.gradient.reshape(N * 3, K) @ columns).reshape(N, 3, S, 3)
+        return shift, gradient.permute(2, 0, 3, 1)
 
-    def at(self, points: Tensor, rest: Tensor, *, neighbours: int = 8) -> Modes:
+    def at(self, points: Tensor, rest: Tensor) -> Modes:
         """The same modes at other points (M, 3) [m]: first-order expansions around the nearest particles, blended by distance.
 
         rest: (N, 3) [m] the particles' rest positions. Affine motions stay exact.
         """
-        distance, index = cKDTree(rest.cpu().numpy()).query(
-            points.detach().cpu().numpy(), k=min(neighbours, len(rest))
-        )
+        tree, places = cKDTree(rest.cpu().numpy()), points.detach().cpu().numpy()
+        distance, index = tree.query(places, k=min(NEAREST, len(rest)))
         weight = 1 / (distance**2 + (0.3 * distance.max(1, keepdims=True)) ** 2 + 1e-12)
-        weight = torch.as_tensor(
-            weight / weight.sum(1, keepdims=True), dtype=rest.dtype, device=rest.device
-        )
+        weight = torch.as_tensor(weight / weight.sum(1, keepdims=True)).to(rest)
         index = torch.as_tensor(index, device=rest.device)
         values = points.new_zeros(len(points), self.values.shape[1])
         gradient = points.new_zeros(len(points), 3, self.values.shape[1])
@@ -84,17 +81,11 @@ def bending_matrix(around: Neighbourhood) -> sparse.csr_matrix:
     own = -coupling.sum(-1)
     root = np.sqrt(kernel / kernel.sum(1, keepdims=True))
     rows = np.arange(particles * count).reshape(particles, count)
-    entries = sparse.coo_matrix(
-        (
-            (root[..., None] * coupling).ravel(),
-            (np.repeat(rows.ravel(), count), np.repeat(index, count, 0).ravel()),
-        ),
-        shape=(particles * count, particles),
-    )
-    diagonal = sparse.coo_matrix(
-        ((root * own).ravel(), (rows.ravel(), np.repeat(np.arange(particles), count))),
-        shape=entries.shape,
-    )
+    shape = particles * count, particles
+    places = np.repeat(rows.ravel(), count), np.repeat(index, count, 0).ravel()
+    entries = sparse.coo_matrix(((root[..., None] * coupling).ravel(), places), shape=shape)
+    places = rows.ravel(), np.repeat(np.arange(particles), count)
+    diagonal = sparse.coo_matrix(((root * own).ravel(), places), shape=shape)
     residual = (entries + diagonal).tocsr()
     return (residual.T @ residual).tocsr()
 
@@ -104,9 +95,8 @@ def _bending_modes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Energies (count,) and orthonormal patterns (N, count) of the softest modes that are not affine, the softest first."""
     if len(affine) >= FILTERED_FROM:
-        found = softest_vectors(
-            matrix, rest.detach(), torch.as_tensor(affine, device=rest.device), count
-        )
+        known = torch.as_tensor(affine, device=rest.device)
+        found = softest_vectors(matrix, rest.detach(), known, count)
         if found is not None:
             return tuple(part.cpu().numpy() for part in found)
     shift = 1e-7 * matrix.diagonal().mean()
@@ -141,17 +131,10 @@ def deformation_modes(rest: Tensor, around: Neighbourhood, *, count: int) -> Mod
         energy = np.concatenate([np.zeros(4), energy * (reach / distance) ** 4])
     modes = modes * np.sqrt(particles)
     index, operator = around.index.cpu().numpy(), around.gradient.double().cpu().numpy()
-    starts = np.arange(particles + 1) * index.shape[1]
-    slopes = [
-        sparse.csr_matrix((operator[..., a].ravel(), index.ravel(), starts), (particles, particles))
-        for a in range(3)
-    ]
-    gradient = np.stack(
-        [
-            slope @ modes - operator[..., a].sum(1)[:, None] * modes
-            for a, slope in enumerate(slopes)
-        ],
-        1,
-    )
-    as_tensor = lambda a: torch.as_tensor(a, dtype=rest.dtype, device=rest.device)  # noqa: E731
-    return Modes(as_tensor(modes), as_tensor(gradient), as_tensor(energy))
+    starts, gradient = np.arange(particles + 1) * index.shape[1], []
+    for a in range(3):
+        entries = operator[..., a].ravel(), index.ravel(), starts
+        slope = sparse.csr_matrix(entries, (particles, particles))
+        gradient.append(slope @ modes - operator[..., a].sum(1)[:, None] * modes)
+    parts = modes, np.stack(gradient, 1), energy
+    return Modes(*(torch.as_tensor(part).to(rest) for part in parts))

@@ -27,6 +27,10 @@ class MotionSample:
     rotations: Tensor | None = None
 
 
+SOFTNESS = 10.0
+"""Modes after the affine ones in which the unit of amplitudes halves."""
+
+
 class ModalMotion(nn.Module):
     """Displacement of frame t = offset_t + sum_k modes_k amplitude_tk (in units `reach` [m] times a factor that falls with k).
 
@@ -42,7 +46,6 @@ class ModalMotion(nn.Module):
         energies: Tensor,
         *,
         reach: float,
-        softness: float = 10.0,
         free_shape: bool = False,
     ) -> None:
         super().__init__()
@@ -50,14 +53,11 @@ class ModalMotion(nn.Module):
         self.reach = reach
         order = (torch.arange(count, device=offsets.device) - 3).clamp(min=0)
         self.register_buffer("offsets", offsets - offsets[0])
-        self.register_buffer("unit", reach / (1 + order / softness))
-        self.register_buffer("turn", 1 / (1 + order / softness))
+        self.register_buffer("unit", reach / (1 + order / SOFTNESS))
+        self.register_buffer("turn", 1 / (1 + order / SOFTNESS))
         self.amplitude = nn.Parameter(torch.zeros(frames, count, 3, device=offsets.device))
-        self.shape_amplitude = (
-            nn.Parameter(torch.zeros(frames, count, 6, device=offsets.device))
-            if free_shape
-            else None
-        )
+        shapes = torch.zeros(frames, count, 6, device=offsets.device)
+        self.shape_amplitude = nn.Parameter(shapes) if free_shape else None
 
     def coefficients(self, frames: Tensor) -> Tensor:
         """Mode coefficients (S, K, 3) [m] of the given frames; zero at frame 0."""
@@ -73,9 +73,7 @@ class ModalMotion(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The same under other coefficients (S, K, 3) [m], of frames (S,), or (1,) for all of them."""
         shift, gradient = modes.displacement(coefficients)
-        return shift + self.offsets[frames][:, None], gradient + torch.eye(
-            3, dtype=gradient.dtype, device=gradient.device
-        )
+        return shift + self.offsets[frames][:, None], gradient + torch.eye(3).to(gradient)
 
     def forward(
         self, frames: Tensor, splats: Splats, modes: Modes, around: Neighbourhood | None = None
@@ -83,20 +81,15 @@ class ModalMotion(nn.Module):
         shift, deformation = self.displacement(frames, modes)
         positions = splats.means + shift
         if self.shape_amplitude is None:
-            return MotionSample(
-                positions,
-                carried_covariance(deformation, splats.scales, splats.rotations),
-                deformation,
-            )
+            shapes = carried_covariance(deformation, splats.scales, splats.rotations)
+            return MotionSample(positions, shapes, deformation)
         moving = (frames > 0).to(self.turn)[:, None, None]
         shape = modes.values @ (moving * self.shape_amplitude[frames] * self.turn[:, None])
         scales = splats.scales * shape[..., :3].exp()
         half = 0.5 * shape[..., 3:]
-        rotations = quaternion_multiply(
-            torch.cat([torch.ones_like(half[..., :1]), half], -1),
-            splats.rotations.expand(len(frames), -1, -1),
-        )
-        rotations = nn.functional.normalize(rotations, dim=-1)
+        turn = torch.cat([torch.ones_like(half[..., :1]), half], -1)
+        rest = splats.rotations.expand(len(frames), -1, -1)
+        rotations = nn.functional.normalize(quaternion_multiply(turn, rest), dim=-1)
         return MotionSample(
             positions, covariance_from(scales, rotations), deformation, scales, rotations
         )
@@ -104,9 +97,8 @@ class ModalMotion(nn.Module):
 
 def _encoded(x: Tensor, frequencies: int) -> Tensor:
     """x, sin(2^l pi x), cos(2^l pi x), l < frequencies."""
-    angles = (
-        torch.pi * x[..., None] * 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
-    )
+    octaves = 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
+    angles = torch.pi * x[..., None] * octaves
     return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
 
 

@@ -14,7 +14,7 @@ from mosa.data.hull import hull_centroid
 from mosa.errors import ConfigError
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.motion.cues import gaussian_cues, neighbourhood, neighbourhood_cues
-from mosa.reconstruction.motion.dynamic import Motion, Scaffold, fit_motion
+from mosa.reconstruction.motion.dynamic import Motion, Scaffold, Target, fit_motion
 from mosa.reconstruction.motion.informed import informed_motion
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import MotionSample
@@ -67,20 +67,16 @@ class MovingParts:
             return known_centres(scene, self.place).to(self.splats.means)
         views, frames = scene.training_cameras, scene.training_frames
         cameras = scene.cameras.select(views)
-        found = list(
-            threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames)
-        )
-        return torch.stack(found).to(self.splats.means)
+        of_frame = lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box)  # noqa: E731
+        return torch.stack(list(threaded(of_frame, frames))).to(self.splats.means)
 
     @cached_property
     def scaffold(self) -> Scaffold:
         """The particles, with the modes at them."""
-        around = neighbourhood(self.splats.means, neighbours=self.settings.neighbours)
-        return Scaffold(
-            self.splats,
-            deformation_modes(self.splats.means, around, count=self.settings.dynamic.modes),
-            around,
-        )
+        means = self.splats.means
+        around = neighbourhood(means, neighbours=self.settings.neighbours)
+        modes = deformation_modes(means, around, count=self.settings.dynamic.modes)
+        return Scaffold(self.splats, modes, around)
 
     @cached_property
     def carried(self) -> Scaffold:
@@ -95,6 +91,10 @@ class MovingParts:
         means = self.splats.means
         return float((means - means.mean(0)).norm(dim=1).max())
 
+    def target(self, carried: Scaffold, windows: Windows, background: Tensor) -> Target:
+        """The parts with the Gaussians and the windows that are compared."""
+        return Target(self.scaffold, carried, windows, self.centres, background, self.reach)
+
     def sample(self, motion: Motion) -> MotionSample:
         """The particles in all training frames."""
         frames = torch.arange(len(self.centres), device=self.splats.means.device)
@@ -102,21 +102,14 @@ class MovingParts:
 
 
 def first_motion(
-    parts: MovingParts,
-    windows: Windows,
-    background: Tensor,
-    seed: int,
-    bar: Callable[[str, int], tqdm],
-    cache: StageCache,
-) -> dict[str, Tensor]:
+    parts: MovingParts, windows: Windows, background: Tensor, seed: int, bar: Callable[[str, int], tqdm], cache: StageCache,
+) -> dict[str, Tensor]:  # fmt: skip
     """Positions, covariances and, where free, shapes of the particles in every training frame."""
     dynamic, splats = parts.settings.dynamic, parts.splats
     tracked = dynamic.track_iterations * (len(parts.centres) - 1) if dynamic.model == "modes" else 0
+    target = parts.target(parts.carried, windows, background)
     with bar("motion", dynamic.iterations + tracked) as steps:
-        motion = fit_motion(
-            parts.scaffold, parts.carried, windows, parts.centres, background, dynamic, reach=parts.reach, seed=seed,
-            progress=steps.update,
-        )  # fmt: skip
+        motion = fit_motion(target, dynamic, seed=seed, progress=steps.update)
     with torch.no_grad():
         sample = parts.sample(motion)
         rendered = rasterize(sample.positions, sample.covariances, splats.opacities, splats.colors[None], windows.cameras,
@@ -133,13 +126,7 @@ def cues_of(
 ) -> MotionCues:
     """Cues of a reconstructed motion, relative to `splats`, where it starts."""
     if settings.cue == "gaussian":
-        return gaussian_cues(
-            motion["positions"],
-            motion["covariances"],
-            splats,
-            motion["scales"],
-            motion["rotations"],
-        )
+        return gaussian_cues(**motion, splats=splats)
     around = neighbourhood(splats.means, neighbours=settings.neighbours)
     return neighbourhood_cues(motion["positions"], motion["covariances"], around)
 
@@ -165,7 +152,7 @@ class SecondLook:
         """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
         reconstruction's own."""
         seen = self._seen(seen)
-        found = self._found(predicted, seen, self._windows())
+        found = self._found(predicted, seen, self._target())
         return self.cues(seen if found is None else found[0])
 
     def with_response(
@@ -175,49 +162,25 @@ class SecondLook:
         is no guide to the images, or where what they keep cannot be told.
 
         first_contact: index of the first frame after it: until then predictions do not differ."""
-        seen, scene, parts, settings = (
-            self._seen(seen),
-            self.scene,
-            self.reconstruction.moving,
-            self.settings.informed,
-        )
-        windows = self._windows()
-        found = self._found(predicted, seen, windows)
+        seen, target, views = self._seen(seen), self._target(), self.settings.informed.response
+        found = self._found(predicted, seen, target)
         if found is None:
             return self.cues(seen), None
         positions, about = found
-        second = (
-            self._found(other, seen, windows)
-            if settings.response and first_contact < len(positions)
-            else None
-        )
+        told = bool(views) and first_contact < len(positions)
+        second = self._found(other, seen, target) if told else None
         if second is None:
             return self.cues(positions), None
-        frames = len(positions) - 1
-        with tqdm(
-            total=frames,
-            desc=f"{scene.sequence}: how far images determine the motion",
-            disable=not self.progress,
-            leave=False,
-        ) as steps:
-            matrices = image_matrices(
-                parts.scaffold,
-                self._carried,
-                windows,
-                parts.centres,
-                self._background(),
-                positions,
-                reach=parts.reach,
-                views=settings.response,
-                progress=steps.update,
-            )
+        with self._bar("how far images determine the motion", len(positions) - 1) as steps:
+            matrices = image_matrices(target, positions, views=views, progress=steps.update)
+        modes = target.scaffold.modes
         response, strength, left = response_of(
-            parts.scaffold.modes, matrices, about, positions, second[1], second[0], first_contact
+            modes, matrices, about, positions, second[1], second[0], first_contact
         )
         log.info(
             "motion of %s: its bias towards the prediction is measured by a second prediction: the weight of the prediction is "
             "%.3g of the images' (median direction), which explains %.0f%% of the change",
-            scene.sequence,
+            self.scene.sequence,
             strength,
             100 * (1 - left),
         )
@@ -248,47 +211,39 @@ class SecondLook:
         if first or appearance is None or appearance.light is None:
             return parts.carried
         appearance = appearance.to(self.device)
-        splats, seen = appearance.splats, self._seen(None)
-        turns = turned_basis(
-            appearance.normals, bind(splats.means, parts.splats.means).carry(seen).rotations
-        )
-        return Scaffold(
-            splats,
-            parts.scaffold.modes.at(splats.means, parts.splats.means),
-            shades=(turns @ appearance.light).exp(),
-        )
+        splats, rest = appearance.splats, parts.splats.means
+        rotations = bind(splats.means, rest).carry(self._seen(None)).rotations
+        shades = (turned_basis(appearance.normals, rotations) @ appearance.light).exp()
+        return Scaffold(splats, parts.scaffold.modes.at(splats.means, rest), shades=shades)
 
     def _seen(self, seen: Tensor | None) -> Tensor:
-        return (self.reconstruction.cues.positions if seen is None else seen).to(
-            self.reconstruction.moving.centres
-        )
+        found = self.reconstruction.cues.positions if seen is None else seen
+        return found.to(self.reconstruction.moving.centres)
 
-    def _windows(self) -> Windows:
-        scene = self.scene
-        return object_windows(
-            scene, scene.training_cameras, scene.training_frames, margin=self.settings.margin
-        ).to(self.device)
+    def _bar(self, title: str, total: int) -> tqdm:
+        title = f"{self.scene.sequence}: {title}"
+        return tqdm(total=total, desc=title, disable=not self.progress, leave=False)
 
-    def _background(self) -> Tensor:
-        return self.scene.background.to(self.reconstruction.moving.centres)
+    def _target(self) -> Target:
+        scene, parts, margin = self.scene, self.reconstruction.moving, self.settings.margin
+        views, frames = scene.training_cameras, scene.training_frames
+        windows = object_windows(scene, views, frames, margin=margin).to(self.device)
+        return parts.target(self._carried, windows, scene.background.to(parts.centres))
 
     def _found(
-        self, predicted: Tensor, seen: Tensor, windows: Windows
+        self, predicted: Tensor, seen: Tensor, target: Target
     ) -> tuple[Tensor, Tensor] | None:
         """(positions, the shapes that they were sought from), (T, N, 3) [m] each; None where the prediction is no guide."""
-        parts, settings, sequence = self.reconstruction.moving, self.settings, self.scene.sequence
-        title = f"{sequence}: motion fitted to images from the prior's prediction"
-        with tqdm(
-            total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False
-        ) as steps:
-            found = informed_motion(parts.scaffold, self._carried, windows, parts.centres, self._background(),
-                                    predicted.to(seen), seen, settings.informed, settings.dynamic, reach=parts.reach,
+        parts, settings = self.reconstruction.moving, self.settings
+        title = "motion fitted to images from the prior's prediction"
+        with self._bar(title, settings.informed.iterations) as steps:
+            found = informed_motion(target, predicted.to(seen), seen, settings.informed, settings.dynamic,
                                     seed=self.seed, judging=parts.carried, progress=steps.update)  # fmt: skip
         if found is None:
             log.warning(
                 "reconstruction.informed: a motion of %s that starts from the calibrated law's prediction follows the images "
                 "much worse than the first reconstruction, which is kept",
-                sequence,
+                self.scene.sequence,
             )
             return None
         with torch.no_grad():
@@ -297,11 +252,8 @@ class SecondLook:
     def cues(self, positions: Tensor) -> MotionCues:
         """Of positions (T, N, 3) [m] that `about` found, for instance those in a checkpoint."""
         splats = self.reconstruction.splats.to(self.device)
-        around, positions = (
-            neighbourhood(splats.means, neighbours=self.settings.neighbours),
-            positions.to(splats.means),
-        )
-        covariances = carried_covariance(
-            around.deformation(positions), splats.scales, splats.rotations
-        )
+        around = neighbourhood(splats.means, neighbours=self.settings.neighbours)
+        positions = positions.to(splats.means)
+        moved = around.deformation(positions)
+        covariances = carried_covariance(moved, splats.scales, splats.rotations)
         return neighbourhood_cues(positions, covariances, around)

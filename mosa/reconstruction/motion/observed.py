@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from mosa.errors import DataError
+from mosa.rendering.cameras import crop_cameras
 from mosa.types import Cameras, Scene
 
 
@@ -26,25 +27,20 @@ class Windows:
 
     def select(self, chosen: Tensor) -> Windows:
         """The windows at `chosen`, a long tensor of indices."""
-        return Windows(
-            self.images[chosen],
-            self.mattes[chosen],
-            self.cameras.select(chosen.tolist()),
-            self.view[chosen],
-            self.frame[chosen],
-        )
+        parts = self.images, self.mattes, self.view, self.frame
+        images, mattes, view, frame = (part[chosen] for part in parts)
+        return Windows(images, mattes, self.cameras.select(chosen.tolist()), view, frame)
 
     def of_frame(self, frame: int) -> Windows:
         return self.select((self.frame == frame).nonzero()[:, 0])
 
     def to(self, device: torch.device | str) -> Windows:
-        return Windows(
-            self.images.to(device),
-            self.mattes.to(device),
-            self.cameras.to(device),
-            self.view.to(device),
-            self.frame.to(device),
-        )
+        return Windows(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+    def masked(self) -> Tensor:
+        """Colours times matte, and the matte, (B, 4, h, w)."""
+        matte = self.mattes[..., None]
+        return torch.cat([self.images * matte, matte], -1).permute(0, 3, 1, 2)
 
 
 def _extent(mattes: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,14 +87,5 @@ def object_windows(
         columns, in_columns = _overlap(x, width, scene.cameras.width)
         images[b, in_rows, in_columns] = scene.images[v, t, rows, columns]
         cut[b, in_rows, in_columns] = mattes[b, rows, columns]
-    K = scene.cameras.K[view].clone()
-    K[:, 0, 2] -= x0
-    K[:, 1, 2] -= y0
-    cameras = Cameras(
-        K,
-        scene.cameras.w2c[view],
-        width,
-        height,
-        tuple(scene.cameras.names[v] for v in view.tolist()),
-    )
+    cameras = crop_cameras(scene.cameras.select(view.tolist()), x0, y0, width, height)
     return Windows(images, cut, cameras, view, frame)

@@ -22,10 +22,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.reconstruction.motion.dynamic import Scaffold
+from mosa.reconstruction.motion.dynamic import Target
 from mosa.reconstruction.motion.informed import project
 from mosa.reconstruction.motion.modes import Modes, coefficients_of
-from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.motion.observed import Windows
 from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
@@ -89,48 +88,37 @@ class Response:
 
 @torch.no_grad()
 def image_matrices(
-    scaffold: Scaffold,
-    carried: Scaffold,
-    windows: Windows,
-    offsets: Tensor,
-    background: Tensor,
-    found: Tensor,
-    *,
-    reach: float,
-    views: int,
-    progress: Callable[[int], None] | None = None,
+    target: Target, found: Tensor, *, views: int, progress: Callable[[int], None] | None = None
 ) -> Tensor:
     """(T - 1, D, D) Gauss-Newton matrices [1/m^2] of the loss of images (mean over pixels and matte, absolute values made
     quadratic) at positions found (T, N, 3) [m], in the first modes, frame after frame; of `views` views each, in turns."""
-    motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
-    project(motion, scaffold, found)
-    splats, device, every = carried.splats, found.device, len(scaffold.modes.energy)
+    motion, carried = target.modal(), target.carried
+    project(motion, target.scaffold, found)
+    splats, device, every = carried.splats, found.device, len(target.scaffold.modes.energy)
     size, matrices = 3 * min(MODES, every), []
     directions = torch.eye(size, 3 * every, device=device).unflatten(1, (every, 3))
 
     def images(c: Tensor, frame: Tensor, window: Windows) -> Tensor:
         """(S, P) pixels of a frame (1,) under S coefficients (S, K, 3)."""
         shift, deformation = motion.displaced(c, frame, carried.modes)
-        colour, alpha = rasterize(
-            splats.means + shift,
-            carried_covariance(deformation, splats.scales, splats.rotations),
-            splats.opacities,
-            carried.colors(frame),
-            window.cameras.select([0] * len(c)),
-            torch.arange(len(c), device=device),
-            background,
+        shapes = carried_covariance(deformation, splats.scales, splats.rotations)
+        cameras, states = window.cameras.select([0] * len(c)), torch.arange(len(c), device=device)
+        colors, back = carried.colors(frame), target.background
+        return some_of(
+            *rasterize(
+                splats.means + shift, shapes, splats.opacities, colors, cameras, states, back
+            )
         )
-        return some_of(colour, alpha)
 
     def some_of(colour: Tensor, alpha: Tensor) -> Tensor:
         values = torch.cat([colour, alpha[..., None]], -1).flatten(1)
         # an odd step meets all four channels
         return values[:, :: 2 * (values.shape[1] // (2 * VALUES)) + 1]
 
-    for frame in range(1, len(offsets)):
+    for frame in range(1, len(target.offsets)):
         at = torch.tensor([frame], device=device)
         here = motion.coefficients(at)
-        own = windows.of_frame(frame)
+        own = target.windows.of_frame(frame)
         step = max(1, len(own) // views)
         chosen = range(frame % step, len(own), step)
         H = torch.zeros(size, size, dtype=torch.float64, device=device)
@@ -138,13 +126,8 @@ def image_matrices(
             window = own.select(torch.tensor([view], device=device))
             base = images(here, at, window)
             weight = ((base - some_of(window.images, window.mattes)).abs() + ABSOLUTE).rsqrt()
-            J = torch.cat(
-                [
-                    (images(here + STEP * some, at, window) - base) / STEP
-                    for some in directions.split(TOGETHER)
-                ]
-            )
-            J = J * weight
+            moved = [images(here + STEP * d, at, window) for d in directions.split(TOGETHER)]
+            J = (torch.cat(moved) - base) / STEP * weight
             H += (J @ J.T).double() / J.shape[1] / len(chosen)
         matrices.append(H)
         if progress is not None:
@@ -177,13 +160,11 @@ def measured(
 
     def left(a: float) -> float:
         explained = torch.einsum("tij,tj->ti", share(a)[-len(moved) :], moved)
-        return float(
-            (followed - explained).square().sum() / followed.square().sum().clamp(min=1e-30)
-        )
+        rest = (followed - explained).square().sum()
+        return float(rest / followed.square().sum().clamp(min=1e-30))
 
-    tried = (
-        unit * torch.logspace(*(torch.tensor(SHARES).log10().tolist()), 51, dtype=torch.float64)
-    ).tolist()
+    ends = torch.tensor(SHARES).log10().tolist()
+    tried = (unit * torch.logspace(*ends, 51, dtype=torch.float64)).tolist()
     costs = [left(a) for a in tried]
     best = min(range(len(tried)), key=costs.__getitem__)
     return tried[best], costs[best]

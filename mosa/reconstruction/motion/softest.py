@@ -32,18 +32,14 @@ def cosines(points: Tensor, count: int) -> Tensor:
     side = min(side, count + 1)
     number = torch.cartesian_prod(*[torch.arange(side, device=points.device)] * 3)
     number = number[((number / size) ** 2).sum(1).argsort(stable=True)[1 : count + 1]]
-    waves = [
-        torch.cos(torch.pi * number[:, a] * ((points[:, a] - low[a]) / size[a])[:, None])
-        for a in range(3)
-    ]
+    place = (points - low) / size
+    waves = [torch.cos(torch.pi * number[:, a] * place[:, a, None]) for a in range(3)]
     return waves[0] * waves[1] * waves[2]
 
 
 def _on(matrix: sparse.csr_matrix, like: Tensor, dtype: torch.dtype) -> Tensor:
-    parts = (
-        torch.as_tensor(a.astype(np.int64), device=like.device)
-        for a in (matrix.indptr, matrix.indices)
-    )
+    places = matrix.indptr, matrix.indices
+    parts = (torch.as_tensor(a.astype(np.int64), device=like.device) for a in places)
     values = torch.as_tensor(matrix.data, dtype=dtype, device=like.device)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
@@ -61,14 +57,8 @@ def largest_eigenvalue(matrix: Tensor, *, steps: int = 15, block: int = 8) -> fl
 
 
 def chebyshev_filter(
-    matrix: sparse.csr_matrix,
-    X: Tensor,
-    low: float,
-    high: float,
-    softest: float,
-    amplification: float,
-    dtype: torch.dtype,
-) -> Tensor:
+    matrix: sparse.csr_matrix, X: Tensor, low: float, high: float, softest: float, amplification: float, dtype: torch.dtype,
+) -> Tensor:  # fmt: skip
     """Vectors (N, k) times a polynomial of the matrix that is small from eigenvalue `low` to `high` and 1 at `softest`, of the
     degree that brings the amplification. Computed in dtype, returned as X is."""
     half, middle = (high - low) / 2, (high + low) / 2

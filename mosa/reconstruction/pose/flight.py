@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mosa.data.hull import Volume
-from mosa.reconstruction.geometry.field import camera_rays, first_crossing, gradient, sample
+from mosa.reconstruction.geometry.field import first_crossing, gradient, sample
 from mosa.reconstruction.geometry.refinement import blurred, pixel_width
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.pose.registration import matte_centres
 from mosa.reconstruction.pose.rigid import rotation_exp
-from mosa.rendering.cameras import sample_images
+from mosa.rendering.cameras import rays, sample_images
 from mosa.types import Scene
 
 BLURS = (3.0, 3.0, 1.5, 1.5, 0.7, 0.4, 0.4)
@@ -58,7 +58,7 @@ def _sampled(
 def visible_points(distance: Volume, views: Windows) -> list[Tensor]:
     """For each window the points (at most POINTS, 3) [m] where rays of its matte meet the surface."""
     found = []
-    centres, directions = camera_rays(views.cameras)
+    centres, directions = rays(views.cameras)
     slopes = gradient(distance.values, distance.pitch)
     for centre, direction, matte in zip(centres, directions, views.mattes):
         ray = direction[matte > 0.5]
@@ -87,12 +87,8 @@ def follow_rigidly(
     radius = float(torch.cat(points).sub(start.centre).norm(dim=1).mean())
     for sigma in BLURS:
         before, after = _channels(first, sigma), _channels(other, sigma)
-        matrix, vector, total, count = (
-            torch.zeros(6, 6).to(start.centre),
-            torch.zeros(6).to(start.centre),
-            0.0,
-            0.0,
-        )
+        matrix, vector = torch.zeros(6, 6).to(start.centre), torch.zeros(6).to(start.centre)
+        total, count = 0.0, 0.0
         for b, own in enumerate(points):
             wanted = _sampled(before[b], own, first.cameras.K[b], first.cameras.w2c[b])[0][:, :4]
             moved = motion.points(own)
@@ -109,10 +105,8 @@ def follow_rigidly(
             weight = 1 / (1 + residual.square().sum(1) / 0.03)
             matrix += torch.einsum("n,nci,ncj->ij", weight, J, J)
             vector += torch.einsum("n,nci,nc->i", weight, J, residual)
-            total, count = (
-                total + float((weight * residual.square().mean(1)).sum()),
-                count + float(weight.sum()),
-            )
+            total += float((weight * residual.square().mean(1)).sum())
+            count += float(weight.sum())
         damping = 1e-4 * matrix.diagonal().mean() * torch.eye(6).to(matrix)
         step = -torch.linalg.solve((matrix + damping).double(), vector.double()).to(vector)
         turn = rotation_exp(step[3:] / radius)
@@ -134,19 +128,16 @@ def free_motions(scene: Scene, distance: Volume, frames: list[Windows]) -> list[
     centre, width = everywhere.mean(0), pixel_width(distance, frames[0])
     times = (scene.times - scene.times[0]).tolist()
     views = scene.training_cameras
-    centres = matte_centres(scene.mattes[views][:, : len(frames)], scene.cameras.select(views)).to(
-        device
-    )
-    motions, first_left = [], float("inf")
-    velocity = None
+    mattes, cameras = scene.mattes[views][:, : len(frames)], scene.cameras.select(views)
+    centres = matte_centres(mattes, cameras).to(device)
+    motions, first_left, velocity = [], float("inf"), None
     for t in range(1, len(frames)):
         if scene.last_free_frame is not None and t > scene.last_free_frame:
             break
         start = Motion(torch.eye(3, device=device), centres[t] - centres[0], centre)
         if velocity is not None:
-            start = Motion(
-                motions[-1].rotation, velocity * times[t] + 0.5 * gravity * times[t] ** 2, centre
-            )
+            shift = velocity * times[t] + 0.5 * gravity * times[t] ** 2
+            start = Motion(motions[-1].rotation, shift, centre)
         ground = scene.ground.height if scene.ground is not None else -float("inf")
         if float((start.points(everywhere) @ up).min()) < ground:
             break

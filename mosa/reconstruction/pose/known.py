@@ -32,7 +32,8 @@ from mosa.reconstruction.pose.registration import (
     matte_centres,
     spread_rotations,
 )
-from mosa.reconstruction.pose.rigid import Poses, damped
+from mosa.reconstruction.pose.rigid import Poses, descend
+from mosa.rendering.cameras import centers
 from mosa.types import REST, Cameras, Scene
 
 log = logging.getLogger(__name__)
@@ -172,24 +173,20 @@ def same(solid: Solid, one: Similarities, other: Similarities) -> bool:
     return max(shares) > SAME
 
 
-def middle_of(scene: Scene, cameras: Cameras, mattes: Tensor, area: float) -> tuple[Tensor, float]:
+def middle_of(
+    scene: Scene, cameras: Cameras, mattes: Tensor, area: float, size: float | None
+) -> tuple[Tensor, float]:
     """A place (3,) [m] and a size [m] of the solid's unit to begin with. area: of its silhouettes,
-    in units squared."""
-    if len(cameras) > 1:
-        center = matte_centres(mattes[:, None], cameras)[0]
-    else:
-        center = scene.box.mean(0)
-    depth = (center - camera_places(cameras)).norm(dim=1)
-    seen = mattes.sum((1, 2)) * (depth / cameras.K[:, 0, 0]).square()
-    size = float((seen.mean() / area).sqrt())
-    if len(cameras) == 1:
+    in units squared; size: where it is known."""
+    single = len(cameras) == 1
+    center = scene.box.mean(0) if single else matte_centres(mattes[:, None], cameras)[0]
+    if size is None:
+        depth = (center - centers(cameras)).norm(dim=1)
+        seen = mattes.sum((1, 2)) * (depth / cameras.K[:, 0, 0]).square()
+        size = float((seen.mean() / area).sqrt())
+    if single:
         center = matte_centres(mattes[:, None], cameras, size * area**0.5)[0]
     return center, size
-
-
-def camera_places(cameras: Cameras) -> Tensor:
-    """(V, 3) [m]."""
-    return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
 
 
 def searched(
@@ -200,14 +197,9 @@ def searched(
     mattes, cameras = scene.mattes[views, 0], scene.cameras.select(views)
     inside = solid.distance.values < 0
     area = sum(float(inside.any(a).sum()) for a in range(3)) / 3 * solid.distance.pitch**2
-    center, begin = middle_of(scene, cameras, mattes, area)
-    if size is not None:
-        if len(cameras) == 1:
-            center = matte_centres(mattes[:, None], cameras, size * area**0.5)[0]
-        begin = size
-    found = Similarities(
-        spread_rotations(ROTATIONS), center.expand(ROTATIONS, 3), torch.full((ROTATIONS,), begin)
-    )
+    center, begin = middle_of(scene, cameras, mattes, area, size)
+    sizes = torch.full((ROTATIONS,), begin)
+    found = Similarities(spread_rotations(ROTATIONS), center.expand(ROTATIONS, 3), sizes)
     for count, iterations, keep in ((24, 3, 96), (40, 6, 32), (80, 10, 12)):
         found, cost = fitted(solid, found, rays.some(count), iterations, sized=sized)
         found = found.take(cost.argsort()[:keep])
@@ -215,11 +207,8 @@ def searched(
     chosen: list[int] = []
     for k in cost.argsort().tolist():
         one = found.take(torch.tensor([k]))
-        if (
-            cost[k] <= FAR**2 * cost.min()
-            and len(chosen) < 4
-            and not any(same(solid, found.take(torch.tensor([j])), one) for j in chosen)
-        ):
+        near = cost[k] <= FAR**2 * cost.min() and len(chosen) < 4
+        if near and not any(same(solid, found.take(torch.tensor([j])), one) for j in chosen):
             chosen.append(k)
     return found.take(torch.tensor(chosen)), cost[chosen]
 
@@ -254,11 +243,7 @@ def flown(solid: Solid, scene: Scene, place: Similarities, size: float | None) -
     for t in range(1, 1 if scene.start == REST else most):
         if float(scene.mattes[views, t].amax((1, 2)).min()) < 0.5:
             break
-        own = outline_rays(scene.mattes[views, t], cameras).some(300)
-        before = tracked[-1]
-        shift = before.center - tracked[-2].center if t > 1 else torch.zeros(1, 3)
-        start = Similarities(before.rotation, before.center + shift, before.size)
-        moved, _ = fitted(solid, start, own, 15, sized=False)
+        own, moved = followed(solid, scene, tracked, t)
         off = float(equations(solid, moved, own)[3])
         if last is None and (
             off > OTHERWISE * left + LOOSE or (not single and lowest(solid, moved, scene) < 0)
@@ -280,6 +265,17 @@ def flown(solid: Solid, scene: Scene, place: Similarities, size: float | None) -
     if size is None and not single:
         deviation = spread(solid, place, matrix[0], noise)
     return Flight(place, misfit, deviation, torch.zeros(3), torch.zeros(3))
+
+
+def followed(
+    solid: Solid, scene: Scene, tracked: list[Similarities], frame: int
+) -> tuple[Rays, Similarities]:
+    """(rays of a frame's outlines, the similarity that fits them), sought from where the frames before lead."""
+    views, before = scene.training_cameras, tracked[-1]
+    own = outline_rays(scene.mattes[views, frame], scene.cameras.select(views)).some(300)
+    shift = before.center - tracked[-2].center if frame > 1 else torch.zeros(1, 3)
+    start = Similarities(before.rotation, before.center + shift, before.size)
+    return own, fitted(solid, start, own, 15, sized=False)[0]
 
 
 def known_start(
@@ -313,13 +309,9 @@ def known_centres(scene: Scene, place: Similarities) -> Tensor:
     tracked = [free.take(torch.tensor([t])) for t in range(len(free.size))]
     flew = len(tracked)
     for t in scene.training_frames[flew:]:
-        own = outline_rays(scene.mattes[views, t], cameras).some(300)
-        before = tracked[-1]
-        shift = before.center - tracked[-2].center if t > 1 else torch.zeros(1, 3)
-        start = Similarities(before.rotation, before.center + shift, before.size)
-        moved, _ = fitted(solid, start, own, 15, sized=False)
+        _, moved = followed(solid, scene, tracked, t)
         if len(views) == 1:
-            eye, here = camera_places(cameras)[0], tracked[flew - 1].center[0]
+            eye, here = centers(cameras)[0], tracked[flew - 1].center[0]
             velocity = torch.zeros(3)
             if flew > 1:
                 step = scene.times[flew - 1] - scene.times[flew - 2]
@@ -366,55 +358,44 @@ def ballistic(
     rows[:, :, 1:] = -t[..., None] * torch.eye(3, dtype=torch.float64)
     found = torch.linalg.lstsq(rows.flatten(0, 1), fall.flatten()).solution
     factor = float(found[0]) if 0.02 < float(found[0]) < 50 else 1.0
-    eye = camera_places(cameras)
+    eye = centers(cameras)
     scaled = Similarities(first.rotation, eye + factor * (first.center - eye), factor * first.size)
     return scaled, found[1:].float()
 
 
 def joint(
     solid: Solid, first: Similarities, velocity: Tensor, rays: list[Rays], times: Tensor,
-    gravity: Tensor, *, sized: bool, iterations: int = 25,
+    gravity: Tensor, *, sized: bool,
 ) -> Flight:  # fmt: skip
     """A free flight fitted to the outlines of all frames: its first pose, size, velocity and spin."""
     reach = solid.reach
-    motion = torch.zeros(13)
-    motion[6:9] = velocity
-    best, trial, damping = motion, motion, torch.full((1,), SOFT)
-    state: tuple[Tensor, ...] | None = None
+    start = torch.zeros(13)
+    start[6:9] = velocity
 
     def placed(motion: Tensor) -> Similarities:
         sizes = first.size * (motion[12] / (first.size * reach)).exp()
         poses = flight(Poses(first.rotation, first.center), motion[:12], times, gravity)
         return Similarities(poses.rotation, poses.center, sizes.expand(len(times)))
 
-    for _ in range(iterations):
-        at = placed(trial)
+    def evaluate(motion: Tensor) -> tuple[Tensor, ...]:
+        at = placed(motion)
         own = [equations(solid, at.take(torch.tensor([t])), each) for t, each in enumerate(rays)]
         cost, vector, matrix, off = (torch.cat(part) for part in zip(*own))
         J = torch.zeros(len(times), 7, 13)
-        J[:, :6, :12] = flight_jacobian(trial[:12], times, float(at.size[0]) * reach)
+        J[:, :6, :12] = flight_jacobian(motion[:12], times, float(at.size[0]) * reach)
         J[:, 6, 12] = at.size[0] / first.size[0]
-        found = (
-            cost.mean(),
-            torch.einsum("tij,ti->j", J, vector) / len(times),
-            torch.einsum("tij,tik,tkl->jl", J, matrix, J) / len(times),
-            off.square().mean().sqrt(),
-        )
-        if state is None or found[0] < state[0]:
-            best, state, damping = trial, found, damping / 3
-        else:
-            damping = damping * 6
-        free = slice(0, 13 if sized else 12)
-        step = torch.zeros(13)
-        step[free] = damped(state[1][None, free], state[2][None, free, free], damping)[0]
-        trial = best + step
-        still = STILL * float(first.size[0]) * reach
-        if float(step.norm()) < still and float(damping) < 10 * SOFT:
-            break
-    assert state is not None
+        gradient = torch.einsum("tij,ti->j", J, vector) / len(times)
+        curvature = torch.einsum("tij,tik,tkl->jl", J, matrix, J) / len(times)
+        return cost.mean(), gradient, curvature, off.square().mean().sqrt()
+
+    still, free = STILL * float(first.size[0]) * reach, slice(0, 13 if sized else 12)
+    small = lambda step, damping: float(step.norm()) < still and damping < 10 * SOFT  # noqa: E731
+    best, (_, _, matrix, off) = descend(
+        evaluate, torch.add, start, damping=SOFT, iterations=25, small=small, free=free
+    )
     at = placed(best)
     rays_in_all = sum(len(each.origin) for each in rays)
-    noise = max(float(state[3]), NOISE) ** 2 * CORRELATED / rays_in_all
+    noise = max(float(off), NOISE) ** 2 * CORRELATED / rays_in_all
     order = [*range(6), 12, *range(6, 12)]
-    deviation = spread(solid, at, state[2][order][:, order], noise) if sized else 0.0
-    return Flight(at, float(state[3]), deviation, best[6:9], best[9:12])
+    deviation = spread(solid, at, matrix[order][:, order], noise) if sized else 0.0
+    return Flight(at, float(off), deviation, best[6:9], best[9:12])

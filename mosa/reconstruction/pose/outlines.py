@@ -13,11 +13,12 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from mosa.reconstruction.geometry.field import camera_rays, sample
+from mosa.reconstruction.geometry.field import sample
 from mosa.reconstruction.geometry.known import Solid
 from mosa.reconstruction.geometry.refinement import edges
 from mosa.reconstruction.pose.registration import choose
 from mosa.reconstruction.pose.rigid import damped, rotation_exp
+from mosa.rendering.cameras import rays as camera_rays
 from mosa.types import Cameras
 
 SAMPLES = 28
@@ -159,14 +160,9 @@ def equations(solid: Solid, at: Similarities, rays: Rays) -> tuple[Tensor, Tenso
         weight = limit / torch.maximum(size, limit)
         weighted = J * weight[..., None]
         cost = (weight * residual.square()).mean(1)
-        parts.append(
-            (
-                cost,
-                (weighted.transpose(1, 2) @ residual[..., None])[..., 0] / residual.shape[1],
-                weighted.transpose(1, 2) @ J / residual.shape[1],
-                residual.square().mean(1).sqrt(),
-            )
-        )
+        turned, count = weighted.transpose(1, 2), residual.shape[1]
+        vector = (turned @ residual[..., None])[..., 0] / count
+        parts.append((cost, vector, turned @ J / count, residual.square().mean(1).sqrt()))
     cost, vector, matrix, off = (torch.cat(part) for part in zip(*parts))
     return cost, vector, matrix, off
 

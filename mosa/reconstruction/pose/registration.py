@@ -10,17 +10,21 @@ end, so that a bright side does not turn the body.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from mosa.data.hull import at_border
 from mosa.errors import DataError
 from mosa.reconstruction.pose.rigid import (
     Level,
     Poses,
     RigidBody,
     damped,
+    descend,
     huber,
     left_jacobian,
     light_columns,
@@ -30,6 +34,7 @@ from mosa.reconstruction.pose.rigid import (
     rotation_exp,
 )
 from mosa.rendering.appearance.lighting import LIGHT
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Cameras, Splats
 
@@ -58,41 +63,30 @@ def matte_centres(mattes: Tensor, cameras: Cameras, size: float | None = None) -
     as large as the silhouettes of a known body, by which a single camera tells how far it is. Raises DataError where fewer than
     two views see the object, or one of a body of unknown size.
     """
-    y = torch.arange(cameras.height, dtype=mattes.dtype, device=mattes.device) + 0.5
-    x = torch.arange(cameras.width, dtype=mattes.dtype, device=mattes.device) + 0.5
+    x, y = (
+        torch.arange(side, dtype=mattes.dtype, device=mattes.device) + 0.5
+        for side in (cameras.width, cameras.height)
+    )
     area = mattes.sum((2, 3))
     u = (mattes.sum(2) @ x) / area.clamp(min=1e-6)
     v = (mattes.sum(3) @ y) / area.clamp(min=1e-6)
-    border = torch.stack(
-        (
-            mattes[:, :, 0].amax(-1),
-            mattes[:, :, -1].amax(-1),
-            mattes[..., 0].amax(-1),
-            mattes[..., -1].amax(-1),
-        )
-    )
     seen = area > 0
-    whole = seen & (border.amax(0) < 0.5)
+    whole = seen & (at_border(mattes) < 0.5)
     use = torch.where(whole.sum(0) >= 2, whole, seen).to(mattes)
     for t, number in enumerate(use.sum(0).tolist()):
         if number < (2 if size is None or len(cameras) > 1 else 1):
             raise DataError(
                 f"frame {t}: {int(number)} of {len(cameras)} views have a matte of the object, at least 2 are needed"
             )
-    K, R = cameras.K.to(mattes), cameras.w2c[:, :3, :3].to(mattes)
-    directions = (
-        torch.linalg.solve(K[:, None], torch.stack((u, v, torch.ones_like(u)), -1)[..., None])[
-            ..., 0
-        ]
-        @ R
-    )
+    cameras = replace(cameras, K=cameras.K.to(mattes), w2c=cameras.w2c.to(mattes))
+    K, origins = cameras.K, centers(cameras)
+    seen = torch.linalg.solve(K[:, None], torch.stack((u, v, torch.ones_like(u)), -1)[..., None])
+    directions = seen[..., 0] @ cameras.w2c[:, :3, :3]
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:].to(mattes))[..., 0]
     if len(cameras) == 1 and size is not None:
         return origins[0] + directions[0] * (size * K[0, 0, 0] / area[0].sqrt())[:, None]
-    P = use[..., None, None] * (
-        torch.eye(3).to(mattes) - directions[..., None] * directions[..., None, :]
-    )
+    across = torch.eye(3).to(mattes) - directions[..., None] * directions[..., None, :]
+    P = use[..., None, None] * across
     return torch.linalg.solve(P.sum(0), (P @ origins[:, None, :, None]).sum(0))[..., 0]
 
 
@@ -102,53 +96,40 @@ def choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 def refine(
-    body: RigidBody,
-    level: Level,
-    poses: Poses,
-    background: Tensor,
-    *,
-    iterations: int,
-    central: bool = False,
+    body: RigidBody, level: Level, poses: Poses, *, iterations: int, central: bool = False
 ) -> tuple[Poses, Tensor]:
     """Each of K poses after a few Levenberg-Marquardt steps, with its cost (K,)."""
     frame = torch.zeros(len(poses.center), dtype=torch.long, device=poses.center.device)
     damping = torch.full((len(frame),), 1e-2).to(poses.center)
     best, trial, state = poses, poses, None
     for _ in range(iterations):
-        found = normal_equations(body, level, trial, background, frame, central=central)
+        found = normal_equations(body, level, trial, frame, central=central)
         if state is None:
             state = found
         else:
             better = found[0] < state[0]
             damping = torch.where(better, damping / 3, damping * 6)
-            best = Poses(
-                choose(better, trial.rotation, best.rotation),
-                choose(better, trial.center, best.center),
-            )
+            pairs = zip(vars(trial).values(), vars(best).values())
+            best = Poses(*(choose(better, new, old) for new, old in pairs))
             state = tuple(choose(better, new, old) for new, old in zip(found, state))
         step = damped(state[1], state[2], damping)
-        step = step * (0.6 * body.radius / step.norm(dim=-1, keepdim=True).clamp(min=1e-12)).clamp(
-            max=1
-        )
+        length = step.norm(dim=-1, keepdim=True)
+        step = step * (0.6 * body.radius / length.clamp(min=1e-12)).clamp(max=1)
         trial = best.moved(step[:, :3], step[:, 3:] / body.radius)
         if float(step.norm(dim=-1).max()) < 2e-3 * level.pixel:
             break
     return best, state[0]
 
 
-def coarse_poses(
-    body: RigidBody, level: Level, center: Tensor, background: Tensor, rotations: int, keep: int
-) -> Poses:
-    """The `keep` best of many rotations, each placed so that its rendered mattes' centre meets that of the real
-    ones."""
+def coarse_poses(body: RigidBody, level: Level, center: Tensor, rotations: int, keep: int) -> Poses:
+    """The `keep` best of many rotations, each placed so that its rendered mattes' centre meets that of the real ones."""
     R = spread_rotations(rotations).to(center)
     poses = Poses(R, center.expand(rotations, 3))
-    seen = body.render(poses, level.cameras, background)
+    seen = body.render(poses, level.cameras, level.background)
     centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras, SILHOUETTE * body.radius)
     poses = Poses(R, center + center - centres)
-    seen = level.weighed(body.render(poses, level.cameras, background))
-    cost = huber(seen - level.target)[0].flatten(1).mean(-1)
-    return poses.take(cost.argsort()[:keep])
+    seen = level.weighed(body.render(poses, level.cameras, level.background))
+    return poses.take(huber(seen - level.target)[0].flatten(1).mean(-1).argsort()[:keep])
 
 
 class Registered(NamedTuple):
@@ -164,38 +145,29 @@ RELIT = (0, 2)
 
 
 def refine_lit(
-    body: RigidBody,
-    level: Level,
-    pose: Poses,
-    before: Tensor,
-    background: Tensor,
-    *,
-    iterations: int = 8,
-    moves: bool = True,
+    body: RigidBody, level: Level, pose: Poses, before: Tensor, *, moves: bool = True
 ) -> tuple[Poses, Tensor]:
-    """One pose and its light (8,), fitted together by Levenberg-Marquardt steps from the light `before`; moves: whether the pose is
-    fitted too, or known. body: with normals."""
-    best, trial, state, damping = (
-        (pose, before),
-        (pose, before),
-        None,
-        torch.full((1,), 1e-3).to(before),
-    )
-    for i in range(iterations):
-        if i in RELIT:
-            columns = light_columns(body, level, *trial, background)
-        found = lit_equations(body, level, *trial, before, columns, background)
-        if state is None or found[0] < state[0]:
-            best, state, damping = trial, found, damping / 3
-        else:
-            damping = damping * 6
-        free = slice(0 if moves else 6, None)
-        step = torch.zeros(6 + LIGHT).to(before)
-        step[free] = damped(state[1][None, free], state[2][None, free, free], damping)[0]
-        trial = (best[0].moved(step[None, :3], step[None, 3:6] / body.radius), best[1] + step[6:])
-        if float(step[:6].norm()) < 2e-3 * level.pixel and float(step[6:].norm()) < 1e-3:
-            break
-    return best
+    """One pose and its light (8,), fitted together from the light `before`; moves: whether the pose is fitted too, or known.
+    body: with normals."""
+    calls, columns = 0, torch.empty(0)
+
+    def evaluate(at: tuple[Poses, Tensor]) -> tuple[Tensor, ...]:
+        nonlocal calls, columns
+        if calls in RELIT:
+            columns = light_columns(body, level, *at)
+        calls += 1
+        return lit_equations(body, level, *at, before, columns)
+
+    def moved(at: tuple[Poses, Tensor], step: Tensor) -> tuple[Poses, Tensor]:
+        return at[0].moved(step[None, :3], step[None, 3:6] / body.radius), at[1] + step[6:]
+
+    def small(step: Tensor, _: float) -> bool:
+        return float(step[:6].norm()) < 2e-3 * level.pixel and float(step[6:].norm()) < 1e-3
+
+    free = slice(0 if moves else 6, None)
+    return descend(
+        evaluate, moved, (pose, before), damping=1e-3, iterations=8, small=small, free=free
+    )[0]
 
 
 def light_of(
@@ -205,17 +177,11 @@ def light_of(
     """The light (8,) under which a body in a known pose (Q, x_c) looks as one frame shows it, from its colours at rest. normals:
     (N, 3) at rest; before: (8,) what is known of the light; the rest as of `register_pose`."""
     body = RigidBody.of(splats, rest_center, normals)
-    images, mattes, cameras = (
-        images[:, None].to(body.arm),
-        mattes[:, None].to(body.arm),
-        cameras.to(body.arm.device),
-    )
-    Q, center = (x.to(body.arm) for x in pose)
-    level = make_level(images, mattes, cameras, center, None)
+    given = (images[:, None], mattes[:, None], background, *pose)
+    images, mattes, background, Q, center = (x.to(body.arm) for x in given)
+    level = make_level(images, mattes, cameras.to(body.arm.device), background, center)
     before = torch.zeros(LIGHT).to(body.arm) if before is None else before.to(body.arm)
-    return refine_lit(
-        body, level, Poses(Q[None], center[None]), before, background.to(body.arm), moves=False
-    )[1]
+    return refine_lit(body, level, Poses(Q[None], center[None]), before, moves=False)[1]
 
 
 def register_pose(
@@ -244,33 +210,29 @@ def register_pose(
     # about which the body turns while searching, wherever X_c is
     middle = splats.means.detach().mean(0)
     body = RigidBody.of(splats, middle, normals)
-    background = background.to(body.arm)
-    images, mattes = images[:, None].to(body.arm), mattes[:, None].to(body.arm)
+    given = images[:, None], mattes[:, None], background
+    images, mattes, background = (x.to(body.arm) for x in given)
     cameras = cameras.to(body.arm.device)
     center = matte_centres(mattes, cameras, SILHOUETTE * body.radius)[0]
-    some = (
-        torch.linspace(0, len(cameras) - 1, min(coarse_views, len(cameras))).round().long().tolist()
-    )
-    thin = body.thinned(400, seed)
-    search = images[some], mattes[some], cameras.select(some), center
-    level = make_level(*search, 28, BRIGHTNESS)
-    poses = coarse_poses(thin, level, center, background, rotations, starts)
+    count = min(coarse_views, len(cameras))
+    chosen = torch.linspace(0, len(cameras) - 1, count).round().long().tolist()
+    some = images[chosen], mattes[chosen], cameras.select(chosen), background, center
+    thin, level = body.thinned(400, seed), make_level(*some, 28, BRIGHTNESS)
+    poses = coarse_poses(thin, level, center, rotations, starts)
     for iterations, keep in ((4, max(3, starts // 3)), (6, 3)):
-        poses, cost = refine(thin, level, poses, background, iterations=iterations)
+        poses, cost = refine(thin, level, poses, iterations=iterations)
         poses = poses.take(distinct(poses, cost, keep))
-    level = make_level(*search, 56, BRIGHTNESS)
-    poses, cost = refine(body, level, poses, background, iterations=8)
+    poses, cost = refine(body, make_level(*some, 56, BRIGHTNESS), poses, iterations=8)
     best = poses.take(cost.argsort()[:1])
-    level, found = make_level(images, mattes, cameras, center, None), None
+    level, found = make_level(images, mattes, cameras, background, center), None
     if normals is None:
-        best, _ = refine(body, level, best, background, iterations=8, central=True)
+        best, _ = refine(body, level, best, iterations=8, central=True)
     else:
         before = torch.zeros(LIGHT).to(body.arm) if light is None else light.to(body.arm)
-        best, found = refine_lit(body, level, best, before, background)
+        best, found = refine_lit(body, level, best, before)
     Q = best.rotation[0]
-    return Registered(
-        Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm)), found
-    )
+    arm = rest_center.to(body.arm) - middle.to(body.arm)
+    return Registered(Q, best.center[0] + Q @ arm, found)
 
 
 def distinct(poses: Poses, cost: Tensor, count: int, *, degrees: float = 5.0) -> Tensor:
@@ -291,9 +253,8 @@ def flight(pose: Poses, motion: Tensor, times: Tensor, gravity: Tensor) -> Poses
     shift, angle, velocity, spin = motion.view(4, 3)
     start = pose.moved(shift[None], angle[None])
     t = times[:, None]
-    return Poses(
-        rotation_exp(spin * t) @ start.rotation, start.center + velocity * t + 0.5 * gravity * t**2
-    )
+    center = start.center + velocity * t + 0.5 * gravity * t**2
+    return Poses(rotation_exp(spin * t) @ start.rotation, center)
 
 
 def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
@@ -343,62 +304,31 @@ def initial_velocity(
     motion = torch.zeros(12).to(body.arm)
     motion[6:9] = (times @ fallen) / times.square().sum()
     for target_px, iterations in ((40, 8), (None, 6))[: 2 if exact else 1]:
-        level = make_level(images, mattes, cameras, start.center[0], target_px)
+        level = make_level(images, mattes, cameras, background, start.center[0], target_px)
         last = target_px is None
-        motion = fit_flight(
-            body,
-            level,
-            start,
-            motion,
-            times,
-            gravity,
-            background,
-            iterations=iterations,
-            central=last,
-        )
+        path = lambda m: flight(start, m, times, gravity)  # noqa: E731
+        motion = fit_flight(body, level, path, motion, times, iterations=iterations, central=last)
     return motion[6:9], motion[9:]
 
 
 def fit_flight(
-    body: RigidBody,
-    level: Level,
-    start: Poses,
-    motion: Tensor,
-    times: Tensor,
-    gravity: Tensor,
-    background: Tensor,
-    *,
-    iterations: int,
+    body: RigidBody, level: Level, path: Callable[[Tensor], Poses], motion: Tensor, times: Tensor, *, iterations: int,
     central: bool,
-) -> Tensor:
-    """`motion` (12,) after damped Gauss-Newton steps over all frames of the level."""
+) -> Tensor:  # fmt: skip
+    """`motion` (12,) after damped Gauss-Newton steps over all frames of the level; path: its poses at the times (T,) [s]."""
     frame = torch.arange(len(times), device=times.device)
-    damping = torch.full((1,), 1e-3).to(motion)
-    best, trial, state = motion, motion, None
-    for _ in range(iterations):
-        poses = flight(start, trial, times, gravity)
-        cost, gradient, matrix = normal_equations(
-            body, level, poses, background, frame, central=central
-        )
-        J = flight_jacobian(trial, times, body.radius)
-        new = (
-            cost.sum(),
-            (J.transpose(1, 2) @ gradient[..., None]).sum(0)[:, 0],
-            (J.transpose(1, 2) @ matrix @ J).sum(0),
-        )
-        if state is None or new[0] < state[0]:
-            best, state, damping = trial, new, damping / 3
-        else:
-            damping = damping * 6
-        step = damped(state[1][None], state[2][None], damping)[0]
-        trial = best + step
-        moved = torch.stack(
-            (
-                step[:3].norm(),
-                step[6:9].norm() * times[-1],
-                step[9:].norm() * times[-1] * body.radius,
-            )
-        ).max()
-        if float(moved) < 2e-3 * level.pixel:
-            break
-    return best
+
+    def evaluate(at: Tensor) -> tuple[Tensor, ...]:
+        cost, gradient, matrix = normal_equations(body, level, path(at), frame, central=central)
+        J = flight_jacobian(at, times, body.radius)
+        turned = J.transpose(1, 2)
+        gradient = (turned @ gradient[..., None]).sum(0)[:, 0]
+        return cost.sum(), gradient, (turned @ matrix @ J).sum(0)
+
+    def small(step: Tensor, _: float) -> bool:
+        _, _, velocity, spin = step.view(4, 3)
+        last = times[-1]
+        ways = step[:3].norm(), velocity.norm() * last, spin.norm() * last * body.radius
+        return float(torch.stack(ways).max()) < 2e-3 * level.pixel
+
+    return descend(evaluate, torch.add, motion, damping=1e-3, iterations=iterations, small=small)[0]

@@ -7,7 +7,9 @@ few steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -48,13 +50,12 @@ class Poses:
 
 @dataclass(frozen=True)
 class Level:
-    """Images of one resolution, cut to the object. target: (T, V, H, W, 4) colour and matte of T frames, as `weighed`.
-
-    pixel: what a pixel covers at the object [m]; brightness: share with which it counts beside hue and matte.
-    """
+    """Images of one resolution, cut to the object. target: (T, V, H, W, 4) colour and matte of T frames on the background (3,), as
+    `weighed`; pixel: what a pixel covers at the object [m]; brightness: share with which it counts beside hue and matte."""
 
     target: Tensor
     cameras: Cameras
+    background: Tensor
     pixel: float
     brightness: float = 1.0
 
@@ -80,13 +81,15 @@ class RigidBody:
 
     @staticmethod
     def of(splats: Splats, rest_center: Tensor, normals: Tensor | None = None) -> RigidBody:
-        arm = splats.means.detach().float() - rest_center.to(splats.means).float()
-        covariances = covariance_from(
-            splats.scales.detach().float(), splats.rotations.detach().float()
+        means, scales, rotations, opacities, colors = (
+            part.detach().float() for part in vars(splats).values()
         )
+        arm = means - rest_center.to(means)
         radius = float(arm.square().sum(-1).mean().sqrt())
-        return RigidBody(arm, covariances, splats.opacities.detach().float(), splats.colors.detach().float(), radius,
-                         None if normals is None else normals.to(arm))  # fmt: skip
+        normals = None if normals is None else normals.to(arm)
+        return RigidBody(
+            arm, covariance_from(scales, rotations), opacities, colors, radius, normals
+        )
 
     def shaded(self, rotation: Tensor, light: Tensor) -> RigidBody:
         """In the colours that it has turned by `rotation` (3, 3) under a light that stays (`lighting.py`)."""
@@ -97,14 +100,13 @@ class RigidBody:
         total = len(self.arm)
         if total <= count:
             return self
-        index = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:count].to(
-            self.arm.device
-        )
-        swell = (total / count) ** (2 / 3)
-        return RigidBody(
-            self.arm[index], swell * self.covariances[index], self.opacities[index], self.colors[index], self.radius,
-            None if self.normals is None else self.normals[index],
-        )  # fmt: skip
+        order = torch.randperm(total, generator=torch.Generator().manual_seed(seed))
+        index = order[:count].to(self.arm.device)
+        parts = self.arm, self.covariances, self.opacities, self.colors
+        arm, covariances, opacities, colors = (part[index] for part in parts)
+        normals = None if self.normals is None else self.normals[index]
+        swollen = (total / count) ** (2 / 3) * covariances
+        return RigidBody(arm, swollen, opacities, colors, self.radius, normals)
 
     @torch.no_grad()
     def render(self, poses: Poses, cameras: Cameras, background: Tensor) -> Tensor:
@@ -116,9 +118,7 @@ class RigidBody:
             R, c = poses.rotation[k : k + chunk], poses.center[k : k + chunk]
             means = self.arm @ R.transpose(1, 2) + c[:, None]
             covariances = R[:, None] @ self.covariances @ R[:, None].transpose(-1, -2)
-            batch = replace(
-                cameras, K=cameras.K.repeat(len(R), 1, 1), w2c=cameras.w2c.repeat(len(R), 1, 1)
-            )
+            batch = cameras.select(list(range(views)) * len(R))
             index = torch.arange(len(R), device=c.device).repeat_interleave(views)
             image, alpha = rasterize(
                 means, covariances, self.opacities, self.colors[None], batch, index, background
@@ -145,13 +145,9 @@ def left_jacobian(v: Tensor) -> Tensor:
 
 
 def make_level(
-    images: Tensor,
-    mattes: Tensor,
-    cameras: Cameras,
-    center: Tensor,
-    target_px: float | None,
+    images: Tensor, mattes: Tensor, cameras: Cameras, background: Tensor, center: Tensor, target_px: float | None = None,
     brightness: float = 1.0,
-) -> Level:
+) -> Level:  # fmt: skip
     """Images (V, T, H, W, 3) and mattes (V, T, H, W) cut to the object, its window reduced to about `target_px`
     (None: kept)."""
     margin = round(0.12 * max(crop_boxes(mattes, margin=0)[2:])) + 2
@@ -166,25 +162,23 @@ def make_level(
         flat = stack.flatten(0, 1).permute(0, 3, 1, 2)
         stack = F.avg_pool2d(flat, factor).permute(0, 2, 3, 1).unflatten(0, (views, frames))
     cut = crop_cameras(cameras, x0, y0, width, height)
-    K = cut.K.clone()
-    K[:, :2] /= factor
-    cut = replace(cut, K=K, width=width // factor, height=height // factor)
+    cut.K[:, :2] /= factor
+    cut = replace(cut, width=width // factor, height=height // factor)
     depth = project(center[None].to(cut.K), cut)[1].clamp(min=1e-3)
     pixel = float((depth[:, 0] / cut.K[:, 0, 0]).median())
-    level = Level(stack.transpose(0, 1).contiguous(), cut, pixel, brightness)
+    level = Level(stack.transpose(0, 1).contiguous(), cut, background, pixel, brightness)
     return replace(level, target=level.weighed(level.target))
 
 
 def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
     """Cost and weight of residuals."""
     size = residual.abs()
-    return torch.where(
-        size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)
-    ), HUBER / size.clamp(min=HUBER)
+    cost = torch.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))
+    return cost, HUBER / size.clamp(min=HUBER)
 
 
 def pose_columns(
-    body: RigidBody, level: Level, poses: Poses, background: Tensor, *, central: bool
+    body: RigidBody, level: Level, poses: Poses, *, central: bool
 ) -> tuple[Tensor, Tensor]:
     """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle times the body's radius [m].
 
@@ -193,15 +187,11 @@ def pose_columns(
     sides = (torch.zeros(1, 6), torch.eye(6), -torch.eye(6))[: 3 if central else 2]
     steps = h * torch.cat(sides).to(poses.center)
     shift, angle = steps[:, :3].repeat(count, 1), steps[:, 3:].repeat(count, 1) / body.radius
-    around = Poses(
-        poses.rotation.repeat_interleave(len(steps), 0),
-        poses.center.repeat_interleave(len(steps), 0),
-    )
-    seen = level.weighed(body.render(around.moved(shift, angle), level.cameras, background))
-    seen = seen.view(count, len(steps), -1)
-    return seen[:, 0], (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (
-        seen[:, 1:] - seen[:, :1]
-    ) / h
+    around = poses.take(torch.arange(count).repeat_interleave(len(steps)).to(shift.device))
+    seen = level.weighed(body.render(around.moved(shift, angle), level.cameras, level.background))
+    here, *sides = seen.view(count, len(steps), -1).split((1, *(6,) * (len(steps) // 6)), 1)
+    columns = (sides[0] - sides[1]) / (2 * h) if central else (sides[0] - here) / h
+    return here[:, 0], columns
 
 
 def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -209,24 +199,15 @@ def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor
     weighted by Huber's rule."""
     cost, weight = huber(residual)
     weighted = columns * weight[:, None]
-    return (
-        cost.sum(-1),
-        (weighted @ residual[..., None])[..., 0],
-        weighted @ columns.transpose(1, 2),
-    )
+    gradient = (weighted @ residual[..., None])[..., 0]
+    return cost.sum(-1), gradient, weighted @ columns.transpose(1, 2)
 
 
 def normal_equations(
-    body: RigidBody,
-    level: Level,
-    poses: Poses,
-    background: Tensor,
-    frame: Tensor,
-    *,
-    central: bool = True,
+    body: RigidBody, level: Level, poses: Poses, frame: Tensor, *, central: bool = True
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`equations` of K poses against the frames (K,) of the level, in the numbers of `pose_columns`."""
-    seen, columns = pose_columns(body, level, poses, background, central=central)
+    seen, columns = pose_columns(body, level, poses, central=central)
     return equations(seen - level.target[frame].flatten(1), columns)
 
 
@@ -238,6 +219,30 @@ def damped(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
     return -torch.linalg.solve(system, gradient.double()[..., None])[..., 0].to(gradient)
 
 
+def descend(
+    evaluate: Callable[[Any], tuple[Tensor, ...]], moved: Callable[[Any, Tensor], Any], start: Any, *, damping: float,
+    iterations: int, small: Callable[[Tensor, float], bool], free: slice = slice(None),
+) -> tuple[Any, tuple[Tensor, ...]]:  # fmt: skip
+    """(best numbers, what `evaluate` gave of them) after Levenberg-Marquardt steps from `start`.
+
+    evaluate: cost (), gradient (D,), Gauss-Newton matrix (D, D), and anything else; moved: numbers a step (D,) further; small:
+    whether a step, under a damping, is the last one; free: numbers that are fitted."""
+    best, trial, state = start, start, None
+    for _ in range(iterations):
+        found = evaluate(trial)
+        if state is None or found[0] < state[0]:
+            best, state, damping = trial, found, damping / 3
+        else:
+            damping = damping * 6
+        step, factor = torch.zeros_like(state[1]), torch.full((1,), damping).to(state[1])
+        step[free] = damped(state[1][None, free], state[2][None, free, free], factor)[0]
+        trial = moved(best, step)
+        if small(step, damping):
+            break
+    assert state is not None
+    return best, state
+
+
 LIGHT_STEP = 0.02
 """Differences for the Jacobian change a number of the light by this."""
 LIGHT_RIDGE = 1e-3
@@ -245,34 +250,24 @@ LIGHT_RIDGE = 1e-3
 numbers, and what they are then does not show."""
 
 
-def light_columns(
-    body: RigidBody, level: Level, pose: Poses, light: Tensor, background: Tensor
-) -> Tensor:
+def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor) -> Tensor:
     """(8, P) derivative of the level's first frame in the numbers of the light, at one pose."""
-    frames = [body.shaded(pose.rotation[0], each).render(pose, level.cameras, background).flatten()
+    frames = [body.shaded(pose.rotation[0], each).render(pose, level.cameras, level.background).flatten()
               for each in (light, *(light + LIGHT_STEP * torch.eye(LIGHT).to(light)))]  # fmt: skip
     return (torch.stack(frames[1:]) - frames[0]) / LIGHT_STEP
 
 
 def lit_equations(
-    body: RigidBody,
-    level: Level,
-    pose: Poses,
-    light: Tensor,
-    before: Tensor,
-    columns: Tensor,
-    background: Tensor,
+    body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, columns: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
     pose's numbers as of `pose_columns`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
     # the colours turn with the light's own columns alone: a pose's columns know its geometry
-    seen, moved = pose_columns(
-        body.shaded(pose.rotation[0], light), level, pose, background, central=True
-    )
+    lit = body.shaded(pose.rotation[0], light)
+    seen, moved = pose_columns(lit, level, pose, central=True)
     every = torch.cat((moved, columns[None]), 1)
-    cost, gradient, matrix = (
-        found[0] for found in equations(seen - level.target[:1].flatten(1), every)
-    )
+    found = equations(seen - level.target[:1].flatten(1), every)
+    cost, gradient, matrix = (part[0] for part in found)
     ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
     matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
     gradient[6:] += ridge * (light - before)

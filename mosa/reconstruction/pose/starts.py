@@ -19,6 +19,7 @@ from mosa.reconstruction.pose.registration import initial_velocity, register_pos
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
+from mosa.rendering.covariance import scales_and_rotations
 from mosa.types import REST, Appearance, Scene, Splats
 
 MOST_FRAMES = 6
@@ -31,18 +32,8 @@ that is simulated from it is worth."""
 
 def splats_of(body: RestShape) -> Splats:
     """The body's particles as (isotropic or not) splats with axes from their covariances."""
-    values, vectors = torch.linalg.eigh(body.covariances.double())
-    vectors = vectors * torch.linalg.det(vectors)[:, None, None]
-    quaternions = torch.as_tensor(
-        Rotation.from_matrix(vectors.cpu().numpy()).as_quat(scalar_first=True)
-    )
-    return Splats(
-        body.rest,
-        values.clamp(min=0).sqrt().to(body.rest),
-        quaternions.to(body.rest),
-        body.opacities,
-        body.colors,
-    )
+    scales, rotations = (x.to(body.rest) for x in scales_and_rotations(body.covariances.double()))
+    return Splats(body.rest, scales, rotations, body.opacities, body.colors)
 
 
 def lowest(body: RestShape, start: Start, scene: Scene, time: float) -> float:
@@ -52,9 +43,8 @@ def lowest(body: RestShape, start: Start, scene: Scene, time: float) -> float:
     R = torch.as_tensor(spin).to(body.rest) @ start.rotation.to(body.rest)
     arm = (body.rest - body.center) @ R.T
     center = start.center + start.velocity * time + 0.5 * gravity * time**2
-    return float(((arm + center) @ up).min()) - (
-        scene.ground.height if scene.ground is not None else -torch.inf
-    )
+    ground = scene.ground.height if scene.ground is not None else -torch.inf
+    return float(((arm + center) @ up).min()) - ground
 
 
 def first_contact(body: RestShape, start: Start, scene: Scene) -> int:
@@ -78,11 +68,9 @@ def appearance_of(body: RestShape) -> Appearance:
         splats = splats_of(body)
         found = Appearance(splats, constant_coefficients(splats.colors))
     if found.light is None or not bool(found.light.any()):
-        found = replace(
-            found,
-            normals=surface_normals(found.splats.means, body.rest),
-            light=found.splats.means.new_zeros(LIGHT),
-        )
+        means = found.splats.means
+        normals, light = surface_normals(means, body.rest), means.new_zeros(LIGHT)
+        found = replace(found, normals=normals, light=light)
     return found
 
 
@@ -115,12 +103,8 @@ def sequence_start(
         )  # fmt: skip
         lit = shading(light, appearance.normals.to(light), rotation)
         splats = replace(splats, colors=splats.colors * lit.to(splats.colors)[:, None])
-    start = Start(
-        rotation.to(body.rest),
-        center.to(body.rest),
-        torch.zeros(3).to(body.rest),
-        torch.zeros(3).to(body.rest),
-    )
+    still = torch.zeros(3)
+    start = Start(*(x.to(body.rest) for x in (rotation, center, still, still)))
     if scene.start == REST:
         return start
     if place is not None and scene.body is not None:
@@ -133,17 +117,9 @@ def sequence_start(
     count, most, exact = 2, MOST_FRAMES, False
     while True:
         velocity, spin = initial_velocity(
-            splats,
-            (rotation, center),
-            images[:, :count],
-            mattes[:, :count],
-            views,
-            times=scene.times[:count],
-            gravity=scene.gravity,
-            background=scene.background,
-            rest_center=body.center,
-            exact=exact,
-        )
+            splats, (rotation, center), images[:, :count], mattes[:, :count], views, times=scene.times[:count],
+            gravity=scene.gravity, background=scene.background, rest_center=body.center, exact=exact,
+        )  # fmt: skip
         start = Start(start.rotation, start.center, velocity.to(body.rest), spin.to(body.rest))
         free = first_contact(body, start, scene)
         if free < 2 and exact:

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from mosa.rendering.appearance.carrying import Binding, Carried, bind
 from mosa.rendering.appearance.lighting import LIGHT, shading
 from mosa.rendering.appearance.spherical_harmonics import (
-    camera_centers,
     colors_in,
     constant_coefficients,
     mean_colors,
 )
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.observer import deformed_covariances, repeat_cameras
 from mosa.rendering.rasterizer import rasterize
@@ -32,34 +32,15 @@ class CarriedSplats(nn.Module):
     def __init__(self, appearance: Appearance, particles: Tensor) -> None:
         """particles: (N, 3) [m]. Errors: DataError for fewer than 8 particles."""
         super().__init__()
-        splats = appearance.splats
-        self._keep(
-            {f.name: getattr(splats, f.name) for f in fields(Splats)}
-            | {"harmonics": appearance.harmonics},
-            particles,
-        )
-        lit = appearance.light is not None and appearance.normals is not None
-        upright = torch.tensor([0.0, 0, 1]).expand_as(splats.means)
-        self._keep(
-            {
-                "normals": appearance.normals if lit else upright,
-                "light": appearance.light if lit else torch.zeros(LIGHT),
-            },
-            particles,
-        )
-        bound = bind(splats.means, particles)
-        self._keep(
-            {
-                f"bound_{f.name}": getattr(bound, f.name)
-                for f in fields(Binding)
-                if f.name != "index"
-            },
-            particles,
-        )
-        self.register_buffer("bound_index", bound.index.to(particles.device), persistent=False)
-
-    def _keep(self, tensors: Mapping[str, Tensor], like: Tensor) -> None:
-        for name, value in tensors.items():
+        splats, normals, light = appearance.splats, appearance.normals, appearance.light
+        if light is None or normals is None:
+            normals = torch.tensor([0.0, 0, 1]).expand_as(splats.means)
+            light = torch.zeros(LIGHT)
+        bound = vars(bind(splats.means, particles))
+        kept = {f"bound_{name}": value for name, value in bound.items()} | vars(splats)
+        kept |= {"harmonics": appearance.harmonics, "normals": normals, "light": light}
+        for name, value in kept.items():
+            like = particles.device if name == "bound_index" else particles
             self.register_buffer(name, value.detach().to(like), persistent=False)
 
     def __len__(self) -> int:
@@ -67,12 +48,8 @@ class CarriedSplats(nn.Module):
 
     @property
     def appearance(self) -> Appearance:
-        return Appearance(
-            Splats(*(getattr(self, f.name) for f in fields(Splats))),
-            self.harmonics,
-            self.normals,
-            self.light,
-        )
+        splats = Splats(*(getattr(self, f.name) for f in fields(Splats)))
+        return Appearance(splats, self.harmonics, self.normals, self.light)
 
     @property
     def binding(self) -> Binding:
@@ -116,24 +93,14 @@ class Seen:
             if self.rotations is None:
                 colors = colors_in(self.harmonics, torch.ones_like(self.means[:1]))
             else:
-                lines = self.means - camera_centers(camera).to(self.means)
-                # R^T d
-                colors = colors_in(
-                    self.harmonics, (lines[..., None, :] @ self.rotations)[..., 0, :]
-                )
+                lines = self.means - centers(camera).to(self.means)
+                turned = lines[..., None, :] @ self.rotations  # R^T d
+                colors = colors_in(self.harmonics, turned[..., 0, :])
             if self.shades is not None:
                 colors = colors * self.shades[..., None]
-            found.append(
-                rasterize(
-                    self.means,
-                    self.covariances,
-                    self.opacities,
-                    colors,
-                    repeat_cameras(camera, frames),
-                    index,
-                    background,
-                )[0]
-            )
+            views = repeat_cameras(camera, frames)
+            given = self.means, self.covariances, self.opacities, colors, views, index
+            found.append(rasterize(*given, background)[0])
         return torch.stack(found)
 
     def colors(self) -> Tensor:
@@ -160,18 +127,12 @@ def seen(body: HasAppearance, positions: Tensor, F_tot: Tensor | None) -> Seen:
     if splats is None:
         if F_tot is None:
             raise ValueError("seen: a body without splats needs F_tot")
-        return Seen(
-            positions,
-            deformed_covariances(F_tot, body.covariances),
-            body.opacities,
-            constant_coefficients(body.colors),
-        )
+        shapes = deformed_covariances(F_tot, body.covariances)
+        return Seen(positions, shapes, body.opacities, constant_coefficients(body.colors))
     carried = splats.carry(positions)
     shapes = carried.covariances(covariance_from(splats.scales, splats.rotations))
     turns = carried.rotations if splats.harmonics.shape[1] > 1 else None
-    shades = (
-        shading(splats.light, splats.normals, carried.rotations)
-        if bool(splats.light.any())
-        else None
-    )
+    shades = None
+    if bool(splats.light.any()):
+        shades = shading(splats.light, splats.normals, carried.rotations)
     return Seen(carried.means, shapes, splats.opacities, splats.harmonics, turns, shades)

@@ -57,11 +57,8 @@ class Binding:
 
     def to(self, like: Tensor) -> Binding:
         """On the device and of the type of a tensor."""
-        moved = {
-            name: getattr(self, name).to(like)
-            for name in ("value", "gradient", "rest", "body", "affine")
-        }
-        return Binding(index=self.index.to(like.device), **moved)
+        index, *numbers = vars(self).values()
+        return Binding(index.to(like.device), *(part.to(like) for part in numbers))
 
     def states(self, positions: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """(means (M, 3), gradients (M, 3, 3)) for each of positions (T, N, 3) [m]."""
@@ -90,7 +87,7 @@ class Binding:
         return Carried(means, gradients, rotations)
 
 
-def bind(splats: Tensor, particles: Tensor, *, neighbours: int = NEIGHBOURS) -> Binding:
+def bind(splats: Tensor, particles: Tensor) -> Binding:
     """Hang splats (M, 3) [m] on particles (N, 3) [m], both at rest. Errors: DataError for fewer than 8 particles.
 
     The fit at a splat's rest position X weighs neighbour i with w = (1 - r^2 / r_max^2)^2, r_max the distance of the farthest: a
@@ -103,7 +100,7 @@ def bind(splats: Tensor, particles: Tensor, *, neighbours: int = NEIGHBOURS) -> 
             f"bind: expected at least 8 particles to carry splats, found {len(particles)}"
         )
     X, P = splats.detach().cpu().double(), particles.detach().cpu().double()
-    count = min(neighbours, len(P))
+    count = min(NEIGHBOURS, len(P))
     index = cKDTree(P.numpy()).query(X.numpy(), k=np.arange(1, count + 1))[1]
     near = P[torch.as_tensor(index)]
 
@@ -115,21 +112,13 @@ def bind(splats: Tensor, particles: Tensor, *, neighbours: int = NEIGHBOURS) -> 
         moment = torch.einsum("mk,mki,mkj->mij", weight, basis, basis)
         ridge = RIDGE * weight.sum(1)[:, None] * torch.tensor([0.0, 1, 1, 1], dtype=torch.float64)
         first = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(at), 4)
-        return weight * torch.einsum(
-            "mki,mi->mk", basis, torch.linalg.solve(moment + torch.diag_embed(ridge), first)
-        )
+        solved = torch.linalg.solve(moment + torch.diag_embed(ridge), first)
+        return weight * torch.einsum("mki,mi->mk", basis, solved)
 
-    slopes = [
-        torch.func.jvp(coefficients, (X,), (axis.expand_as(X),))[1]
-        for axis in torch.eye(3, dtype=torch.float64)
-    ]
+    axes = torch.eye(3, dtype=torch.float64)
+    slopes = [torch.func.jvp(coefficients, (X,), (axis.expand_as(X),))[1] for axis in axes]
     middle = P.mean(0)
     body = P - middle
-    return Binding(
-        torch.as_tensor(index),
-        coefficients(X),
-        torch.stack(slopes, -1),
-        X - middle,
-        body,
-        body @ torch.linalg.pinv(body.T @ body, hermitian=True),
-    )
+    affine = body @ torch.linalg.pinv(body.T @ body, hermitian=True)
+    values = coefficients(X), torch.stack(slopes, -1)
+    return Binding(torch.as_tensor(index), *values, X - middle, body, affine)

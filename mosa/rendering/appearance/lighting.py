@@ -17,20 +17,18 @@ from mosa.rendering.appearance.spherical_harmonics import basis
 
 LIGHT = 8
 """Numbers of a light: the harmonics of degree 1 and 2."""
+NEIGHBOURS = 24
+"""Particles that tell a normal."""
 
 
-def surface_normals(points: Tensor, particles: Tensor, *, neighbours: int = 24) -> Tensor:
+def surface_normals(points: Tensor, particles: Tensor) -> Tensor:
     """Outward unit normals (M, 3) at points (M, 3) [m] on or near the surface of what particles (N, 3) [m] fill: away from the
     weighted mean of the nearest, with w = 1 - r^2 / r_max^2; along z where that is nowhere else."""
     P, X = particles.detach().cpu().double(), points.detach().cpu().double()
-    distance, index = cKDTree(P.numpy()).query(
-        X.numpy(), k=np.arange(1, min(neighbours, len(P)) + 1)
-    )
-    share = (
-        1
-        - (torch.as_tensor(distance) / torch.as_tensor(distance[:, -1:]).clamp(min=1e-12)).square()
-    )
-    away = (share[..., None] * (X[:, None] - P[torch.as_tensor(index)])).sum(1)
+    count = np.arange(1, min(NEIGHBOURS, len(P)) + 1)
+    distance, index = map(torch.as_tensor, cKDTree(P.numpy()).query(X.numpy(), k=count))
+    share = 1 - (distance / distance[:, -1:].clamp(min=1e-12)).square()
+    away = (share[..., None] * (X[:, None] - P[index])).sum(1)
     length = away.norm(dim=1, keepdim=True)
     away = torch.where(length > 1e-9, away / length.clamp(min=1e-9), away.new_tensor([0.0, 0, 1]))
     return away.to(points)

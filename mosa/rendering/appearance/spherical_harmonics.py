@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.types import Cameras
 
 DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 """Number of coefficients per colour channel -> degree."""
@@ -65,11 +64,6 @@ def colors_in(coefficients: Tensor, directions: Tensor) -> Tensor:
     """Colours max(0, 1/2 + sum_k c_k Y_k) (..., N, 3) of coefficients (N, K, 3) seen along directions (..., N, 3)."""
     values = basis(directions, degree_of(coefficients))
     return (torch.einsum("...nk,nkc->...nc", values, coefficients) + 0.5).clamp(min=0)
-
-
-def camera_centers(cameras: Cameras) -> Tensor:
-    """Where the cameras are, (V, 3) [m]."""
-    return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
 
 
 def rotated(coefficients: Tensor, rotation: Tensor) -> Tensor:

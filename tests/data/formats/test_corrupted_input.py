@@ -158,7 +158,7 @@ TRANSFORMS = {
     "size": (entries(lambda d: d.update(w=1920)), "intrinsics are for w = 1920 px"),
     "no matte": (
         lambda f: iio.imwrite(f / "images/0_000.png", np.array(iio.imread(f / "images/0_000.png"))[..., :3]),
-        "no matte: expected an alpha",
+        "expected RGBA with the matte as alpha or a mask_path in",
     ),
     "opaque": (
         lambda f: [iio.imwrite(p, iio.imread(p) | np.array([0, 0, 0, 255], np.uint8)) for p in (f / "images").glob("0_*")],
@@ -235,7 +235,7 @@ KEYS = [
     ),
     ({"path": None}, "scene.path: expected the folder"),
     ({"colour": "red"}, "scene.colour: not a key of this format"),
-    ({"scale": 2.0}, r"scene.scale: expected a number in \(0, 1\]"),
+    ({"scale": 2.0}, r"scene.scale: expected a number above 0 and at most 1"),
     ({"scale": 0.1}, "scene.scale: .* at least 16 px"),
     ({"gravity": [0, -9.8]}, "scene.gravity: expected three"),
     ({"up": [0, 0, 0]}, "scene.up: expected a direction"),
@@ -267,7 +267,7 @@ KEYS = [
         {"holdout_frames": "last"},
         "scene.holdout_frames: expected a list of frame numbers or how many",
     ),
-    ({"holdout_frames": -1}, "scene.holdout_frames: expected a number >= 0"),
+    ({"holdout_frames": -1}, "scene.holdout_frames: expected a whole number of at least 0"),
     ({"frames": [0, 1]}, "scene.frames: expected at least three frames"),
     (
         {"holdout_cameras": ["seven"]},
@@ -331,5 +331,7 @@ def test_uneven_times_can_be_overridden(pacnerf_folder, transforms_folder):
 
 @pytest.mark.parametrize("value", [-1, 2.5, True])
 def test_fill_holes_is_a_number_of_pixels(pacnerf_folder, value):
-    with pytest.raises(ConfigError, match=r"scene.fill_holes: expected a number of pixels"):
+    with pytest.raises(
+        ConfigError, match=r"scene.fill_holes: expected a whole number of at least 0"
+    ):
         load_scene(format="pacnerf", path=str(pacnerf_folder), fill_holes=value, **WORLD)

@@ -16,12 +16,13 @@ from mosa.data.synthetic.films import pictures_to_footage
 from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
 from mosa.data.synthetic.surface import extract_surface
 from mosa.errors import ConfigError, DataError
-from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry, surface_of
-from mosa.reconstruction.geometry.carving import CarvingSettings, carve, keep_silhouettes
+from mosa.reconstruction.geometry.body import FIRST, THEN, Geometry, find_geometry, surface_of
+from mosa.reconstruction.geometry.carving import carve, keep_silhouettes
 from mosa.reconstruction.geometry.field import first_crossing, sample, scatter, smooth
 from mosa.reconstruction.geometry.refinement import refine, signed_distance, surface_information
 from mosa.reconstruction.motion.observed import Windows, object_windows
 from mosa.reconstruction.pose.flight import Motion, free_motions
+from mosa.reconstruction.settings import GeometrySection
 from mosa.types import Ground, Scene
 
 SIZE, PITCH = 80, 0.006
@@ -83,7 +84,7 @@ def found(scene: Scene, **settings) -> tuple[Volume, Geometry]:
     return hull, find_geometry(
         scene,
         hull,
-        GeometrySettings(**settings),
+        GeometrySection(**settings),
         ridge_passes=24,
         sigma=1.2,
         margin=6,
@@ -119,9 +120,10 @@ def test_a_hollow_that_no_outline_shows_is_emptied_and_nothing_else(bowl):
     assert figures["geometry/uncertain_share"] < 0.03
 
 
-def test_equal_images_give_equal_bits(bowl):
-    short = {"first": ((1, 1.0),), "then": ((2, 0.6),)}
-    one, other = (found(bowl, **short)[1] for _ in range(2))
+def test_equal_images_give_equal_bits(bowl, monkeypatch):
+    monkeypatch.setattr("mosa.reconstruction.geometry.body.FIRST", ((1, 1.0),))
+    monkeypatch.setattr("mosa.reconstruction.geometry.body.THEN", ((2, 0.6),))
+    one, other = (found(bowl)[1] for _ in range(2))
     assert torch.equal(one.body.values, other.body.values) and torch.equal(
         one.deviation, other.deviation
     )
@@ -184,10 +186,9 @@ def test_the_surface_moves_to_where_colours_and_outlines_put_it(squashed):
     hull = replace(hull, values=(hull.values > 0.5).float())
     centre = torch.tensor(squashed_body.forward(np.zeros((1, 3)), 0.0, 1.0)[0], dtype=torch.float32)
     rest = squashed.truth.positions[0][::7]
-    settings = GeometrySettings()
     start = signed_distance(hull)
-    distance = refine(start, start, [still], settings.refinement, settings.first + settings.then)
-    information = surface_information(distance, [still], settings.refinement, 0.4)
+    distance = refine(start, start, [still], FIRST + THEN)
+    information = surface_information(distance, [still], 0.4)
     directions = torch.nn.functional.normalize(rest - centre, dim=1)
     radii = torch.tensor(squashed_body.RADII, dtype=torch.float32)
     surface = centre + directions / (directions / radii).norm(dim=1, keepdim=True)
@@ -213,7 +214,7 @@ def test_a_body_of_which_images_leave_nothing_is_its_hull_and_an_empty_hull_is_n
         UserWarning,
         match=r"scene bowl: carving and refinement left nothing of a visual hull of \d+ voxels of 6 mm",
     ):
-        hull, geometry = found(bowl, first=(), then=())
+        hull, geometry = found(bowl)
     assert (
         torch.equal(geometry.body.values, found(bowl, source="hull")[1].body.values)
         and geometry.free_frames == 1
@@ -226,7 +227,7 @@ def test_a_body_of_which_images_leave_nothing_is_its_hull_and_an_empty_hull_is_n
         match=r"scene bowl: expected a visual hull with an inside, found 1 voxels of 6 mm: .*resolution",
     ):
         find_geometry(
-            bowl, flat, GeometrySettings(), ridge_passes=0, sigma=1.2, margin=6, device="cpu"
+            bowl, flat, GeometrySection(), ridge_passes=0, sigma=1.2, margin=6, device="cpu"
         )
 
 
@@ -338,14 +339,11 @@ def test_geometry_comes_back_from_what_is_stored_and_the_hull_has_no_uncertainty
         ConfigError,
         match=r"reconstruction\.geometry\.source: expected images or hull or gaussians, found 'depth'",
     ):
-        GeometrySettings(source="depth")
+        GeometrySection(source="depth")
 
 
-def test_no_pass_carves_nothing_and_two_lone_cameras_neither(bowl):
+def test_two_lone_cameras_carve_nothing(bowl):
     hull = visual_hull(bowl.mattes[:, 0], bowl.cameras, bowl.box, pitch=0.008)
     body = replace(hull, values=(hull.values > 0.5).float())
     views = object_windows(bowl, list(range(12)), [0])
-    assert torch.equal(carve(body, views, CarvingSettings(passes=0)).values, body.values)
-    assert torch.equal(
-        carve(body, views.select(torch.tensor([0, 6])), CarvingSettings()).values, body.values
-    )
+    assert torch.equal(carve(body, views.select(torch.tensor([0, 6]))).values, body.values)

@@ -8,7 +8,7 @@ import torch
 from mosa.errors import ConfigError
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
 from mosa.reconstruction.motion.cues import neighbourhood
-from mosa.reconstruction.motion.dynamic import Scaffold, elastic_energy, fit_motion
+from mosa.reconstruction.motion.dynamic import Scaffold, Target, elastic_energy, fit_motion
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import ModalMotion, MotionBasisNetwork
 from mosa.reconstruction.motion.observed import object_windows
@@ -199,7 +199,7 @@ def test_a_rendered_motion_is_recovered(settings, bound, scaffold):
         true = truth(torch.arange(frames), shifted, scaffold.modes).positions
     windows = object_windows(scene, list(range(6)), list(range(frames)))
     body = Scaffold(shifted, scaffold.modes, scaffold.around)
-    motion = fit_motion(body, body, windows, offsets, torch.ones(3), settings, reach=0.1, seed=0)
+    motion = fit_motion(Target(body, body, windows, offsets, torch.ones(3), 0.1), settings, seed=0)
     with torch.no_grad():
         found = motion(torch.arange(frames), shifted, scaffold.modes, scaffold.around).positions
         start = shifted.means + offsets[:, None]
@@ -236,7 +236,7 @@ def test_a_body_that_bends_far_is_not_straightened(scaffold):
             carriers="particles", track_iterations=30, iterations=80, bending_scale=scale
         )
         motion = fit_motion(
-            body, body, windows, offsets, torch.ones(3), settings, reach=0.1, seed=0
+            Target(body, body, windows, offsets, torch.ones(3), 0.1), settings, seed=0
         )
         with torch.no_grad():
             found = motion(torch.arange(frames), shifted, scaffold.modes, scaffold.around).positions

@@ -9,7 +9,7 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.reconstruction.motion.cues import neighbourhood
-from mosa.reconstruction.motion.dynamic import Scaffold
+from mosa.reconstruction.motion.dynamic import Scaffold, Target
 from mosa.reconstruction.motion.informed import informed_motion, laid_onto, project
 from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.reconstruction.motion.motion import ModalMotion
@@ -57,16 +57,11 @@ def fitted(bent, predicted, seen, **settings):
     windows, body, _ = bent
     chosen = InformedSettings(**{"iterations": 60, "lr": 0.01} | settings)
     motion, _ = informed_motion(
-        body,
-        body,
-        windows,
-        OFFSETS,
-        torch.ones(3),
+        Target(body, body, windows, OFFSETS, torch.ones(3), 0.1),
         predicted,
         seen,
         chosen,
         DynamicSettings(carriers="particles"),
-        reach=0.1,
         seed=0,
     )
     with torch.no_grad():
@@ -168,16 +163,11 @@ def test_a_prediction_that_is_no_body_is_not_followed(bent, share):
     wrong[2, :, 1] = wrong[2, :, 1].mean() + share * (wrong[2, :, 1] - wrong[2, :, 1].mean())
     for predicted, followed in ((wrong, False), (true, True)):
         found = informed_motion(
-            body,
-            body,
-            windows,
-            OFFSETS,
-            torch.ones(3),
+            Target(body, body, windows, OFFSETS, torch.ones(3), 0.1),
             predicted,
             true,
             InformedSettings(iterations=30),
             DynamicSettings(carriers="particles"),
-            reach=0.1,
             seed=0,
         )
         assert (found is not None) == followed

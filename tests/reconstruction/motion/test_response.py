@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
+from mosa.reconstruction.motion.dynamic import Target
 from mosa.reconstruction.motion.informed import informed_motion
 from mosa.reconstruction.motion.modes import Modes
 from mosa.reconstruction.motion.moved import SecondLook
@@ -110,11 +111,13 @@ def test_of_a_body_that_is_filmed(bent):  # noqa: F811
     found, half = [], still + 0.5 * (true - still)
     for share in (0.5, 0.8):
         motion, about = informed_motion(
-            body, body, windows, OFFSETS, torch.ones(3), still + share * (true - still), half,
-            InformedSettings(iterations=40, lr=0.01), DynamicSettings(carriers="particles"), reach=0.1, seed=0)  # fmt: skip
+            Target(body, body, windows, OFFSETS, torch.ones(3), 0.1), still + share * (true - still), half,
+            InformedSettings(iterations=40, lr=0.01), DynamicSettings(carriers="particles"), seed=0)  # fmt: skip
         with torch.no_grad():
             found.append((motion(EVERY, body.splats, body.modes, body.around).positions, about))
-    H = image_matrices(body, body, windows, OFFSETS, torch.ones(3), found[0][0], reach=0.1, views=6)
+    H = image_matrices(
+        Target(body, body, windows, OFFSETS, torch.ones(3), 0.1), found[0][0], views=6
+    )
     assert H.shape == (2, 72, 72) and torch.allclose(H, H.mT, atol=1e-5 * float(H.max()))
     assert float(torch.linalg.eigvalsh(H).min()) > -1e-5 * float(H.max())
     response, _, left = response_of(
@@ -147,9 +150,9 @@ def test_the_response_of_another_sequence_is_refused(known):
 
 def test_a_part_of_large_pictures_tells_what_all_of_them_do(bent, monkeypatch):  # noqa: F811
     windows, body, true = bent
-    whole = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
+    whole = image_matrices(Target(body, body, windows, OFFSETS, torch.ones(3), 0.1), true, views=6)
     monkeypatch.setattr(
         "mosa.reconstruction.motion.response.VALUES", windows.images[0].numel() // 5
     )
-    part = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
+    part = image_matrices(Target(body, body, windows, OFFSETS, torch.ones(3), 0.1), true, views=6)
     assert not torch.equal(part, whole) and float((part - whole).norm() / whole.norm()) < 0.2

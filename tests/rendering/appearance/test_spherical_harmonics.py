@@ -10,11 +10,11 @@ from scipy.special import sph_harm_y
 from mosa.errors import ConfigError
 from mosa.rendering.appearance.spherical_harmonics import (
     basis,
-    camera_centers,
     colors_in,
     constant_coefficients,
     mean_colors,
 )
+from mosa.rendering.cameras import centers
 
 
 def test_basis_is_the_real_one_of_the_complex_harmonics():
@@ -53,7 +53,7 @@ def test_a_camera_sees_the_side_that_faces_it():
     coefficients = torch.zeros(3, 4, 3).double()
     coefficients[:, 3, 0] = 0.5
     scene.means = torch.zeros(1, 3, 3).double()
-    eyes = camera_centers(scene.cameras)
+    eyes = centers(scene.cameras)
     colors = colors_in(coefficients, scene.means[[0, 0]] - eyes[:, None])
     along = -eyes / eyes.norm(dim=1, keepdim=True)
     wanted = 0.5 - 0.5 * math.sqrt(3 / (4 * math.pi)) * along[:, 0]

@@ -90,7 +90,7 @@ class BuiltinObject:
 
 RABBIT = HiddenMaterial(
     E=2e5, nu=0.3, ratio=1.6, fibre=(1.0, 0.3, 0.0), amplitude=0.2, period=0.125
-)
+)  # fmt: skip
 # stiffer and slower to squash, fibres lean across the axis, and the stiffness varies along the body
 PEANUT = HiddenMaterial(
     E=3e5, nu=0.35, ratio=1.9, fibre=(0.2, 0.5, 1.0), amplitude=0.25, period=0.16, axis=(0.3, 0.9, 0.3)
@@ -105,52 +105,28 @@ CLAY = HiddenYield(
     period=0.125,
 )  # fmt: skip
 CHICK = HiddenMaterial(
-    E=2.2e5,
-    nu=0.28,
-    ratio=1.8,
-    fibre=(0.3, -0.2, 1.0),
-    amplitude=0.15,
-    period=0.13,
-    axis=(0.0, 1.0, 0.3),
-)
+    E=2.2e5, nu=0.28, ratio=1.8, fibre=(0.3, -0.2, 1.0), amplitude=0.15, period=0.13, axis=(0.0, 1.0, 0.3)
+)  # fmt: skip
 # the second five: shapes, materials and drops were fixed together, before anything was fitted on them
 GORILLA = HiddenMaterial(
-    E=3e5,
-    nu=0.3,
-    ratio=1.75,
-    fibre=(0.3, 1.0, 0.4),
-    amplitude=0.2,
-    period=0.15,
-    axis=(0.6, 0.7, 0.3),
-)
+    E=3e5, nu=0.3, ratio=1.75, fibre=(0.3, 1.0, 0.4), amplitude=0.2, period=0.15, axis=(0.6, 0.7, 0.3)
+)  # fmt: skip
 CHICK2 = HiddenMaterial(
-    E=2.4e5,
-    nu=0.27,
-    ratio=2.0,
-    fibre=(0.5, 0.6, -0.7),
-    amplitude=0.25,
-    period=0.12,
-    axis=(0.3, -0.4, 0.9),
-)
+    E=2.4e5, nu=0.27, ratio=2.0, fibre=(0.5, 0.6, -0.7), amplitude=0.25, period=0.12, axis=(0.3, -0.4, 0.9)
+)  # fmt: skip
 RAINBOWBALL = HiddenMaterial(
     E=1.8e5, nu=0.36, ratio=1.5, fibre=(-0.6, 0.5, 0.6), amplitude=0.18, period=0.11, axis=(0.6, 0.2, -0.7)
 )  # fmt: skip
 CALF = HiddenMaterial(
-    E=3.5e5,
-    nu=0.33,
-    ratio=1.65,
-    fibre=(1.0, 0.2, 0.35),
-    amplitude=0.22,
-    period=0.17,
-    axis=(0.9, 0.2, 0.4),
-)
+    E=3.5e5, nu=0.33, ratio=1.65, fibre=(1.0, 0.2, 0.35), amplitude=0.22, period=0.17, axis=(0.9, 0.2, 0.4)
+)  # fmt: skip
 # no directions, one stiffness: what is learned of it has to be nothing
 RING = HiddenMaterial(E=2.5e5, nu=0.34, ratio=1.0, fibre=(1.0, 0.0, 0.0), amplitude=0.0, period=0.1)
 
 # strong fibres in the plane of x and the vertical, no other variation: what a compression test of a specimen measures
 CYLINDER = HiddenMaterial(
     E=2e5, nu=0.3, ratio=1.8, fibre=(1.0, 0.4, 0.0), amplitude=0.0, period=0.1
-)
+)  # fmt: skip
 
 DROPS = {
     "train": Drop(speed=2.5),
@@ -230,9 +206,7 @@ def stand_in(shape: str, height: float, law: str, *, spacing: float = 0.0125, re
     material = PublishedMaterial(
         law=law, values=tuple(values.items()), held=held, convention=convention
     )
-    film = Footage(
-        cameras=11, frames=frames, size=400, fps=24.0, field=0.52, target=0.38, distance=3.0
-    )
+    film = Footage(11, frames, size=400, fps=24.0, field=0.52, target=0.38, distance=3.0)
     return BuiltinObject(
         shape,
         height,

@@ -24,26 +24,15 @@ ARMS = (
     ((0.050, 0.178, -0.062), (0.056, 0.110, -0.116), (0.030, 0.028, -0.118)),
 )
 LEGS = (
-    (
-        (-0.066, 0.100, 0.044),
-        (-0.056, 0.072, 0.082),
-        (-0.088, 0.026, 0.080),
-        (-0.050, 0.025, 0.092),
-    ),
-    (
-        (-0.066, 0.100, -0.044),
-        (-0.034, 0.068, -0.070),
-        (-0.052, 0.026, -0.066),
-        (-0.016, 0.025, -0.070),
-    ),
-)
+    ((-0.066, 0.100, 0.044), (-0.056, 0.072, 0.082), (-0.088, 0.026, 0.080), (-0.050, 0.025, 0.092)),
+    ((-0.066, 0.100, -0.044), (-0.034, 0.068, -0.070), (-0.052, 0.026, -0.066), (-0.016, 0.025, -0.070)),
+)  # fmt: skip
 
 
 def limb(points: np.ndarray, joints, radii) -> np.ndarray:
     """Capsules from joint to joint, with the radius of each joint."""
-    return np.min(
-        [capsule(points, a, b, r, s) for a, b, r, s in zip(joints, joints[1:], radii, radii[1:])], 0
-    )
+    pairs = zip(joints, joints[1:], radii, radii[1:])
+    return np.min([capsule(points, a, b, r, s) for a, b, r, s in pairs], 0)
 
 
 def gorilla_distance(points: np.ndarray) -> np.ndarray:
@@ -67,17 +56,14 @@ def gorilla_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     colors = (0.40, 0.32, 0.27), (0.58, 0.54, 0.50), (0.55, 0.30, 0.18)
     color = coat(points, rng, colors, patch=0.085, grain=0.027)
     edge = waves(points, rng, 0.035) * 0.004
-    color = blend(
-        color,
-        (0.74, 0.72, 0.68),
-        step(-sphere(points, (-0.050, 0.190, 0.010), 0.052) + edge, 0.0, 0.010),
-    )
+    back = sphere(points, (-0.050, 0.190, 0.010), 0.052)
+    color = blend(color, (0.74, 0.72, 0.68), step(-back + edge, 0.0, 0.010))
     color = spot(color, points, (0.146, 0.204, 0.010), 0.036, (0.62, 0.48, 0.40), 0.005)
     for joints in ARMS:
         color = spot(color, points, joints[2], 0.031, (0.64, 0.50, 0.42), 0.006)
     for center, radius in (((0.137, 0.230, 0.030), 0.010), ((0.139, 0.229, -0.014), 0.008)):
         color = spot(color, points, center, radius, (0.05, 0.04, 0.04), 0.003)
-    return np.clip(color, 0.02, 1.0)
+    return color
 
 
 # --- calf -----------------------------------------------------------------------------------------------------------------
@@ -102,9 +88,8 @@ def calf_distance(points: np.ndarray) -> np.ndarray:
     muzzle = capsule(points, (0.122, 0.226, 0.004), (0.148, 0.206, 0.008), 0.028, 0.024)
     head = join(sphere(points, (0.112, 0.232, 0.004), 0.035), muzzle, 0.012)
     for tip in ((0.098, 0.250, 0.052), (0.096, 0.242, -0.046)):
-        head = join(
-            head, capsule(points, (0.104, 0.240, 0.02 * np.sign(tip[2])), tip, 0.018, 0.016), 0.008
-        )
+        root = (0.104, 0.240, 0.02 * np.sign(tip[2]))
+        head = join(head, capsule(points, root, tip, 0.018, 0.016), 0.008)
     body = join(body, head, 0.014)
     for joints in FEET:
         body = join(body, limb(points, joints, (0.030, 0.025, 0.0235)), 0.014)
@@ -120,7 +105,7 @@ def calf_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     color = blend(color, (0.24, 0.20, 0.19), step(0.018 - points[:, 1], 0.0, 0.006))
     for center, radius in (((0.136, 0.252, 0.030), 0.010), ((0.137, 0.250, -0.022), 0.008)):
         color = spot(color, points, center, radius, (0.05, 0.04, 0.05), 0.003)
-    return np.clip(color, 0.02, 1.0)
+    return color
 
 
 # --- ring -----------------------------------------------------------------------------------------------------------------
@@ -143,6 +128,4 @@ def ring_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     colors = (0.30, 0.62, 0.60), (0.86, 0.66, 0.28), (0.56, 0.18, 0.20)
     color = coat(points, rng, colors, patch=0.08, grain=0.025)
     white = RING_CENTER + np.array([0.07, -0.04, -0.03])
-    return np.clip(
-        blend(color, (0.94, 0.93, 0.88), step(-sphere(points, white, 0.036), 0.0, 0.006)), 0.02, 1.0
-    )
+    return spot(color, points, white, 0.036, (0.94, 0.93, 0.88), 0.006)

@@ -45,9 +45,8 @@ def capsule(
     start, axis = np.asarray(start), np.asarray(end) - np.asarray(start)
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
     end_radius = radius if end_radius is None else end_radius
-    return np.linalg.norm(points - start - along[:, None] * axis, axis=-1) - (
-        radius + along * (end_radius - radius)
-    )
+    away = np.linalg.norm(points - start - along[:, None] * axis, axis=-1)
+    return away - (radius + along * (end_radius - radius))
 
 
 def join(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
@@ -72,9 +71,14 @@ def blend(color: np.ndarray, other, amount: np.ndarray) -> np.ndarray:
     return color + amount[:, None] * (np.asarray(other) - color)
 
 
+def cover(color: np.ndarray, part: np.ndarray, other, edge: float) -> np.ndarray:
+    """Colour (M, 3) with `other` inside of a part of distance (M,) [m], soft over `edge` [m]."""
+    return blend(color, other, step(-part, 0.0, edge))
+
+
 def spot(color: np.ndarray, points: np.ndarray, center, radius: float, other, edge: float):
     """Colour (M, 3) with `other` within `radius` of a centre [m], soft over `edge` [m]."""
-    return blend(color, other, step(-sphere(points, center, radius), 0.0, edge))
+    return cover(color, sphere(points, center, radius), other, edge)
 
 
 def waves(
@@ -103,5 +107,6 @@ def coat(
 
 
 def shape(distance: Field, color, low, high) -> Shape:
-    """low, high: corners of the box that holds it [m]."""
-    return Shape(distance, color, np.array([low, high]))
+    """low, high: corners of the box that holds it [m]. No colour is quite black."""
+    painted = lambda points, rng: np.clip(color(points, rng), 0.02, 1.0)  # noqa: E731
+    return Shape(distance, painted, np.array([low, high]))

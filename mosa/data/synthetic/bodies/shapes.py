@@ -17,6 +17,7 @@ from mosa.data.synthetic.bodies.parts import (
     blend,
     capsule,
     coat,
+    cover,
     ellipsoid,
     join,
     mirrored,
@@ -76,21 +77,15 @@ def rabbit_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         sphere(points, (0.088, 0.084, 0.0), 0.032), capsule(both, (0.05, 0.016, 0.05), (0.09, 0.014, 0.04), 0.026),
         sphere(both, (0.090, 0.040, 0.026), 0.020),
     ):  # fmt: skip
-        color = blend(color, white, step(-(part + edge), 0.0, 0.006))
-    color = blend(
-        color, (0.30, 0.18, 0.13), step(-ear(points, *RIGHT_EAR, margin=0.004), 0.0, 0.008)
-    )
+        color = cover(color, part + edge, white, 0.006)
+    color = cover(color, ear(points, *RIGHT_EAR, margin=0.004), (0.30, 0.18, 0.13), 0.008)
     for start, end in (LEFT_EAR, RIGHT_EAR):
         front = np.array([0.020, 0.004, 0.0])
-        color = blend(
-            color,
-            pink,
-            step(-ear(points, np.add(start, front), np.add(end, front), margin=-0.008), 0.0, 0.006),
-        )
+        inner = ear(points, np.add(start, front), np.add(end, front), margin=-0.008)
+        color = cover(color, inner, pink, 0.006)
     color = spot(color, points, (0.105, 0.141, 0.0), 0.0110, pink, 0.004)
     color = spot(color, both, (0.080, 0.162, 0.040), 0.0125, (0.07, 0.05, 0.05), 0.004)
-    color = spot(color, both, (0.0875, 0.1685, 0.0405), 0.0045, (1.0, 1.0, 1.0), 0.002)
-    return np.clip(color, 0.02, 1.0)
+    return spot(color, both, (0.0875, 0.1685, 0.0405), 0.0045, (1.0, 1.0, 1.0), 0.002)
 
 
 # --- peanut ---------------------------------------------------------------------------------------------------------------
@@ -109,12 +104,8 @@ def peanut_distance(points: np.ndarray) -> np.ndarray:
     upper = ellipsoid(bent, (0.0, 0.190, 0.008), (0.055, 0.070, 0.057))
     angle = np.arctan2(bent[:, 2], bent[:, 0])
     away = np.hypot(bent[:, 0], bent[:, 2]) / 0.05
-    ribs = (
-        0.0012
-        * np.cos(9 * angle)
-        * np.clip(away, 0, 1)
-        * np.cos(2 * np.pi * bent[:, 1] / 0.045) ** 2
-    )
+    along = np.cos(2 * np.pi * bent[:, 1] / 0.045) ** 2
+    ribs = 0.0012 * np.cos(9 * angle) * np.clip(away, 0, 1) * along
     return join(lower, upper, 0.035) - ribs
 
 
@@ -123,12 +114,10 @@ def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     colors = (0.86, 0.66, 0.36), (0.28, 0.52, 0.42), (0.58, 0.20, 0.16)
     color = coat(points, rng, colors, patch=0.11, grain=0.028)
     points = upright(points)
-    band = step(0.016 - np.abs(points[:, 1] - 0.135 - 0.2 * points[:, 0]), 0.0, 0.008) * step(
-        points[:, 2], -0.02, 0.04
-    )
+    waist = np.abs(points[:, 1] - 0.135 - 0.2 * points[:, 0])
+    band = step(0.016 - waist, 0.0, 0.008) * step(points[:, 2], -0.02, 0.04)
     color = blend(color, (0.95, 0.90, 0.80), band)
-    color = spot(color, points, (0.05, 0.215, 0.02), 0.022, (0.20, 0.28, 0.55), 0.006)
-    return np.clip(color, 0.02, 1.0)
+    return spot(color, points, (0.05, 0.215, 0.02), 0.022, (0.20, 0.28, 0.55), 0.006)
 
 
 # --- mandarin -------------------------------------------------------------------------------------------------------------
@@ -154,8 +143,7 @@ def mandarin_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     color = coat(points, rng, colors, patch=0.09, grain=0.026)
     color = blend(color, (0.26, 0.46, 0.18), step(points[:, 1], 0.158, 0.012))
     color = spot(color, points, (0.080, 0.105, 0.055), 0.028, (0.95, 0.95, 0.90), 0.004)
-    color = spot(color, points, (0.084, 0.105, 0.060), 0.016, (0.16, 0.30, 0.60), 0.004)
-    return np.clip(color, 0.02, 1.0)
+    return spot(color, points, (0.084, 0.105, 0.060), 0.016, (0.16, 0.30, 0.60), 0.004)
 
 
 # --- chick ----------------------------------------------------------------------------------------------------------------
@@ -179,10 +167,9 @@ def chick_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     colors = (0.96, 0.84, 0.36), (0.72, 0.50, 0.20), (0.98, 0.95, 0.80)
     color = coat(points, rng, colors, patch=0.09, grain=0.026)
     beak = capsule(points, (0.090, 0.154, 0.0), (0.112, 0.149, 0.0), 0.026, 0.024)
-    color = blend(color, (0.93, 0.48, 0.14), step(-beak, 0.0, 0.006))
+    color = cover(color, beak, (0.93, 0.48, 0.14), 0.006)
     color = spot(color, both, (0.074, 0.184, 0.038), 0.013, (0.07, 0.05, 0.05), 0.003)
-    color = spot(color, points, (-0.010, 0.080, 0.100), 0.022, (0.24, 0.38, 0.62), 0.005)
-    return np.clip(color, 0.02, 1.0)
+    return spot(color, points, (-0.010, 0.080, 0.100), 0.022, (0.24, 0.38, 0.62), 0.005)
 
 
 # --- second chick ---------------------------------------------------------------------------------------------------------
@@ -212,28 +199,20 @@ def chick2_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     colors = (0.93, 0.86, 0.66), (0.62, 0.40, 0.22), (0.80, 0.52, 0.24)
     color = coat(points, rng, colors, patch=0.085, grain=0.026)
     red = (0.86, 0.30, 0.16)
-    color = blend(
-        color,
-        red,
-        step(-capsule(points, (0.108, 0.188, 0.013), (0.128, 0.181, 0.014), 0.024), 0.0, 0.005),
-    )
+    beak = capsule(points, (0.108, 0.188, 0.013), (0.128, 0.181, 0.014), 0.024)
+    color = cover(color, beak, red, 0.005)
     color = blend(color, red, step(0.030 - points[:, 1], 0.0, 0.006))
     color = spot(color, points, (-0.024, 0.130, -0.122), 0.030, (0.22, 0.17, 0.15), 0.006)
     for center, radius in (((0.092, 0.216, 0.040), 0.012), ((0.094, 0.214, -0.026), 0.010)):
         color = spot(color, points, center, radius, (0.06, 0.05, 0.06), 0.003)
-    return np.clip(color, 0.02, 1.0)
+    return color
 
 
 # --- rainbow ball ---------------------------------------------------------------------------------------------------------
 
 RAINBOW = (
-    (0.86, 0.16, 0.16),
-    (0.95, 0.55, 0.12),
-    (0.96, 0.86, 0.20),
-    (0.24, 0.66, 0.28),
-    (0.18, 0.44, 0.80),
-    (0.48, 0.24, 0.62),
-)
+    (0.86, 0.16, 0.16), (0.95, 0.55, 0.12), (0.96, 0.86, 0.20), (0.24, 0.66, 0.28), (0.18, 0.44, 0.80), (0.48, 0.24, 0.62),
+)  # fmt: skip
 
 
 def rainbowball_distance(points: np.ndarray) -> np.ndarray:
@@ -251,18 +230,10 @@ def rainbowball_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     color = np.broadcast_to(np.asarray(RAINBOW[0]), points.shape).copy()
     for k in range(1, len(RAINBOW)):
         color = blend(color, RAINBOW[k], step(turn, float(k), 0.08))
-    color = (
-        color
-        * (
-            1
-            + np.clip(
-                0.09 * waves(points, rng, 0.028) + 0.06 * waves(points, rng, 0.045), -0.3, 0.3
-            )
-        )[:, None]
-    )
+    mottle = 0.09 * waves(points, rng, 0.028) + 0.06 * waves(points, rng, 0.045)
+    color = color * (1 + np.clip(mottle, -0.3, 0.3))[:, None]
     color = blend(color, (0.96, 0.96, 0.94), step(arm @ axis, 0.084, 0.006))
-    color = spot(color, points, (-0.06, 0.05, 0.07), 0.030, (0.14, 0.14, 0.20), 0.005)
-    return np.clip(color, 0.02, 1.0)
+    return spot(color, points, (-0.06, 0.05, 0.07), 0.030, (0.14, 0.14, 0.20), 0.005)
 
 
 # --- cylinder -------------------------------------------------------------------------------------------------------------
@@ -278,11 +249,8 @@ def cylinder_distance(points: np.ndarray) -> np.ndarray:
     along = arm @ CYLINDER_AXIS
     away = np.linalg.norm(arm - along[:, None] * CYLINDER_AXIS, axis=-1) - (0.085 - rounding)
     over = np.abs(along) - (half - rounding)
-    return (
-        np.minimum(np.maximum(away, over), 0)
-        + np.hypot(np.maximum(away, 0), np.maximum(over, 0))
-        - rounding
-    )
+    inside, beyond = np.minimum(np.maximum(away, over), 0), np.maximum([away, over], 0)
+    return inside + np.hypot(*beyond) - rounding
 
 
 def cylinder_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -290,15 +258,7 @@ def cylinder_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     colors = (0.62, 0.64, 0.66), (0.20, 0.36, 0.66), (0.86, 0.66, 0.28)
     color = coat(points, rng, colors, patch=0.085, grain=0.026)
     color = spot(color, points, (0.090, 0.080, 0.020), 0.034, (0.80, 0.20, 0.18), 0.006)
-    return np.clip(
-        blend(
-            color,
-            (0.95, 0.94, 0.90),
-            step(-sphere(points, (-0.040, 0.160, 0.075), 0.030), 0.0, 0.006),
-        ),
-        0.02,
-        1.0,
-    )
+    return spot(color, points, (-0.040, 0.160, 0.075), 0.030, (0.95, 0.94, 0.90), 0.006)
 
 
 SHAPES = {

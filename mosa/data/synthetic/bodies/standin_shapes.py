@@ -19,8 +19,7 @@ def painted(colors, size: float) -> Callable[[np.ndarray, np.random.Generator], 
     """A coat of three colours; size: of its patches, 1 for a body of half a metre."""
 
     def color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        found = coat(points, rng, colors, patch=0.17 * size, grain=0.052 * size)
-        return np.clip(found, 0.02, 1.0)
+        return coat(points, rng, colors, patch=0.17 * size, grain=0.052 * size)
 
     return color
 

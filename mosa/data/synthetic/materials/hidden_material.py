@@ -31,12 +31,8 @@ def fibre_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) 
     """mu/2 (|F|^2 - 3) - mu log J + lam/2 (log J)^2 + kf/2 (|F a|^2 - 1)^2 [J/m^3]; F: (..., 3, 3), fibre: (..., 3)."""
     log_J = torch.log(torch.linalg.det(F))
     stretch = ((F @ fibre[..., None])[..., 0] ** 2).sum(-1)
-    return (
-        0.5 * mu * ((F * F).sum((-2, -1)) - 3)
-        - mu * log_J
-        + 0.5 * lam * log_J**2
-        + 0.5 * kf * (stretch - 1) ** 2
-    )
+    matrix = 0.5 * mu * ((F * F).sum((-2, -1)) - 3) - mu * log_J + 0.5 * lam * log_J**2
+    return matrix + 0.5 * kf * (stretch - 1) ** 2
 
 
 @wp.func
@@ -66,22 +62,11 @@ def corotated_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tens
     return matrix + 0.25 * kf * (torch.exp(2 * (stretch - 1) ** 2) - 1)
 
 
-register_law(
-    "fibre_corotated",
-    fibre_corotated,
-    {"mu": 1, "lam": 1, "kf": 1, "fibre": 3},
-    uses_rotation=True,
-    energy=corotated_energy,
-)
+NEEDS = {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}
+register_law("fibre_corotated", fibre_corotated, NEEDS, uses_rotation=True, energy=corotated_energy)
+register_law(LAW, fibre_neo_hookean, NEEDS, needs_positive_J=True, energy=fibre_energy)
 FORMS = {LAW: 1.0, "fibre_corotated": 3.0}
 """Laws of this material, each with how much stiffer its fibres get than at rest, for the time step."""
-register_law(
-    LAW,
-    fibre_neo_hookean,
-    {"mu": 1, "lam": 1, "kf": 1, "fibre": 3},
-    needs_positive_J=True,
-    energy=fibre_energy,
-)
 
 
 def fibre_stiffness(E: float, nu: float, ratio: float) -> float:
@@ -138,12 +123,8 @@ class HiddenMaterial(Hidden):
         mu, lam = self.elastic(factor)
         fibre = torch.tensor(self.fibre, dtype=rest.dtype)
         kf = fibre_stiffness(self.E, self.nu, self.ratio) * factor
-        return {
-            "mu": mu,
-            "lam": lam,
-            "kf": kf,
-            "fibre": (fibre / fibre.norm()).expand(len(rest), 3),
-        }
+        turned = (fibre / fibre.norm()).expand(len(rest), 3)
+        return {"mu": mu, "lam": lam, "kf": kf, "fibre": turned}
 
     def mean_modulus(self) -> float:
         """lam + 2 mu + 4 kf [Pa], kf as stiff as the fibres get."""
@@ -154,11 +135,5 @@ class HiddenMaterial(Hidden):
         """Numbers for Truth.parameters: E, nu of the matrix, moduli along and across the fibre [Pa], their ratio."""
         k = 4 * fibre_stiffness(self.E, self.nu, self.ratio)
         across = self.E / (1 - self.nu**2 * k / (self.E + k))
-        return {
-            "E": self.E,
-            "nu": self.nu,
-            "E_along": self.E + k,
-            "E_across": across,
-            "ratio": self.ratio,
-            "heterogeneity": self.amplitude,
-        }
+        moduli = {"E": self.E, "nu": self.nu, "E_along": self.E + k, "E_across": across}
+        return {**moduli, "ratio": self.ratio, "heterogeneity": self.amplitude}

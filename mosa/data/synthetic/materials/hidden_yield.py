@@ -39,10 +39,8 @@ class HiddenYield(Hidden):
         factor = self.factor(rest)
         mu, lam = self.elastic(factor)
         values = {"mu": mu, "lam": lam, "yield_stress": self.yield_stress * factor}
-        values |= {
-            name: torch.full_like(factor, c)
-            for name, c in zip(COEFFICIENTS, self.coefficients, strict=True)
-        }
+        pairs = zip(COEFFICIENTS, self.coefficients, strict=True)
+        values |= {name: torch.full_like(factor, c) for name, c in pairs}
         turn = torch.tensor(self.turn, dtype=torch.float64)
         angle = turn.norm()
         axes = (turn * (angle / 2).tan() / angle).to(rest)  # as `axes_rotation` takes it
@@ -51,10 +49,5 @@ class HiddenYield(Hidden):
     def summary(self) -> dict[str, float]:
         """Numbers for Truth.parameters; ratio: of the largest of Hill's coefficients to the smallest."""
         ratio = max(self.coefficients) / min(self.coefficients)
-        return {
-            "E": self.E,
-            "nu": self.nu,
-            "yield_stress": self.yield_stress,
-            "ratio": ratio,
-            "heterogeneity": self.amplitude,
-        }
+        elastic = {"E": self.E, "nu": self.nu, "yield_stress": self.yield_stress}
+        return {**elastic, "ratio": ratio, "heterogeneity": self.amplitude}

@@ -102,11 +102,8 @@ def symmetric_exponential(H: wp.mat33d):
     """exp of a symmetric matrix."""
     shift = _ONE + wp.sqrt(wp.ddot(H, H))
     U, S, V = svd_value(H + shift * wp.identity(n=3, dtype=wp.float64))
-    return (
-        V
-        * wp.diag(wp.vec3d(wp.exp(S[0] - shift), wp.exp(S[1] - shift), wp.exp(S[2] - shift)))
-        * wp.transpose(V)
-    )
+    grown = wp.vec3d(wp.exp(S[0] - shift), wp.exp(S[1] - shift), wp.exp(S[2] - shift))
+    return V * wp.diag(grown) * wp.transpose(V)
 
 
 @wp.func_grad(symmetric_exponential)

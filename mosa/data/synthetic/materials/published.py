@@ -43,10 +43,8 @@ class PublishedMaterial:
     def _one(self) -> dict[str, Tensor]:
         from mosa.modules.body.material import Material
 
-        return {
-            name: value.detach()
-            for name, value in Material(self.law, dict(self.values)).per_particle().items()
-        }
+        found = Material(self.law, dict(self.values)).per_particle()
+        return {name: value.detach() for name, value in found.items()}
 
     def parameters(self, rest: Tensor) -> dict[str, Tensor]:
         """What the law takes, per particle; rest: (N, 3) [m]."""
