@@ -28,6 +28,8 @@ SHORTER, SHORTEST = 0.4, 0.05
 """A step that does not improve is tried again so much shorter; one of fewer standard deviations of the posterior is not tried."""
 KNOWN = 1e-6
 """Standard deviation of numbers that a model does without, which draws of a posterior need."""
+ROWS = 65_536
+"""Of a Jacobian that are in float64 at a time."""
 EVIDENCE_PASSES = 20
 """Of the fixed point for the sizes of the blocks: each costs one inverse of a matrix of all numbers."""
 
@@ -139,6 +141,22 @@ class Posterior:
 def _length(step: Tensor, matrix: Tensor) -> float:
     """Of a step (D,), in standard deviations of the posterior with that matrix (D, D)."""
     return float((step @ matrix @ step).clamp(min=0).sqrt())
+
+
+def normal_equations(J: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+    """(J^T J, J^T r) of J (R, D) and r (R,), float64 on the host and summed in float64.
+
+    Sums in float32 lose what films tell beside a measured force, whose residuals are thousands of times as steep: J^T J then has
+    negative eigenvalues, and there is no posterior."""
+    H, g = (
+        J.new_zeros(J.shape[1], J.shape[1], dtype=torch.float64),
+        J.new_zeros(J.shape[1], dtype=torch.float64),
+    )
+    for rows, residuals in zip(J.split(ROWS), r.split(ROWS)):
+        wide = rows.double()
+        H += wide.T @ wide
+        g += wide.T @ residuals.double()
+    return H.cpu(), g.cpu()
 
 
 @dataclass
@@ -261,7 +279,7 @@ class GaussNewton:
         r = seat.residuals() if r is None else r
         self.columns = None  # before the next are made: one Jacobian is in memory at a time
         J = self.columns = self.jacobian(numbers, r)
-        H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
+        H, g = normal_equations(J, r)
         if not bool(torch.isfinite(H).all()):
             raise SimulationDiverged(
                 "Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior"
@@ -301,7 +319,7 @@ class GaussNewton:
                 numbers, r, after, trust = moved, there, cost, min(1.0, 2 * trust)
             else:
                 trust *= SHORTER
-            H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
+            H, g = normal_equations(J, r)
             M = H + precision
         seat.write(numbers)
         self.matrix, self.data = M, H

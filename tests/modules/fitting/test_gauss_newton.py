@@ -9,7 +9,14 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
+from mosa.modules.fitting.gauss_newton import (
+    ROWS,
+    Block,
+    GaussNewton,
+    Posterior,
+    Seat,
+    normal_equations,
+)
 
 
 def drawn(*shape, seed=0):
@@ -419,3 +426,18 @@ def test_nothing_is_transferred_before_an_iteration():
 
 def linear_residuals(newton, A, b):
     return lambda: A @ newton.seats[0].read() - b
+
+
+def test_what_few_residuals_tell_stays_beside_steep_ones():
+    """Two numbers of which a measured force tells the sum 1e5 times as well as a film the difference."""
+    generator = torch.Generator().manual_seed(0)
+    count = ROWS + 1000
+    force, film = torch.randn(2, count, generator=generator)
+    J = torch.stack([1e5 * force + film, 1e5 * force - film], 1)
+    H, g = normal_equations(J, film)
+    exact = J.double().T @ J.double()
+    assert float((H - exact).abs().max()) < 1e-12 * float(exact.max())
+    assert float(torch.linalg.eigvalsh(H).min()) == pytest.approx(2 * count, rel=0.02)
+    in_float32 = float(torch.linalg.eigvalsh((J.T @ J).double()).min())
+    assert abs(in_float32 - 2 * count) > 100 * count  # of either sign
+    torch.testing.assert_close(g, J.double().T @ film.double())
