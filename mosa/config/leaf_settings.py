@@ -107,9 +107,9 @@ class SplatsSettings(LawSections):
     rotation: Four | None = None
     """[ax, ay, az, degrees] about the body's centre, in the file's axes, before it falls"""
     velocity: Three = [0, 0, 0]
-    """m/s"""
+    """[vx, vy, vz] m/s, in the file's axes"""
     angular_velocity: Three = [0, 0, 0]
-    """rad/s"""
+    """[wx, wy, wz] rad/s about the body's centre, in the file's axes"""
     frames: Count = 40
     """number of frames"""
     rate: Positive = 30

@@ -35,7 +35,8 @@ command line.
 | `callbacks`, `logger` | `default`, ...; `tensorboard`, `csv`, `wandb`, `none` | Lightning's callbacks and loggers |
 | `ablation`, `debug`, `experiment` | `full`, ...; `default`; `bird`, ... | sets of keys that belong together |
 
-The other commands have `conf/eval.yaml`, `conf/capture.yaml`, `conf/splats.yaml` and `conf/environments.yaml`.
+The other commands have `conf/eval.yaml`, `conf/capture.yaml`, `conf/splats.yaml`, `conf/environments.yaml` and
+`conf/material.yaml`.
 
 ## Defaults and descriptions
 

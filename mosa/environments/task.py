@@ -197,7 +197,8 @@ class Task(ABC):
         """The same gravity over a ground at height 0 with friction, in a wide box, whatever the scene's own are."""
         if float((world.up - torch.tensor([0.0, 1.0, 0.0]).to(world.up)).abs().max()) > 1e-6:
             raise ConfigError(
-                f"task {self.name}: expected a world with up = [0, 1, 0], found {world.up.tolist()}"
+                f"task {self.name}: expected a world with up = [0, 1, 0], found {world.up.tolist()}; "
+                "train the twin on cameras in a world with y up"
             )
         box = torch.tensor([[-ROOM, -1.0, -ROOM], [ROOM, ROOM, ROOM]]).to(world.box)
         return replace(

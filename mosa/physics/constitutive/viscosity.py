@@ -2,7 +2,9 @@
 
 The first variant is that of the paper's appendix on constitutive models, the second and the fluid are those of public simulators.
 
-Parameters: kappa bulk modulus [Pa]; mu shear modulus [Pa], for the fluid a viscosity [Pa s]; yield_stress [Pa]; viscosity [Pa s].
+Parameters: kappa bulk modulus [Pa], of the fluid a seventh of it; mu shear modulus [Pa], of the
+fluid twice the viscosity [Pa s]; uniaxial yield_stress [Pa]; viscosity [Pa s], twice Bingham's:
+|s| = sqrt(2/3) yield_stress + viscosity |D_p|.
 Return mappings have the signature of `plasticity`.
 """
 
