@@ -24,7 +24,13 @@ from mosa.config.checkpoints import TENSORS, check_kinds, check_numbers, checked
 from mosa.config.record import BodyRecord
 from mosa.data.io.splat_formats import Formats, check_formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation.analysis.comparison import DARK, ground_lines, ground_shadow, on_ground
+from mosa.evaluation.analysis.comparison import (
+    DARK,
+    ground_lines,
+    ground_shadow,
+    on_ground,
+    outline,
+)
 from mosa.evaluation.analysis.figures import ffmpeg, side_by_side, to_uint8, write_video
 from mosa.evaluation.uncertainty import (
     DRAWS,
@@ -337,7 +343,9 @@ class Twin:
                 ground_shadow(part, self.world, camera, body.size, filled)
                 for part, filled in zip(points.tensor_split(ends[:-1]), convex)
             ]
-            image *= (1 - DARK * np.max(dark, 0))[..., None]
+            # none shines through between the body's splats
+            free = 1 - outline(points[: ends[0]], camera, body.size)
+            image *= (1 - DARK * free * np.max(dark, 0))[..., None]
         behind = torch.from_numpy(floors).to(body.rest)
         return shown.images(camera, behind)[0].clamp(0, 1).cpu()
 
@@ -401,9 +409,10 @@ class Twin:
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             images = self._pictures(rollout, solids, size, view, shadow)
-            frames = [to_uint8(image) for image in images]
             if caption:
-                frames = side_by_side({title: frames}, footer=moments)
+                frames = side_by_side({title: images}, footer=moments)
+            else:
+                frames = [to_uint8(image) for image in images]
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))
         return folder
 

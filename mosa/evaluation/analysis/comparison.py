@@ -200,25 +200,44 @@ def ground_shadow(
     camera. It is the sharper the nearer the solid is to the ground. size: of the object [m];
     convex: the solid fills the space between its points."""
     assert world.ground is not None
-    up, w2c, K = world.up.double(), cameras.w2c[0].double().cpu(), cameras.K[0].double().cpu()
-    points = points.double().cpu()
+    up, points = world.up.double().cpu(), points.double().cpu()
     high = points @ up - world.ground.height
-    seen = (points - high[:, None] * up) @ w2c[:3, :3].T + w2c[:3, 3]
-    seen = seen[(seen[:, 2] > 0) & (high > -0.1 * size)]
-    if not len(seen):
-        return np.zeros((cameras.height, cameras.width))
-    x, y = ((seen @ K.T)[:, :2] / seen[:, 2:]).numpy().T
+    below, high = (points - high[:, None] * up)[high > -0.1 * size], high[high > -0.1 * size]
+    dots, wide = _dots(below, cameras, size, convex)
+    if not wide:
+        return dots
+    soft = 0.03 + 0.1 * float((high.min() / size).clamp(0, 1))
+    whole = cv2.dilate(dots, _disc(0.03 * wide))  # no gaps between points
+    return cv2.GaussianBlur(whole, (0, 0), max(soft * wide, 0.5))
+
+
+def outline(points: Tensor, cameras: Cameras, size: float) -> np.ndarray:
+    """(H, W), 1 where one camera sees a body with points (N, 3) [m], gaps between them closed, and
+    0 elsewhere. size: of the body [m]."""
+    dots, wide = _dots(points.double().cpu(), cameras, size)
+    return cv2.morphologyEx(dots, cv2.MORPH_CLOSE, _disc(0.05 * wide))
+
+
+def _dots(points: Tensor, cameras: Cameras, size: float, convex: bool = False) -> tuple[np.ndarray, float]:  # fmt: skip
+    """((H, W) 1 at the pixels of points (N, 3), or inside of their hull, px of `size` or 0 where none is in front)."""
+    w2c, K = cameras.w2c[0].double().cpu(), cameras.K[0].double().cpu()
+    seen = points @ w2c[:3, :3].T + w2c[:3, 3]
+    seen = seen[seen[:, 2] > 0]
     shape = (cameras.height, cameras.width)
+    if not len(seen):
+        return np.zeros(shape), 0.0
+    pixel = ((seen @ K.T)[:, :2] / seen[:, 2:]).numpy()
     if convex:
-        hull = cv2.convexHull(np.stack([x, y], 1).clip(-1e4, 1e4).astype(np.int32))
+        hull = cv2.convexHull(pixel.clip(-1e4, 1e4).astype(np.int32))
         dots = cv2.fillConvexPoly(np.zeros(shape), hull, 1.0)
     else:
-        dots = np.histogram2d(y, x, shape, ((0, shape[0]), (0, shape[1])))[0]
-    wide = size * float(K[0, 0] / seen[:, 2].mean())  # px of the object
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(0.03 * wide) + 1,) * 2)
-    soft = 0.03 + 0.1 * float((high.min() / size).clamp(0, 1))
-    whole = cv2.dilate(np.minimum(dots, 1.0), disc)  # no gaps between points
-    return cv2.GaussianBlur(whole, (0, 0), max(soft * wide, 0.5))
+        edges = ((0, shape[0]), (0, shape[1]))
+        dots = np.histogram2d(pixel[:, 1], pixel[:, 0], shape, edges)[0].clip(max=1)
+    return dots, size * float(K[0, 0] / seen[:, 2].mean())
+
+
+def _disc(radius: float) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius) + 1,) * 2)
 
 
 def on_ground(
