@@ -8,6 +8,7 @@ from annotated_types import Interval
 from pydantic import Field
 
 from mosa.config.command_settings import EvalSettings, Extensions, LawSections, TrainSettings
+from mosa.modules.body.settings import HeterogeneitySettings
 from mosa.settings import (
     Count,
     Entries,
@@ -58,11 +59,17 @@ class FilmSection(Settings):
     """frames per second; null: 0.3 of real time; the value of `rate`: real time"""
     view: Three | None = None
     """direction from the object to the camera; null: from the side, a little above"""
+    shadow: bool = True
+    """shadows of the object and the obstacles on the ground, under light from above"""
+    caption: bool = True
+    """title and times in the pictures"""
 
 
 class SplatsSettings(LawSections):
     """python -m mosa.splats"""
 
+    heterogeneity: HeterogeneitySettings = HeterogeneitySettings(enabled=False)
+    """variation of the stiffness, which an object of a file has none of"""
     extensions: Extensions = []
     ply: Text
     """3DGS PLY (INRIA's layout) of the object"""
@@ -92,7 +99,10 @@ class SplatsSettings(LawSections):
     density: Positive | None = None
     """kg/m^3; null: 1000, or that of the run or preset"""
     preset: Text | None = None
-    """jelly, silicone_10A, natural_rubber, clay, honey or dry_sand, in place of prior"""
+    """jelly, silicone_10A, natural_rubber, clay, honey or dry_sand; refused beside prior, adapter
+    and ckpt_path"""
+    appearance: Literal["splats", "particles"] = "splats"
+    """what is shown; particles: for fluids and sand"""
     gravity: Weight = 9.81
     """m/s^2"""
     height: Weight = 0.2

@@ -92,7 +92,7 @@ def rasterize(
 
     means: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2], only the symmetric part counts (`covariance_from` makes
     them of scales and rotations); opacities: (N,) or (S, N) in [0, 1]; features: (B, N, C) or (1, N, C) shared by
-    all images; cameras: B of them; state_index: (B,) state that image b shows; background: (C,) or None for zeros;
+    all images; cameras: B of them; state_index: (B,) state that image b shows; background: (C,), (B, H, W, C) or None for zeros;
     scan: gaussian (default on CPU) | tile (default on CUDA, and what a CPU test compares with). The dtype of the
     inputs, float32 or float64, is that of the computation.
 

@@ -112,7 +112,9 @@ def read_object(
             f"size: {path} has no unit, and in metres its object would be {longest:.3g} m long; "
             f"expected the length of its longest side [m], as size=0.2 (size={longest:.3g} keeps it)"
         )
-    if size is not None:
+    if size is None:
+        log.info("no size given: 1 unit is 1 m; the object's longest side is %.3g m", longest)
+    else:
         factor = size / longest
         splats = replace(splats, means=factor * splats.means, scales=factor * splats.scales)
         if not usual:
@@ -190,7 +192,8 @@ def object_twin(
     body = build_body(record, tensors)
     if learned is not None:
         take_law(body, learned.body)
-    body.splats = CarriedSplats(shown, body.rest)
+    if settings.appearance == "splats":
+        body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
     twin = Twin(body.eval(), world_of(record), record.frame_dt, record, start)
     for k, solid in enumerate(twin.world.colliders):
@@ -241,7 +244,7 @@ def drop(cfg: DictConfig) -> None:
     volume, size = float(twin.body.volume.sum()), twin.body.size
     log.info(
         "object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long",
-        len(twin.body.splats),
+        len(found.splats.means if twin.body.splats is None else twin.body.splats),
         len(twin.body.rest),
         1e6 * volume,
         size,

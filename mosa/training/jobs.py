@@ -121,7 +121,9 @@ def run_command(run: Callable[[], None]) -> None:
             if (message := explained(error)) is None:
                 if begun and not isinstance(error, HydraException):
                     raise
-                said = dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error))
+                said = dict.fromkeys(
+                    APPEND.sub("", str(e).split("\n    full_key")[0]) for e in causes(error)
+                )
                 message = (
                     f"ConfigError: {chr(10).join(said)[:2000]}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds parameters of laws "
                     "and options of adapters alone; all keys: python -m mosa.config.reference <command> [KEY]"
@@ -130,6 +132,8 @@ def run_command(run: Callable[[], None]) -> None:
             sys.exit(2)
 
 
+APPEND = re.compile(r"\nTo append to your config use \+.*")
+"""Hydra's advice on every unknown key, though most of them take no other."""
 begun: list[bool] = []
 """Whether this process has begun a job or a sweep."""
 

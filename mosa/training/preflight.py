@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
@@ -27,7 +30,7 @@ from mosa.reconstruction.pose.starts import first_contact
 from mosa.system.limits import counted
 from mosa.training.memory import ball_of
 from mosa.twin.presets import preset
-from mosa.twin.twin import Twin
+from mosa.twin.twin import Twin, viewed_from
 from mosa.types import REST, Scene
 
 PARTICLE_BYTES = 5e3
@@ -58,14 +61,24 @@ def check_evaluation(values: Mapping[str, Any]) -> EvalSettings:
     return settings
 
 
-def check_splats(values: Mapping[str, Any]) -> SplatsSettings:
-    """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
+def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> SplatsSettings:
+    """All that the configuration of `python -m mosa.splats` says by itself, and that these overrides
+    and those of the command line say beside each other. Errors: ConfigError naming the key."""
     settings = SplatsSettings.read(values)
     if settings.video:
         ffmpeg("video")
     check_formats(settings.formats)
+    if settings.film.view is not None and any(settings.up):
+        viewed_from(settings.film.view, torch.tensor(settings.up).float(), "film.view")
     if settings.preset is not None:
         preset(settings.preset)
+        task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
+        words = [*overrides, *task]
+        if also := [w for w in words if re.match(r"[+~]*(prior|adapter|ckpt_path)\b", w)]:
+            raise ConfigError(
+                f"preset: {settings.preset} is a law with all its values, found {' '.join(also)} beside it, "
+                "which choose another: leave out the one or the other"
+            )
     colliders_from_config(settings.colliders or (), "colliders")
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)

@@ -22,10 +22,16 @@ from torch import Tensor
 from mosa.config.build import build_body, world_of
 from mosa.config.checkpoints import TENSORS, check_kinds, check_numbers, checked, read_checkpoint
 from mosa.config.record import BodyRecord
-from mosa.data.io.splat_formats import Formats, drop_later_frames, save_frames
+from mosa.data.io.splat_formats import Formats, check_formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation.analysis.comparison import ground_lines, ground_shadow, on_ground
-from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_video
+from mosa.evaluation.analysis.comparison import (
+    DARK,
+    ground_lines,
+    ground_shadow,
+    on_ground,
+    outline,
+)
+from mosa.evaluation.analysis.figures import ffmpeg, side_by_side, to_uint8, write_video
 from mosa.evaluation.uncertainty import (
     DRAWS,
     among_forms,
@@ -38,6 +44,7 @@ from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
 from mosa.physics.contact.driven import Driven
+from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
@@ -280,16 +287,22 @@ class Twin:
         size: Pixels = 400,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         view: Sequence[float] | None = None,
+        shadow: bool = True,
     ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
         rollout was simulated with (None: the world's). rollout: or a list of the states of T steps,
         whose solids are drawn where they were then (None: those of `reset`). Half spaces are not
         drawn. view: (3,) from the body to the camera, None for a view from the side and a little
-        above."""
-        return self._pictures(*self._met(rollout, colliders), size, view)
+        above. shadow: on the ground, of the body and of the solids, under light from above."""
+        return self._pictures(*self._met(rollout, colliders), size, view, shadow)
 
     def _pictures(
-        self, rollout: Rollout, solids: Sequence[Collider], size: int, view: Sequence[float] | None
+        self,
+        rollout: Rollout,
+        solids: Sequence[Collider],
+        size: int,
+        view: Sequence[float] | None,
+        shadow: bool,
     ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
@@ -308,28 +321,33 @@ class Twin:
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
         toward = side / side.norm() + 0.25 * up
         if view is not None:
-            given = numbers("view", view, "a direction (x, y, z)", (3,)).to(up)
-            if not float(torch.linalg.cross(given, up).norm()) > 1e-3 * float(given.norm()):
-                raise ConfigError(
-                    f"view: expected a direction that is not up or down, found {view}"
-                )
+            given = viewed_from(view, up)
             toward = float(toward.norm()) * given / given.norm()
         eye = target + distance * toward
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         K, w2c = (t[None].to(body.rest) for t in (K, look_at(eye, target, up)))
         camera = Cameras(K, w2c, size, size, ("view",))
-        alone = seen(body, rollout.x, rollout.F_tot)
-        shown = with_solids(alone, solids, rollout.times, up, body.size / 30)
-        images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
-        lines = ground_lines(self.world, camera, body.size)
+        shown = seen(body, rollout.x, rollout.F_tot)
+        ends, convex = [len(shown.opacities)], [False]
+        for k, solid in enumerate(solids):
+            shown = with_solids(shown, solids[k : k + 1], rollout.times, up, body.size / 30)
+            ends.append(len(shown.opacities))
+            convex.append(not isinstance(solid.shape, SignedDistanceField))
+        white, lines = torch.ones(3), ground_lines(self.world, camera, body.size)
         if not lines:
-            return images
-        drawn = []
-        for image, points in zip(images, shown.means):
-            parts = points.tensor_split([len(alone.opacities)])
-            shadow = np.max([ground_shadow(p, self.world, camera, body.size) for p in parts], 0)
-            drawn.append(on_ground(to_uint8(image), lines, 1, torch.ones(3), shadow))
-        return torch.from_numpy(np.stack(drawn)).float() / 255
+            return shown.images(camera, white.to(body.rest))[0].clamp(0, 1).cpu()
+        floor = on_ground(np.full((size, size, 3), 255, np.uint8), lines, 1, white)
+        floors = np.repeat(floor[None] / np.float32(255), len(shown.means), 0)
+        for image, points in zip(floors if shadow else (), shown.means):
+            dark = [
+                ground_shadow(part, self.world, camera, body.size, filled)
+                for part, filled in zip(points.tensor_split(ends[:-1]), convex)
+            ]
+            # none shines through between the body's splats
+            free = 1 - outline(points[: ends[0]], camera, body.size)
+            image *= (1 - DARK * free * np.max(dark, 0))[..., None]
+        behind = torch.from_numpy(floors).to(body.rest)
+        return shown.images(camera, behind)[0].clamp(0, 1).cpu()
 
     def _met(
         self,
@@ -362,13 +380,20 @@ class Twin:
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         size: Pixels = 400, fps: float | None = None, view: Sequence[float] | None = None,
+        shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
-        the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px] and view, as
-        there; fps, None for 0.3 of real time. Errors: ConfigError where they are not."""
+        the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view and
+        shadow, as there; fps, None for 0.3 of real time; caption: title and times. Errors, before
+        anything is written: ConfigError where they are not, or a format's or the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
+        check_formats(formats)
+        if video:
+            ffmpeg("video")
+            if view is not None:
+                viewed_from(view, self.world.up)
         apart = float(rollout.times[1]) if len(rollout.times) > 1 else self.frame_dt
         folder = made_folder(Path(folder) / "ply").parent
         save_body(folder / BODY_FILE, self.body, self.world)
@@ -383,8 +408,11 @@ class Twin:
         )
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            images = self._pictures(rollout, solids, size, view)
-            frames = side_by_side({title: images}, footer=moments)
+            images = self._pictures(rollout, solids, size, view, shadow)
+            if caption:
+                frames = side_by_side({title: images}, footer=moments)
+            else:
+                frames = [to_uint8(image) for image in images]
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))
         return folder
 
@@ -411,6 +439,14 @@ class Twin:
     def __repr__(self) -> str:
         body = self.body
         return f"Twin({len(body.rest)} particles, {1e3 * body.size:.4g} mm, {self.material!r})"
+
+
+def viewed_from(view: Sequence[float], up: Tensor, name: str = "view") -> Tensor:
+    """(3,) the direction from a body to the camera. Errors: ConfigError naming `name`."""
+    given = numbers(name, view, "a direction (x, y, z)", (3,)).to(up)
+    if not float(torch.linalg.cross(given, up).norm()) > 1e-3 * float(given.norm() * up.norm()):
+        raise ConfigError(f"{name}: expected a direction that is not up or down, found {view}")
+    return given
 
 
 def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import re
 import threading
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.marker_figures import MEASURED, PREDICTED
+from mosa.system.console import begin_log
 from mosa.system.limits import named_device
 from mosa.system.refused import one_message
 from mosa.twin.twin import Twin
@@ -236,6 +238,11 @@ def options(arguments: Sequence[str]) -> dict[str, str | None]:
         key, mark, value = argument.partition("=")
         if key not in known and known["run"] is None and Path(argument).exists():
             key, mark, value = "run", "=", argument
+        if not mark and known["run"] is None and not argument.startswith("-"):
+            raise ConfigError(
+                f"run: expected the folder of a run, found no folder {argument!r}; "
+                "python -m mosa.viewer --help lists the options"
+            )
         if not mark or key not in known:
             raise ConfigError(
                 "viewer: expected the folder of a run, --live, checkpoint=<file>, host=<address>, port=<number>, "
@@ -282,6 +289,10 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
 
 
 def main(arguments: Sequence[str]) -> None:
+    logging.basicConfig(format="%(message)s")
+    begin_log()
+    # of a held body that creeps: the page sets no substeps
+    warnings.filterwarnings("ignore", "substeps: ")
     with one_message():
         chosen = options(arguments)
         viewer = opened(chosen)

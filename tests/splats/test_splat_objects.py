@@ -157,6 +157,13 @@ def test_it_falls_on_an_obstacle_that_its_checkpoint_keeps(tmp_path):
     assert torch.equal(again.simulate(frames=8).x, rollout.x)
 
 
+def test_particles_can_be_shown_in_place_of_splats(tmp_path):
+    twin = object_twin(ball(600, 0.007), settings(100, resolution=32, appearance="particles"))
+    assert twin.body.splats is None
+    again = Twin.load(save_twin(twin, tmp_path / "last.ckpt"))
+    assert again.body.splats is None and torch.equal(again.body.colors, twin.body.colors)
+
+
 def test_an_obstacle_below_the_ground_is_said():
     made = {"up": [0, -1, 0], "resolution": 32, "recentre": True}
     ends = [{"type": "sphere", "radius": 0.05, "position": [0, y, 0]} for y in (-0.05, 0.05)]
@@ -195,10 +202,10 @@ def test_a_learned_law_is_taken_over(tmp_path):
 def test_the_command_makes_all_of_it(tmp_path):
     source = ball(count=600, scale=0.007)
     path = save_ply(tmp_path / "ball.ply", source.splats, source.harmonics)
-    arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply]", "prior=corotated",
+    arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply]",
                  "recentre=true", "colliders=[{type:sphere,radius:0.05,position:[0,0.05,0]}]",
                  "velocity=[60,0,0]",  # farther than any box around the object
-                 "preset=jelly", "film={size:64,fps:30,view:[1,0.3,0]}",
+                 "preset=jelly", "film={size:64,fps:30,view:[1,0.3,0],shadow:false,caption:false}",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True
@@ -215,6 +222,8 @@ def test_the_command_makes_all_of_it(tmp_path):
     assert (dropped.E, dropped.density) == pytest.approx((4.3e3, 1010.0))
     film = cv2.VideoCapture(str(tmp_path / "run" / "simulation.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 64 and film.get(cv2.CAP_PROP_FPS) == 30
+    assert film.get(cv2.CAP_PROP_FRAME_HEIGHT) == 64  # no caption
+    assert "no size given: 1 unit is 1 m" in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(
@@ -230,6 +239,7 @@ def test_the_command_makes_all_of_it(tmp_path):
         ("up", [0, 1], "up: expected three"),
         ("preset", "rubber", "preset: expected one of jelly, "),
         ("colliders", [{"type": "sphere"}], "colliders"),
+        ("film", {"view": [0, 2, 0]}, r"^film\.view: expected a direction that is not up or down"),
     ],
 )
 def test_a_wrong_value_is_named(key, value, message):
@@ -238,3 +248,14 @@ def test_a_wrong_value_is_named(key, value, message):
     check_splats(values)
     with pytest.raises(ConfigError, match=message):
         check_splats(values | {key: value})
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["prior.parameters.E=1e6"], ["prior=corotated", "adapter=operator"], ["ckpt_path=a.ckpt"]],
+)
+def test_a_preset_beside_another_law_is_refused(words):
+    values = {**LAW, "ply": "a.ply", "preset": "jelly"}
+    check_splats(values, ["preset=jelly", "simulation.particles=100"])
+    with pytest.raises(ConfigError, match=f"^preset: jelly is a law .* found {' '.join(words)} be"):
+        check_splats(values, ["preset=jelly", *words])

@@ -166,5 +166,31 @@ def test_a_shadow_lies_below_the_body_and_sharpens_as_it_lands():
     area = np.pi * 5**2
     assert low.max() > 0.9 and area < (low > 0.5).sum() < 1.6 * area
     assert (high > 0.02).sum() > 1.2 * (low > 0.02).sum()
+    corners = torch.cartesian_prod(*3 * [torch.tensor([-2.0, 2.0])]) + 2 * UP
+    filled = ground_shadow(corners, twin().world, camera, 1.0, convex=True)
+    assert filled[16:48, 16:48].min() > 0.9
     buried = ground_shadow(ball - 2 * UP, twin().world, camera, 1.0)
     assert buried.shape == (64, 64) and not buried.any()
+
+
+def test_a_shadow_darkens_the_floor_and_not_the_body():
+    """Cream, as near to the white floor as a shadow once took for it, that falls onto the ground."""
+    one, cream = twin(), torch.tensor([254.0, 237.0, 229.0]) / 255
+    one.body.colors.copy_(cream.expand_as(one.body.colors))
+    rollout = one.simulate(frames=10, height=0.1)
+    shaded, plain = one.render(rollout, size=96), one.render(rollout, size=96, shadow=False)
+    body = (plain - cream).abs().amax(-1) < 2e-3  # opaque to 2 %, as blue is 0.1 off white
+    assert 0.1 < body.float().mean() < 0.9
+    assert (shaded - plain)[body].abs().max() < 0.01
+    assert (plain - shaded)[~body].max() > 0.15
+
+
+def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, monkeypatch):
+    one, folder = twin(), tmp_path / "no"
+    rollout = one.simulate(frames=2)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ConfigError, match="sog needs the program splat-transform"):
+        one.export(rollout, folder, video=False, formats=("ply", "sog"))
+    with pytest.raises(ConfigError, match=r"^view: expected a direction that is not up or down"):
+        one.export(rollout, folder, view=(0, 2, 0))
+    assert not folder.exists()

@@ -439,7 +439,7 @@ def test_the_legend_goes_through_the_scale_s_colours():
 
 
 def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
-    for arguments, message in (([], "run: expected the folder"), (["folder"], "expected the folder of a run, .*found 'folder'"),
+    for arguments, message in (([], "run: expected the folder"), (["folder"], "run: expected .*, found no folder 'folder'"),
                                (["run=x", "folder"], "expected the folder of a run, .*found 'folder'"),
                                (["--lives"], "expected the folder of a run, .*found '--lives'"), (["run=x", "a=2"], "found 'a=2'"),
                                (["run=x", "port=no"], "port: expected a number .*, found 'no'")):  # fmt: skip

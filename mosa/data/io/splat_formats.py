@@ -57,7 +57,7 @@ def check_formats(formats: Sequence[str]) -> None:
     if "sog" in formats and shutil.which(CONVERTER) is None:
         raise ConfigError(
             f"formats: sog needs the program {CONVERTER} on the PATH: npm install --global "
-            "@playcanvas/splat-transform (Node 22 or newer)"
+            "@playcanvas/splat-transform (Node 20 or newer)"
         )
 
 

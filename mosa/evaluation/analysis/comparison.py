@@ -35,8 +35,6 @@ DIFFERENCE = 0.5
 NEAR_BACKGROUND = 12
 """8-bit levels: ground lines are drawn where a pixel is as close to the background as that, so that they lie behind the object."""
 
-SOFT = 80
-"""8-bit levels: a pixel of an edge is as far from the background as that, and a shadow fades up to there."""
 DARK = 0.45
 """Of the light that a shadow takes where it is deepest."""
 
@@ -195,47 +193,66 @@ def enlarge(image: np.ndarray, times: int) -> np.ndarray:
     return cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
 
 
-def ground_shadow(points: Tensor, world: World, cameras: Cameras, size: float) -> np.ndarray:
+def ground_shadow(
+    points: Tensor, world: World, cameras: Cameras, size: float, convex: bool = False
+) -> np.ndarray:
     """(H, W) in [0, 1]: the shadow of a solid with points (N, 3) [m] on the ground, under light from above, in the images of one
-    camera. It is the sharper the nearer the solid is to the ground. size: of the object [m]."""
+    camera. It is the sharper the nearer the solid is to the ground. size: of the object [m];
+    convex: the solid fills the space between its points."""
     assert world.ground is not None
-    up, w2c, K = world.up.double(), cameras.w2c[0].double().cpu(), cameras.K[0].double().cpu()
-    points = points.double().cpu()
+    up, points = world.up.double().cpu(), points.double().cpu()
     high = points @ up - world.ground.height
-    seen = (points - high[:, None] * up) @ w2c[:3, :3].T + w2c[:3, 3]
-    seen = seen[(seen[:, 2] > 0) & (high > -0.1 * size)]
-    if not len(seen):
-        return np.zeros((cameras.height, cameras.width))
-    x, y = ((seen @ K.T)[:, :2] / seen[:, 2:]).numpy().T
-    shape = (cameras.height, cameras.width)
-    dots = np.histogram2d(y, x, shape, ((0, shape[0]), (0, shape[1])))[0]
-    wide = size * float(K[0, 0] / seen[:, 2].mean())  # px of the object
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(0.03 * wide) + 1,) * 2)
+    below, high = (points - high[:, None] * up)[high > -0.1 * size], high[high > -0.1 * size]
+    dots, wide = _dots(below, cameras, size, convex)
+    if not wide:
+        return dots
     soft = 0.03 + 0.1 * float((high.min() / size).clamp(0, 1))
-    whole = cv2.dilate(np.minimum(dots, 1.0), disc)  # no gaps between points
+    whole = cv2.dilate(dots, _disc(0.03 * wide))  # no gaps between points
     return cv2.GaussianBlur(whole, (0, 0), max(soft * wide, 0.5))
 
 
+def outline(points: Tensor, cameras: Cameras, size: float) -> np.ndarray:
+    """(H, W), 1 where one camera sees a body with points (N, 3) [m], gaps between them closed, and
+    0 elsewhere. size: of the body [m]."""
+    dots, wide = _dots(points.double().cpu(), cameras, size)
+    return cv2.morphologyEx(dots, cv2.MORPH_CLOSE, _disc(0.05 * wide))
+
+
+def _dots(points: Tensor, cameras: Cameras, size: float, convex: bool = False) -> tuple[np.ndarray, float]:  # fmt: skip
+    """((H, W) 1 at the pixels of points (N, 3), or inside of their hull, px of `size` or 0 where none is in front)."""
+    w2c, K = cameras.w2c[0].double().cpu(), cameras.K[0].double().cpu()
+    seen = points @ w2c[:3, :3].T + w2c[:3, 3]
+    seen = seen[seen[:, 2] > 0]
+    shape = (cameras.height, cameras.width)
+    if not len(seen):
+        return np.zeros(shape), 0.0
+    pixel = ((seen @ K.T)[:, :2] / seen[:, 2:]).numpy()
+    if convex:
+        hull = cv2.convexHull(pixel.clip(-1e4, 1e4).astype(np.int32))
+        dots = cv2.fillConvexPoly(np.zeros(shape), hull, 1.0)
+    else:
+        edges = ((0, shape[0]), (0, shape[1]))
+        dots = np.histogram2d(pixel[:, 1], pixel[:, 0], shape, edges)[0].clip(max=1)
+    return dots, size * float(K[0, 0] / seen[:, 2].mean())
+
+
+def _disc(radius: float) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius) + 1,) * 2)
+
+
 def on_ground(
-    image: np.ndarray,
-    lines: list[np.ndarray],
-    times: int,
-    background: Tensor,
-    shadow: np.ndarray | None = None,
+    image: np.ndarray, lines: list[np.ndarray], times: int, background: Tensor
 ) -> np.ndarray:
-    """An image (H, W, 3) uint8, enlarged `times`, with ground lines [px before that], and a shadow (H, W) in [0, 1], where it shows
-    the background."""
+    """An image (H, W, 3) uint8, enlarged `times`, with ground lines [px before that] where it shows the background."""
     if not lines:
         return image
     ink = np.zeros(image.shape[:2], np.uint8)
     # of 1/16 px
     fixed = [np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines]
     cv2.polylines(ink, fixed, False, 255, 1, cv2.LINE_AA, shift=4)
-    far = np.abs(image - 255.0 * background.numpy()).max(-1)
-    behind = far <= NEAR_BACKGROUND
+    behind = np.abs(image - 255.0 * background.numpy()).max(-1) <= NEAR_BACKGROUND
     share = 0.5 * (ink / 255 * behind)[..., None]
-    light = 1.0 if shadow is None else 1 - DARK * (shadow * (1 - far / SOFT).clip(0))[..., None]
-    return ((image * (1 - share) + 120 * share) * light + 0.5).astype(np.uint8)
+    return (image * (1 - share) + 120 * share + 0.5).astype(np.uint8)
 
 
 def legend(shown: Comparison) -> np.ndarray:

@@ -85,7 +85,8 @@ class Seen:
     shades: Tensor | None = None
 
     def images(self, cameras: Cameras, background: Tensor) -> Tensor:
-        """(V, T, H, W, 3), in [0, 1] up to harmonics that are brighter than white. One camera at a time, which bounds memory."""
+        """(V, T, H, W, 3), in [0, 1] up to harmonics that are brighter than white. background: (3,), or (T, H, W, 3) pictures of
+        what lies behind. One camera at a time, which bounds memory."""
         frames = len(self.means)
         index, found = torch.arange(frames, device=self.means.device), []
         for v in range(len(cameras)):
