@@ -26,7 +26,7 @@ class HeterogeneitySettings(Settings):
     kind: Literal["modes", "network"] = "modes"
     """modes: a sum of smooth waves, for Gauss-Newton; network: the paper's coordinate network"""
     wavelength: float = Field(0.33, ge=0.02, le=2)
-    """modes: the shortest wave, over the body's longest side"""
+    """modes: shortest wavelength, as a share of the body's longest side"""
     most: Width = 50
     """modes: number of waves, at most, the longest first"""
     hidden: Width = 32

@@ -13,7 +13,8 @@ class LawOptions(Settings):
     where: ClassVar[str] = "prior.options"
 
     yield_convention: Literal["paper", "sqrt23"] = "paper"
-    """factor of von Mises' yield stress: 1 (paper) or sqrt(2/3) (PAC-NeRF)"""
+    """what yield_stress is in von_mises: paper: the largest norm of dev tau; sqrt23: the uniaxial yield
+    stress, sqrt(3/2) times that norm (PAC-NeRF)"""
     friction_cone: Literal["klar", "printed"] = "klar"
     """Drucker-Prager's slope of an angle phi: klar: sqrt(2/3) 2 sin phi/(3 - sin phi); printed: the
     root over all of it, as the paper prints"""
