@@ -57,6 +57,15 @@ class Measurements:
         """(m,) bool: the stresses of the other tests."""
         return self.test[self.row] != test
 
+    def pulled(self) -> np.ndarray:
+        """(m,) bool: stresses of uniaxial tests, but for the smallest."""
+        large = np.abs(self.value) > 0.05 * np.abs(self.value).max()
+        return (self.kind == "uniaxial")[self.row] & large
+
+    def against(self) -> int:
+        """How many of them pull at a stretch below 1, or press above 1."""
+        return int((self.pulled() & ((self.given[self.row, 0] - 1) * self.value < 0)).sum())
+
 
 def read_tests(path: str | Path, unit: str) -> Measurements:
     """The tests of a csv file. unit: of its stresses, a name of `UNITS`. Errors: DataError naming file, line and column."""
@@ -70,6 +79,8 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing or (strange := [name for name in header if name not in COLUMNS]):
         wrong = f"no {missing[0]}" if missing else f"an unknown column {strange[0]!r}"
+        if ";" in "".join(header):
+            wrong += ": separate columns by commas, and write numbers with a decimal point"
         raise DataError(
             f"tests: {path}: expected the columns {', '.join(NEEDED)} and of "
             f"{', '.join(COLUMNS)} any others, found {wrong}"
@@ -138,14 +149,14 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         raise DataError(
             f"tests: {where}: sd_1, sd_2: expected a positive number beside every stress, or none at all"
         )
-    pulled = (kinds == "uniaxial")[row_of] & (np.abs(value) > 0.05 * np.abs(value).max())
-    against = pulled & ((given[row_of, 0] - 1) * value < 0)
-    if 2 * against.sum() > pulled.sum():
-        raise DataError(
-            f"tests: {where}: first: expected stretches above 1 under tension, below 1 under pressure, "
-            f"found {against.sum()} of {pulled.sum()} otherwise: strains, or the other sign of stresses?"
-        )
     scale = UNITS[unit]
-    return Measurements(
+    found = Measurements(
         tuple(names), test, kinds, axis, angles, given, row_of, component, scale * value, scale * sd
     )
+    against, pulled = found.against(), int(found.pulled().sum())
+    if 2 * against > pulled:
+        raise DataError(
+            f"tests: {where}: first: expected stretches above 1 under tension, below 1 under pressure, "
+            f"found {against} of {pulled} otherwise: strains, or the other sign of stresses?"
+        )
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from warnings import warn
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -12,8 +13,8 @@ from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import MaterialSettings
 from mosa.errors import ConfigError
 from mosa.material_tests.fitting import Fitting, Law
-from mosa.material_tests.measurements import read_tests
-from mosa.material_tests.report import figures, table, write
+from mosa.material_tests.measurements import UNITS, read_tests
+from mosa.material_tests.report import doubts, figures, table, write
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import AUTO
 from mosa.physics.constitutive.laws import law_named
@@ -49,10 +50,13 @@ def build_law(values: dict) -> Law:
 def fit_tests(cfg: DictConfig) -> float:
     """Fit, predict every test from the others, write; returns the rms [Pa]."""
     quiet()
-    if OmegaConf.is_missing(cfg, "tests"):
-        raise ConfigError(
-            "tests: expected a csv file of stress-strain tests (docs/material_tests.md), found none"
-        )
+    needed = {
+        "tests": "a csv file of stress-strain tests (docs/material_tests.md)",
+        "unit": f"the unit of the file's stresses, one of {', '.join(UNITS)}",
+    }
+    for key, expected in needed.items():
+        if OmegaConf.is_missing(cfg, key):
+            raise ConfigError(f"{key}: expected {expected}, found none")
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
     MaterialSettings.read(values)
@@ -71,6 +75,8 @@ def fit_tests(cfg: DictConfig) -> float:
     write(folder, law, data, fit, left_out, values["unit"], values, values["density"])
     found = figures(data, fit, left_out)
     write_figures(folder, found)
+    for doubt in doubts(law, data, fit, values["unit"]):
+        warn(doubt, stacklevel=1)
     log.info("%s", table(law, data, fit, left_out, values["unit"]))
     log.info("%s: results.md, tests.png, material.json, checkpoints/specimen.ckpt", folder)
     return float(found["rms"])
