@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from warnings import warn
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ from mosa.types import Rollout
 COLUMNS = ("time", "fx", "fy", "fz")
 MODEL_ERROR = 0.01
 """Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
+FAR = 5.0
+"""Standard deviations of a misfit (rms) beyond which it is warned of."""
 
 
 class Measured(Settings):
@@ -137,7 +140,39 @@ def force_residuals(
 ) -> Tensor:
     """(M,) differences from the mean forces of all frame intervals that were measured, over their
     standard deviations."""
-    parts: list[Tensor] = []
+    compared = compared_forces(rollout, curves, world, frame_dt)
+    return torch.cat([(felt - mean) / sd for felt, mean, sd in compared])
+
+
+def force_figures(
+    rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
+) -> dict[str, float]:
+    """`forces/<of>/...`, of the mean forces of frame intervals: `rms_share`, predicted minus
+    measured, and `allowed_share`, its standard deviation, over the largest measured force;
+    `measured_N` and `predicted_N` where that is. Warns of a misfit far beyond what is allowed."""
+    found = {}
+    for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
+        at = mean.abs().argmax()
+        pair = ("measured_N", float(mean[at])), ("predicted_N", float(felt[at]))
+        shares = {"rms_share": felt - mean, "allowed_share": sd}
+        own = {k: float((v / mean[at]).square().mean().sqrt()) for k, v in shares.items()}
+        if own["rms_share"] > FAR * own["allowed_share"]:
+            warn(
+                f"world.forces: {curve.of}: the predicted force is off by {own['rms_share']:.0%} of the largest measured "
+                f"(rms), allowed are {own['allowed_share']:.1%}; {pair[1][1]:.4g} N for {pair[0][1]:.4g} N. Expected: the force "
+                "that the body exerts (check the sign), world axes, N, times from frame 0 on, the right friction and motion",
+                stacklevel=2,
+            )
+        found |= {f"forces/{curve.of}/{k}": v for k, v in {**own, **dict(pair)}.items()}
+    return found
+
+
+def compared_forces(
+    rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """By curve: predicted and measured mean forces, and the standard deviation of the latter, each
+    (M,) [N] of the frame intervals and components that were measured."""
+    parts = []
     if rollout.reactions is None:
         raise ConfigError(
             "world.forces: expected a law on a grid, found an adapter without reactions"
@@ -150,5 +185,6 @@ def force_residuals(
                 f"frames, found {curve.times[0]:.6g} to {curve.times[-1]:.6g} s"
             )
         felt = rollout.reactions.mean(1)[:, column, :3].double()
-        parts.append(((felt - mean) / sd)[torch.isfinite(mean)])
-    return torch.cat(parts)
+        there = torch.isfinite(mean)
+        parts.append((felt[there], mean[there], sd[there]))
+    return parts

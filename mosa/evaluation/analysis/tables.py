@@ -297,6 +297,22 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     return "\n".join(lines)
 
 
+def force_lines(figures: Mapping[str, float]) -> str:
+    """A line for each measured force: how far the learned law's is off."""
+    lines = []
+    for key in [k for k in figures if k.startswith("forces/") and k.endswith("/rms_share")]:
+        get = {
+            n: figures[key.replace("rms_share", n)]
+            for n in ("allowed_share", "measured_N", "predicted_N")
+        }
+        lines.append(
+            f"- Force on {key.split('/', 1)[1].removesuffix('/rms_share')}: the predicted one is off by {figures[key]:.1%} of the "
+            f"largest measured (rms of frame intervals; standard deviation {get['allowed_share']:.1%}). Where it is largest: "
+            f"measured {get['measured_N']:.4g} N, predicted {get['predicted_N']:.4g} N."
+        )
+    return "\n".join(lines)
+
+
 def geometry_lines(figures: Mapping[str, float]) -> str:
     """Sentences on the body that was filled: how surely its surface is known, and against the true shape where that is known."""
     lines, get = [], lambda name: figures.get(f"geometry/{name}")
