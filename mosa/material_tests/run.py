@@ -12,6 +12,7 @@ from mosa.config.checkpoints import known_numbers
 from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import MaterialSettings
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.law_stress import check_own
 from mosa.material_tests.fitting import Fitting, Law
 from mosa.material_tests.measurements import UNITS, read_tests
 from mosa.material_tests.report import doubts, figures, table, write
@@ -40,6 +41,7 @@ def build_law(values: dict) -> Law:
         raise ConfigError(
             f"adapter: expected operator or none, found {values['adapter']['name']}: others have no energy"
         )
+    check_own(material)
     if adapter is None and values["incompressible"] and "nu" in material.raw:
         material.raw["nu"].requires_grad_(False)  # the pressure replaces it
     if adapter is not None:

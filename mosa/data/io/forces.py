@@ -150,7 +150,7 @@ def force_figures(
     """`forces/<of>/...`, of the mean forces of frame intervals: `rms_share`, predicted minus
     measured, and `allowed_share`, its standard deviation, over the largest measured force;
     `measured_N` and `predicted_N` where that is. Warns of a misfit far beyond what is allowed."""
-    found = {}
+    found: dict[str, float] = {}
     for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
         at = mean.abs().argmax()
         pair = ("measured_N", float(mean[at])), ("predicted_N", float(felt[at]))
