@@ -73,7 +73,7 @@ def source(material: Material, adapter: object) -> Source:
     if material.law not in ENERGIES:
         raise ConfigError(
             f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow, are "
-            "damped or have no energy"
+            "damped (fit without damping) or have no energy"
         )
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
         raise ConfigError(

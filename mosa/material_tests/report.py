@@ -191,10 +191,10 @@ def plot(
         sd = None if np.isnan(data.sd).any() else data.sd[chosen][order] / scale
         look = {"fmt": "o", "ms": 3, "lw": 0.6, "color": color, "label": f"stress_{c + 1}"}
         panel.errorbar(x[order], data.value[chosen][order] / scale, sd, **look)
-        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color)
+        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color, label="fitted")
         if data.names[k] in left_out:
             found = left_out[data.names[k]][chosen[own]]
-            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1)
+            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1, label="left out")
         panel.set_title(data.names[k], fontsize=9)
         kind = data.kind[data.row[chosen][0]]
         panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
