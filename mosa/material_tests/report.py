@@ -27,10 +27,6 @@ from mosa.twin.twin import Twin
 matplotlib.use("Agg")
 GOOD, SAME = 0.8, 1.1
 """R2 below which a fit is warned of; ratio of errors above which exports differ from the fit."""
-SOFTEST = 10.0
-"""[Pa] Young's modulus below which a solid is taken for a mistake of the unit."""
-NEAR = 0.01
-"""Of a range, or of 1: a number so close to its end is at its bound."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -95,33 +91,24 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
                     part = factor / 2 / (1 + nu)
                     rows.append((label, part * value, part * slope.item() * sd, unit))
                 name = f"E (at the given nu = {nu:.4g})"
-            bounds = [b for b in (form.low, form.high) if math.isfinite(b)]
-            near = any(abs(value - b) < NEAR * max(abs(b), 1) for b in bounds)
+            near = any(abs(value - b) < 0.01 * max(abs(b), 1) for b in (form.low, form.high))
             unknown = f"not determined{' (at its bound)' if near else ''}"
             rows.append((name, value, abs(slope.item()) * sd if sd < UNSURE else unknown, unit))
         else:
-            rows.append((name, value, sd, "" if name.startswith("stiffness_") else "rad"))
+            told = sd if sd < UNSURE else "not determined"
+            rows.append((name, value, told, "" if name.startswith("stiffness_") else "rad"))
     return rows
 
 
 def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
-    """What a user should look at: poor curves, stresses of the wrong sign, an implausible unit, an export that is another law."""
-    totals, found = figures(data, fit, {}), []
-    if float(totals["R2"]) < GOOD:
-        found.append(
-            f"tests: R2 is {totals['R2']:.2f}: the law does not follow these curves. Either it cannot (try another prior), or the "
+    """What a user should look at: poor curves, an export that is another law."""
+    R2, poor = float(figures(data, fit, {})["R2"]), ""
+    if R2 < GOOD:
+        poor = (
+            f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), or the "
             "file holds true stress (expected: force over the undeformed area) or strain (expected: stretch, 1 at rest)"
         )
-    if against := data.against():
-        found.append(
-            f"tests: first: {against} of the stresses pull at a stretch below 1, or press above 1: strain in place of stretch?"
-        )
-    E = law.material.physical().get("E")
-    if E is not None and E.item() < SOFTEST:
-        found.append(
-            f"unit: E = {E.item():.3g} Pa is softer than any solid: are the stresses in {unit}?"
-        )
-    return [*found, *filter(None, [note(law, data, fit, unit)])]
+    return [each for each in (poor, note(law, data, fit, unit)) if each]
 
 
 def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
@@ -207,9 +194,7 @@ def plot(
 
 
 def written(law: Law, fit: Fit, note: str = "") -> dict[str, Any]:
-    """The material as plain data, which `mosa-export-law` and a person read, with the posterior of the unconstrained numbers.
-
-    note: what an export says of it."""
+    """The material as plain data, with the posterior of the unconstrained numbers; note: a warning of `mosa-export-law`."""
     posterior = {
         "names": list(fit.names),
         "theta": fit.theta.tolist(),

@@ -14,7 +14,7 @@ from mosa.config.leaf_settings import MaterialSettings
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.law_stress import check_own
 from mosa.material_tests.fitting import Fitting, Law
-from mosa.material_tests.measurements import UNITS, read_tests
+from mosa.material_tests.measurements import read_tests
 from mosa.material_tests.report import doubts, figures, table, write
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import AUTO
@@ -22,6 +22,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.training.run_folder import quiet, run_folder, write_figures
 
 log = logging.getLogger(__name__)
+NEEDED = {"tests": "a csv file of tests (docs/material_tests.md)", "unit": "Pa, kPa or MPa"}
 
 
 def build_law(values: dict) -> Law:
@@ -52,11 +53,7 @@ def build_law(values: dict) -> Law:
 def fit_tests(cfg: DictConfig) -> float:
     """Fit, predict every test from the others, write; returns the rms [Pa]."""
     quiet()
-    needed = {
-        "tests": "a csv file of stress-strain tests (docs/material_tests.md)",
-        "unit": f"the unit of the file's stresses, one of {', '.join(UNITS)}",
-    }
-    for key, expected in needed.items():
+    for key, expected in NEEDED.items():
         if OmegaConf.is_missing(cfg, key):
             raise ConfigError(f"{key}: expected {expected}, found none")
     values, folder = plain(cfg), run_folder()

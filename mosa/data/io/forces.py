@@ -140,8 +140,8 @@ def force_residuals(
 ) -> Tensor:
     """(M,) differences from the mean forces of all frame intervals that were measured, over their
     standard deviations."""
-    compared = compared_forces(rollout, curves, world, frame_dt)
-    return torch.cat([(felt - mean) / sd for felt, mean, sd in compared])
+    parts = compared_forces(rollout, curves, world, frame_dt)
+    return torch.cat([(felt - mean) / sd for felt, mean, sd in parts])
 
 
 def force_figures(
@@ -153,25 +153,23 @@ def force_figures(
     found: dict[str, float] = {}
     for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
         at = mean.abs().argmax()
-        pair = ("measured_N", float(mean[at])), ("predicted_N", float(felt[at]))
-        shares = {"rms_share": felt - mean, "allowed_share": sd}
-        own = {k: float((v / mean[at]).square().mean().sqrt()) for k, v in shares.items()}
-        if own["rms_share"] > FAR * own["allowed_share"]:
+        off, allowed = (float((v / mean[at]).square().mean().sqrt()) for v in (felt - mean, sd))
+        names = ("rms_share", "allowed_share", "measured_N", "predicted_N")
+        values = (off, allowed, float(mean[at]), float(felt[at]))
+        found |= {f"forces/{curve.of}/{name}": value for name, value in zip(names, values)}
+        if off > FAR * allowed:
             warn(
-                f"world.forces: {curve.of}: the predicted force is off by {own['rms_share']:.0%} of the largest measured "
-                f"(rms), allowed are {own['allowed_share']:.1%}; {pair[1][1]:.4g} N for {pair[0][1]:.4g} N. Expected: the force "
-                "that the body exerts (check the sign), world axes, N, times from frame 0 on, the right friction and motion",
+                f"world.forces: {curve.of}: the predicted force is off by {off:.0%} of the largest measured, allowed are "
+                f"{allowed:.1%}. Expected: the force that the body exerts (check the sign), world axes, N, times from frame 0",
                 stacklevel=2,
             )
-        found |= {f"forces/{curve.of}/{k}": v for k, v in {**own, **dict(pair)}.items()}
     return found
 
 
 def compared_forces(
     rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """By curve: predicted and measured mean forces, and the standard deviation of the latter, each
-    (M,) [N] of the frame intervals and components that were measured."""
+    """By curve: predicted and measured mean forces that were measured, and their standard deviation, (M,) [N]."""
     parts = []
     if rollout.reactions is None:
         raise ConfigError(

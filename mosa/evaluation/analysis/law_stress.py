@@ -154,9 +154,8 @@ PROPERTIES = {
 
 @typed
 def check_law(law: str, parameters: Mapping[str, Any]) -> dict[str, float]:
-    """Relative errors of a registered law, at 100 drawn deformations: of a symmetric stress (`symmetry`), of
-    frame indifference (`objectivity`), of the adjoint against differences (`gradient`) and of d P/dF against its
-    transpose (`loops`: closed loops make no work; of laws that neither yield nor flow). Warns of each above `WRONG`.
+    """Relative errors of a registered law, at 100 drawn deformations: `symmetry`, `objectivity`, `gradient` (adjoint
+    against differences), `loops` (d P/dF against its transpose; not of laws that yield or flow). Warns above `WRONG`.
 
     parameters: as `prior.parameters`. Errors: ConfigError for an unknown law or parameter."""
     return errors_of(in_double(Material(law, parameters)))
@@ -170,16 +169,13 @@ def check_own(material: Material) -> None:
 
 def errors_of(material: Material) -> dict[str, float]:
     law, F = law_named(material.law), deformations(100)
-    tau, slope, Q = (
-        kirchhoff(material, None, F),
-        tangent(material, None, F),
-        deformations(100, 1, 0.0),
-    )
+    tau, slope = kirchhoff(material, None, F), tangent(material, None, F)
     D, h = torch.randn(F.shape, generator=torch.Generator().manual_seed(2), dtype=F.dtype), 1e-5
     moved = (kirchhoff(material, None, F + h * D) - kirchhoff(material, None, F - h * D)) / (2 * h)
     parts = {"symmetry": (tau, tau.mT),
              "gradient": (torch.einsum("nijkl,nkl->nij", slope, D), moved)}  # fmt: skip
     if law.reference is None:
+        Q = deformations(100, 1, 0.0)
         parts["objectivity"] = kirchhoff(material, None, Q @ F), Q @ tau @ Q.mT
     if not law.plastic and law.viscosity is None and law.reference is None:
         inverse = torch.linalg.inv(F)  # P = tau F^-T
@@ -189,8 +185,6 @@ def errors_of(material: Material) -> dict[str, float]:
     found = {k: float((a - b).abs().max() / b.abs().max()) for k, (a, b) in parts.items()}
     for name, error in found.items():
         if not error < WRONG:
-            warn(
-                f"law {material.law!r}: {name} is off by {error:.2g} of the largest: expected {PROPERTIES[name]}",
-                stacklevel=3,
-            )
+            said = f"{name} is off by {error:.2g} of the largest: expected {PROPERTIES[name]}"
+            warn(f"law {material.law!r}: {said}", stacklevel=3)
     return found

@@ -299,18 +299,13 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
 
 def force_lines(figures: Mapping[str, float]) -> str:
     """A line for each measured force: how far the learned law's is off."""
-    lines = []
-    for key in [k for k in figures if k.startswith("forces/") and k.endswith("/rms_share")]:
-        get = {
-            n: figures[key.replace("rms_share", n)]
-            for n in ("allowed_share", "measured_N", "predicted_N")
-        }
-        lines.append(
-            f"- Force on {key.split('/', 1)[1].removesuffix('/rms_share')}: the predicted one is off by {figures[key]:.1%} of the "
-            f"largest measured (rms of frame intervals; standard deviation {get['allowed_share']:.1%}). Where it is largest: "
-            f"measured {get['measured_N']:.4g} N, predicted {get['predicted_N']:.4g} N."
-        )
-    return "\n".join(lines)
+    return "\n".join(
+        f"- Force on {of}: the predicted one is off by {off:.1%} (rms) of the largest measured, "
+        f"{figures[f'forces/{of}/measured_N']:.4g} N, where {figures[f'forces/{of}/predicted_N']:.4g} N are predicted. "
+        f"Allowed standard deviation: {figures[f'forces/{of}/allowed_share']:.1%}."
+        for of, off in _part(figures, "forces/", "/rms_share").items()
+        if f"forces/{of}/allowed_share" in figures
+    )
 
 
 def geometry_lines(figures: Mapping[str, float]) -> str:

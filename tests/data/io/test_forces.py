@@ -114,7 +114,9 @@ def test_a_fit_says_how_far_its_force_is_from_the_measured_one(recwarn):
     with pytest.warns(UserWarning, match=r"world.forces: high: .* off by \d\d% .*check the sign"):
         wrong = force_figures(rollout, [replace(curve, forces=-curve.forces)], PRESS, FRAME_DT)
     assert wrong["forces/high/measured_N"] * wrong["forces/high/predicted_N"] < 0
-    assert f"{wrong['forces/high/rms_share']:.1%} of the largest measured" in force_lines(wrong)
+    assert f"{wrong['forces/high/rms_share']:.1%} (rms) of the largest measured" in force_lines(
+        wrong
+    )
 
 
 @pytest.mark.parametrize("kinds, told", [((True, False, False), True), ((False,) * 3, False)])
