@@ -6,6 +6,7 @@ Public names, each imported when it is first asked for:
     SceneDataModule   the data of a scene under Lightning: films, reconstruction, batches of frames with their motion cues
     LitMosa           the LightningModule: a body in its world, fitted in stages
     Twin              a learned body, to simulate from new starts
+    check_law         whether a law of one's own is objective, symmetric and has an energy
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ _PLACES = {
     "SceneDataModule": "mosa.training.datamodule",
     "LitMosa": "mosa.training.lit_mosa",
     "Twin": "mosa.twin",
+    "check_law": "mosa.evaluation.analysis.law_stress",
 }
-__all__ = ["LitMosa", "SceneDataModule", "Twin", "__version__", "compose"]
+__all__ = ["LitMosa", "SceneDataModule", "Twin", "__version__", "check_law", "compose"]
 
 if TYPE_CHECKING:
     from mosa.config.composition import compose
+    from mosa.evaluation.analysis.law_stress import check_law
     from mosa.training.datamodule import SceneDataModule
     from mosa.training.lit_mosa import LitMosa
     from mosa.twin.twin import Twin

@@ -423,13 +423,13 @@ def _untold(function: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def node_of(model: type[Settings], without: Iterable[str] = ()) -> dict[str, Any]:
-    """The defaults of a model as plain data, for Hydra, with '???' for a text that has none. without: keys that groups
+    """The defaults of a model as plain data, for Hydra, with '???' for a text or a choice that has none. without: keys that groups
     choose whole."""
     found: dict[str, Any] = {}
     for name, f in model.model_fields.items():
         default = f.get_default(call_default_factory=True)
         if default is not PydanticUndefined and name not in without:
             found[name] = default.plain() if isinstance(default, Settings) else default
-        elif bare(annotation_of(f)) is str:
+        elif bare(annotation_of(f)) is str or get_origin(bare(annotation_of(f))) is Literal:
             found[name] = "???"
     return found

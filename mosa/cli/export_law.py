@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from pathlib import Path
 
-from mosa.system.console import say_version
+from mosa.system.console import one_line, say_version
 from mosa.system.refused import one_message
 from mosa.system.threads import settle_threads
 
@@ -28,6 +29,7 @@ def main(words: list[str] | None = None) -> None:
     given = parser.parse_args(words)
     from mosa.export.run import LARGEST, export
 
+    warnings.formatwarning = lambda *about: f"{one_line(*about)}\n"
     with one_message():
         differences = export(given.source, given.folder, given.check)
     for name, value in differences.items():

@@ -16,6 +16,7 @@ from mosa.config.command_settings import TrainSettings
 from mosa.config.record import BodyRecord
 from mosa.data.io.forces import columns_of, forces_from_config
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.law_stress import check_own
 from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.body.heterogeneity import HeterogeneityField
@@ -180,6 +181,7 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
     low, high = torch.zeros(3), torch.ones(3)
     with torch.random.fork_rng(devices=[]):
         material, _ = build_prior(settings.prior)
+        check_own(material)
         heterogeneity = build_heterogeneity(settings.heterogeneity, low, high)
         with warnings.catch_warnings():  # said again where the body is built
             warnings.simplefilter("ignore")

@@ -299,7 +299,7 @@ class MaterialSettings(LawSections):
     extensions: Extensions = []
     tests: Text
     """csv: test, mode, first, stress_1, ... (docs/material_tests.md)"""
-    unit: Literal["Pa", "kPa", "MPa"] = "Pa"
+    unit: Literal["Pa", "kPa", "MPa"]
     """unit of the file's stresses"""
     incompressible: bool = True
     """true: the volume is constant; false: lateral stretches are solved for so that free faces

@@ -16,26 +16,11 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import DataError
-from mosa.evaluation.analysis.law_stress import kirchhoff, tangent
+from mosa.evaluation.analysis.law_stress import deformations, kirchhoff, tangent
 from mosa.export.source import Source
 from mosa.physics.launching import launch
 
 ABAQUS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-def deformations(count: int, seed: int = 0, strain: float = 0.2) -> Tensor:
-    """(count, 3, 3) float64: I plus normal numbers of standard deviation `strain`, turned at random, 0.3 < det F < 3."""
-    g = torch.Generator().manual_seed(seed)
-    found = torch.empty(0, 3, 3, dtype=torch.float64)
-    while len(found) < count:
-        F = torch.eye(3, dtype=torch.float64) + strain * torch.randn(
-            2 * count, 3, 3, generator=g, dtype=torch.float64
-        )
-        Q = torch.linalg.qr(torch.randn(2 * count, 3, 3, generator=g, dtype=torch.float64)).Q
-        F = Q * torch.linalg.det(Q)[:, None, None] @ F
-        J = torch.linalg.det(F)
-        found = torch.cat([found, F[(J > 0.3) & (J < 3)]])
-    return found[:count]
 
 
 def relative(found: Tensor, expected: Tensor) -> float:

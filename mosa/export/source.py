@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from warnings import warn
 
 import torch
 
@@ -34,7 +35,10 @@ def read_source(path: str | Path) -> Source:
     """Of a checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without energy."""
     path = Path(path)
     if path.suffix == ".json" and os.path.isfile(path):
-        return source(*read_material(path))
+        found = source(*read_material(path))
+        if note := read_json(path).get("note"):
+            warn(f"{path}: {note}", stacklevel=1)
+        return found
     body = Twin.load(path).body
     return source(body.material, body.adapter)
 
@@ -69,7 +73,7 @@ def source(material: Material, adapter: object) -> Source:
     if material.law not in ENERGIES:
         raise ConfigError(
             f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow, are "
-            "damped or have no energy"
+            "damped (fit without damping) or have no energy"
         )
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
         raise ConfigError(

@@ -28,6 +28,8 @@ UNKNOWN = 100.0
 """Standard deviation of an unconstrained number that the tests do not determine."""
 HOPELESS = 1e3
 """Residual in units of the measured stresses' root mean square, where the law has no equilibrium."""
+UNSURE = 3.0
+"""Standard deviation of an unconstrained number, which may be a logarithm, above which it is not determined."""
 LEAST = 1e-5
 """Noise, in the unit of the residuals: of a test that a law meets exactly."""
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
@@ -37,7 +39,8 @@ SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 @dataclass(frozen=True)
 class Fit:
     """theta: (k,) numbers by `names`, unconstrained; covariance (k, k); noise: factor on the given standard deviations, or [Pa];
-    sigma: of the stiffness' numbers; effective: how many numbers the tests determine; predicted: (m,) [Pa]."""
+    sigma: of the stiffness' numbers; effective: how many numbers the tests determine; predicted: (m,) [Pa]; simulated: of a fit
+    with a pressure, (m,) [Pa] of the same numbers without it, as simulations and exports have them; NaN without an equilibrium."""
 
     names: tuple[str, ...]
     theta: np.ndarray
@@ -46,6 +49,7 @@ class Fit:
     sigma: float
     effective: float
     predicted: np.ndarray
+    simulated: np.ndarray | None = None
 
 
 class Law:
@@ -152,10 +156,16 @@ class Fitting:
             best = solve(best.x, 100)
             if max(abs(np.log(np.array(before) / (noise, sigma)))) < 0.02:
                 break
+        effective = float(shares[np.sqrt(np.diag(covariance)) < UNSURE].sum())
         scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
-        return Fit(
-            self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
-        )
+        told = self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
+        if not self.specimens.incompressible or not rows.all():
+            return Fit(*told)
+        try:
+            free = Specimens(self.data, False).predict(self.law.material, self.law.adapter)
+        except SimulationDiverged:
+            free = np.full(len(self.data.value), np.nan)
+        return Fit(*told, free)
 
     def drawn(self, rows: np.ndarray) -> list[np.ndarray]:
         """Starts: the configured one with its stiffness scaled to the tests, and others about it."""

@@ -20,6 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from warnings import warn
 
 import numpy as np
 
@@ -70,6 +71,8 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing or (strange := [name for name in header if name not in COLUMNS]):
         wrong = f"no {missing[0]}" if missing else f"an unknown column {strange[0]!r}"
+        if ";" in "".join(header):
+            wrong += ": separate columns by commas, and write numbers with a decimal point"
         raise DataError(
             f"tests: {path}: expected the columns {', '.join(NEEDED)} and of "
             f"{', '.join(COLUMNS)} any others, found {wrong}"
@@ -144,6 +147,11 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         raise DataError(
             f"tests: {where}: first: expected stretches above 1 under tension, below 1 under pressure, "
             f"found {against.sum()} of {pulled.sum()} otherwise: strains, or the other sign of stresses?"
+        )
+    if against.any():
+        warn(
+            f"tests: {where}: first: {against.sum()} of the stresses pull at a stretch below 1, or press above 1: strains?",
+            stacklevel=2,
         )
     scale = UNITS[unit]
     return Measurements(

@@ -16,17 +16,17 @@ import torch
 from mosa.config.build import build_body, world_of
 from mosa.config.record import BodyRecord
 from mosa.evaluation.analysis.law_stress import described
-from mosa.material_tests.fitting import Fit, Law
+from mosa.material_tests.fitting import UNSURE, Fit, Law
 from mosa.material_tests.measurements import UNITS, Measurements
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.body import Start
-from mosa.modules.body.material import FORMS, Form, unit_of
+from mosa.modules.body.material import FORMS, NU_MAX, Form, unit_of
 from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-UNSURE = 3.0
-"""Standard deviation of an unconstrained number, which may be a logarithm, above which it is not determined."""
+GOOD, SAME = 0.8, 1.1
+"""R2 below which a fit is warned of; ratio of errors above which exports differ from the fit."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -52,7 +52,8 @@ def figures(
     data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray]
 ) -> dict[str, float | str]:
     """Of all stresses [Pa]: `rms`, `rms_curves` (mean over curves), R2 (mean over curves), `left_out` (mean over tests of the rms
-    of a test that the fit did not see); `rms_of_sd`: in units of the given standard deviations; numbers, noise [Pa]."""
+    of a test that the fit did not see); `rms_simulated`: without the pressure of an incompressible fit; `rms_of_sd`: in units of
+    the given standard deviations; numbers, noise [Pa]."""
     away = fit.predicted - data.value
     parts = curves(data).values()
     found: dict[str, float | str] = {
@@ -63,6 +64,8 @@ def figures(
         "numbers_determined": fit.effective,
         "noise": fit.noise,
     }
+    if fit.simulated is not None:
+        found["rms_simulated"] = rms(fit.simulated - data.value)
     if not np.isnan(data.sd).any():
         found["rms_of_sd"] = rms(away / data.sd)
     if left_out:
@@ -71,8 +74,9 @@ def figures(
     return found
 
 
-def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float, str]]:
-    """(name, value, standard deviation, unit) of every number that was fitted, physical."""
+def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
+    """(name, value, standard deviation or why there is none, unit) of every number that was fitted, physical; where a pressure
+    replaces nu, E as mu and 3 mu, which do not depend on the given nu."""
     rows = []
     for name, value, sd in zip(fit.names, fit.theta, np.sqrt(np.diag(fit.covariance))):
         form = FORMS.get(name)
@@ -80,13 +84,44 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float, str]]:
             raw = torch.tensor(float(value), dtype=torch.float64, requires_grad=True)
             physical = form.physical(raw)
             (slope,) = torch.autograd.grad(physical, raw)
-            unit = unit_of(law.material.law, name)
-            rows.append(
-                (name, physical.item(), abs(slope.item()) * sd if sd < UNSURE else math.inf, unit)
-            )
+            unit, value = unit_of(law.material.law, name), physical.item()
+            if name == "E" and fit.simulated is not None and "nu" not in fit.names:
+                nu = law.material.physical()["nu"].item()
+                for label, factor in (("mu", 1), ("3 mu (E at nu = 1/2)", 3)):
+                    part = factor / 2 / (1 + nu)
+                    rows.append((label, part * value, part * slope.item() * sd, unit))
+                name = f"E (at the given nu = {nu:.4g})"
+            near = any(abs(value - b) < 0.01 * max(abs(b), 1) for b in (form.low, form.high))
+            unknown = f"not determined{' (at its bound)' if near else ''}"
+            rows.append((name, value, abs(slope.item()) * sd if sd < UNSURE else unknown, unit))
         else:
-            rows.append((name, value, sd, "" if name.startswith("stiffness_") else "rad"))
+            told = sd if sd < UNSURE else "not determined"
+            rows.append((name, value, told, "" if name.startswith("stiffness_") else "rad"))
     return rows
+
+
+def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
+    """What a user should look at: poor curves, an export that is another law."""
+    R2, poor = float(figures(data, fit, {})["R2"]), ""
+    if R2 < GOOD:
+        poor = (
+            f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), or the "
+            "file holds true stress (expected: force over the undeformed area) or strain (expected: stretch, 1 at rest)"
+        )
+    return [each for each in (poor, note(law, data, fit, unit)) if each]
+
+
+def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
+    """What material.json and the checkpoint say of a fit with a pressure; empty where its absence does not matter."""
+    totals, scale = figures(data, fit, {}), UNITS[unit]
+    if fit.simulated is None or float(totals["rms_simulated"]) < SAME * float(totals["rms"]):
+        return ""
+    nu = float(law.material.poisson().detach())
+    return (
+        f"fitted as incompressible; the law that simulations and exports get has nu = {nu:.4g} (at most {NU_MAX:g}), and an rms in "
+        f"the tests of {float(totals['rms_simulated']) / scale:.4g} {unit} in place of {float(totals['rms']) / scale:.4g} {unit}. "
+        f"Closest: prior.parameters.nu={NU_MAX:g}, or incompressible=false, which fits that law"
+    )
 
 
 def table(
@@ -105,7 +140,7 @@ def table(
         )
     lines += ["", "| number | value | standard deviation | unit |", "|---|---|---|---|"]
     lines += [
-        f"| {n} | {v:.4g} | {f'{sd:.2g}' if sd < math.inf else 'not determined'} | {u} |"
+        f"| {n} | {v:.4g} | {sd if isinstance(sd, str) else f'{sd:.2g}'} | {u} |"
         for n, v, sd, u in uncertain(law, fit)
     ]
     lines += [
@@ -143,10 +178,10 @@ def plot(
         sd = None if np.isnan(data.sd).any() else data.sd[chosen][order] / scale
         look = {"fmt": "o", "ms": 3, "lw": 0.6, "color": color, "label": f"stress_{c + 1}"}
         panel.errorbar(x[order], data.value[chosen][order] / scale, sd, **look)
-        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color)
+        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color, label="fitted")
         if data.names[k] in left_out:
             found = left_out[data.names[k]][chosen[own]]
-            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1)
+            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1, label="left out")
         panel.set_title(data.names[k], fontsize=9)
         kind = data.kind[data.row[chosen][0]]
         panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
@@ -158,14 +193,14 @@ def plot(
     plt.close(figure)
 
 
-def written(law: Law, fit: Fit) -> dict[str, Any]:
-    """The material as plain data, which `mosa-export-law` and a person read, with the posterior of the unconstrained numbers."""
+def written(law: Law, fit: Fit, note: str = "") -> dict[str, Any]:
+    """The material as plain data, with the posterior of the unconstrained numbers; note: a warning of `mosa-export-law`."""
     posterior = {
         "names": list(fit.names),
         "theta": fit.theta.tolist(),
         "covariance": fit.covariance.tolist(),
     }
-    return described(law.material, law.adapter) | {"posterior": posterior}
+    return described(law.material, law.adapter) | {"posterior": posterior, "note": note}
 
 
 def specimen_twin(law: Law, values: Mapping[str, Any], density: float) -> Twin:
@@ -178,7 +213,7 @@ def specimen_twin(law: Law, values: Mapping[str, Any], density: float) -> Twin:
     n, eye = len(rest), torch.eye(3)
     tensors = {"rest": rest, "volume": torch.full((n,), spacing**3), "colors": torch.full((n, 3), 0.6),
                "opacities": torch.full((n,), 0.8), "covariances": 0.1 * spacing**2 * eye.expand(n, 3, 3).contiguous()}  # fmt: skip
-    sections = ("seed", "prior", "simulation", "heterogeneity", "adapter")
+    sections = ("seed", "prior", "simulation", "heterogeneity", "adapter", "note")
     record = BodyRecord(
         settings={name: values[name] for name in sections if name in values},
         ground={"height": 0.0, "mode": "separate", "friction": 0.5},
@@ -202,5 +237,8 @@ def write(folder: Path, law: Law, data: Measurements, fit: Fit, left_out: Mappin
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "results.md").write_text(table(law, data, fit, left_out, unit))
     plot(folder / "tests.png", data, fit, left_out, unit)
-    (folder / "material.json").write_text(json.dumps(written(law, fit), indent=1, allow_nan=False))
-    save_twin(specimen_twin(law, values, density), folder / "checkpoints" / "specimen.ckpt")
+    told = note(law, data, fit, unit)
+    kept = json.dumps(written(law, fit, told), indent=1, allow_nan=False)
+    (folder / "material.json").write_text(kept)
+    twin = specimen_twin(law, {**values, "note": told}, density)
+    save_twin(twin, folder / "checkpoints" / "specimen.ckpt")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from warnings import warn
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -11,15 +12,17 @@ from mosa.config.checkpoints import known_numbers
 from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import MaterialSettings
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.law_stress import check_own
 from mosa.material_tests.fitting import Fitting, Law
 from mosa.material_tests.measurements import read_tests
-from mosa.material_tests.report import figures, table, write
+from mosa.material_tests.report import doubts, figures, table, write
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import AUTO
 from mosa.physics.constitutive.laws import law_named
 from mosa.training.run_folder import quiet, run_folder, write_figures
 
 log = logging.getLogger(__name__)
+NEEDED = {"tests": "a csv file of tests (docs/material_tests.md)", "unit": "Pa, kPa or MPa"}
 
 
 def build_law(values: dict) -> Law:
@@ -39,6 +42,7 @@ def build_law(values: dict) -> Law:
         raise ConfigError(
             f"adapter: expected operator or none, found {values['adapter']['name']}: others have no energy"
         )
+    check_own(material)
     if adapter is None and values["incompressible"] and "nu" in material.raw:
         material.raw["nu"].requires_grad_(False)  # the pressure replaces it
     if adapter is not None:
@@ -49,10 +53,9 @@ def build_law(values: dict) -> Law:
 def fit_tests(cfg: DictConfig) -> float:
     """Fit, predict every test from the others, write; returns the rms [Pa]."""
     quiet()
-    if OmegaConf.is_missing(cfg, "tests"):
-        raise ConfigError(
-            "tests: expected a csv file of stress-strain tests (docs/material_tests.md), found none"
-        )
+    for key, expected in NEEDED.items():
+        if OmegaConf.is_missing(cfg, key):
+            raise ConfigError(f"{key}: expected {expected}, found none")
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
     MaterialSettings.read(values)
@@ -71,6 +74,8 @@ def fit_tests(cfg: DictConfig) -> float:
     write(folder, law, data, fit, left_out, values["unit"], values, values["density"])
     found = figures(data, fit, left_out)
     write_figures(folder, found)
+    for doubt in doubts(law, data, fit, values["unit"]):
+        warn(doubt, stacklevel=1)
     log.info("%s", table(law, data, fit, left_out, values["unit"]))
     log.info("%s: results.md, tests.png, material.json, checkpoints/specimen.ckpt", folder)
     return float(found["rms"])

@@ -23,6 +23,7 @@ from mosa.evaluation.analysis.marker_figures import write_markers
 from mosa.evaluation.analysis.tables import (
     columns_text,
     determined_text,
+    force_lines,
     geometry_lines,
     parameter_table,
     results_table,
@@ -139,7 +140,7 @@ def write_outputs(
             )
     law = body.material.law
     parts = (note, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
-             determined_text(figures, law), geometry_lines(figures))  # fmt: skip
+             determined_text(figures, law), force_lines(figures), geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:
         partial.write_text(table + "\n")

@@ -112,9 +112,7 @@ def train(cfg: DictConfig) -> float | None:
         check_seen(cfg, scene)
         check_with_data(settings.plain(), scene, len(others), most)
     else:
-        log.info(
-            "tracked points only: no reconstruction from images, no figures of images, no video"
-        )
+        log.info("tracked points only: no reconstruction from images, no figures of images")
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -126,7 +124,7 @@ def train(cfg: DictConfig) -> float | None:
         warnings.warn(
             f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
             f"{ENOUGH:g}: the grid makes them too stiff and the learned law compensates for it, so it may predict worse "
-            f"than its prior; take about {resolved.particles} particles, or adapter=none",
+            f"than its prior; take about {resolved.particles} particles{', or adapter=none' if cfg.adapter.name else ''}",
             stacklevel=1,
         )
     with clock.measure("starts"):

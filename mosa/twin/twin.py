@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
+from warnings import warn
 
 import numpy as np
 import torch
@@ -124,6 +125,8 @@ class Twin:
             ) from error
         check_numbers(record, len(read_numbers(body)), path)
         posterior = None if record.posterior is None else Posterior.read(record.posterior.plain())
+        if note := record.settings.get("note"):  # of a fit to tests
+            warn(f"{path}: {note}", stacklevel=2)
         return cls(body.to(device).eval(), world, record.frame_dt, record.body, start, posterior)
 
     @typed

@@ -11,9 +11,10 @@ from forked import call
 from mosa.config.checkpoints import known_numbers
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.law_stress import in_double, kirchhoff, tangent
+from mosa.export.source import read_source
 from mosa.material_tests.fitting import Fitting, Law
 from mosa.material_tests.measurements import measurements, read_tests
-from mosa.material_tests.report import figures, rms, written
+from mosa.material_tests.report import doubts, figures, rms, uncertain, written
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
@@ -163,10 +164,53 @@ def test_two_halves_of_the_tests_say_what_all_of_them_say(tmp_path):
     with pytest.raises(ConfigError, match="expected numbers of neo_hookean that are learned"):
         known_numbers(str(path), Material("neo_hookean", {"E": E, "nu": 0.4}), None, "known")
     whole = json.loads(path.read_text())
-    for text in ("{}", "[" * 100_000, json.dumps(whole | {"stiffness": [1]})):
+    for text in ("{}", "[" * 100_000, json.dumps(whole | {"posterior": [1]})):
         path.write_text(text)
         with pytest.raises(DataError, match=r"known: .*material\.json: expected a material\.json"):
             known_numbers(str(path), law.material, None, "known")
+
+
+def pulled(lengths, stresses, law="neo_hookean", **more):
+    states = [dict(r, stress_1=P) for r, P in zip(rows("uniaxial x", lengths), stresses)]
+    start = Material(law, {"E": 3e4, "nu": 0.45, **more}, ["nu"])
+    data = measurements(states, "MPa", "here")
+    fitting = Fitting(Law(start, None, "full"), data, True, starts=1, seed=0)
+    fit = fitting.fit()
+    law = fitting.law.set(fit.theta)
+    return uncertain(law, fit), "; ".join(doubts(law, data, fit, "MPa")), fit
+
+
+def test_slips_in_a_file_are_warned_of():
+    l = np.linspace(1.1, 4.0, 12)
+    P = 0.4 * (l - l**-2)
+    numbers, right, _ = pulled(l, P)
+    assert "R2" not in right and "strain" not in right
+    assert [n for n, *_ in numbers] == ["mu", "3 mu (E at nu = 1/2)", "E (at the given nu = 0.45)"]
+    assert [v for _, v, *_ in numbers] == pytest.approx([4e5, 1.2e6, 4e5 * 2 * 1.45], rel=1e-6)
+    assert "true stress" in pulled(l, 0.4 * l**4)[1]
+    l = np.linspace(0.8, 4.0, 12)  # strains, the first below 1
+    with pytest.warns(UserWarning, match="1 of the stresses pull at a stretch below 1"):
+        pulled(l, 0.4 * (1 + l - (1 + l) ** -2))
+
+
+def test_the_numbers_that_are_determined_are_those_of_the_table():
+    l = np.linspace(1.1, 4.0, 12)
+    numbers, _, fit = pulled(l, 0.4 * (l - l**-2), "mooney_rivlin", second_share=0.1)
+    assert numbers[-1][0] == "second_share" and numbers[-1][2] == "not determined (at its bound)"
+    assert fit.effective == pytest.approx(1) and len(fit.names) == 2
+
+
+def test_an_export_of_an_incompressible_fit_says_how_far_it_is(tmp_path):
+    l = np.linspace(1.1, 4.0, 12)
+    _, found, fit = pulled(l, 0.4 * (l - l**-2))
+    assert "nu = 0.45 (at most 0.49), and an rms in the tests of" in found
+    start = in_double(Material("neo_hookean", {"E": 4e5 * 2.9, "nu": 0.45}))
+    free = predicted("neo_hookean", start.begins | {"E": 4e5 * 2.9, "nu": 0.45}, rows("uniaxial x", l), False)  # fmt: skip
+    assert fit.simulated == pytest.approx(free, rel=1e-5)
+    path = tmp_path / "material.json"
+    path.write_text(json.dumps(written(Law(start, None, "full"), fit, found)))
+    with pytest.warns(UserWarning, match="material.json: fitted as incompressible"):
+        read_source(path)
 
 
 HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
@@ -177,6 +221,7 @@ HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
     [
         ("test,mode,first\n", "stress_1"),
         (HEADER.replace("sd_1", "colour"), "unknown column 'colour'"),
+        (HEADER.replace(",", ";") + "a;uniaxial x;1,1;;1,2;;\n", "separate columns by commas"),
         (HEADER, "rows below the header"),
         (HEADER + "a,bending x,1,,1,,\n", "row 1: mode: expected uniaxial x"),
         (HEADER + "a,biaxial xx,1,1,1,,\n", "found 'biaxial xx'"),
@@ -225,12 +270,13 @@ def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):
     assert kept["E"] * (1 + NU) / (1 + kept["nu"]) == pytest.approx(
         E, rel=1e-3
     )  # mu is what they tell
-    twin = Twin.load(folder / "checkpoints" / "specimen.ckpt")
+    with pytest.warns(UserWarning, match="specimen.ckpt: fitted as incompressible"):
+        twin = Twin.load(folder / "checkpoints" / "specimen.ckpt")
     assert float(twin.body.material.physical()["E"]) == pytest.approx(kept["E"], rel=1e-5)
 
 
 def test_what_cannot_be_fitted_is_said():
-    run = call("mosa/material_tests/__main__.py", "tests=none.csv", "prior=von_mises")
+    run = call("mosa/material_tests/__main__.py", "tests=none.csv", "unit=Pa", "prior=von_mises")
     assert run.returncode != 0 and "none.csv" in run.stdout + run.stderr
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from warnings import warn
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ from mosa.types import Rollout
 COLUMNS = ("time", "fx", "fy", "fz")
 MODEL_ERROR = 0.01
 """Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
+FAR = 5.0
+"""Standard deviations of a misfit (rms) beyond which it is warned of."""
 
 
 class Measured(Settings):
@@ -137,7 +140,37 @@ def force_residuals(
 ) -> Tensor:
     """(M,) differences from the mean forces of all frame intervals that were measured, over their
     standard deviations."""
-    parts: list[Tensor] = []
+    parts = compared_forces(rollout, curves, world, frame_dt)
+    return torch.cat([(felt - mean) / sd for felt, mean, sd in parts])
+
+
+def force_figures(
+    rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
+) -> dict[str, float]:
+    """`forces/<of>/...`, of the mean forces of frame intervals: `rms_share`, predicted minus
+    measured, and `allowed_share`, its standard deviation, over the largest measured force;
+    `measured_N` and `predicted_N` where that is. Warns of a misfit far beyond what is allowed."""
+    found: dict[str, float] = {}
+    for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
+        at = mean.abs().argmax()
+        off, allowed = (float((v / mean[at]).square().mean().sqrt()) for v in (felt - mean, sd))
+        names = ("rms_share", "allowed_share", "measured_N", "predicted_N")
+        values = (off, allowed, float(mean[at]), float(felt[at]))
+        found |= {f"forces/{curve.of}/{name}": value for name, value in zip(names, values)}
+        if off > FAR * allowed:
+            warn(
+                f"world.forces: {curve.of}: the predicted force is off by {off:.0%} of the largest measured, allowed are "
+                f"{allowed:.1%}. Expected: the force that the body exerts (check the sign), world axes, N, times from frame 0",
+                stacklevel=2,
+            )
+    return found
+
+
+def compared_forces(
+    rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """By curve: predicted and measured mean forces that were measured, and their standard deviation, (M,) [N]."""
+    parts = []
     if rollout.reactions is None:
         raise ConfigError(
             "world.forces: expected a law on a grid, found an adapter without reactions"
@@ -150,5 +183,6 @@ def force_residuals(
                 f"frames, found {curve.times[0]:.6g} to {curve.times[-1]:.6g} s"
             )
         felt = rollout.reactions.mean(1)[:, column, :3].double()
-        parts.append(((felt - mean) / sd)[torch.isfinite(mean)])
-    return torch.cat(parts)
+        there = torch.isfinite(mean)
+        parts.append((felt[there], mean[there], sd[there]))
+    return parts

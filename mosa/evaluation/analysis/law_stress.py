@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
+from warnings import warn
 
 import torch
 import warp as wp
@@ -16,6 +19,7 @@ from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import field_types, kernels_of
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.launching import launch
+from mosa.settings import typed
 
 KINDS = [field_types(wp.float64)[k] for k in (0, 0, 3, 2, 1, 0)]
 """Of a stress kernel's arrays: F, C_affine, parameters, G, h, tau."""
@@ -121,3 +125,66 @@ def tangent(material: Material, adapter: HyperelasticAdapter | None, F: Tensor) 
             launch(kernel, len(F), wrapped(parts), wp.get_device("cpu"), wrapped(seeds))
             result[:, i, j] = seeds[0]
     return result
+
+
+def deformations(count: int, seed: int = 0, strain: float = 0.2) -> Tensor:
+    """(count, 3, 3) float64: I plus normal numbers of standard deviation `strain`, turned at random, 0.3 < det F < 3."""
+    g = torch.Generator().manual_seed(seed)
+    found = torch.empty(0, 3, 3, dtype=torch.float64)
+    while len(found) < count:
+        F = torch.eye(3, dtype=torch.float64) + strain * torch.randn(
+            2 * count, 3, 3, generator=g, dtype=torch.float64
+        )
+        Q = torch.linalg.qr(torch.randn(2 * count, 3, 3, generator=g, dtype=torch.float64)).Q
+        F = Q * torch.linalg.det(Q)[:, None, None] @ F
+        J = torch.linalg.det(F)
+        found = torch.cat([found, F[(J > 0.3) & (J < 3)]])
+    return found[:count]
+
+
+WRONG = 1e-6
+"""Relative error above which a law is warned of; rounding is at 1e-9."""
+PROPERTIES = {
+    "symmetry": "a symmetric Kirchhoff stress: a skew part is a torque from nothing",
+    "objectivity": "tau(Q F) = Q tau(F) Q^T of every rotation Q: a turned body has the turned stress (F F^T in place of F^T F?)",
+    "gradient": "an adjoint that is the derivative of the stress: see Warp's notes on differentiable functions",
+    "loops": "a stress that is the derivative of an energy: closed loops of deformation make work",
+}
+
+
+@typed
+def check_law(law: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Relative errors of a registered law, at 100 drawn deformations: `symmetry`, `objectivity`, `gradient` (adjoint
+    against differences), `loops` (d P/dF against its transpose; not of laws that yield or flow). Warns above `WRONG`.
+
+    parameters: as `prior.parameters`. Errors: ConfigError for an unknown law or parameter."""
+    return errors_of(in_double(Material(law, parameters)))
+
+
+def check_own(material: Material) -> None:
+    """`check_law` of a law that is not this program's, at its start."""
+    if not vars(law_named(material.law).stress)["func"].__module__.startswith("mosa."):
+        errors_of(in_double(copy.deepcopy(material)))
+
+
+def errors_of(material: Material) -> dict[str, float]:
+    law, F = law_named(material.law), deformations(100)
+    tau, slope = kirchhoff(material, None, F), tangent(material, None, F)
+    D, h = torch.randn(F.shape, generator=torch.Generator().manual_seed(2), dtype=F.dtype), 1e-5
+    moved = (kirchhoff(material, None, F + h * D) - kirchhoff(material, None, F - h * D)) / (2 * h)
+    parts = {"symmetry": (tau, tau.mT),
+             "gradient": (torch.einsum("nijkl,nkl->nij", slope, D), moved)}  # fmt: skip
+    if law.reference is None:
+        Q = deformations(100, 1, 0.0)
+        parts["objectivity"] = kirchhoff(material, None, Q @ F), Q @ tau @ Q.mT
+    if not law.plastic and law.viscosity is None and law.reference is None:
+        inverse = torch.linalg.inv(F)  # P = tau F^-T
+        dP = torch.einsum("nimkl,njm->nijkl", slope, inverse)
+        dP = dP - torch.einsum("nil,njk->nijkl", tau @ inverse.mT, inverse)
+        parts["loops"] = dP, dP.permute(0, 3, 4, 1, 2)
+    found = {k: float((a - b).abs().max() / b.abs().max()) for k, (a, b) in parts.items()}
+    for name, error in found.items():
+        if not error < WRONG:
+            said = f"{name} is off by {error:.2g} of the largest: expected {PROPERTIES[name]}"
+            warn(f"law {material.law!r}: {said}", stacklevel=3)
+    return found

@@ -297,6 +297,17 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     return "\n".join(lines)
 
 
+def force_lines(figures: Mapping[str, float]) -> str:
+    """A line for each measured force: how far the learned law's is off."""
+    return "\n".join(
+        f"- Force on {of}: the predicted one is off by {off:.1%} (rms) of the largest measured, "
+        f"{figures[f'forces/{of}/measured_N']:.4g} N, where {figures[f'forces/{of}/predicted_N']:.4g} N are predicted. "
+        f"Allowed standard deviation: {figures[f'forces/{of}/allowed_share']:.1%}."
+        for of, off in _part(figures, "forces/", "/rms_share").items()
+        if f"forces/{of}/allowed_share" in figures
+    )
+
+
 def geometry_lines(figures: Mapping[str, float]) -> str:
     """Sentences on the body that was filled: how surely its surface is known, and against the true shape where that is known."""
     lines, get = [], lambda name: figures.get(f"geometry/{name}")

@@ -8,8 +8,15 @@ import pytest
 import torch
 from small_bodies import FREE, NU, E, cues_of, small_body, start, take_of
 
-from mosa.data.io.forces import ForceCurve, force_residuals, forces_from_config, read_forces
+from mosa.data.io.forces import (
+    ForceCurve,
+    force_figures,
+    force_residuals,
+    forces_from_config,
+    read_forces,
+)
 from mosa.errors import ConfigError, DataError
+from mosa.evaluation.analysis.tables import force_lines
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.stages import Stage
@@ -91,6 +98,25 @@ def test_the_stiffness_of_a_block_from_a_press_alone(tmp_path):
     assert values["nu"] == pytest.approx(NU) and values["E"] == pytest.approx(E, rel=0.03)
     spread = float(found.posterior().covariance[0, 0].sqrt())
     assert abs(values["E"] / E - 1) < 3 * spread < 0.1
+
+
+@torch.no_grad()
+def test_a_fit_says_how_far_its_force_is_from_the_measured_one(recwarn):
+    """The curve of the rollout itself, joined by lines, and the same curve of the wrong sign."""
+    _, _, rollout = pressed()
+    felt = rollout.reactions.mean(1)[:, 1, :3].double()
+    middle = FRAME_DT * (torch.arange(FRAMES - 1).double() + 0.5)
+    times = torch.cat([middle.new_zeros(1), middle, middle.new_full((1,), FRAME_DT * (FRAMES - 1))])
+    curve = ForceCurve("high", times, torch.cat([felt[:1], felt, felt[-1:]]))
+    right = force_figures(rollout, [curve], PRESS, FRAME_DT)
+    assert right["forces/high/rms_share"] < 5 * right["forces/high/allowed_share"] < 0.5
+    assert not [w for w in recwarn if "world.forces" in str(w.message)]
+    with pytest.warns(UserWarning, match=r"world.forces: high: .* off by \d\d% .*check the sign"):
+        wrong = force_figures(rollout, [replace(curve, forces=-curve.forces)], PRESS, FRAME_DT)
+    assert wrong["forces/high/measured_N"] * wrong["forces/high/predicted_N"] < 0
+    assert f"{wrong['forces/high/rms_share']:.1%} (rms) of the largest measured" in force_lines(
+        wrong
+    )
 
 
 @pytest.mark.parametrize("kinds, told", [((True, False, False), True), ((False,) * 3, False)])

@@ -6,7 +6,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 
@@ -18,9 +18,8 @@ from mosa.modules.fitting.search.yielding import LASTS
 from mosa.physics.constitutive.laws import law_named
 from mosa.system.progress import tqdm
 
-if TYPE_CHECKING:
-    from mosa.modules.fitting.identification import Identification
-
+Calibration = Any
+"""An `identification.Identification`, whose module imports this one."""
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 OFFSET_STEPS = (-0.2, 0.05, 0.3, 0.55, 0.8)
 POISSON_STEPS = (0.32, 0.2, 0.42)
@@ -90,7 +89,7 @@ def valleys(found: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
 class Starts:
     """Places at which a calibration may start: unconstrained parameters by name, and their scores."""
 
-    def __init__(self, calibration: Identification) -> None:
+    def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.material = calibration, calibration.body.material
         self.learned, self._begins = self.material.learned, self.material.begins
         modulated = self.material.modulated
@@ -123,7 +122,7 @@ class Starts:
         return self._scores[key]
 
 
-def search(calibration: Identification) -> float:
+def search(calibration: Calibration) -> float:
     """Start a calibration near the smallest score [m], which is returned.
 
     The deepest valleys of a coarse grid (`rows_of_grid`) come first; where there are several,
@@ -196,7 +195,7 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
 
 
 def nearest_end(
-    calibration: Identification,
+    calibration: Calibration,
     start_at: Callable[[dict[str, float]], None],
     rows: Sequence[dict[str, float]],
     kept: int = KEPT,
@@ -233,7 +232,7 @@ def nearest_end(
 
 
 def went_on(
-    calibration: Identification, state: dict, iterations: int
+    calibration: Calibration, state: dict, iterations: int
 ) -> tuple[float, dict[str, dict], dict]:
     """(score [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
     calibration.restore(state)
@@ -262,7 +261,7 @@ TRIED = 4
 def choose_law(
     body: Body,
     candidates: Sequence[str],
-    build: Callable[[], Identification],
+    build: Callable[[], Calibration],
     lasts: Callable[[], float],
 ) -> dict[str, float]:
     """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction
