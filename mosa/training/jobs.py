@@ -14,6 +14,7 @@ import shutil
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -257,8 +258,8 @@ def held_back() -> Iterator[None]:
 
 
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
-    """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
-    result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    """job(cfg) and its result. A mistake of the user ends in one message and exit code 2. In a sweep every error is kept for the end,
+    the result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
     with tolerant_output():  # also in a launcher's worker, and for the message
         return attempted(job, cfg)
 
@@ -288,7 +289,10 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         message = f"{type(error).__name__}: {error}"
     except Exception as error:
         if (message := explained(error, folder)) is None:
-            raise
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                raise
+            traceback.print_exc()  # a mistake of a program costs a sweep its job alone
+            message = f"{type(error).__name__}: {error}"
     fail(message)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)

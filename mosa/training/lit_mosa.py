@@ -32,7 +32,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_stages, plain, rehearse, world_of
-from mosa.config.checkpoints import check_plain, check_same_data, known_numbers, read_checkpoint
+from mosa.config.checkpoints import (
+    check_plain,
+    check_same_data,
+    check_same_scene,
+    known_numbers,
+    read_checkpoint,
+)
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
@@ -241,6 +247,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def configure_callbacks(self) -> list[L.Callback]:
         """Asked for first of all, before the data take their time."""
         check_trainer(self.trainer)
+        data = getattr(self.trainer, "datamodule", None)
+        if self.record is not None and hasattr(data, "cfg"):
+            check_same_scene(self.record, plain(data.cfg), "the module")
         known = any(isinstance(each, Stages) for each in self.trainer.callbacks)
         return [] if known else [Stages()]
 
@@ -315,6 +324,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 "simulation.particles"
             )
         if self.record is not None:
+            check_same_scene(record, self.record.settings, "the checkpoint")
             check_same_data(record, self.record.data, "the checkpoint")
         for name in KEPT:
             setattr(self, name, copy.copy(getattr(saved, name)))
