@@ -64,6 +64,11 @@ class KeepLast(Checkpoint):
     def on_train_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
         trainer.save_checkpoint(self.path)
 
+    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Of a fit that was complete where it went on, and had no epoch."""
+        if not self.path.is_file():
+            trainer.save_checkpoint(self.path)
+
 
 class FitProgress(L.Callback):
     """One tqdm bar per stage with loss and parameters."""

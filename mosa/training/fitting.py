@@ -16,9 +16,11 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
+from mosa.config.build import plain
 from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
+from mosa.settings import arguments_of, untold
 from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
@@ -79,6 +81,8 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
 def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     """Lightning's Trainer of conf/trainer, with the callbacks of conf/callbacks and the loggers of conf/logger. Errors: ConfigError
     naming the section."""
+    given, begin = plain(cfg.trainer), L.Trainer.__init__
+    arguments_of(begin, "trainer", "precision", *untold(begin)).part(given)
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
     trainer = made(
         "trainer",
@@ -88,7 +92,7 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
         default_root_dir=str(folder),
         plugins=[AtomicCheckpointIO(), LightningEnvironment()],
     )
-    check_trainer(trainer)
+    check_trainer(trainer, given.get("precision"))
     check_monitors(cfg, callbacks)
     return trainer
 
@@ -113,6 +117,8 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
         stored = read_checkpoint(ckpt_path)
         record = check_same(stored, module, ckpt_path)
         check_numbers(record, len(read_numbers(module.body)), ckpt_path)
+        if record.fit is not None and record.fit.stage == len(module.stages):
+            log.info("the fit of %s was complete: no further step", ckpt_path)
     device = module.body.rest.device
     begun: list[bool] = []
     trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))

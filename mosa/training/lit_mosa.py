@@ -97,8 +97,8 @@ def body_of(shape: RestShape, record: BodyRecord) -> Body:
     return body.to(shape.rest.device)
 
 
-def check_trainer(trainer: L.Trainer) -> None:
-    """Errors: ConfigError naming an argument that no fit can do with."""
+def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
+    """Errors: ConfigError naming an argument that no fit can do with. precision: as it was given, which a Trainer may change."""
     if trainer.world_size != 1:
         raise ConfigError(
             f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.world_size}: a fit "
@@ -106,7 +106,7 @@ def check_trainer(trainer: L.Trainer) -> None:
         )
     if trainer.precision not in PRECISIONS:
         raise ConfigError(
-            f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {trainer.precision!r}: the "
+            f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {precision or trainer.precision!r}: the "
             "simulation is single precision, or double by simulation.precision=64"
         )
     if trainer.accumulate_grad_batches != 1:  # the schedule of views counts a batch as a step
