@@ -18,8 +18,9 @@ from mosa.training import workflow as pipeline
 from mosa.twin.twin import Twin
 
 ROOT = Path(__file__).parents[2]
-QUICK = ["debug=default", "scene=transforms", "scene.scale=1", "scene.box=[[-0.7,-0.1,-0.7],[0.7,1,0.7]]", "fit.prior.newton_iterations=1",
-         "adapter=none", "heterogeneity.enabled=false", "reconstruction.static.iterations=40", "reconstruction.resolution=40",
+QUICK = ["debug=default", "scene=transforms", "scene.scale=1", "scene.box=[[-0.7,-0.1,-0.7],[0.7,1,0.7]]",
+         "fit.prior.newton_iterations=1", "adapter=none", "heterogeneity.enabled=false",
+         "reconstruction.static.iterations=40", "reconstruction.resolution=40",
          "reconstruction.appearance.iterations=40", "reconstruction.dynamic.iterations=20",
          "reconstruction.dynamic.track_iterations=10", "logger=none", "evaluation.samples=256", "evaluation.assignment=64",
          "evaluation.video=false"]  # fmt: skip

@@ -36,7 +36,9 @@ def test_a_fit_goes_on_with_its_own_scene_alone(tmp_path, other):
     data = SceneDataModule("debug=default", other)
     data.prepare_data = lambda: pytest.fail("the films were made")
     for run in (trainer.fit, trainer.validate, trainer.test):
-        with pytest.raises(ConfigError, match=r"a fit to this scene, found one to another.*scene\."):
+        with pytest.raises(
+            ConfigError, match=r"a fit to this scene, found one to another.*scene\."
+        ):
             run(module, datamodule=data)
     with pytest.raises(ConfigError, match=r"found one to another.*scene\."):
         LitMosa.load_from_checkpoint(tmp_path / "tiny.ckpt").on_load_checkpoint(
