@@ -5,6 +5,7 @@ What is promised, and what is not, is in docs/safety.md.
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickletools
 import zipfile
@@ -18,7 +19,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa import __version__
 from mosa.config.record import VERSION, BodyRecord, PosteriorRecord, RunRecord
 from mosa.data.formats.footage import read_json
 from mosa.errors import ConfigError, DataError, MosaError
@@ -183,8 +183,9 @@ def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
         except ConfigError as error:
             if "unknown key" not in str(error):
                 raise
+            version = importlib.import_module("mosa").__version__  # beside all layers
             raise DataError(
-                f"{error}: expected the settings of this version of mosa, {__version__}, found those of "
+                f"{error}: expected the settings of this version of mosa, {version}, found those of "
                 "another one; learn it again, or use the version that wrote it"
             ) from error
     return record

@@ -164,10 +164,10 @@ def main(words: list[str]) -> None:
     if words[0] not in COMMANDS:
         print(f"expected one of {', '.join(COMMANDS)}, found {words[0]}", file=sys.stderr)
         sys.exit(2)
-    beside = (*arguments(), *of_scenes()) if words[0] == "train" else ()
     key = f"{words[1]}." if words[1:] else ""
-    beside = [*beside, *(of_trainer() if beside and key.startswith("trainer.") else ())]
-    found = [*rows(COMMANDS[words[0]], None), *beside]
+    found = list(rows(COMMANDS[words[0]], None))
+    if words[0] == "train":
+        found += [*arguments(), *of_scenes(), *(of_trainer() if key.startswith("trainer.") else ())]
     asked = [row for row in found if f"{row[0]}.".startswith(key)]
     # an entry of a mapping has no row of its own
     asked = asked or [row for row in found if row[1] and key.startswith(f"{row[0]}.")]

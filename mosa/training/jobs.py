@@ -254,7 +254,8 @@ def held_back() -> Iterator[None]:
 
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2. In a sweep
-    every error is kept for the end, the result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    every error is kept for the end, the result is infinite, and the other jobs go on.
+    A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
     with tolerant_output():  # also in a launcher's worker, and for the message
         return attempted(job, cfg)
 
