@@ -68,7 +68,7 @@ def said_of(error: BaseException) -> str:
         said += f"\nAvailable options in '{found[1]}': {', '.join(options)}{nearest(found[2], options, '')}"
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
         known = [row[0] for model in COMMANDS.values() for row in rows(model, None)]
-        said = said.replace(found[0], nearest(found[1], known, ""))
+        said = said.replace(found[0], f"{nearest(found[1], known, '')}.")
     return said[:2000]
 
 

@@ -123,8 +123,6 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
         stored = read_checkpoint(ckpt_path)
         record = check_same(stored, module, ckpt_path)
         check_numbers(record, len(read_numbers(module.body)), ckpt_path)
-        if record.fit is not None and record.fit.stage == len(module.stages):
-            log.info("the fit of %s was complete: no further step", ckpt_path)
     device = module.body.rest.device
     begun: list[bool] = []
     trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))

@@ -115,7 +115,7 @@ def test_a_profiler_that_was_asked_for_is_heard():
 class Ended(L.LightningModule):
     """A fit that was complete where it goes on."""
 
-    stage_over = True
+    stage, stage_over = None, True
 
     def training_step(self, batch, batch_idx):
         pytest.fail("a step")
@@ -124,10 +124,12 @@ class Ended(L.LightningModule):
         return None
 
 
-def test_a_complete_fit_leaves_its_checkpoint_in_a_new_folder(tmp_path):
+def test_a_complete_fit_leaves_its_checkpoint_in_a_new_folder(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     trainer = L.Trainer(
         accelerator="cpu", max_epochs=0, logger=False, default_root_dir=tmp_path,
         callbacks=[KeepLast()], enable_model_summary=False,
     )  # fmt: skip
     trainer.fit(Ended(), torch.utils.data.DataLoader([0]))
     assert (tmp_path / "checkpoints" / "last.ckpt").is_file()
+    assert "the fit was complete: no further step" in caplog.text
