@@ -159,7 +159,7 @@ class Failures(Callback):
 
 def summarize(folder: str | Path) -> None:
     """The table of a sweep's runs on the screen and in its folder; of other commands there is none."""
-    if not any(Path(folder).glob("*/metrics.json")):
+    if not any(any(Path(folder).glob(each)) for each in ("*/metrics.json", f"{FAILED}/*.txt")):
         return
     try:
         rows, files = write_table(folder)

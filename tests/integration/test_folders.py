@@ -125,7 +125,7 @@ def test_a_folder_that_is_held_out_has_figures(run):
     assert set(np.load(run / "rollout.npz")) >= {"train/x", "train/test_60/x", "test/second/x"}
     assert set(np.load(run / "observed.npz")) >= {"train/x", "train/test_60/x"}
     log = (run / "train.log").read_text()
-    assert "cameras of different image sizes" in log and "start of test/second: velocity (" in log
+    assert "px, brought to" in log and "start of test/second: velocity (" in log
 
 
 def test_eval_finds_the_folders_again(run, tmp_path, monkeypatch):

@@ -73,8 +73,6 @@ def test_a_sweep_counts_the_jobs_that_failed_in_this_sweep(sweep, tmp_path, caps
 
 def test_a_mistake_of_a_program_costs_a_sweep_its_job_alone(sweep, tmp_path, capsys):
     """A user's callback that raised ended the sweep, without its table and without failed/."""
-    (tmp_path / "2_seed-2").mkdir()
-    (tmp_path / "2_seed-2" / "metrics.json").write_text("{}")
     (tmp_path / "3_seed-3").mkdir()
     assert attempt(fail(ValueError("digits: x")), None) == float("inf")
     assert "Traceback" in capsys.readouterr().err
