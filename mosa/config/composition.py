@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -58,16 +58,21 @@ def configuration() -> str:
     return str(inside if inside.is_dir() else package.parent / "conf")
 
 
+def keys_of(values: Any, where: str = "") -> Iterator[str]:
+    """Of a configuration in plain containers, those of its sections too."""
+    for key, value in values.items() if isinstance(values, dict) else ():
+        yield f"{where}{key}"
+        yield from keys_of(value, f"{where}{key}.")
+
+
 def said_of(error: BaseException) -> str:
     """What Hydra says of an override that it cannot take, and the options or the nearest key, where it does not name those."""
-    from mosa.config.reference import rows
-
     said = "\n".join(dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error)))
     if found := re.search(r"Could not load '(\w+)/(.+)'", said):
         options = sorted(f.stem for f in Path(configuration(), found[1]).glob("*.yaml"))
         said += f"\nAvailable options in '{found[1]}': {', '.join(options)}{nearest(found[2], options, '')}"
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
-        known = [row[0] for model in COMMANDS.values() for row in rows(model, None)]
+        known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
         said = said.replace(found[0], f"{nearest(found[1], known, '')}.")
     return said[:2000]
 
