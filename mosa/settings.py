@@ -402,14 +402,14 @@ def typed(function: Public) -> Public:
     @functools.wraps(function)
     def called(*args: Any, **keys: Any) -> Any:
         # not by Signature.bind, which takes longer than the checks; the call itself refuses names that it has not
-        arguments_of(function, "", *_untold(function)).part(dict(zip(names, args)) | keys)
+        arguments_of(function, "", *untold(function)).part(dict(zip(names, args)) | keys)
         return function(*args, **keys)
 
     return called  # type: ignore[return-value]
 
 
 @functools.cache
-def _untold(function: Callable[..., Any]) -> tuple[str, ...]:
+def untold(function: Callable[..., Any]) -> tuple[str, ...]:
     """Names of the arguments whose types are none of settings."""
 
     def told(kind: Any) -> bool:

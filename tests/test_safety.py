@@ -100,6 +100,8 @@ DAMAGED = {
     "older": (at("mosa", "version", value=2), "mosa.version: expected 3, found '2': it is of another version of this program"),
     "no version": (at("mosa", "version", value=None), "mosa.version: expected 3, found 'None'"),
     "unknown": (at("mosa", "more", value=1), "mosa.more: unknown key; expected one of settings, law"),
+    "older adapter": (at("mosa", "settings", "adapter", "strain", value="log"),
+              r"adapter\.strain: unknown key.*of this version of mosa, \d.*another one; learn it again"),
     "simulation": (at("mosa", "settings", "simulation", "speed", value=1), "simulation.speed: unknown key"),
     "courant": (at("mosa", "settings", "simulation", "courant", value=7), "simulation.courant: expected a number above 0"),
     "no world": (at("mosa", "world", value=None), "mosa.world: expected this key, found none"),

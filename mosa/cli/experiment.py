@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mosa.config.composition import configuration
 from mosa.errors import ConfigError
 from mosa.system.console import say_version
 from mosa.system.refused import one_message
@@ -185,18 +184,12 @@ def check_overrides(words: list[str], overrides: list[str]) -> None:
             )
     if not words:
         return
-    from hydra import compose, initialize_config_dir
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
     from mosa.config.build import plain
-    from mosa.config.extensions import load_extensions
+    from mosa.config.composition import compose
     from mosa.training.preflight import check_configuration
 
     try:
-        with initialize_config_dir(configuration(), version_base="1.3"):
-            values = plain(compose("train", overrides))
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
-    load_extensions(values.get("extensions"))
+        values = plain(compose(*overrides))
+    except ConfigError as error:
+        raise ConfigError(f"--set: {error}") from error
     check_configuration(values)

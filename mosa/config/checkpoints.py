@@ -5,6 +5,7 @@ What is promised, and what is not, is in docs/safety.md.
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickletools
 import zipfile
@@ -25,7 +26,7 @@ from mosa.evaluation.uncertainty import INFLATION
 from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
-from mosa.settings import Names, check
+from mosa.settings import Names, arguments_of, check
 from mosa.system.limits import machine_memory
 from mosa.types import dense
 
@@ -173,8 +174,20 @@ def check_containers(checkpoint: Any) -> None:
 def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
     """The record in a read checkpoint; its settings of the body are checked with it. Errors: DataError naming file and part."""
     with reading(f"{path}: stored record"):
-        record = RunRecord.read(checkpoint["mosa"])
-        adapter_class(record.sections.adapter.plain())
+        try:
+            record = RunRecord.read(checkpoint["mosa"])
+            keys = record.sections.adapter.plain()
+            if (build := adapter_class(keys)) is not None:
+                del keys["name"]
+                arguments_of(build, "adapter").read(keys, "adapter")
+        except ConfigError as error:
+            if "unknown key" not in str(error):
+                raise
+            version = importlib.import_module("mosa").__version__  # beside all layers
+            raise DataError(
+                f"{error}: expected the settings of this version of mosa, {version}, found those of "
+                "another one; learn it again, or use the version that wrote it"
+            ) from error
     return record
 
 
@@ -362,11 +375,12 @@ def check_same_run(record: RunRecord, values: Mapping[str, Any], folder: str | P
         )
 
 
-def check_same_scene(record: RunRecord, values: Mapping[str, Any], path: str | Path) -> None:
+def check_same_scene(record: BodyRecord, values: Mapping[str, Any], path: str | Path) -> None:
     """The checkpoint that ckpt_path names was fitted to the data that the fit is to go on with: a body of as many particles would
     take another's law for its own. Other keys may differ. Errors: ConfigError naming those that must not."""
     without = (*BESIDE, "scene.test")
-    found = list(differing(record.settings.get("scene"), values.get("scene"), without, "scene"))
+    scenes = (each.get("scene") or {} for each in (record.settings, values))
+    found = list(differing(*scenes, without, "scene"))
     sizes = [{k: v for k, v in (each.get("simulation") or {}).items() if k in ("particles", "dx")}
              for each in (record.settings, values)]  # fmt: skip
     if found := [*found, *differing(*sizes, where="simulation")]:

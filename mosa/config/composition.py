@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,14 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import COMMANDS
-from mosa.settings import node_of
+from mosa.errors import ConfigError
+from mosa.settings import nearest, node_of
+from mosa.system.refused import causes
 
 GROUPED = "scene"
 """The group whose option a bare name chooses."""
@@ -54,13 +58,35 @@ def configuration() -> str:
     return str(inside if inside.is_dir() else package.parent / "conf")
 
 
+def keys_of(values: Any, where: str = "") -> Iterator[str]:
+    """Of a configuration in plain containers, those of its sections too."""
+    for key, value in values.items() if isinstance(values, dict) else ():
+        yield f"{where}{key}"
+        yield from keys_of(value, f"{where}{key}.")
+
+
+def said_of(error: BaseException) -> str:
+    """What Hydra says of an override that it cannot take, and the options or the nearest key, where it does not name those."""
+    said = "\n".join(dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error)))
+    if found := re.search(r"Could not load '(\w+)/(.+)'", said):
+        options = sorted(f.stem for f in Path(configuration(), found[1]).glob("*.yaml"))
+        said += f"\nAvailable options in '{found[1]}': {', '.join(options)}{nearest(found[2], options, '')}"
+    if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
+        known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
+        said = said.replace(found[0], f"{nearest(found[1], known, '')}.")
+    return said[:2000]
+
+
 def compose(*overrides: str, name: str = "train") -> DictConfig:
     """conf/<name>.yaml with overrides as on the command line: `compose("scene=rabbit", "prior=neo_hookean")`.
     Imports the modules of `extensions`, as the commands do.
 
-    Errors: Hydra's for an override that it does not know, ConfigError for an extension."""
-    with initialize_config_dir(configuration(), version_base="1.3"):
-        cfg = hydra_compose(name, overrides=list(overrides))
+    Errors: ConfigError for an override that Hydra does not know, or an extension."""
+    try:
+        with initialize_config_dir(configuration(), version_base="1.3"):
+            cfg = hydra_compose(name, overrides=list(overrides))
+    except HydraException as error:
+        raise ConfigError(said_of(error)) from error
     load_extensions(OmegaConf.to_container(cfg).get("extensions"))  # type: ignore[union-attr]
     return cfg
 

@@ -50,7 +50,7 @@ def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stag
         if not running or (need == "newton") in running:
             return None
         if own is not None:
-            runs = "Adam" if need == "newton" else "Gauss-Newton; the rates are Adam's"
+            runs = "Adam" if need == "newton" else "Gauss-Newton, and this key is Adam's"
             return f"fit.{own} runs {runs}"
         return "no stage runs Gauss-Newton" if need == "newton" else (
             "all stages run Gauss-Newton, which compares motion cues alone (fit=adam does not)")  # fmt: skip

@@ -15,7 +15,15 @@ from pydantic_core import PydanticUndefined
 
 from mosa.config.composition import configuration
 from mosa.config.leaf_settings import COMMANDS
-from mosa.settings import Settings, annotation_of, described, model_in, nearest
+from mosa.settings import (
+    Settings,
+    annotation_of,
+    arguments_of,
+    described,
+    model_in,
+    nearest,
+    untold,
+)
 
 HEAD = """# Configuration
 
@@ -97,7 +105,6 @@ def arguments() -> Iterator[tuple[str, str, str, str]]:
     """Of `prior.options`, and of the adapters, whose files say what their keys mean."""
     from mosa.modules.adapters.registry import adapter_class
     from mosa.physics.engine.law_options import LawOptions
-    from mosa.settings import arguments_of
 
     yield from rows(LawOptions, LawOptions(), "prior.options.")
     for option in ("operator", "mosa", "direct", "nclaw", "neuma", "interaction"):
@@ -117,6 +124,19 @@ def of_scenes() -> Iterator[tuple[str, str, str, str]]:
             if key != "format" and (key, about) not in said:
                 said.add((key, about))
                 yield f"scene.{key}", value, where, about
+
+
+def of_trainer() -> Iterator[tuple[str, str, str, str]]:
+    """Keys of conf/trainer/cpu.yaml, and the other arguments of Lightning's Trainer that are numbers, texts or flags."""
+    import lightning as L
+
+    begin, written = L.Trainer.__init__, in_file("trainer", "cpu")
+    kinds = arguments_of(begin, "trainer", *untold(begin))
+    others = {key: row for key, *row in rows(kinds, None)}
+    for key in written | others:
+        default, kind, _ = others.get(key, ("", "", ""))
+        value, about = written.get(key, (default, ""))
+        yield f"trainer.{key}", value, kind, about or "an argument of Lightning's Trainer"
 
 
 def table(found: Iterator[tuple[str, str, str, str]]) -> str:
@@ -144,9 +164,10 @@ def main(words: list[str]) -> None:
     if words[0] not in COMMANDS:
         print(f"expected one of {', '.join(COMMANDS)}, found {words[0]}", file=sys.stderr)
         sys.exit(2)
-    beside = (*arguments(), *of_scenes()) if words[0] == "train" else ()
-    found = [*rows(COMMANDS[words[0]], None), *beside]
     key = f"{words[1]}." if words[1:] else ""
+    found = list(rows(COMMANDS[words[0]], None))
+    if words[0] == "train":
+        found += [*arguments(), *of_scenes(), *(of_trainer() if key.startswith("trainer.") else ())]
     asked = [row for row in found if f"{row[0]}.".startswith(key)]
     # an entry of a mapping has no row of its own
     asked = asked or [row for row in found if row[1] and key.startswith(f"{row[0]}.")]

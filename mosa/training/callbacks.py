@@ -53,6 +53,8 @@ class KeepLast(Checkpoint):
     def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
         """The figures of an earlier run in this folder go: they would say that this one is complete."""
         (Path(trainer.default_root_dir) / "metrics.json").unlink(missing_ok=True)
+        if module.stage is None:
+            log.info("the fit was complete: no further step")
 
     def on_train_batch_end(
         self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
@@ -63,6 +65,11 @@ class KeepLast(Checkpoint):
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
         trainer.save_checkpoint(self.path)
+
+    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Of a fit that was complete where it went on, and had no epoch."""
+        if not self.path.is_file():
+            trainer.save_checkpoint(self.path)
 
 
 class FitProgress(L.Callback):

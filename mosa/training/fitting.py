@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
+from mosa.config.build import plain
 from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
+from mosa.settings import arguments_of, nearest, untold
 from mosa.system.refused import lacks_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
@@ -60,9 +63,12 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
         else:
             cause = error
         if str(error).startswith("Error locating target"):
+            target, why = str(entry.get("_target_")), str(cause.__cause__ or cause)
+            module, _, name = target.rpartition(".")
+            if (there := sys.modules.get(module)) is not None:
+                why = f"the module {module} has no {name}{nearest(name, dir(there), '')}"
             raise ConfigError(
-                f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found "
-                f"{entry.get('_target_')} ({cause.__cause__ or cause})"
+                f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found {target} ({why})"
             ) from error
         lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
         if isinstance(cause, ModuleNotFoundError) and cause.name:
@@ -79,6 +85,8 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
 def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     """Lightning's Trainer of conf/trainer, with the callbacks of conf/callbacks and the loggers of conf/logger. Errors: ConfigError
     naming the section."""
+    given, begin = plain(cfg.trainer), L.Trainer.__init__
+    arguments_of(begin, "trainer", "precision", *untold(begin)).part(given)
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
     trainer = made(
         "trainer",
@@ -88,7 +96,7 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
         default_root_dir=str(folder),
         plugins=[AtomicCheckpointIO(), LightningEnvironment()],
     )
-    check_trainer(trainer)
+    check_trainer(trainer, given.get("precision"))
     check_monitors(cfg, callbacks)
     return trainer
 
@@ -97,7 +105,9 @@ def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
     """Errors: ConfigError where a callback or a sweep's objective is of validation and nothing is held out."""
     if cfg.scene.get("holdout_cameras") or cfg.scene.get("holdout_frames"):
         return
-    monitors = [(f"callbacks: {type(c).__name__}", getattr(c, "monitor", None)) for c in callbacks]
+    monitors = [
+        (f"callbacks: {type(c).__name__}.monitor", getattr(c, "monitor", None)) for c in callbacks
+    ]
     for where, figure in [*monitors, ("optimized_metric", cfg.optimized_metric)]:
         if str(figure).startswith(VALIDATION):
             raise ConfigError(

@@ -14,6 +14,7 @@ import shutil
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -26,10 +27,10 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from mosa.config.composition import configuration
+from mosa.config.composition import configuration, said_of
 from mosa.errors import ConfigError, MosaError
 from mosa.system.console import fail, say_version
-from mosa.system.refused import causes, explained, let_go
+from mosa.system.refused import explained, let_go
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.training.sweep_table import FAILED, text_of, write_table
@@ -121,19 +122,14 @@ def run_command(run: Callable[[], None]) -> None:
             if (message := explained(error)) is None:
                 if begun and not isinstance(error, HydraException):
                     raise
-                said = dict.fromkeys(
-                    APPEND.sub("", str(e).split("\n    full_key")[0]) for e in causes(error)
-                )
                 message = (
-                    f"ConfigError: {chr(10).join(said)[:2000]}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds parameters of laws "
+                    f"ConfigError: {said_of(error)}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds parameters of laws "
                     "and options of adapters alone; all keys: python -m mosa.config.reference <command> [KEY]"
                 )
             print(f"\n{message}", file=sys.stderr)
             sys.exit(2)
 
 
-APPEND = re.compile(r"\nTo append to your config use \+.*")
-"""Hydra's advice on every unknown key, though most of them take no other."""
 begun: list[bool] = []
 """Whether this process has begun a job or a sweep."""
 
@@ -163,7 +159,7 @@ class Failures(Callback):
 
 def summarize(folder: str | Path) -> None:
     """The table of a sweep's runs on the screen and in its folder; of other commands there is none."""
-    if not any(Path(folder).glob("*/metrics.json")):
+    if not any(any(Path(folder).glob(each)) for each in ("*/metrics.json", f"{FAILED}/*.txt")):
         return
     try:
         rows, files = write_table(folder)
@@ -257,8 +253,9 @@ def held_back() -> Iterator[None]:
 
 
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
-    """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
-    result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    """job(cfg) and its result. A mistake of the user ends in one message and exit code 2. In a sweep
+    every error is kept for the end, the result is infinite, and the other jobs go on.
+    A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
     with tolerant_output():  # also in a launcher's worker, and for the message
         return attempted(job, cfg)
 
@@ -288,7 +285,10 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         message = f"{type(error).__name__}: {error}"
     except Exception as error:
         if (message := explained(error, folder)) is None:
-            raise
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                raise
+            traceback.print_exc()  # a mistake of a program costs a sweep its job alone
+            message = f"{type(error).__name__}: {error}"
     fail(message)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)

@@ -32,7 +32,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_stages, plain, rehearse, world_of
-from mosa.config.checkpoints import check_plain, check_same_data, known_numbers, read_checkpoint
+from mosa.config.checkpoints import (
+    check_plain,
+    check_same_data,
+    check_same_scene,
+    known_numbers,
+    read_checkpoint,
+)
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
@@ -91,8 +97,8 @@ def body_of(shape: RestShape, record: BodyRecord) -> Body:
     return body.to(shape.rest.device)
 
 
-def check_trainer(trainer: L.Trainer) -> None:
-    """Errors: ConfigError naming an argument that no fit can do with."""
+def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
+    """Errors: ConfigError naming an argument that no fit can do with. precision: as it was given, which a Trainer may change."""
     if trainer.world_size != 1:
         raise ConfigError(
             f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.world_size}: a fit "
@@ -100,7 +106,7 @@ def check_trainer(trainer: L.Trainer) -> None:
         )
     if trainer.precision not in PRECISIONS:
         raise ConfigError(
-            f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {trainer.precision!r}: the "
+            f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {precision or trainer.precision!r}: the "
             "simulation is single precision, or double by simulation.precision=64"
         )
     if trainer.accumulate_grad_batches != 1:  # the schedule of views counts a batch as a step
@@ -241,6 +247,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def configure_callbacks(self) -> list[L.Callback]:
         """Asked for first of all, before the data take their time."""
         check_trainer(self.trainer)
+        data = getattr(self.trainer, "datamodule", None)
+        if self.record is not None and hasattr(data, "cfg"):
+            check_same_scene(self.record, plain(data.cfg), "the module")
         known = any(isinstance(each, Stages) for each in self.trainer.callbacks)
         return [] if known else [Stages()]
 
@@ -315,6 +324,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 "simulation.particles"
             )
         if self.record is not None:
+            check_same_scene(record, self.record.settings, "the checkpoint")
             check_same_data(record, self.record.data, "the checkpoint")
         for name in KEPT:
             setattr(self, name, copy.copy(getattr(saved, name)))

@@ -52,7 +52,7 @@ def sweep_table(folder: str | Path) -> list[Row]:
         except (OSError, ValueError, yaml.YAMLError) as error:
             raise DataError(f"{job}: a damaged file ({error}); remove the job's folder") from error
         row["time_s"] = seconds(figures) or ""
-        rows.append(row | figures)
+        rows.append(row | {k: v for k, v in figures.items() if k not in row})  # seed is both
     if not rows:
         raise DataError(f"{folder}: expected the folder of a sweep with 0_..., 1_..., found no job")
     return rows

@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
+import mosa
 from mosa.config.build import build_adapter, build_stages, rehearse
 from mosa.config.command_settings import TrainSettings
 from mosa.errors import ConfigError
@@ -52,6 +53,17 @@ def test_every_option_of_a_group_composes(name):
 def test_a_mistyped_option_is_refused(override):
     with pytest.raises(MissingConfigException, match=override.split("=")[1]):
         composed(override)
+
+
+@pytest.mark.parametrize("override, message", [
+    ("prior=neo_hokean", "Could not find 'prior/neo_hokean'.*neo_hookean"),
+    ("callbacks=[default,early_stoping]", "options in 'callbacks': default, early_stopping.*nearest is early_stopping"),
+    ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
+])  # fmt: skip
+def test_a_mistyped_override_in_python_names_what_there_is(override, message):
+    with pytest.raises(ConfigError, match=message) as found:
+        mosa.compose(override)
+    assert "use +" not in str(found.value)
 
 
 @pytest.mark.parametrize("adapter, message", [

@@ -44,6 +44,8 @@ def test_a_script_of_one_s_own_hears_it_too(monkeypatch):
     (["losses.flow=0", "losses.rotation=0", "fit.joint.lr=0.1", "fit.clip=2"], ["losses.flow", "fit.joint.lr", "fit.clip"]),
     (["fit=adam", "losses.flow=0", "fit.joint.lr=0.1", "identification.count=5", "fit.joint.newton_iterations=3"],
      ["identification.count", "fit.joint.newton_iterations"]),
+    (["fit.joint.newton_iterations=6", "fit.prior.iterations=6", "fit.joint.iterations=0"],
+     ["fit.prior.iterations"]),
     (["adapter=mosa", "losses.flow=0", "fit.prior.lr=0.1", "fit.joint.lr=0.1", "identification.count=5"], ["fit.prior.lr"]),
     (["heterogeneity.hidden=8", "heterogeneity.most=20"], ["heterogeneity.hidden"]),
     (["heterogeneity.enabled=false", "heterogeneity.most=20"], ["heterogeneity.most"]),
@@ -55,3 +57,10 @@ def test_a_script_of_one_s_own_hears_it_too(monkeypatch):
 ])  # fmt: skip
 def test_what_has_no_effect_is_said(overrides, expected):
     assert [key for key in found(*overrides)] == [each.split("=")[0] for each in expected]
+
+
+def test_each_optimiser_has_its_own_number_of_iterations():
+    """More iterations of Gauss-Newton did nothing without more of Adam."""
+    for given, most in (([], 2), (["fit.joint.newton_iterations=6"], 6)):
+        values = OmegaConf.to_container(mosa.compose("debug=default", *given), resolve=True)
+        assert rehearse(values)[-1].iterations == most

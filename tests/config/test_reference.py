@@ -19,6 +19,10 @@ def test_a_key_that_is_not_there_is_named_with_the_nearest(capsys):
     assert capsys.readouterr().out.startswith("simulate.height = null\n    m, lowest point")
     main(["eval", "simulate.velocity.x"])
     assert capsys.readouterr().out.startswith("simulate.velocity = ")
+    main(["train", "trainer.max_epochs"])
+    assert capsys.readouterr().out.startswith("trainer.max_epochs = -1\n    the last stage ends")
+    main(["train", "trainer.profiler"])
+    assert "Lightning's Trainer" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
         main(["eval", "simulate.hight"])
     found = capsys.readouterr()

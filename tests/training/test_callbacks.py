@@ -5,6 +5,7 @@ from collections import OrderedDict, defaultdict
 from pathlib import Path
 from types import SimpleNamespace
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,7 @@ from mosa import compose
 from mosa.config.checkpoints import check_plain
 from mosa.errors import ConfigError
 from mosa.modules.fitting.stages import Stage
-from mosa.training.callbacks import Pace, StageNotes
+from mosa.training.callbacks import KeepLast, Pace, StageNotes
 from mosa.training.fitting import build_trainer
 from mosa.training.run_folder import quiet
 
@@ -96,6 +97,8 @@ def test_a_state_that_a_checkpoint_could_not_be_read_with_is_named(value):
 
 @pytest.mark.parametrize("override, message", [
     ("+trainer.precision=64-true", r"trainer\.precision: expected 32-true, found '64-true'"),
+    ("+trainer.precision=16-mixed", r"trainer\.precision: .*found '16-mixed'"),
+    ("trainer.max_epochs=many", r"trainer\.max_epochs: expected a whole number, or null, found 'many'"),
     ("+trainer.accumulate_grad_batches=2", r"trainer\.accumulate_grad_batches: expected 1, found 2"),
 ])  # fmt: skip
 def test_a_trainer_that_no_fit_can_do_with_is_refused_before_the_data(tmp_path, override, message):
@@ -107,3 +110,26 @@ def test_a_profiler_that_was_asked_for_is_heard():
     quiet()
     assert not logging.getLogger("lightning.pytorch.trainer").isEnabledFor(logging.INFO)
     assert logging.getLogger("lightning.pytorch.profilers.profiler").isEnabledFor(logging.INFO)
+
+
+class Ended(L.LightningModule):
+    """A fit that was complete where it goes on."""
+
+    stage, stage_over = None, True
+
+    def training_step(self, batch, batch_idx):
+        pytest.fail("a step")
+
+    def configure_optimizers(self):
+        return None
+
+
+def test_a_complete_fit_leaves_its_checkpoint_in_a_new_folder(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    trainer = L.Trainer(
+        accelerator="cpu", max_epochs=0, logger=False, default_root_dir=tmp_path,
+        callbacks=[KeepLast()], enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(Ended(), torch.utils.data.DataLoader([0]))
+    assert (tmp_path / "checkpoints" / "last.ckpt").is_file()
+    assert "the fit was complete: no further step" in caplog.text

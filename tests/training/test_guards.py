@@ -83,6 +83,16 @@ def test_a_body_of_another_size_is_refused_before_the_reconstruction(tmp_path):
             check_begin(cfg)
 
 
+def test_a_checkpoint_of_an_older_version_is_refused_before_the_reconstruction(tmp_path):
+    """train.py went on from it; eval.py refused it and said nothing of its age."""
+    stored = going_on()
+    stored["mosa"]["settings"]["adapter"]["strain"] = "log"
+    torch.save(stored, path := tmp_path / "last.ckpt")
+    cfg = OmegaConf.create(composed("debug=default") | {"ckpt_path": str(path)})
+    with pytest.raises(DataError, match=r"adapter\.strain: unknown key.*this version of mosa"):
+        check_begin(cfg)
+
+
 RUNNING = {
     "iteration": 1,
     "factors": [1.0],

@@ -71,7 +71,18 @@ def test_a_sweep_counts_the_jobs_that_failed_in_this_sweep(sweep, tmp_path, caps
     assert Failures.count == 0
 
 
+def test_a_mistake_of_a_program_costs_a_sweep_its_job_alone(sweep, tmp_path, capsys):
+    """A user's callback that raised ended the sweep, without its table and without failed/."""
+    (tmp_path / "3_seed-3").mkdir()
+    assert attempt(fail(ValueError("digits: x")), None) == float("inf")
+    assert "Traceback" in capsys.readouterr().err
+    Failures().on_multirun_end(sweep)
+    assert "3: ValueError: digits: x" in capsys.readouterr().err
+    assert Failures.count == 1 and "failed,ValueError: digits: x" in (tmp_path / "sweep.csv").read_text()  # fmt: skip
+
+
 def test_a_mistake_of_the_program_is_not_swallowed(sweep):
+    HydraConfig.get().mode = RunMode.RUN
     with pytest.raises(ZeroDivisionError):
         attempt(lambda _: 1 / 0, None)
     with pytest.raises(ConnectionResetError):
@@ -133,6 +144,7 @@ def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, cap
         "observed.npz" in (said := capsys.readouterr().err)
         and "its folder has been removed meanwhile" in said
     )
+    HydraConfig.get().mode = RunMode.RUN
     with pytest.raises(FileNotFoundError):  # a file that is not there is the program's
         attempt(lambda _: (tmp_path / "none").read_text(), None)
 
@@ -158,6 +170,7 @@ def test_what_the_machine_has_not_is_one_message(sweep, capsys, error):
     attempt(fail(error), None)
     said = capsys.readouterr().err.strip()
     assert len(said.splitlines()) == 1 and ("simulation.particles" in said or "ulimit -n" in said)
+    HydraConfig.get().mode = RunMode.RUN
     with pytest.raises(RuntimeError):
         attempt(fail(RuntimeError("another one")), None)
 
@@ -171,8 +184,10 @@ def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alo
         RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED"),
     ):
         monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+        HydraConfig.get().mode = RunMode.MULTIRUN
         attempt(fail(error), None)
         assert "the GPU has no memory left" in capsys.readouterr().err
+        HydraConfig.get().mode = RunMode.RUN
         for room in (None, (60e9, 150e9)):
             monkeypatch.setattr(refused, "gpu_memory", lambda r=room: r)
             with pytest.raises(type(error)):

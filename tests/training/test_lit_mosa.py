@@ -2,6 +2,12 @@
 
 from types import SimpleNamespace
 
+import lightning as L
+import pytest
+from strangers import checkpoint, saved
+
+from mosa import SceneDataModule
+from mosa.errors import ConfigError
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.training import lit_mosa
 from mosa.training.lit_mosa import LitMosa
@@ -20,3 +26,21 @@ def test_another_experiment_is_read_once_for_a_law(monkeypatch):
     assert [module.known, module.known] == ["other.ckpt"] * 2 and read == ["corotated"]
     module.body.material.law = "neo_hookean"
     assert module.known == "other.ckpt" and read == ["corotated", "neo_hookean"]
+
+
+@pytest.mark.parametrize("other", ["scene=ring", "scene.sequence=test_60"])
+def test_a_fit_goes_on_with_its_own_scene_alone(tmp_path, other):
+    """It trained silently on another scene's films, where those had as many particles."""
+    module = LitMosa.load_from_checkpoint(checkpoint(tmp_path / "tiny.ckpt"))
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    data = SceneDataModule("debug=default", other)
+    data.prepare_data = lambda: pytest.fail("the films were made")
+    for run in (trainer.fit, trainer.validate, trainer.test):
+        with pytest.raises(
+            ConfigError, match=r"a fit to this scene, found one to another.*scene\."
+        ):
+            run(module, datamodule=data)
+    with pytest.raises(ConfigError, match=r"found one to another.*scene\."):
+        LitMosa.load_from_checkpoint(tmp_path / "tiny.ckpt").on_load_checkpoint(
+            saved("debug=default", other)
+        )

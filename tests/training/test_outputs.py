@@ -33,7 +33,9 @@ def test_what_is_chosen_by_validation_needs_something_held_out():
         check_monitors(chosen, [])
     usual = OmegaConf.create({"scene": {"holdout_frames": None}, "optimized_metric": "test/rms_m"})
     check_monitors(usual, [])
-    with pytest.raises(ConfigError, match=r"EarlyStopping is val/loss: expected something"):
+    with pytest.raises(
+        ConfigError, match=r"EarlyStopping\.monitor is val/loss: expected something"
+    ):
         check_monitors(usual, [EarlyStopping("val/loss")])
     for held_out in {"holdout_frames": 1}, {"holdout_cameras": [0]}:
         check_monitors(OmegaConf.merge(chosen, {"scene": held_out}), [EarlyStopping("val/loss")])

@@ -166,7 +166,8 @@ def test_what_does_not_say_what_is_learned_may_differ(tmp_path, changed):
 def test_a_fit_that_begins_takes_away_the_figures_of_the_run_before(tmp_path):
     """They would say that it is complete, were it killed."""
     write_figures(tmp_path, {"test/rms_m": 0.5})
-    KeepLast().on_fit_start(SimpleNamespace(default_root_dir=str(tmp_path)), None)
+    fit = SimpleNamespace(stage=None)
+    KeepLast().on_fit_start(SimpleNamespace(default_root_dir=str(tmp_path)), fit)
     assert not (tmp_path / "metrics.json").exists()
 
 

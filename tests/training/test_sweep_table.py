@@ -39,6 +39,15 @@ def test_a_row_for_each_job_with_overrides_figures_time_and_failure(folder):
     assert lines[1].split() == ["0", "stvk", "0.01235", "3e+04", "0.03", "3.5", "complete"]
 
 
+def test_a_key_that_is_also_a_figure_keeps_its_column(folder):
+    """The seed, over which most sweeps go, had none: a run says its own among its figures."""
+    for number, law in enumerate(("stvk", "ogden")):
+        job = folder / f"{number}_prior-{law}"
+        (job / ".hydra" / "overrides.yaml").write_text(f"- seed={number}\n")
+        (job / "metrics.json").write_text(json.dumps({"seed": number, "test/rms_m": 0.01}))
+    assert text_of(sweep_table(folder)[:2]).splitlines()[0].split()[:2] == ["job", "seed"]
+
+
 def test_the_table_stands_at_the_end_of_a_sweep_and_is_written_by_a_command(folder, capsys):
     Failures().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}}))
     ended = capsys.readouterr()

@@ -17,7 +17,7 @@ class StageSettings(Settings):
     where: ClassVar[str] = "fit.*"
     needs: ClassVar[dict[str, str]] = {
         "newton_iterations": "newton",
-        "lr lr_networks lr_adapter lr_contact": "adam",
+        "iterations lr lr_networks lr_adapter lr_contact": "adam",
     }
 
     optimizer: Literal["auto", "gauss_newton", "adam"] = "auto"
@@ -28,7 +28,7 @@ class StageSettings(Settings):
     looks: Whole = 0
     """stage `prior` by Gauss-Newton: further calibrations, each after a second fit of the motion"""
     iterations: Whole
-    """steps of Adam; 0 leaves the stage out"""
+    """steps of Adam; 0 leaves the stage out, also by Gauss-Newton"""
     lr: Weight
     """Adam's rate, on the logarithms and logits of the global parameters"""
     lr_networks: Weight = 0.0
@@ -94,9 +94,8 @@ class Stage(StageSettings):
                 "heterogeneity.kind=modes), not networks; expected adam or auto"
             )
         chosen = "adam" if self.optimizer == "adam" or not few else "gauss_newton"
-        iterations = self.iterations
-        if chosen == "gauss_newton":
-            iterations = min(iterations, self.newton_iterations)
+        newton = chosen == "gauss_newton" and self.iterations > 0
+        iterations = self.newton_iterations if newton else self.iterations
         return self.but(optimizer=chosen, iterations=iterations)
 
     def decay(self, iteration: int) -> float:
