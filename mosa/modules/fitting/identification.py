@@ -354,18 +354,14 @@ class Identification:
 
     @torch.no_grad()
     def iterate(self) -> dict[str, float]:
-        """One iteration of Gauss-Newton: a pass, or `SERVES` with one Jacobian, each under its own
-        noise. Returns the last one's report (`GaussNewton.iterate`). `prepare` comes before it, or
-        is done here."""
-        begun = report = self._pass()
-        settled = self.iteration > NOISE_ITERATIONS and len(self.takes) == 1
-        again = SERVES - 1 if self.compares else 0
-        for _ in range(again):
+        """One iteration of Gauss-Newton: a pass, or, in the stage `prior_eta`, `SERVES` with one
+        Jacobian, each under its own noise. Returns the last one's report (`GaussNewton.iterate`).
+        `prepare` comes before it, or is done here."""
+        report = self._pass()
+        for _ in range(SERVES - 1 if self.compares else 0):
             if self.converged or report["share"] == 0:
                 break
             report = self._pass(self._served())
-        if report is not begun and begun["share"] < 1:  # its first step was cut short: not the last
-            self.converged = False
         return report
 
     def _served(self) -> Tensor:
