@@ -16,7 +16,7 @@ class EvaluationSettings(Settings):
     """built-in scenes: simulate the true law on the learner's grid (row floor)"""
     samples: Count = 8192
     """points of the chamfer distance"""
-    assignment: Count = 2048
+    assignment: Count = 512
     """points of the exact assignment of the earth mover's distance"""
     video: bool = True
     """make video.mp4 and strip.png"""

@@ -263,11 +263,11 @@ class GaussNewton:
 
     @torch.no_grad()
     def iterate(
-        self, learn: bool = True, settled: bool = True, r: Tensor | None = None
-    ) -> dict[str, float]:
+        self, learn: bool = True, settled: bool = True, r: Tensor | None = None, J: Tensor | None = None
+    ) -> dict[str, float]:  # fmt: skip
         """One iteration from where the first seat stands. learn: update the blocks' factors by the evidence first; settled: whether
         what is compared stays as it is, so that steps after the first that improves are worth their while; r: (R,) the residuals
-        there, where they are known.
+        there, where they are known; J: (R, D) a Jacobian that serves again, None for a new one.
 
         Returns cost before and after, the way that was gone over the length of the first step (0: no step improved), that length in
         standard deviations of the posterior, and each learned block's factor. Errors: SimulationDiverged where a column fails.
@@ -277,8 +277,8 @@ class GaussNewton:
         for other in self.seats[1:]:
             other.write(numbers)
         r = seat.residuals() if r is None else r
-        self.columns = None  # before the next are made: one Jacobian is in memory at a time
-        J = self.columns = self.jacobian(numbers, r)
+        self.columns = J  # None before the next are made: one Jacobian is in memory at a time
+        J = self.columns = self.jacobian(numbers, r) if J is None else J
         H, g = normal_equations(J, r)
         if not bool(torch.isfinite(H).all()):
             raise SimulationDiverged(
@@ -314,7 +314,8 @@ class GaussNewton:
                 numbers, after = moved, cost
                 break
             weights = M @ step
-            J += torch.outer(there - r - J @ step.to(r), (weights / (step @ weights)).to(r))
+            # in place: an outer product by itself would be as large as the Jacobian
+            J.addr_(there - r - J @ step.to(r), (weights / (step @ weights)).to(r))
             if improved:
                 numbers, r, after, trust = moved, there, cost, min(1.0, 2 * trust)
             else:

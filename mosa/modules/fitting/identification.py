@@ -44,6 +44,10 @@ SOFTLY = (0.05, 0.1, 0.25, 0.5)
 """Shares of the data that the first iterations on several drops count. Counted in full from the start, a few drops are explained by
 sizes that later ones do not bear out, and the fit is half done when its iterations are over: see
 docs/lab/2026-11-identification.md."""
+SERVES = 3
+"""Passes of an iteration with one Jacobian, which costs as many rollouts as there are numbers: those of the stage `prior_eta`,
+which is a comparison alone, and of the joint stage where it has settled and learns from one recording. Of several recordings each
+pass has its own. See docs/lab/2026-11-performance.md."""
 FLAT = 0.5
 """Of minus the logarithm of the posterior: an iteration of the joint stage that lowers it by less, with the sizes settled, is the
 last. Numbers that still move then lie on a floor that the data do not tell apart."""
@@ -87,6 +91,7 @@ class Identification:
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
         self.calibrating, self.iterations = stage.calibrates, stage.iterations
+        self.compares = not stage.calibrates and not stage.learns_adapter
         self.adapter = stage.learns_adapter and is_learned(body.adapter) and "operator" in parts
         self.heterogeneity = (
             not self.calibrating and is_learned(body.heterogeneity) and "stiffness" in parts
@@ -347,14 +352,47 @@ class Identification:
         self._residuals = seat.residuals()
         return self.newton.cost(seat.read(), self._residuals)
 
+    @torch.no_grad()
     def iterate(self) -> dict[str, float]:
-        """One iteration of Gauss-Newton, see `GaussNewton.iterate`; `prepare` comes before it, or is done here."""
+        """One iteration of Gauss-Newton: a pass, or, in the stage `prior_eta`, `SERVES` with one
+        Jacobian, each under its own noise. Returns the last one's report (`GaussNewton.iterate`).
+        `prepare` comes before it, or is done here."""
+        report = self._pass()
+        for _ in range(SERVES - 1 if self.compares else 0):
+            if self.converged or report["share"] == 0:
+                break
+            report = self._pass(self._served())
+        return report
+
+    def _served(self) -> Tensor:
+        """The last pass's Jacobian under the noise of the next one, for which all is prepared."""
+        ones = [
+            residuals.Fields(
+                *map(torch.ones_like, each),
+                None if each.force is None else torch.ones_like(each.force),
+            )
+            for each in self._fields(self.body)
+        ]
+
+        def units() -> Tensor:
+            return residuals.whitened(ones, self.noise, [(1.0, 1.0, 1.0)] * len(ones))
+
+        before, J = units(), self.newton.columns
+        self.prepare()
+        J *= (units() / before)[:, None]
+        if self.two_grids:  # residuals are linear in the share of their difference
+            there = self._compared(self._fields(self.body), self.grid_share() + 1)
+            J[:, -1] = there - self._residuals
+        return J
+
+    def _pass(self, J: Tensor | None = None) -> dict[str, float]:
+        """Steps with one Jacobian (R, D), None for a new one."""
         if self._residuals is None:
             self.prepare()
         r, self._residuals = self._residuals, None
         learn = 1 <= self.iteration < EVIDENCE_ITERATIONS
         settled = self.iteration >= NOISE_ITERATIONS and not self.calibrating
-        report = self.report = self.newton.iterate(learn=learn, r=r, settled=settled)
+        report = self.report = self.newton.iterate(learn=learn, r=r, settled=settled, J=J)
         self.iteration += 1
         step = report["length"] * report["share"]
         small = self.iteration > NOISE_ITERATIONS and step < self.settings.tolerance

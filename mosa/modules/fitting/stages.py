@@ -24,7 +24,7 @@ class StageSettings(Settings):
     """auto: Gauss-Newton if the stage learns no network (adapter=operator or none,
     heterogeneity.kind=modes), else Adam"""
     newton_iterations: Count = 8
-    """iterations of Gauss-Newton, at most"""
+    """iterations of Gauss-Newton, at most, each with a Jacobian of its own"""
     looks: Whole = 0
     """stage `prior` by Gauss-Newton: further calibrations, each after a second fit of the motion"""
     iterations: Whole
@@ -152,7 +152,7 @@ class FitSection(Settings):
     )
     """first stage: the calibrated prior"""
     prior_eta: StageSettings = StageSettings(
-        newton_iterations=3, iterations=20, lr=0.02, lr_networks=5e-3
+        newton_iterations=1, iterations=20, lr=0.02, lr_networks=5e-3
     )
     """second stage: with the stiffness over the body"""
     joint: StageSettings = StageSettings(

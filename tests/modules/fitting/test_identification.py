@@ -14,7 +14,13 @@ from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.modules.adapters.hyperelastic import anisotropic_basis
 from mosa.modules.fitting import identification as identification_module
 from mosa.modules.fitting.gauss_newton import Posterior, Seat
-from mosa.modules.fitting.identification import COARSER, EVIDENCE_ITERATIONS, SOFTLY, Identification
+from mosa.modules.fitting.identification import (
+    COARSER,
+    EVIDENCE_ITERATIONS,
+    NOISE_ITERATIONS,
+    SOFTLY,
+    Identification,
+)
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.parameters import as_rival, read_numbers, write_numbers
 from mosa.modules.fitting.search.backbone import compass
@@ -60,6 +66,45 @@ def test_an_iteration_that_hardly_lowers_the_cost_is_the_last(monkeypatch, lower
         lambda **_: {"before": 10.0, "after": 10.0 - lowered, "share": 1.0, "length": 3.0},
     )
     assert next((i + 1 for i in range(8) if found.iterate() and found.converged), None) == stops
+
+
+def test_the_comparison_stage_makes_its_passes_with_one_jacobian(monkeypatch):
+    found = identification(small_body(), [take_and_turn(small_body(), 0.5)])
+    passes = []
+    monkeypatch.setattr(found, "_served", lambda: "served")
+    monkeypatch.setattr(
+        found.newton,
+        "iterate",
+        lambda J, **_: (
+            passes.append(J) or {"before": 10.0, "after": 9.0, "share": 1.0, "length": 3.0}
+        ),
+    )
+    found.iterate()
+    assert passes == [None]
+    found.compares = True
+    found.iterate()
+    assert passes == [None, None, "served", "served"]
+
+
+def test_a_jacobian_that_serves_again_is_that_of_the_noise_in_use(monkeypatch):
+    found = identification(
+        small_body(), [take_and_turn(small_body(numbers=fibres(0.3)), 0.5, frames=SHORT)]
+    )
+    found.newton.steps = 0  # it stays where it stands
+    found.iterate()
+    found.iteration, prepare = NOISE_ITERATIONS, found.prepare
+
+    def with_other_noise() -> float:
+        found.noise = [
+            tuple(each * factor for each, factor in zip(scales, (2.0, 3.0, 0.5)))
+            for scales in found.noise
+        ]
+        return prepare()
+
+    monkeypatch.setattr(found, "prepare", with_other_noise)
+    served = found._served().clone()
+    fresh = found.newton.jacobian(found.newton.seats[0].read(), found._residuals)
+    assert float((served - fresh).norm()) < 1e-6 * float(fresh.norm())
 
 
 def test_the_first_iterations_on_several_drops_count_a_part_of_the_data():
