@@ -59,6 +59,7 @@ def test_what_a_file_composes_is_known_and_has_all_defaults(name):
     missing = {
         "eval": ["ckpt_path=a"],
         "splats": ["ply=a"],
+        "material": ["unit=Pa"],
         "capture": ["videos=a", "poses=b", "output=c"],
     }
     values = composed(*missing.get(name, []), name=name)

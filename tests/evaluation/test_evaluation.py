@@ -61,7 +61,7 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
 
     monkeypatch.setattr(evaluation, "rollouts", rollouts)
     monkeypatch.setattr(evaluation, "sequence_metrics", measured)
-    figures, kept = evaluate(body, sequences, None, EvaluationSettings())
+    figures, kept = evaluate(body, sequences, SimpleNamespace(forces=()), EvaluationSettings())
     worst = {key for key, value in figures.items() if value in (float("inf"), -float("inf"))}
     expected = {"train/rms_m", "train/psnr_crop", *(f"prior_eta/{part}/{name}" for part in ("test", "test/a")
                                                      for name in ("rms_m", "psnr_crop"))}  # fmt: skip
@@ -74,4 +74,4 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
     assert "adapted" not in kept["train"] and "adapted" in kept["test/a"]
     lost |= {prefix: {"adapted", "prior", "prior_eta"} for prefix in lost}
     with pytest.raises(SimulationDiverged, match="train, test/a"):
-        evaluate(body, sequences, None, EvaluationSettings())
+        evaluate(body, sequences, SimpleNamespace(forces=()), EvaluationSettings())

@@ -35,7 +35,7 @@ def test_every_stage_learns(fitted):
 
 def test_the_body_is_what_lies_behind_the_static_gaussians(fitted):
     run, _ = fitted
-    found = run.reconstruction
+    found = run.data.reconstruction
     assert found.geometry["geometry/free_frames"] == 1
     assert "geometry/deviation_m" not in found.geometry  # which the hull's refinement gives
     assert len(found.static.means) <= 800 and 20 <= len(found.splats.means) <= 120
