@@ -188,6 +188,8 @@ def test_a_warning_and_what_ended_a_run_are_in_the_log(tmp_path, capsys, monkeyp
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
+        # a command that an earlier test ran in this process has left it on
+        logging.captureWarnings(False)
         console.begin_log()
         try:
             warnings.warn("three holes in a matte", stacklevel=1)
