@@ -45,9 +45,8 @@ SOFTLY = (0.05, 0.1, 0.25, 0.5)
 sizes that later ones do not bear out, and the fit is half done when its iterations are over: see
 docs/lab/2026-11-identification.md."""
 SERVES = 3
-"""Passes of an iteration with one Jacobian, which costs as many rollouts as there are numbers: those of the stage `prior_eta`,
-which is a comparison alone, and of the joint stage where it has settled and learns from one recording. Of several recordings each
-pass has its own. See docs/lab/2026-11-performance.md."""
+"""Passes with one Jacobian, which costs as many rollouts as there are numbers, in the stage `prior_eta`, which is a comparison
+alone. In the joint stage fewer Jacobians cost accuracy: docs/lab/2026-11-performance.md."""
 FLAT = 0.5
 """Of minus the logarithm of the posterior: an iteration of the joint stage that lowers it by less, with the sizes settled, is the
 last. Numbers that still move then lie on a floor that the data do not tell apart."""
