@@ -18,6 +18,9 @@ from mosa.experiments.report.printed import printed_table
 from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
 from mosa.system.whole_files import write_table, write_whole
 
+SHOWN = 4
+"""Jobs that were not run, of which the page shows the names."""
+
 
 def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, command: str) -> Path:
     """Tables and pictures of the jobs that are complete into `folder`; the Markdown page's path."""
@@ -73,11 +76,14 @@ def markdown_page(
     if experiment.printed is not None:
         parts.append(printed_table(experiment.printed))
     missing = [
-        f"{'failed' if job.failed else 'not run'}: {job.folder.name} ({' '.join(job.overrides)})"
-        + (f": {job.failed}" if job.failed else "")
+        f"failed: {job.folder.name} ({' '.join(job.overrides)}): {job.failed}"
         for job in jobs
-        if not job.finished
+        if not job.finished and job.failed
     ]
+    waiting = [job.folder.name for job in jobs if not job.finished and not job.failed]
+    if waiting:
+        shown = ", ".join(waiting[:SHOWN]) + (", ..." if len(waiting) > SHOWN else "")
+        missing.append(f"not run: {len(waiting)} jobs ({shown})")
     parts.append("\n".join(f"- {line}" for line in (*lines, *missing)))
     return "\n\n".join(parts) + "\n"
 
