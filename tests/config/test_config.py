@@ -127,6 +127,13 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
     } == {"adam"}
 
 
+@pytest.mark.parametrize("overrides, law", [("", "auto"), ("fit=adam", "corotated"), ("fit=paper", "corotated"),
+    ("debug=default", "corotated"), ("fit=adam prior=stvk", "stvk"), ("debug=default prior=auto", "auto")])  # fmt: skip
+def test_laws_are_compared_where_none_is_named(overrides, law):
+    # by Gauss-Newton: Adam, and a smoke run, take one
+    assert composed(*overrides.split())["prior"]["law"] == law
+
+
 @pytest.mark.parametrize("override, adapter, expected", [(None, None, 3), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
                                                          (None, "hyperelastic", 0)])  # fmt: skip
 def test_a_calibration_looks_again_where_it_is_all_there_is(override, adapter, expected):
