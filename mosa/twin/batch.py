@@ -14,7 +14,7 @@ from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import Driven
 from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
-from mosa.settings import Count, Expected, typed
+from mosa.settings import Count, Expected, shown, typed
 from mosa.system.limits import counted
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.start import (
@@ -25,6 +25,9 @@ from mosa.twin.start import (
     check_wants_no_gradients,
     start_in,
 )
+
+FARTHEST = 100.0
+"""Of a law's numbers, which are logarithms or shares: the largest single precision is e^89."""
 
 
 class TwinWorlds:
@@ -42,8 +45,10 @@ class TwinWorlds:
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
             shape = (count, len(read_numbers(body)))
-            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers"
+            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers within {FARTHEST:g}"
             laws = numbers("laws", laws, said, shape)
+            if float(laws.detach().abs().max()) > FARTHEST:
+                raise ConfigError(f"laws: expected {said}, found {shown(laws)}")
         self.body = body
         self.world = world
         self.frame_dt = frame_dt

@@ -21,7 +21,7 @@ from mosa.modules.body.material import RELATIVE, Material, unit_of
 from mosa.physics.constitutive.damping import DAMPED, DAMPING
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import AS_USUAL
-from mosa.settings import is_number
+from mosa.settings import is_number, typed
 from mosa.twin.presets import preset
 
 DENSEST = (0.1, 1e5)
@@ -41,8 +41,8 @@ class TwinMaterial:
     def __init__(self, twin: Any) -> None:
         object.__setattr__(self, "_twin", twin)
 
-    def __setattr__(self, name: str, value: float) -> None:
-        self.set(None, **{name: value})
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.set(**{name: value})
 
     @property
     def _body(self) -> Body:
@@ -127,6 +127,7 @@ class TwinMaterial:
         return mandel_matrix(J).detach()
 
     # ---------------------------------------------------------------- setting
+    @typed
     def set(self, law: str | None = None, **values: float) -> None:
         """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa
         s], and all of `parameters`.

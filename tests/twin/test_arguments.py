@@ -75,7 +75,7 @@ GRID = {"dx": 0.05, "substeps": 40, "frame_dt": 1 / 30}
     ("gravity", ("abc", (0, 1), (0, math.nan, 0), 5, None, (0, 1e9, 0))),
     ("up", ("abc", (0, 1), (0, math.nan, 0), 5, [[0, 1, 0]])), ("ground", (5, "sticky", {}, True, [0.0])),
     (r"ground\.height", (Ground("a"), Ground(math.nan), Ground(True), Ground(10**400), Ground(None))),
-    ("plane 0: friction", (Ground(0.0, "separate", "a"), Ground(0.0, "touch", -1), Ground(0.0, "touch", math.nan))),
+    (r"ground\.friction", (Ground(0.0, "separate", "a"), Ground(0.0, "touch", -1), Ground(0.0, "touch", math.nan))),
     ("planes", (5, [5], "ab", {}, [None])), ("colliders", (5, [5], "ab", [{"type": "sphere"}], [None])),
     ("box", (5, "ab", [[0, 0, 0]], [[1, 1, 1], [0, 2, 2]], torch.full((2, 3), math.nan))),
     ("options", (5, None, {}, "a", True)), ("device", ("foo", "cuda:99", 5, None, "")),

@@ -14,7 +14,7 @@ from pydantic import InstanceOf
 from mosa.data.checks.cameras import check_agreement, holes_report
 from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
-from mosa.data.checks.tangents import check_pictures
+from mosa.data.checks.tangents import check_copies, check_pictures
 from mosa.data.formats.footage import TIME_JITTER, Footage
 from mosa.data.hull import at_border
 from mosa.errors import ConfigError, DataError
@@ -170,6 +170,7 @@ def check_film(scene: Scene, label: str) -> None:
         check_agreement(scene, label, frame)
     check_fall(scene, label)
     if not scene.synthetic:
+        check_copies(scene, label)
         check_outlines(scene, label)
         check_particles(scene, label)
 
