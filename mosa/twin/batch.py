@@ -14,7 +14,7 @@ from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import Driven
 from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
-from mosa.settings import Count, Expected, shown, typed
+from mosa.settings import Count, Expected, typed
 from mosa.system.limits import counted
 from mosa.twin.episode import Episode, Stepped, TwinState
 from mosa.twin.start import (
@@ -46,9 +46,7 @@ class TwinWorlds:
         if laws is not None:
             shape = (count, len(read_numbers(body)))
             said = f"one for each of {count} worlds, a tensor {shape} of finite numbers within {FARTHEST:g}"
-            laws = numbers("laws", laws, said, shape)
-            if float(laws.detach().abs().max()) > FARTHEST:
-                raise ConfigError(f"laws: expected {said}, found {shown(laws)}")
+            laws = numbers("laws", laws, said, shape, most=FARTHEST)
         self.body = body
         self.world = world
         self.frame_dt = frame_dt

@@ -265,13 +265,10 @@ class Episode:
         """Put some worlds back to a start, each to its own of `starts`, None for those it had; the others stay as they are. Time
         is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
         """
-        if self.worlds is None or not all(type(b) is int and 0 <= b < self.worlds for b in which):
+        assert self.worlds is not None
+        if not all(0 <= b < self.worlds for b in which):
             raise ConfigError(
-                f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}"
-            )
-        if starts is not None and len(starts) != len(which):
-            raise ConfigError(
-                f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}"
+                f"restart: expected numbers of worlds below {self.worlds}, found {list(which)}"
             )
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
@@ -485,11 +482,8 @@ def _worlds(
         raise ConfigError(
             "simulation.adaptive: expected false with many worlds, which take the same substeps"
         )
-    if laws is not None and (len(laws) != len(starts) or options["model"] != body.model()):
-        raise ConfigError(
-            f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
-            f"{'' if options['model'] == body.model() else ' of another variant'}"
-        )
+    if laws is not None and options["model"] != body.model():
+        raise ConfigError("laws: expected those of variant adapted, found another variant")
     if gravity is None:
         pulls = [world.gravity.to(body.rest)] * len(starts)
     else:

@@ -5,11 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
-from annotated_types import Interval
+from annotated_types import Interval, MinLen
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.planes import MODES
-from mosa.settings import Expected, Section, Text, Weight, described, is_number, such
+from mosa.settings import (
+    Expected,
+    Number,
+    Section,
+    Settings,
+    Text,
+    Weight,
+    described,
+    is_number,
+    such,
+)
 from mosa.settings import fits as is_one
 
 FARTHEST = 1e6
@@ -44,15 +54,13 @@ def rows(valid: Callable[[Any], bool], least: int = 1) -> Callable[[Any], bool]:
 
 three = numbers(3)
 Length = Annotated[float, Interval(gt=0, le=FARTHEST)]
-Three = told(f"three finite numbers within {FARTHEST:g}", three)
-Turn = told(
-    "(ax, ay, az, degrees), four finite numbers with a non-zero axis",
-    numbers(4, lambda v: any(v[:3])),
-)
-Velocity = told(
-    f"three finite numbers within {FARTHEST:g}, or such a triple for each piece",
-    lambda v: three(v) or rows(three)(v),
-)
+Three = Annotated[Any, Expected(f"three finite numbers within {FARTHEST:g}"), such(three)]
+Turn = Annotated[Any, Expected("(ax, ay, az, degrees), four finite numbers with a non-zero axis"),
+                 such(numbers(4, lambda v: any(v[:3])))]  # fmt: skip
+Velocity = Annotated[Any, Expected(f"three finite numbers within {FARTHEST:g}, or such a triple for each piece"),
+                     such(lambda v: three(v) or rows(three)(v))]  # fmt: skip
+Times = Annotated[Any, Expected("ascending finite numbers"),
+                  such(lambda v: rows(is_number)(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:])))]  # fmt: skip
 KEYS = {
     "radius": Length, "length": Length, "size": told("three lengths above 0 [m]", numbers(3, lambda v: min(v) > 0)),
     "path": Text, "spacing": Length, "scale": Length,
@@ -60,31 +68,32 @@ KEYS = {
     "mode": Literal[tuple(MODES)], "friction": Weight, "name": Text, "position": Three, "rotation": Turn,
     "motion": Section, "normal": told("a non-zero vector of three finite numbers", numbers(3, any)),
 }  # fmt: skip
-MOTION = {
-    "velocity": Velocity, "angular_velocity": Velocity,
-    "times": told("ascending finite numbers",
-                  lambda v: rows(is_number)(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:]))),
-    "waypoints": told("a list of poses {time, position, rotation}", rows(lambda v: isinstance(v, Mapping), 0)),
-}  # fmt: skip
-WAYPOINT = {"time": told("a finite number", is_number), "position": Three, "rotation": Turn}
+
+
+class Waypoint(Settings):
+    """A pose of a motion's waypoints."""
+
+    time: Number
+    position: Three
+    rotation: Turn | None = None
+
+
+Waypoints = Annotated[list[Waypoint], Expected("two poses {time, position, rotation} or more"), MinLen(2)]  # fmt: skip
+
+
+class MotionKeys(Settings):
+    """An entry's motion; values without one count as absent."""
+
+    velocity: Velocity | None = None
+    angular_velocity: Velocity | None = None
+    times: Times | None = None
+    waypoints: Waypoints | None = None
 
 
 def check_keys(item: Mapping, where: str) -> None:
     """Errors: ConfigError naming the first key whose value is not of its kind; keys without a value count as absent."""
     fits(item, KEYS, where)
-    motion = item.get("motion") or {}
-    fits(motion, MOTION, f"{where}.motion")
-    for i, point in enumerate(motion.get("waypoints") or ()):
-        at = f"{where}.motion.waypoints[{i}]"
-        if missing := [key for key in ("time", "position") if point.get(key) is None]:
-            raise ConfigError(
-                f"{at}: expected time and position in each, found one without {missing[0]!r}"
-            )
-        if unknown := [key for key in point if key not in WAYPOINT]:
-            raise ConfigError(
-                f"{at}.{unknown[0]}: unknown key; expected one of {', '.join(WAYPOINT)}"
-            )
-        fits(point, WAYPOINT, at)
+    MotionKeys.read(item.get("motion") or {}, f"{where}.motion")
 
 
 def fits(values: Mapping, kinds: Mapping[str, Any], where: str) -> None:

@@ -81,6 +81,11 @@ def check_contact(where: str, mode: str, friction: float) -> None:
         raise ConfigError(f"{where}mode: expected one of {', '.join(MODES)}, found {mode!r}")
     if not (is_number(friction) and friction >= 0):
         raise ConfigError(f"{where}friction: expected a finite number >= 0, found {friction}")
+    check_rubbing(where, mode, friction)
+
+
+def check_rubbing(where: str, mode: str, friction: float) -> None:
+    """Errors: ConfigError for friction in a mode without."""
     if friction > 0 and mode not in RUBBING:
         raise ConfigError(
             f"{where}friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}"
