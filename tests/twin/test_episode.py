@@ -719,3 +719,26 @@ def test_a_solid_that_no_body_would_feel_is_refused(solid, action):
         made.reset(colliders=solids, substeps=8)
         for _ in range(3):
             made.step(None if action is None else {"fast": action})
+
+
+def test_a_state_of_another_clock_is_refused_and_of_other_substeps_goes_on():
+    """Own motions of solids go by the time that has passed, whatever the substeps of the reset were."""
+    made, solid = twin(), PUSHER | {"motion": {"velocity": [0.2, 0, 0]}}
+    made.reset(colliders=[solid], substeps=20)
+    for _ in range(3):
+        kept = made.step().state
+    made.reset(colliders=[solid], substeps=40)
+    made.state = kept
+    after = made.step().state
+    moved = (after.position - kept.position).norm()
+    assert float(moved) == pytest.approx(0.2 * FRAME_DT) and float(after.time) == pytest.approx(
+        4 * FRAME_DT
+    )
+    made.reset(colliders=[solid], control_dt=FRAME_DT / 2)
+    with pytest.raises(
+        ConfigError, match=r"^state\.time: expected 3 steps of 0\.00833333 s, found"
+    ):
+        made.state = kept
+    for wrong in ([1], None, {"x": kept.x}):
+        with pytest.raises(DataError, match=r"^state: expected C_affine, F, .*, found"):
+            TwinState.read(wrong)

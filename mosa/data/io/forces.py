@@ -158,7 +158,9 @@ def force_figures(
     for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
         at = mean.abs().argmax()
         most = float(mean[at].abs()) or curve.largest  # 0 in all frames: the body was not met yet
-        off, allowed = (float((v / most).square().mean().sqrt()) for v in (felt - mean, sd))
+        off, allowed = (
+            float((v.detach() / most).square().mean().sqrt()) for v in (felt - mean, sd)
+        )
         names = ("rms_share", "allowed_share", "measured_N", "predicted_N")
         values = (off, allowed, float(mean[at]), float(felt[at]))
         found |= {f"forces/{curve.of}/{name}": value for name, value in zip(names, values)}

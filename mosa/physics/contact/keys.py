@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
-from annotated_types import Interval, MinLen
+from annotated_types import Interval
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.planes import MODES
@@ -61,6 +61,8 @@ Velocity = Annotated[Any, Expected(f"three finite numbers within {FARTHEST:g}, o
                      such(lambda v: three(v) or rows(three)(v))]  # fmt: skip
 Times = Annotated[Any, Expected("ascending finite numbers"),
                   such(lambda v: rows(is_number)(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:])))]  # fmt: skip
+Poses = Annotated[Any, Expected("two poses {time, position, rotation} or more"),
+                  such(rows(lambda v: isinstance(v, Mapping), 2))]  # fmt: skip
 KEYS = {
     "radius": Length, "length": Length, "size": told("three lengths above 0 [m]", numbers(3, lambda v: min(v) > 0)),
     "path": Text, "spacing": Length, "scale": Length,
@@ -78,22 +80,21 @@ class Waypoint(Settings):
     rotation: Turn | None = None
 
 
-Waypoints = Annotated[list[Waypoint], Expected("two poses {time, position, rotation} or more"), MinLen(2)]  # fmt: skip
-
-
 class MotionKeys(Settings):
     """An entry's motion; values without one count as absent."""
 
     velocity: Velocity | None = None
     angular_velocity: Velocity | None = None
     times: Times | None = None
-    waypoints: Waypoints | None = None
+    waypoints: Poses | None = None
 
 
 def check_keys(item: Mapping, where: str) -> None:
     """Errors: ConfigError naming the first key whose value is not of its kind; keys without a value count as absent."""
     fits(item, KEYS, where)
-    MotionKeys.read(item.get("motion") or {}, f"{where}.motion")
+    motion = MotionKeys.read(item.get("motion") or {}, f"{where}.motion")
+    for i, point in enumerate(motion.waypoints or ()):
+        Waypoint.read(point, f"{where}.motion.waypoints[{i}]")
 
 
 def fits(values: Mapping, kinds: Mapping[str, Any], where: str) -> None:
