@@ -487,7 +487,9 @@ def test_errors_of_starts_and_states():
         match=r"laws: expected one for each of 2 worlds, a tensor .*found shape \(3, 5\)",
     ):
         made.worlds(2, torch.zeros(3, 5))
-    for laws in (torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool()):
+    for laws in (
+        torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool(), torch.zeros(2, 22).cfloat(),
+    ):  # fmt: skip
         with pytest.raises(
             ConfigError,
             match=r"laws: expected one for each of 2 worlds, a tensor \(2, 22\) of finite numbers",
@@ -511,6 +513,8 @@ def test_errors_of_starts_and_states():
         match=r"state\.substeps: expected a whole number of at least 0 and at most 2\^53, found 4611",
     ):
         made.state = replace(made.state, substeps=torch.tensor(2**62))
+    with pytest.raises(ConfigError, match=r"state\.substeps: .* of at least 0 .*, found -1"):
+        made.state = replace(made.state, substeps=torch.tensor(-1))
     with pytest.raises(
         ConfigError,
         match=r"state\.x: expected a dense tensor torch.float64 \(120, 3\), found Tensor \(torch.float64 .* \(7, 3\)",

@@ -50,13 +50,7 @@ def read_views(
     for camera, (K, w2c) in calibration.items():
         rows, full, lens, cut = [], None, None, 0.0
         for frame in frames:
-            path = file(camera, frame)
-            if not path.is_file():
-                raise DataError(
-                    f"{path}: image not found, though {listing} lists camera {camera} and other cameras have "
-                    f"frame {frame}; restore it or restrict scene.frames"
-                )
-            pixels = read_image(path)
+            pixels = read_image(path := file(camera, frame))
             if full is None:
                 full, first = pixels.shape[1::-1], path.name
                 size = scaled_size(*full, scale)

@@ -7,20 +7,18 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
-from mosa.errors import ConfigError
 from mosa.physics.contact.planes import MODES
-from mosa.settings import (
+from mosa.settings import (  # fmt: skip
     Expected,
     Number,
     Section,
     Settings,
     Text,
     Weight,
-    described,
+    check_values,
     is_number,
     such,
 )
-from mosa.settings import fits as is_one
 
 FARTHEST = 1e6
 """Lengths and places [m] of a solid, and its speeds [m/s]: beyond, single precision has no centimetres left."""
@@ -91,16 +89,7 @@ class MotionKeys(Settings):
 
 def check_keys(item: Mapping, where: str) -> None:
     """Errors: ConfigError naming the first key whose value is not of its kind; keys without a value count as absent."""
-    fits(item, KEYS, where)
+    check_values({key: value for key, value in item.items() if value is not None}, KEYS, where)
     motion = MotionKeys.read(item.get("motion") or {}, f"{where}.motion")
     for i, point in enumerate(motion.waypoints or ()):
         Waypoint.read(point, f"{where}.motion.waypoints[{i}]")
-
-
-def fits(values: Mapping, kinds: Mapping[str, Any], where: str) -> None:
-    """Errors: ConfigError naming the first value that is not of its kind."""
-    for key, kind in kinds.items():
-        if values.get(key) is not None and not is_one(kind, values[key]):
-            raise ConfigError(
-                f"{where}.{key}: expected {described(kind)}, found {str(values[key])[:120]!r}"
-            )
