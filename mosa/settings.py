@@ -309,10 +309,9 @@ def numbers_described(kind: Any, told: list[Any]) -> str | None:
     """Of a whole number or a number with bounds; None for another type."""
     if kind not in (int, float):
         return None
-    low = max(((b.ge if isinstance(b, Ge) else b.gt), isinstance(b, Gt)) for b in told
-              if isinstance(b, (Ge, Gt))) if any(isinstance(b, (Ge, Gt)) for b in told) else None  # fmt: skip
-    high = min(((b.le if isinstance(b, Le) else b.lt), not isinstance(b, Lt)) for b in told
-               if isinstance(b, (Le, Lt))) if any(isinstance(b, (Le, Lt)) for b in told) else None  # fmt: skip
+    lows = [(b.ge if isinstance(b, Ge) else b.gt, isinstance(b, Gt)) for b in told if isinstance(b, (Ge, Gt))]  # fmt: skip
+    highs = [(b.le if isinstance(b, Le) else b.lt, isinstance(b, Le)) for b in told if isinstance(b, (Le, Lt))]  # fmt: skip
+    low, high = max(lows, default=None), min(highs, default=None)
     number = (lambda v: f"{v:g}") if kind is float else str
     parts = ["a number" if kind is float else "a whole number"]
     if low is not None:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.data.checks.silhouettes import uncovered_share, whole_views
+from mosa.data.checks.silhouettes import uncovered_and_islands, whole_views
 from mosa.data.hull import Volume, hull_bounds, occupancy, visual_hull
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
@@ -236,7 +236,7 @@ def check_place(path: str, splats: Splats, scene: Scene) -> None:
     inside = occupancy(splats.means, mattes, cameras) > 0.25
     within = float((splats.opacities * inside).sum() / splats.opacities.sum())
     reach = 2 * float(splats.scales.mean())
-    filled = 1 - float(uncovered_share(splats.means, reach, mattes, cameras).median())
+    filled = 1 - float(uncovered_and_islands(splats.means, reach, mattes, cameras)[0].median())
     said = (
         f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "
         f"and {filled:.0%} of the mattes filled: check the file's unit, axes and place in the scene's world"

@@ -80,10 +80,9 @@ class TwinState:
     def read(cls, tensors: Mapping[str, Tensor]) -> TwinState:
         """Errors: DataError naming what is missing or unknown."""
         names = {f.name for f in fields(cls)}
-        if set(tensors) != names:
-            raise DataError(
-                f"state: expected {', '.join(sorted(names))}, found {', '.join(sorted(tensors))}"
-            )
+        if not isinstance(tensors, Mapping) or set(tensors) != names:
+            found = ", ".join(map(str, tensors)) if isinstance(tensors, Mapping) else shown(tensors)
+            raise DataError(f"state: expected {', '.join(sorted(names))}, found {found}")
         return cls(**tensors)
 
 
@@ -221,13 +220,21 @@ class Episode:
                 raise ConfigError(
                     f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}"
                 )
+        frames, time = int(state.frames), float(state.time)
+        if not math.isclose(time, frames * self.frame_dt, abs_tol=1e-9 * self.frame_dt):
+            raise ConfigError(
+                f"state.time: expected {frames} steps of {self.frame_dt:g} s, found {time:g} s: reset with the control_dt "
+                "that the state was made with"
+            )
         particles = ParticleState(
             *(getattr(state, name).to(now.x.device) for name in State._fields)
         )
         particles = entered(
             particles, self._stepper.axes, particles.v.dtype, self._stepper.prepared.numerics.dx
         )
-        self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
+        # own motions go by time, and the other reset may have had other substeps
+        done = int(state.substeps) if self.substeps is None else frames * self.substeps
+        self._moment = Moment(particles, done, frames, float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
@@ -258,13 +265,10 @@ class Episode:
         """Put some worlds back to a start, each to its own of `starts`, None for those it had; the others stay as they are. Time
         is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
         """
-        if self.worlds is None or not all(type(b) is int and 0 <= b < self.worlds for b in which):
+        assert self.worlds is not None
+        if not all(0 <= b < self.worlds for b in which):
             raise ConfigError(
-                f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}"
-            )
-        if starts is not None and len(starts) != len(which):
-            raise ConfigError(
-                f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}"
+                f"restart: expected numbers of worlds below {self.worlds}, found {list(which)}"
             )
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
@@ -478,11 +482,8 @@ def _worlds(
         raise ConfigError(
             "simulation.adaptive: expected false with many worlds, which take the same substeps"
         )
-    if laws is not None and (len(laws) != len(starts) or options["model"] != body.model()):
-        raise ConfigError(
-            f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
-            f"{'' if options['model'] == body.model() else ' of another variant'}"
-        )
+    if laws is not None and options["model"] != body.model():
+        raise ConfigError("laws: expected those of variant adapted, found another variant")
     if gravity is None:
         pulls = [world.gravity.to(body.rest)] * len(starts)
     else:

@@ -50,7 +50,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
-from mosa.settings import Count, Expected, Number, Seed, such, typed
+from mosa.settings import Count, Expected, Number, Positive, Seed, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
@@ -364,6 +364,10 @@ class Twin:
             met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         else:
             rollout, world, met = rollout_of(motion), self.episode.world, len(motion[0].position)
+        if rollout.x.shape[1:] != self.body.rest.shape:
+            raise ConfigError(
+                f"rollout: expected one of this body's {len(self.body.rest)} particles, found {rollout!r}"
+            )
         if met and colliders is None:
             solids = world.solids
         else:
@@ -382,7 +386,7 @@ class Twin:
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        size: Pixels = 400, fps: float | None = None, view: Sequence[float] | None = None,
+        size: Pixels = 400, fps: Positive | None = None, view: Sequence[float] | None = None,
         shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;

@@ -111,6 +111,8 @@ def assembled(
     found = {}
     for name, number, quaternion, shift in images:
         where = f"{file}, image {name}"
+        if name in found:
+            raise DataError(f"{where}: expected every image once, found it twice")
         if number not in cameras:
             raise DataError(
                 f"{where}: expected one of the cameras {sorted(cameras)}, found CAMERA_ID {number}"
@@ -171,7 +173,7 @@ def whole(words: list[str], where: str) -> list[int]:
 def lines_of(file: Path) -> list[tuple[int, str]]:
     """Numbered lines that are no comments, empty ones included. Errors: DataError."""
     try:
-        lines = file.read_text().splitlines()
+        lines = file.read_text("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise DataError(
             f"{file}: expected the text of a COLMAP model, found a damaged file ({error}); export it again"
@@ -190,6 +192,8 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
                 f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line[:80]!r}"
             )
         number, width, height = whole([words[0], *words[2:4]], where)
+        if number in found:
+            raise DataError(f"{where}: expected every CAMERA_ID once, found {number} twice")
         found[number] = intrinsics(words[1], width, height, numbers(words[4:], where), where)
     return found
 

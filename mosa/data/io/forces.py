@@ -55,6 +55,11 @@ class ForceCurve:
         rough = rough[torch.isfinite(rough)]
         return float((rough.square().mean() / 6).sqrt()) if len(rough) else 0.0
 
+    @property
+    def largest(self) -> float:
+        """[N] of all components."""
+        return float(self.forces.nan_to_num().abs().max())
+
     def means(self, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
         """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its
         standard deviation (T - 1, 3) [N], with what a grid gets wrong). The samples are joined by
@@ -77,8 +82,7 @@ class ForceCurve:
         mean[blanks[at][1:] > blanks[at - 1][:-1]] = torch.nan
         inside = (self.times[:, None] > ends[:-1]) & (self.times[:, None] <= ends[1:])
         count = inside.sum(0).clamp_min(1)[:, None]
-        largest = float(self.forces[torch.isfinite(self.forces)].abs().max())
-        sd = (self.noise() ** 2 / count + (MODEL_ERROR * largest) ** 2).sqrt().expand_as(mean)
+        sd = (self.noise() ** 2 / count + (MODEL_ERROR * self.largest) ** 2).sqrt().expand_as(mean)
         return mean, sd
 
 
@@ -114,10 +118,10 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
         torch.tensor(found.get(name, blank), dtype=torch.float64) for name in COLUMNS
     )
     forces = torch.stack(columns, 1)
-    if len(times) < 2 or not bool((times.diff() > 0).all()):
+    if len(times) < 2 or not bool((times.diff() > 0).all() & times.isfinite().all()):
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
     there = forces[~torch.isnan(forces)]
-    if not len(there) or not 0 < float(there.abs().max()) <= LARGEST:
+    if not len(there) or not 1 / LARGEST < float(there.abs().max()) <= LARGEST:
         raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")
     return ForceCurve(of, times, forces, sd)
 
@@ -153,7 +157,10 @@ def force_figures(
     found: dict[str, float] = {}
     for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
         at = mean.abs().argmax()
-        off, allowed = (float((v / mean[at]).square().mean().sqrt()) for v in (felt - mean, sd))
+        most = float(mean[at].abs()) or curve.largest  # 0 in all frames: the body was not met yet
+        off, allowed = (
+            float((v.detach() / most).square().mean().sqrt()) for v in (felt - mean, sd)
+        )
         names = ("rms_share", "allowed_share", "measured_N", "predicted_N")
         values = (off, allowed, float(mean[at]), float(felt[at]))
         found |= {f"forces/{curve.of}/{name}": value for name, value in zip(names, values)}

@@ -34,6 +34,9 @@ JUMP = 0.3
 FROZEN, DIGITS = 0.1, 4
 """Of the largest step, and last digits: a point that moves by more before and after does not stand
 still between."""
+TORN, STILL = 3.0, 0.01
+"""Of the steps beside: a step of all points that is so many times longer is no motion. Where these
+are below that share of it, the points were at rest, and were moved."""
 GAP = 2.5
 """Samples apart between which a recording is interpolated; a longer gap stays one."""
 
@@ -118,12 +121,25 @@ def check_moves_on(found: Recording, where: str) -> None:
         warnings.simplefilter("ignore")  # of frames in which nothing is seen
         place = np.nanmedian(found.positions, 0)
         size = np.nanmax(np.nanmax(place, 0) - np.nanmin(place, 0))
-        alone = np.linalg.norm(moves - np.nanmedian(moves, 1, keepdims=True), axis=-1)
+        together = np.nanmedian(moves, 1)
+        alone = np.linalg.norm(moves - together[:, None], axis=-1)
+        middle = np.nanmedian(found.positions, 1)
+        wide = np.nanmax(np.nanmax(middle, 0) - np.nanmin(middle, 0))
     for t, m in np.argwhere(alone > JUMP * size)[:1]:
         raise DataError(
             f"{where}: expected points that move with the others, found {found.names[m]!r} "
             f"{alone[t, m]:.2g} m away from them within one sample at {found.times[t + 1]:g} s: "
             "exchanged names? Leave these rows out"
+        )
+    step = np.nan_to_num(np.linalg.norm(together, axis=-1), nan=np.inf)
+    beside = np.stack([np.roll(step, k)[2:-2] for k in (-2, -1, 1, 2)]).max(0)
+    jumps = (TORN * beside < step[2:-2]) & (step[2:-2] < beside / STILL)
+    for t in 2 + np.flatnonzero(jumps & (step[2:-2] > FROZEN * wide))[:1]:
+        warnings.warn(
+            f"{where}: expected points that move on, found all of them {step[t]:.2g} m away within one "
+            f"sample at {found.times[t + 1]:g} s, in a motion of {beside[t - 2]:.2g} m a sample: "
+            "was a stretch cut out? Leave out what is before it or after it",
+            stacklevel=3,
         )
 
 

@@ -97,6 +97,9 @@ class Collider:
     motion: Motion | Trajectory | Points = field(default_factory=Motion)
     name: str = ""
 
+    def __post_init__(self) -> None:
+        check_contact(f"collider {self.name}: " if self.name else "", self.mode, self.friction)
+
 
 class PackedColliders(NamedTuple):
     """K colliders for the kernels, without their motion. shapes: (K, 11): size 3, friction, lattice origin 3 and spacing,
@@ -123,7 +126,6 @@ def pack_colliders(
             raise ConfigError(
                 f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}"
             )
-        check_contact(f"{where}: ", collider.mode, collider.friction)
         if isinstance(shape, Particles):
             shapes[i, packing.SIZE] = NOWHERE
         for j, value in enumerate(_sizes(shape)):
@@ -244,8 +246,6 @@ def collider_of(item: Mapping, where: str) -> Collider:
         raise ConfigError(f"{where}: a {kind} needs {', '.join(missing)}")
     check_keys(item, where)
     item = {key: value for key, value in item.items() if value is not None}
-    mode, friction = item.get("mode", "sticky"), float(item.get("friction", 0.0))
-    check_contact(f"{where}.", mode, friction)
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
@@ -254,10 +254,10 @@ def collider_of(item: Mapping, where: str) -> Collider:
             shape = make(
                 *(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed)
             )
-        motion = _motion(item)
+        contact = {key: item[key] for key in ("mode", "friction", "name") if key in item}
+        return Collider(shape, motion=_motion(item), **contact)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
-    return Collider(shape, mode, friction, motion, str(item.get("name", "")))
 
 
 def _motion(item: dict) -> Motion:
@@ -275,18 +275,12 @@ def _motion(item: dict) -> Motion:
             raise ConfigError(
                 "motion: waypoints stand alone, without position, velocity or angular_velocity"
             )
-        if len(points) < 2:
-            raise ConfigError(f"motion.waypoints: expected at least two poses, found {len(points)}")
         turns = [
             axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation
             for p in points
         ]
         return Motion.waypoints(
             [p["time"] for p in points], [p["position"] for p in points], torch.stack(turns)
-        )
-    if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:
-        raise ConfigError(
-            f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints"
         )
     return Motion(item.get("position", (0.0, 0.0, 0.0)), rotation, **motion)
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import ConfigError
@@ -39,6 +40,12 @@ def check_clear(
         distance = signed_distance(collider.shape, at)
         pressed = max(pressed, 0.5 * spacing - float(distance.min()))
         deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
+        if half_width(collider.shape) < 0.5 * spacing:  # it may stand between particles
+            pairs = torch.from_numpy(
+                cKDTree(at.numpy()).query_pairs(1.2 * spacing, output_type="ndarray")
+            )
+            between = signed_distance(collider.shape, at[pairs].mean(1)) < 0
+            deep[-1][pairs[between]] = True
         places.append(str([round(p, 4) for p in position.tolist()]))
     share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:

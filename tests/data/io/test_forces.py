@@ -180,3 +180,21 @@ def test_a_force_of_nothing_is_refused(tmp_path):
     (tmp_path / "bad.csv").write_text("t,force\n0,1\n1,2\n")
     with pytest.raises(DataError, match=r"bad.csv: .*found the columns t, force"):
         forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
+
+
+def test_a_body_that_is_met_later_has_finite_shares(tmp_path):
+    """Frames in which the measured force is 0 throughout; and a clock that never ends."""
+    _, _, rollout = pressed()
+    times = torch.tensor([0.0, 1.0, 2.0]).double()
+    curve = ForceCurve(
+        "high", times, torch.tensor([[0.0] * 3, [0.0] * 3, [0.0, 5.0, 0.0]]).double()
+    )
+    with pytest.warns(UserWarning, match="world.forces: high"):
+        found = force_figures(rollout, [curve], PRESS, FRAME_DT)
+    felt = rollout.reactions.mean(1)[:, 1, :3].double()
+    assert found["forces/high/rms_share"] == pytest.approx(float(felt.square().mean().sqrt()) / 5)
+    for rows in ("0,1.0\ninf,1.0", "-inf,1.0\n0,1.0"):
+        path = tmp_path / "a.csv"
+        path.write_text(f"time,fy\n{rows}\n")
+        with pytest.raises(DataError, match="time: expected at least two ascending"):
+            read_forces(path, "high")
