@@ -117,13 +117,15 @@ def umat(found: Source) -> str:
     principal: list[str] = []
     stress, stiff, along, slopes = derivatives(found.energy)
     names = [
+        "psi",
         *(f"S({k + 1})" for k in range(6)),
         *(f"CC({i + 1},{j + 1})" for i in range(6) for j in range(i, 6)),
     ]
     for into, targets, expressions in (
-        (entries, names, [*stress, *stiff]),
-        (principal, [*(f"s({k + 1})" for k in range(3)), *(f"ds({i + 1},{j + 1})" for i in range(3) for j in range(3))],
-         [*along, *slopes]),
+        (entries, names, [found.energy.entries, *stress, *stiff]),
+        (principal, ["psi", *(f"s({k + 1})" for k in range(3)),
+                     *(f"ds({i + 1},{j + 1})" for i in range(3) for j in range(3))],
+         [found.energy.stretches, *along, *slopes]),
     ):  # fmt: skip
         steps, rest = reduced(expressions)
         into += [f"double precision :: {name}" for name, _ in steps]
