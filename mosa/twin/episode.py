@@ -34,7 +34,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.numerics import State, flat
 from mosa.physics.time.clock import Moment
 from mosa.settings import shown
-from mosa.twin.start import check_wants_no_gradients
+from mosa.twin.start import Crossings, check_wants_no_gradients
 from mosa.types import ParticleState, Rollout, dense, in_brief
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -172,6 +172,8 @@ class Episode:
             self._driven = torch.zeros(len(self.colliders), dtype=torch.bool)
             self._moment, self._poses = moment, self._placed(moment, 0)
             self._starts, self._first = starts, self._poses
+            self._crossings = None if self.worlds is not None else Crossings(self.colliders)
+            self._look()
             self._said: dict[int, Tensor] = {}  # rotation vectors of the last actions
 
     @property
@@ -259,6 +261,7 @@ class Episode:
             )
             self._moment, self._driven = moment, driven
             self._poses = after[0] if after else self._poses
+            self._look()
             return Stepped(self.state, reactions)
 
     def restart(self, which: Sequence[int], starts: Sequence[Start] | None = None) -> TwinState:
@@ -300,6 +303,11 @@ class Episode:
             self._poses = poses
             self._moment = moment._replace(state=state)
             return self.state
+
+    def _look(self) -> None:
+        """Of one world alone."""
+        if self._crossings is not None:
+            self._crossings.look(*self._poses)
 
     def _gradients(self):
         return torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled())

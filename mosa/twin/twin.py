@@ -64,6 +64,7 @@ from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
 from mosa.twin.shown_solids import with_solids
 from mosa.twin.start import (
+    Crossings,
     Seconds,
     Variant,
     check_frames,
@@ -203,6 +204,11 @@ class Twin:
             )  # fmt: skip
             fixed = ready.simulator.substeps if ready.timing is None else None
             warn_of_creep(self.body, world, self.frame_dt, fixed)
+            if len(world.colliders) > 1:
+                crossings = Crossings(world.colliders)
+                times = self.frame_dt * torch.arange(frames)
+                for moment in zip(*poses(world.colliders, times)):
+                    crossings.look(*moment)
             return ready.simulate(frames, world.solids, progress=lambda _: bar.update())
 
     @typed

@@ -84,7 +84,7 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 
 
 def parameter_table(figures: Mapping[str, float], law: str) -> str:
-    """Markdown table of identified parameters: after calibration, after the joint stage, each with its relative error where the
+    """Markdown table of identified parameters: of the prior and of the learned law, each with its relative error where the
     truth is known. law: of the prior, which says what they are measured in."""
     names = [
         k.split("/", 1)[1]
@@ -97,7 +97,7 @@ def parameter_table(figures: Mapping[str, float], law: str) -> str:
     rows = [[with_unit(law, n), *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
             for n in names]  # fmt: skip
-    return markdown(["parameter", "prior", "joint", "error of prior", "error of joint"], rows)
+    return markdown(["parameter", "prior", "adapted", "error of prior", "error of adapted"], rows)
 
 
 def with_unit(law: str, name: str) -> str:
@@ -258,7 +258,10 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         lines.append(
             f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}."
         )
-    if "posterior/stiffest_cone_deg" in figures:
+    # a part that the choice of the law left out was not measured
+    taken = chosen(held_back) if held_back else "operator+stiffness"
+    left_out = {"operator", "stiffness"} - set(taken.split("+"))
+    if "posterior/stiffest_cone_deg" in figures and "operator" not in left_out:
         ratio, half = figures["id/stiffness_ratio"], figures["posterior/stiffest_cone_deg"]
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
         spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
@@ -280,7 +283,7 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         ("operator", "numbers of the anisotropic stiffness"),
         ("stiffness", "modes of the stiffness over the body"),
     ):
-        if f"posterior/{name}_numbers" in figures:
+        if f"posterior/{name}_numbers" in figures and name not in left_out:
             lines.append(
                 f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
                 f"{figures[f'posterior/{name}_determined']:.1f}; the others keep their prior values."

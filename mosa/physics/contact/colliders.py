@@ -6,6 +6,7 @@ B-spline grid lets material on both sides of a thinner one touch.
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -284,6 +285,9 @@ def _motion(item: dict) -> Motion:
         )
     return Motion(item.get("position", (0.0, 0.0, 0.0)), rotation, **motion)
 
+TURNS = (30, 45, 60, 90, 120, 135, 180, 270, 360)
+"""[degrees] whose radians are asked about."""
+
 
 def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
     """Rotation vector (3,) [rad] of (ax, ay, az, degrees). Errors: ConfigError, also for a
@@ -299,6 +303,13 @@ def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
         raise ConfigError(
             f"rotation: expected (ax, ay, az, degrees), found {value.tolist()}, a quaternion by "
             "its norm of 1"
+        )
+    found = [abs(float(value[3])) / math.radians(each) for each in TURNS]
+    if near := [each for each, ratio in zip(TURNS, found) if abs(ratio - 1) < 1e-3]:
+        warnings.warn(
+            f"rotation: expected degrees, found {float(value[3]):g}, which is {near[0]} degrees in "
+            "radians",
+            stacklevel=5,
         )
     return value[:3] / value[:3].norm() * torch.deg2rad(value[3])
 
