@@ -56,8 +56,9 @@ def test_a_mistyped_option_is_refused(override):
 
 
 @pytest.mark.parametrize("override, message", [
-    ("prior=neo_hokean", "Could not find 'prior/neo_hokean'.*neo_hookean"),
-    ("callbacks=[default,early_stoping]", "options in 'callbacks': default, early_stopping.*nearest is early_stopping"),
+    ("prior=neo_hokean", r"prior: expected .*, found neo_hokean; .*neo_hookean; .* hydra\.searchpath"),
+    ("callbacks=[default,early_stoping]", "callbacks: expected one of default, early_st.*nearest is early_stopping"),
+    ("hydra/launcher=rai", "hydra/launcher: expected one of .*basic"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):

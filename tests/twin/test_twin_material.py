@@ -65,6 +65,8 @@ def test_a_value_out_of_range_is_named():
         material.nu = 0.7
     with pytest.raises(ConfigError, match="density: expected"):
         material.density = -1
+    with pytest.warns(UserWarning, match=r"^density: 1.1 kg/m\^3 is lighter .* in g/cm\^3"):
+        material.density = 1.1
     with pytest.raises(ConfigError, match="preset: expected one of jelly, "):
         material.preset("steel")
     assert material.nu == pytest.approx(NU)
