@@ -140,6 +140,28 @@ def test_the_command_writes_reads_and_checks(tmp_path, capsys):
     assert json.loads((tmp_path / "law" / "law.json").read_text())["values"]["kept"] < 1
 
 
+def test_an_energy_of_another_package_is_exported(tmp_path, monkeypatch, capsys):
+    form = "from mosa.export.energies import ENERGIES, neo_hookean\nENERGIES['stvk_paper'] = neo_hookean"
+    (tmp_path / "own_energy.py").write_text(form)
+    monkeypatch.syspath_prepend(tmp_path)
+    law = {"law": "stvk_paper", "parameters": {"E": 1e5, "nu": 0.3}, "stiffness": None}
+    (tmp_path / "material.json").write_text(json.dumps(law))
+
+    def code(*words) -> int:
+        with pytest.raises(SystemExit) as ended:
+            main([str(tmp_path / "material.json"), str(tmp_path / "law"), "--check", "0", *words])
+        return ended.value.code
+
+    try:
+        assert code() == 2 and "by a module of --extensions" in capsys.readouterr().err
+        assert code("--extensions", "own_enrgy") == 2
+        assert "extensions: expected a module" in capsys.readouterr().err
+        assert code("--extensions", "own_energy") == 0
+        assert 'Law "stvk_paper"' in (tmp_path / "law" / "umat.f90").read_text()
+    finally:
+        ENERGIES.pop("stvk_paper", None)
+
+
 def test_a_law_without_an_energy_is_refused(tmp_path):
     yielding = Material("von_mises", {"E": 1e5, "nu": 0.3, "yield_stress": 1e3})
     with pytest.raises(ConfigError, match="found von_mises"):
