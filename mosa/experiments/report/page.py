@@ -94,6 +94,8 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
                     for claim in experiment.claims
                 )
             )
+        if experiment.plot == "map":
+            parts += [said] if (said := ranges(experiment, tables)) else []
         if provenance:
             parts.append(f"[Tables, seeds, machine and command]({results.name}/{name}.md)")
     beside = [
@@ -109,6 +111,22 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
     whole = [INTRODUCTION, markdown(header, lines), *parts]
     write_whole(page, "\n\n".join(whole) + "\n")
     return page
+
+
+def ranges(experiment: Experiment, tables: Tables) -> str:
+    """A line for each figure of a map: its smallest and largest cell, and where they are."""
+    lines = []
+    for figure in experiment.figures:
+        cells = [
+            (cell.mean, f"{cell.text(figure.decimals)} ({row}, {column})")
+            for row, columns in tables.get(figure.label, {}).items()
+            for column, cell in columns.items()
+            if cell is not None and math.isfinite(cell.mean)
+        ]
+        if cells:
+            axes = f"{experiment.rows}, {experiment.columns}"
+            lines.append(f"- {figure.label} ({axes}): {min(cells)[1]} to {max(cells)[1]}")
+    return "\n".join(lines)
 
 
 def read_title(page: Path) -> str:
