@@ -10,7 +10,15 @@ import torch
 
 from mosa.cli.export_law import main
 from mosa.errors import ConfigError, DataError
-from mosa.export.checking import check_ufl, check_umat, check_warp, deformations, energy_of, expected, umat_of
+from mosa.export.checking import (
+    check_ufl,
+    check_umat,
+    check_warp,
+    deformations,
+    energy_of,
+    expected,
+    umat_of,
+)
 from mosa.export.energies import ENERGIES, ENTRIES, STRETCHES, energy
 from mosa.export.source import as_json, read_material, source
 from mosa.export.texts import ufl_text, umat, warp_text

@@ -102,7 +102,9 @@ def test_radians_and_millimetres_are_asked_about(given, said):
 
 
 def test_a_solid_in_millimetres_that_holds_the_body_is_named():
-    with pytest.raises(ConfigError, match=r"it reaches 86.6 m from its origin \(lengths are in metre"):
+    with pytest.raises(
+        ConfigError, match=r"it reaches 86.6 m from its origin \(lengths are in metre"
+    ):
         twin().reset(colliders=[{"type": "box", "size": [100, 100, 100], "position": [0, 0.1, 0]}])
 
 
@@ -154,7 +156,9 @@ def test_jaws_that_close_through_each_other_are_named_once():
     assert told(lambda: stepped(0.021)) == []
     (found,) = told(lambda: stepped(0.012))
     assert "found left and right 16 mm inside each other" in found
-    moving = [{**each, "motion": {"velocity": [-10 * each["position"][0], 0, 0]}} for each in plates]
+    moving = [
+        {**each, "motion": {"velocity": [-10 * each["position"][0], 0, 0]}} for each in plates
+    ]
     assert len(told(lambda: twin().simulate(frames=6, **STILL, colliders=moving))) == 1
 
 

@@ -285,6 +285,7 @@ def _motion(item: dict) -> Motion:
         )
     return Motion(item.get("position", (0.0, 0.0, 0.0)), rotation, **motion)
 
+
 TURNS = (30, 45, 60, 90, 120, 135, 180, 270, 360)
 """[degrees] whose radians are asked about."""
 
