@@ -61,7 +61,7 @@ def test_what_is_set_is_simulated():
 
 def test_a_value_out_of_range_is_named():
     material = twin(adapter=False).material
-    with pytest.raises(ConfigError, match=r"^nu: expected a number between"):
+    with pytest.raises(ConfigError, match=r"^nu: expected a number between .*incompressible=true"):
         material.nu = 0.7
     with pytest.raises(ConfigError, match="density: expected"):
         material.density = -1
