@@ -189,15 +189,17 @@ def start_in(
             stacklevel=4,
         )
     for i, each in enumerate(world.colliders):
+        if isinstance(each.shape, (HalfSpace, Particles)):
+            continue
         expected, far = f"{field}[{i}]: expected a", LARGE * body.size
+        away = float((pose_at(each.motion)[0] - center.detach().cpu()).norm()) - reach(each.shape)
         if isinstance(each.shape, SignedDistanceField) and (size := each.shape.extent) > far:
             warnings.warn(
                 f"{expected} mesh about as large as the body of {body.size:.3g} m, "
                 f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
                 stacklevel=4,
             )
-        away = float((pose_at(each.motion)[0] - center.detach().cpu()).norm()) - reach(each.shape)
-        if away > far and not isinstance(each.shape, (HalfSpace, Particles)):
+        elif away > far:
             warnings.warn(
                 f"{expected} solid within reach of the body of {body.size:.3g} m, found it "
                 f"{away:.3g} m away: lengths are in metres",
