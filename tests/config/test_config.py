@@ -209,6 +209,10 @@ def test_forces_need_a_fit_that_compares_them(tmp_path):
         f"world.forces=[{{of:grip,file:{tmp_path}/cell.csv}}]",
     ]
     rehearse(composed(*world))
+    of_another = [world[0], world[1].replace(".csv", ".csv,recording:test_60")]
+    rehearse(composed(*of_another, "scene.also_train=[test_60]"))
+    with pytest.raises(ConfigError, match=r"recording: .* \(there are none\).* found 'test_60'"):
+        rehearse(composed(*of_another))
     with pytest.raises(ConfigError, match=r"world\.forces: expected stages that run Gauss-Newton"):
         rehearse(composed(*world, "fit=adam"))
     with pytest.raises(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from warnings import warn
@@ -33,18 +33,25 @@ class Measured(Settings):
     of: Text
     file: Text
     sd: Positive | None = None
+    recording: Text | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ForceCurve:
     """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on,
     ascending; forces: (n, 3) [N], NaN for a component that was not measured; sd [N]: noise of one
-    sample, None: found from the samples' roughness."""
+    sample, None: found from the samples' roughness; recording: in which it was measured, None: the first."""
 
     of: str
     times: Tensor
     forces: Tensor
     sd: float | None = None
+    recording: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its figures."""
+        return self.of if self.recording is None else f"{self.recording}/{self.of}"
 
     def noise(self) -> float:
         """Standard deviation of one sample [N]: of white noise the second differences have six
@@ -89,14 +96,24 @@ class ForceCurve:
 def forces_from_config(
     items: Sequence[Mapping[str, Any]] | None,
 ) -> tuple[ForceCurve, ...]:
-    """Of entries {of: name of a collider or driven set, file: csv, sd [N]}.
+    """Of entries {of: name of a collider or driven set, file: csv, sd [N], recording: name}.
 
     Columns of the file: time [s], fx, fy, fz [N].
     A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
     entry, DataError the file."""
     check("world.forces", items, Entries | None)
     read = [Measured.read(item, f"world.forces[{i}]") for i, item in enumerate(items or ())]
-    return tuple(read_forces(Path(each.file), each.of, each.sd) for each in read)
+    return tuple(
+        replace(read_forces(Path(each.file), each.of, each.sd), recording=each.recording)
+        for each in read
+    )
+
+
+def curves_of(curves: Sequence[ForceCurve], recording: str, first: bool) -> list[ForceCurve]:
+    """Those that were measured in a recording; first: whether it is the one that a run begins with."""
+    return [
+        each for each in curves if each.recording in ((recording, None) if first else (recording,))
+    ]
 
 
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
@@ -163,10 +180,10 @@ def force_figures(
         )
         names = ("rms_share", "allowed_share", "measured_N", "predicted_N")
         values = (off, allowed, float(mean[at]), float(felt[at]))
-        found |= {f"forces/{curve.of}/{name}": value for name, value in zip(names, values)}
+        found |= {f"forces/{curve.name}/{name}": value for name, value in zip(names, values)}
         if off > FAR * allowed:
             warn(
-                f"world.forces: {curve.of}: the predicted force is off by {off:.0%} of the largest measured, allowed are "
+                f"world.forces: {curve.name}: the predicted force is off by {off:.0%} of the largest measured, allowed are "
                 f"{allowed:.1%}. Expected: the force that the body exerts (check the sign), world axes, N, times from frame 0",
                 stacklevel=2,
             )

@@ -2,6 +2,7 @@
 from a press alone."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -119,25 +120,32 @@ def test_a_fit_says_how_far_its_force_is_from_the_measured_one(recwarn):
     )
 
 
-@pytest.mark.parametrize("kinds, told", [((True, False, False), True), ((False,) * 3, False)])
-def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told):
-    """A force that says nothing changes no error, though its rows stand between those of two gains."""
+@pytest.mark.parametrize(
+    ("kinds", "told", "recording"),
+    [((True, False, False), True, "second"), ((False,) * 3, False, None)],
+)
+def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told, recording):
+    """A force that says nothing changes no error, though its rows stand between those of two gains, or of two recordings."""
     times = torch.linspace(0, 1, 5, dtype=torch.float64)
     numbers = 0.1 * torch.randn(19, generator=torch.Generator().manual_seed(0)).double()
     begins = pressed()[1]
-    take = take_of(small_body(numbers=numbers), begins, FRAMES, PRESS)
+    take = take_of(small_body(numbers=numbers), begins, 5, PRESS)
+    takes = [take, SimpleNamespace(**vars(take) | {"name": "second"})][
+        : 1 + (recording is not None)
+    ]
+    curve = ForceCurve("high", times, torch.zeros(5, 3).double(), 1e9, recording)
     found = {}
-    for name, curves in {
-        "with": (ForceCurve("high", times, torch.zeros(5, 3).double(), 1e9),), "without": (),
-    }.items():  # fmt: skip
+    for name, curves in {"with": (curve,), "without": ()}.items():  # fmt: skip
         if not (told or curves):
             continue
         joint = Identification(
-            small_body(E=1.2 * E), [take], replace(PRESS, forces=curves),
+            small_body(E=1.2 * E), takes, replace(PRESS, forces=curves),
             Stage(name="joint", iterations=1, lr=0.1), Criterion(name="both"),
             IdentificationSettings(grid_error=0.0, threads=1), kinds,
         )  # fmt: skip
         joint.iterate()
+        felt = [each.force is not None for each in joint._fields(joint.body)]
+        assert felt == [bool(curves) and take is takes[-1] for take in takes for _ in range(2)]
         found[name] = joint.held_back()
     if told:
         assert found["with"] == pytest.approx(found["without"], rel=1e-6)
