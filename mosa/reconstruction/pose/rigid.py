@@ -251,7 +251,10 @@ LIGHT_STEP = 0.02
 """Differences for the Jacobian change a number of the light by this."""
 LIGHT_RIDGE = 1e-3
 """Of the mean of the light's own diagonal: what pulls it to the light that was known before. One pose hardly tells some of its
-numbers, and what they are then does not show."""
+numbers."""
+TOLD = 30
+"""Independent data that a frame's misfit counts as, beside a light whose numbers are known to within 1 before: a body that hardly
+turned does not tell its light, which shows once it turns further."""
 
 
 def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor) -> Tensor:
@@ -271,7 +274,7 @@ def lit_equations(
     every = torch.cat((moved, columns[None]), 1)
     found = equations(seen - level.target[:1].flatten(1), every)
     cost, gradient, matrix = (part[0] for part in found)
-    ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
+    ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean() + 2 * cost / TOLD
     matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
     gradient[6:] += ridge * (light - before)
     return cost + 0.5 * ridge * (light - before).square().sum(), gradient, matrix
