@@ -209,16 +209,17 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
 
 
 def check_forces(world: Mapping[str, Any], recordings: Sequence[str] = ()) -> None:
-    """Driven sets and measured forces, before anything takes long. recordings: names of those beside the first. Errors: ConfigError
-    naming the key, DataError the file."""
+    """Driven sets and measured forces, before anything takes long. recordings: names of those beside
+    the first. Errors: ConfigError naming the key, DataError the file."""
     solids = colliders_from_config(world.get("colliders") or ())
     sets = driven_from_config(world.get("driven") or ())
     curves = forces_from_config(world.get("forces"))
     columns_of(curves, solids_of(solids, sets))
     if unknown := [c.recording for c in curves if c.recording not in (None, *recordings)]:
         raise ConfigError(
-            f"world.forces: recording: expected the name of a recording of scene.also_train or scene.test "
-            f"({', '.join(recordings) or 'there are none'}), none for that of scene.path, found {unknown[0]!r}"
+            "world.forces: recording: expected the name of one of scene.also_train or scene.test "
+            f"({', '.join(recordings) or 'there are none'}), no key for that of scene.path, found "
+            f"{unknown[0]!r}"
         )
 
 

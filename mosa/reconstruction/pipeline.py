@@ -400,7 +400,7 @@ def follow(
         return posed(rest.to("cpu"), *(p.cpu() for p in pose))
 
     def turned(rest: Splats) -> tuple[Splats, tuple[Tensor, ...]]:
-        """In the pose, in the light that falls on it there: the one that frame 0 shows; with its normals there and this light."""
+        """In the pose, in the light that falls on it there, which frame 0 shows; (its normals, the light)."""
         normals = surface_normals(rest.means, reconstruction.splats.means)
         still = [c for c in views if bool((scene.mattes[c, 0] > 0.5).any())]
         light = light_of(

@@ -40,7 +40,8 @@ class Measured(Settings):
 class ForceCurve:
     """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on,
     ascending; forces: (n, 3) [N], NaN for a component that was not measured; sd [N]: noise of one
-    sample, None: found from the samples' roughness; recording: in which it was measured, None: the first."""
+    sample, None: found from the samples' roughness; recording: in which it was measured, None:
+    the first."""
 
     of: str
     times: Tensor
@@ -110,7 +111,7 @@ def forces_from_config(
 
 
 def curves_of(curves: Sequence[ForceCurve], recording: str, first: bool) -> list[ForceCurve]:
-    """Those that were measured in a recording; first: whether it is the one that a run begins with."""
+    """Those that were measured in a recording; first: whether a run begins with it."""
     return [
         each for each in curves if each.recording in ((recording, None) if first else (recording,))
     ]

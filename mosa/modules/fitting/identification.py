@@ -233,7 +233,7 @@ class Identification:
         return found
 
     def _differences(self, rollout: Rollout, index: int) -> residuals.Fields:
-        """Of a rollout from what was seen of take `index`, and the forces that were measured there."""
+        """Of a rollout from what was seen of take `index`, and from the forces measured there."""
         take = self.takes[index]
         curves, turn = curves_of(self.world.forces, take.name, index == 0), take.start.rotation
         found = residuals.fields(rollout, take.cues, turn, self.chosen, take.response)

@@ -35,8 +35,9 @@ NETWORK = {"bases", "hidden", "basis_layers", "coefficient_layers", "space_frequ
 
 @dataclass(frozen=True)
 class Scaffold:
-    """Gaussians in frame 0 with the modes at their positions and, where they are the particles, their neighbourhoods; normals:
-    (M, 3) of the surface at them, and light: (8,) that stays while they move (`lighting.py`), None where it is not known."""
+    """Gaussians in frame 0 with the modes at their positions and, where they are the particles, their
+    neighbourhoods; normals: (M, 3) of the surface at them, and light: (8,) that stays while they move
+    (`lighting.py`), None where it is not known."""
 
     splats: Splats
     modes: Modes
@@ -45,10 +46,10 @@ class Scaffold:
     light: Tensor | None = None
 
     def colors(self, deformation: Tensor | None) -> Tensor:
-        """(S, M, 3) under deformation gradients (S, M, 3, 3), (1, M, 3) where they are the same under all.
+        """(S, M, 3) under deformation gradients (S, M, 3, 3); (1, M, 3) where they are the same under all.
 
-        The light's part of them follows the motion that is being found: else a bright side would go along with a body that
-        turns, and hold back a motion by which it turns."""
+        The light's part of them follows the motion that is being found: else a bright side would go
+        along with a body that turns, and hold back a motion by which it turns."""
         colors = self.splats.colors[None]
         if self.light is None or self.normals is None or deformation is None:
             return colors

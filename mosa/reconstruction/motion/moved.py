@@ -41,8 +41,9 @@ log = logging.getLogger(__name__)
 class MovingParts:
     """What a motion of particles is fitted with. Found when it is first asked for, and kept: the second look takes the first one's.
 
-    splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both fits; place: of a body of
-    known shape in frame 0; lit: the static ones' normals in frame 0 and the light, where it is known.
+    splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both
+    fits; place: of a body of known shape in frame 0; lit: the static ones' normals in frame 0 and the
+    light, where it is known.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class MovingParts:
         return self.carriers(self.static, *self.lit)
 
     def carriers(self, seen: Splats, *lit: Tensor) -> Scaffold:
-        """Gaussians of frame 0 that the particles' motion carries; lit: normals and light, as of `Scaffold`."""
+        """Gaussians of frame 0 that the particles carry; lit: normals and light, as of `Scaffold`."""
         return Scaffold(seen, self.scaffold.modes.at(seen.means, self.splats.means), None, *lit)
 
     @property

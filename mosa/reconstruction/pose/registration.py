@@ -145,8 +145,8 @@ RELIT = (0, 2)
 
 
 LIT = 30
-"""Iterations with a light at most. A disc of faint colours, begun 3 and 6 degrees off, was 1.1 and 2.8 degrees off after 8 of them and
-0.6 and 0.3 after 24."""
+"""Iterations with a light at most. A disc of faint colours, begun 3 and 6 degrees off, was 1.1 and
+2.8 degrees off after 8 of them, and 0.6 and 0.3 after 24."""
 
 
 def refine_lit(

@@ -108,8 +108,8 @@ class RigidBody:
     def render(
         self, poses: Poses, cameras: Cameras, background: Tensor, light: Tensor | None = None
     ) -> Tensor:
-        """Colour and alpha of every pose in every view, (K, V, H, W, 4). light: (8,) that stays while the body turns
-        (`lighting.py`), None where the colours go along."""
+        """Colour and alpha of every pose in every view, (K, V, H, W, 4). light: (8,) that stays while
+        the body turns (`lighting.py`), None where the colours go along."""
         views, colors = len(cameras), self.colors[None]
         chunk = max(1, PIXELS_AT_ONCE // (views * cameras.width * cameras.height))
         parts = []
@@ -182,8 +182,8 @@ def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
 def pose_columns(
     body: RigidBody, level: Level, poses: Poses, *, central: bool, light: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle times the body's radius [m];
-    light: as of `RigidBody.render`.
+    """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle
+    times the body's radius [m]; light: as of `RigidBody.render`.
 
     One-sided differences (`central` false) cost half and move the optimum a little: good enough on the way, not at the end."""
     count, h = len(poses.center), STEP_PX * level.pixel
@@ -253,8 +253,8 @@ LIGHT_RIDGE = 1e-3
 """Of the mean of the light's own diagonal: what pulls it to the light that was known before. One pose hardly tells some of its
 numbers."""
 TOLD = 30
-"""Independent data that a frame's misfit counts as, beside a light whose numbers are known to within 1 before: a body that hardly
-turned does not tell its light, which shows once it turns further."""
+"""Independent data that a frame's misfit counts as, beside a light whose numbers are known to within
+1 before: a body that hardly turned does not tell its light, which shows once it turns further."""
 
 
 def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor) -> Tensor:

@@ -46,7 +46,8 @@ def shading(light: Tensor, normals: Tensor, rotations: Tensor) -> Tensor:
 
 
 def moved_shading(light: Tensor, normals: Tensor, deformation: Tensor) -> Tensor:
-    """The same (..., M) under deformation gradients (..., M, 3, 3), whose cofactors turn normals; with their gradient."""
+    """The same (..., M) under deformation gradients (..., M, 3, 3), whose cofactors turn normals; with
+    their gradient."""
     a, b, c = deformation.unbind(-1)
     x, y, z = normals[:, 0, None], normals[:, 1, None], normals[:, 2, None]
     cross = torch.linalg.cross

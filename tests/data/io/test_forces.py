@@ -125,7 +125,8 @@ def test_a_fit_says_how_far_its_force_is_from_the_measured_one(recwarn):
     [((True, False, False), True, "second"), ((False,) * 3, False, None)],
 )
 def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told, recording):
-    """A force that says nothing changes no error, though its rows stand between those of two gains, or of two recordings."""
+    """A force that says nothing changes no error, though its rows stand between those of two gains,
+    or after those of another recording."""
     times = torch.linspace(0, 1, 5, dtype=torch.float64)
     numbers = 0.1 * torch.randn(19, generator=torch.Generator().manual_seed(0)).double()
     begins = pressed()[1]
