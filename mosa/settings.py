@@ -389,7 +389,7 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
 def call(where: str, build: Callable[..., Any], keys: Mapping[str, Any], **given: Any) -> Any:
     """build(**given, **keys), the keys checked by its annotations. Errors: ConfigError for a key that it does not take, that is
     missing, or whose value is of another type."""
-    checked = arguments_of(build, where, *given).read(keys, where)
+    checked = arguments_of(build, "", *given).read(keys, where)  # once for all places
     return build(**given, **{key: getattr(checked, key) for key in keys})
 
 
