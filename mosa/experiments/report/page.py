@@ -26,8 +26,8 @@ INTRODUCTION = """# Results
 This page lists every table and figure of the paper that this program reproduces, and says which
 claims hold. Each section links to a page with its tables, the difference between its data and the
 paper's, the paper's printed figures, commit, seeds and machine. The table below names the
-commit of the figures and, in brackets, how many later commits changed the program. The paper's
-data were not released: the bodies here are simulated, so their true motion is known.
+version and commit of the figures and, in brackets, how many later commits changed the program.
+The paper's data were not released: the bodies here are simulated, so their true motion is known.
 `mosa-experiment --page` makes this page from `docs/results/` ([how to reproduce the
 tables](reproduce.md)).
 
@@ -107,7 +107,8 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             f"## Without images\n\nLaws learned from the true motion of a body: {', '.join(beside)}."
         )
     page = results.parent / "results.md"
-    header = ["", "jobs complete", "commit (changes of the program since)", "the paper's claims", "claims about ours"]  # fmt: skip
+    age = "version, commit (changes of the program since)"
+    header = ["", "jobs complete", age, "the paper's claims", "claims about ours"]
     whole = [INTRODUCTION, markdown(header, lines), *parts]
     write_whole(page, "\n\n".join(whole) + "\n")
     return page
@@ -139,8 +140,10 @@ def state_of(lines: Sequence[str]) -> tuple[str, str]:
     if jobs is None:
         return NOT_RUN, ""
     since, said = commits_since(lines), "; ".join(lines)
+    age = sorted(set(re.findall(r"\bversion (\d[\d.]*\d)", said)))
     changed = ", with changes" if re.search(r"\bcommit [0-9a-f]+, with changes", said) else ""
-    return jobs[1], "" if since is None else f"{since[0]}{changed} ({since[1]})"
+    age += [] if since is None else [f"{since[0]}{changed} ({since[1]})"]
+    return jobs[1], ", ".join(age)
 
 
 OUTCOMES = {"holds against": ("holds against what was run", "hold against what was run"), "holds": ("holds", "hold"),

@@ -200,10 +200,14 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
 
 @pytest.mark.parametrize(
     ("count", "said"),
-    [("3", "0123456789ab, with changes (3)"), ("0", "0123456789ab, with changes (0)"), (None, "")],
+    [
+        ("3", "0.1.0, 0123456789ab, with changes (3)"),
+        ("0", "0.1.0, 0123456789ab, with changes (0)"),
+        (None, "0.1.0"),
+    ],
 )
 def test_the_page_counts_the_changes_of_the_program_since_its_figures(monkeypatch, count, said):
-    """Of a commit that this checkout does not know, it says nothing."""
+    """Of a commit that this checkout does not know, it says the version alone."""
     asked = []
     monkeypatch.setattr(commits, "git", lambda *words: asked.append(words) or count)
     found = state_of(
@@ -215,7 +219,7 @@ def test_the_page_counts_the_changes_of_the_program_since_its_figures(monkeypatc
     )
     assert asked == [("rev-list", "--count", "0123456789ab..HEAD", "--", "mosa", "conf")]
     assert found == ("2 of 2", said)
-    assert state_of(["2 of 2 jobs complete", "version 0.1.0, commit unknown"]) == ("2 of 2", "")
+    assert state_of(["2 of 2 jobs complete", "version 0.1.0, commit unknown"])[1] == "0.1.0"
     assert len(asked) == 1
 
 
