@@ -136,6 +136,7 @@ FILMED = [
     *FIT,
     *ROUGH,
     "adapter=none",
+    "simulation.courant=0.4",
     "scene.scale=1",
     "scene.ground.mode=sticky",
     "scene.box=[[-0.7,-0.1,-0.7],[0.7,1,0.7]]",
@@ -144,7 +145,7 @@ TRIALS = ["options.steps=4", "search.iterations=1", "search.batch=1", "search.va
           "films=1", "seeds=[0]"]  # fmt: skip
 FALLS = ["resolution=24", "simulation.particles=200", "frames=3", "film.size=16"]
 REALLY = {
-    "rabbit": ({"train.py": BUILT_IN, "prior=auto": ["prior.candidates=[neo_hookean,stvk]"], "eval.py": ["plan=1"]}, {}),
+    "rabbit": ({"train.py": BUILT_IN, "prior=auto": ["prior.candidates=[neo_hookean,stvk]"], "eval.py": ["plan=2"]}, {}),
     "capture": ({"mosa.capture": ["max_offset=0.5", "before=0.07", "after=0.07", "rate=30"], "scene=transforms": FILMED},
                 {"/data/": "{folder}/data/"}),
     "several_recordings": ({"scene=mandarin": BUILT_IN, "scene=transforms": FILMED, "mosa-material": ["starts=1"]},
