@@ -1,13 +1,10 @@
 """The whole way on a film of a cone, 160 x 120 px: what is found, what is written, what is said of mistakes."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
+import forked
 import numpy as np
 import pytest
 from filming import BODY, CONTACT, HEIGHT, WORLD, filmed, write_films
@@ -21,8 +18,6 @@ from mosa.data.images.reading import read_image
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 from mosa.settings import node_of
-
-ROOT = Path(__file__).parents[2]
 
 
 def keys(folder, **changes) -> dict:
@@ -165,11 +160,11 @@ def test_keys_are_checked_before_anything_is_read(filmed_folder):
 def test_the_command_ends_in_one_message(filmed_folder, tmp_path):
     folder, _, _ = filmed_folder
     shutil.copytree(folder / "videos", tmp_path / "videos")
-    words = ["videos=videos", f"poses={folder / 'sparse'}", "output=scene"]
-    result = subprocess.run([sys.executable, "-m", "mosa.capture", *words], cwd=tmp_path, capture_output=True, text=True,
-                            env=os.environ | {"PYTHONPATH": str(ROOT)})  # fmt: skip
+    words = [f"videos={tmp_path}/videos", f"poses={folder / 'sparse'}", f"output={tmp_path}/scene"]
+    result = forked.call("mosa/capture/__main__.py", *words)
     assert result.returncode == 2 and "Traceback" not in result.stderr, result.stderr[-2000:]
-    assert "DataError: videos/phone0.mp4: no background plate: expected phone0.png" in result.stderr
+    said = f"DataError: {tmp_path}/videos/phone0.mp4: no background plate: expected phone0.png"
+    assert said in result.stderr
 
 
 @pytest.mark.parametrize(

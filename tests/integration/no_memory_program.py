@@ -28,7 +28,9 @@ ALLOC = RuntimeError(
 )
 
 cache, folder = Path(sys.argv[1]), Path(sys.argv[2])
-SMALL = ["debug=default", f"scene.cache={cache}", "evaluation.video=false", "logger=none"]
+SMALL = ["debug=default", f"scene.cache={cache}", "adapter=none", "heterogeneity.enabled=false", "fit.prior.looks=0",
+         "evaluation.video=false", "evaluation.floor=false", "logger=none"]  # fmt: skip
+"""A fit of one stage and two steps."""
 RUN, CHECKPOINT = folder / "run", folder / "run" / "checkpoints" / "last.ckpt"
 FIRST, AGAIN = [*SMALL, f"hydra.run.dir={RUN}"], [*SMALL, f"hydra.run.dir={RUN}", "resume=auto"]
 

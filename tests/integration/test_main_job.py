@@ -366,30 +366,32 @@ def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
     return seen
 
 
-HELD_OUT = {"test/test_60", "test/test_40"}
+TRAINED, HELD_OUT = {"train"}, {"test/test_60", "test/test_40"}
 
 
 @pytest.mark.parametrize(
-    "where, variant", [("test", "prior"), ("test", "adapted"), ("train", "adapted")]
+    "lost",
+    [
+        {"adapted": HELD_OUT},
+        {"prior": HELD_OUT, "adapted": TRAINED},
+    ],
 )
 def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(
-    run, tmp_path, monkeypatch, where, variant
+    run, tmp_path, monkeypatch, lost
 ):
-    """The fit was lost with it, and all other figures. On the training drop too, which no stage has to simulate freely."""
-    simulate, failing = Body.simulate, [False]
+    """The fit was lost with it, and all other figures. On the training drop too, which no stage has to simulate freely.
+    lost: sequences by the law that cannot be simulated there."""
+    simulate, failing = Body.simulate, []
 
     def diverges(self, start, world, frames, frame_dt, **more):
-        asked, wanted = more.get("model") or self.model(), self.model(variant)
-        if (
-            failing[0]
-            and asked.material is wanted.material
-            and asked.heterogeneity is wanted.heterogeneity
-        ):
-            raise SimulationDiverged("substep 7, particle 3: gone")
+        asked = more.get("model") or self.model()
+        for wanted in map(self.model, failing):
+            if asked.material is wanted.material and asked.heterogeneity is wanted.heterogeneity:
+                raise SimulationDiverged("substep 7, particle 3: gone")
         return simulate(self, start, world, frames, frame_dt, **more)
 
     def rollouts(body, sequence, world):
-        failing[0] = sequence.prefix.startswith(where)
+        failing[:] = [variant for variant, where in lost.items() if sequence.prefix in where]
         return evaluation_rollouts(body, sequence, world)
 
     evaluation_rollouts = evaluation.rollouts
@@ -398,25 +400,29 @@ def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(
     monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", *FEW_FIGURES[1:]])
-    named = "test/test_60" if where == "test" else "train"
-    with pytest.warns(
-        UserWarning,
-        match=rf"{named}: the (prior|learned law) cannot be simulated .*particle 3: gone",
-    ):
+    with pytest.warns(UserWarning) as told:
         pipeline.evaluate_checkpoint(cfg)
     figures, before = read_figures(tmp_path / "metrics.json"), read_figures(run / "metrics.json")
-    model = evaluation.PREFIX[variant]
-    for part in ("test/test_60", "test") if where == "test" else ("train",):
-        assert figures[f"{model}{part}/rms_m"] == figures[f"{model}{part}/cd_m"] == float("inf")
-        assert figures[f"{model}{part}/psnr_crop"] == -float("inf")
-    other, spared = "prior_eta/test/rms_m", "train" if where == "test" else "test"
-    assert figures[other] == pytest.approx(before[other], rel=1e-5) and np.isfinite(
-        figures[f"{model}{spared}/rms_m"]
-    )
-    motion = np.load(tmp_path / {"prior": "prior.npz", "adapted": "rollout.npz"}[variant])
-    assert {key.split("/x")[0] for key in motion if key.endswith("/x")} == (
-        {"train"} if where == "test" else HELD_OUT
-    )
+    warned = [str(warning.message) for warning in told]
+    for variant, where in lost.items():
+        model = evaluation.PREFIX[variant]
+        law = {"prior": "the prior", "adapted": "the learned law"}[variant]
+        for sequence in where:
+            assert any(
+                line.startswith(f"{sequence}: {law} cannot be simulated ")
+                and "particle 3: gone" in line
+                for line in warned
+            ), (sequence, law, warned)
+        for part in where | ({"test"} if where == HELD_OUT else set()):
+            assert figures[f"{model}{part}/rms_m"] == figures[f"{model}{part}/cd_m"] == float("inf")
+            assert figures[f"{model}{part}/psnr_crop"] == -float("inf")
+        spared = "train" if where == HELD_OUT else "test"
+        assert np.isfinite(figures[f"{model}{spared}/rms_m"])
+        motion = np.load(tmp_path / {"prior": "prior.npz", "adapted": "rollout.npz"}[variant])
+        kept = {key.split("/x")[0] for key in motion if key.endswith("/x")}
+        assert kept == (HELD_OUT | TRAINED) - where
+    other = "prior_eta/test/rms_m"
+    assert figures[other] == pytest.approx(before[other], rel=1e-5)
     assert "inf" in (tmp_path / "results.md").read_text() and (tmp_path / "video.mp4").is_file()
     shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
     assert read_run(tmp_path)

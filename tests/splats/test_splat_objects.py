@@ -1,11 +1,10 @@
 """A 3DGS file becomes a body without any video: filled, given a law, dropped, exported, and read again."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import cv2
+import forked
 import numpy as np
 import pytest
 import torch
@@ -207,9 +206,7 @@ def test_the_command_makes_all_of_it(tmp_path):
                  "velocity=[60,0,0]",  # farther than any box around the object
                  "preset=jelly", "film={size:64,fps:30,view:[1,0.3,0],shadow:false,caption:false}",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True
-    )
+    done = forked.call("mosa/splats/__main__.py", *arguments)
     assert done.returncode == 0, done.stderr[-2000:]
     for name in (
         "splats/ply/002.ply",
