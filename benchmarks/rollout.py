@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/rollout.py [--device cpu|cuda] [--counts 10000 30000] [--substeps 40] [--frames 5]
                                                    [--repeats 5] [--variants none constant stride1 ...] [--forward-only]
-                                                   [--set precision=tf32 fused=true]
+                                                   [--set fused=true]
     python benchmarks/rollout.py --check           a small CPU run against benchmarks/rollout_ratios.json; --store rewrites it
 
 A block of corotated material falls for `--frames` intervals of `--substeps` (five on CUDA, one on a CPU where not given): what a

@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
-from mosa.modules.adapters.fused.selection import PRECISIONS, chosen, weights_of
+from mosa.modules.adapters.fused.selection import chosen, weights_of
 from mosa.modules.adapters.progressive import Correction, ProgressiveOperator, apply
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
 from mosa.modules.adapters.warm_start import warm_start
@@ -34,7 +34,6 @@ class StressAdapter(Adapter):
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
-    precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster);
     factors: residual | printed, how the 12 numbers make a matrix (`microplane.CORRECTIONS`);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
@@ -43,7 +42,6 @@ class StressAdapter(Adapter):
         self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: Positive | None = 0.1, input_scale: Positive = 10.0,
         hidden: Width = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
         state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
-        precision: Literal["accurate", "tf32"] = "accurate",
         factors: Literal["residual", "printed"] = "residual",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
@@ -52,8 +50,7 @@ class StressAdapter(Adapter):
             raise ConfigError(
                 "adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone"
             )
-        self.rest_free, self.recompute = rest_free, recompute
-        self.fused, self.precision = fused, precision
+        self.rest_free, self.recompute, self.fused = rest_free, recompute, fused
         shape: dict[str, Any] = {
             "alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden,
             "factors": factors, "state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post,
@@ -149,8 +146,8 @@ class StressAdapter(Adapter):
         if chosen(self.fused, operator, w):
             from mosa.modules.adapters.fused.operation import Settings, fused_operator
 
-            scale, precision = float(operator.scale), PRECISIONS[self.precision]
-            settings = Settings(operator.alpha, operator.l_max, scale, self.rest_free, precision)
+            scale = float(operator.scale)
+            settings = Settings(operator.alpha, operator.l_max, scale, self.rest_free)
             found = fused_operator(w, s, unit.reshape(1), settings, weights_of(operator))
             G, h, numbers, pre, post = found
             return G, h, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))

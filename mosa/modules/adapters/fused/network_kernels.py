@@ -5,8 +5,8 @@ rest, which the loads of w and s fill with zeros, and so are those after it. w a
 in multiples of `unit` (1,); everything that one kernel leaves for another is stored by column, (columns, M), so that the kernels
 with one lane per particle read it in order.
 
-H: hidden width, a power of two; P: precision of products (tf32x3 | tf32); KEEP: weights stay in shared memory from tile to tile,
-where they fit. Weights are those of torch's linear layers: (out, in); V. is a weight as the second factor of the forward product.
+H: hidden width, a power of two. Weights are those of torch's linear layers: (out, in). Products are
+three of tf32 with the rounding errors carried along, as exact as float32.
 """
 
 import os
@@ -18,11 +18,6 @@ from triton.language.extra import libdevice
 if os.environ.get("TRITON_INTERPRET") == "1":  # the interpreter calls no device functions
 
     @triton.jit
-    def cut(x):
-        """What the tensor cores do to factors in tf32."""
-        return (x.to(tl.int32, bitcast=True) & -0x2000).to(tl.float32, bitcast=True)
-
-    @triton.jit
     def exp(z):
         return tl.exp(tl.minimum(z, 88.0))
 
@@ -31,10 +26,6 @@ if os.environ.get("TRITON_INTERPRET") == "1":  # the interpreter calls no device
         return y / z
 
 else:
-
-    @triton.jit
-    def cut(x):
-        return x
 
     @triton.jit
     def exp(z):
@@ -86,18 +77,8 @@ def store_by_column(p, value, r, c, M, count):
 
 
 @triton.jit
-def factor(x, P: tl.constexpr):
-    """x as a factor of `product`: where P is tf32, to 10 bits after the point, to the nearest. The tensor cores alone would cut,
-    always towards zero: over 20 products in a row that bias adds up to ten times the error of rounding."""
-    if P == "tf32":
-        x = cut((x.to(tl.int32, bitcast=True) + 0x1000).to(tl.float32, bitcast=True))
-    return x
-
-
-@triton.jit
-def product(x, y, P: tl.constexpr):
-    """x y; y has been through `factor`."""
-    return tl.dot(factor(x, P), y, input_precision=P)
+def product(x, y):
+    return tl.dot(x, y, input_precision="tf32x3")
 
 
 @triton.jit
@@ -123,32 +104,15 @@ def tile_of(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr):
 
 
 @triton.jit
-def forward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl.constexpr):
-    return factor(tl.trans(tile_of(W, OUT, IN, STRIDE)), P)
+def times(x, W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr):
+    """x W^T, padded as `tile_of`."""
+    return product(x, tl.trans(tile_of(W, OUT, IN, STRIDE)))
 
 
 @triton.jit
-def kept(
-    W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
-):  # fmt: skip
-    """A weight for `times`: the second factor itself where weights stay from tile to tile, else where it lies."""
-    return forward(W, OUT, IN, STRIDE, P) if KEEP else W
-
-
-@triton.jit
-def times(
-    x, V, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
-):  # fmt: skip
-    """x V, of a weight that is `kept`."""
-    return product(x, V if KEEP else forward(V, OUT, IN, STRIDE, P), P)
-
-
-@triton.jit
-def layer(
-    x, V, b, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, KEEP: tl.constexpr, P: tl.constexpr
-):  # fmt: skip
-    """x V + b, padded as `tile_of`."""
-    y = times(x, V, OUT, IN, STRIDE, KEEP, P)
+def layer(x, W, b, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr):
+    """x W^T + b."""
+    y = times(x, W, OUT, IN, STRIDE)
     if OUT == 6 or OUT == 12:
         bias = vector(b, tl.arange(0, 16), OUT)
     elif OUT == 36:
@@ -161,18 +125,16 @@ def layer(
 @triton.jit(do_not_specialize=["N"])
 def phi_forward(
     w, s, unit, W1, b1, W2, b2, W3, b3, pre, s1, N, M, scale, bound,
-    BOUNDED: tl.constexpr, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    BOUNDED: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Step 1: pre (6, M) and s1 = s / unit + pre (6, M)."""
     c = tl.arange(0, 16)
-    V1, V2 = kept(W1, H, 12, 12, KEEP, P), kept(W2, H, H, H, KEEP, P)
-    V3 = kept(W3, 6, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s, unit, r, N, M, scale, True)
-        z, _ = silu(layer(x, V1, b1, H, 12, 12, KEEP, P))
-        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
-        y = layer(z, V3, b3, 6, H, H, KEEP, P)
+        z, _ = silu(layer(x, W1, b1, H, 12, 12))
+        z, _ = silu(layer(z, W2, b2, H, H, H))
+        y = layer(z, W3, b3, 6, H, H)
         if BOUNDED:
             y = bound * tanh(y)
         store_by_column(pre, y, r, c, M, 6)
@@ -185,60 +147,53 @@ def phi_forward(
 @triton.jit(do_not_specialize=["N"])
 def psi1_forward(
     w, s1, W1, b1, W2, b2, W3, b3, Wp, bp, l1, t, N, M, scale, alpha,
-    KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Step 2: l1 (H, M) and the 36 numbers of the planes, rows 0 to 35 of t (48, M)."""
     h, planes = tl.arange(0, H), tl.arange(0, 64)
-    V1, V2 = kept(W1, H, 12, 12, KEEP, P), kept(W2, H, H, H, KEEP, P)
-    V3, Vp = kept(W3, H, H, H, KEEP, P), kept(Wp, 36, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s1, w, r, N, M, scale, False)
-        z, _ = silu(layer(x, V1, b1, H, 12, 12, KEEP, P))
-        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
-        y = layer(z, V3, b3, H, H, H, KEEP, P)
+        z, _ = silu(layer(x, W1, b1, H, 12, 12))
+        z, _ = silu(layer(z, W2, b2, H, H, H))
+        y = layer(z, W3, b3, H, H, H)
         store_by_column(l1, y, r, h, M, H)
-        numbers = alpha * tanh(layer(y, Vp, bp, 36, H, H, KEEP, P))
+        numbers = alpha * tanh(layer(y, Wp, bp, 36, H, H))
         store_by_column(t, numbers, r, planes, M, 36)
 
 
 @triton.jit(do_not_specialize=["N"])
 def psi2_forward(
-    l1, W1, b1, W2, b2, W3, b3, t, l2, N, M, alpha, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    l1, W1, b1, W2, b2, W3, b3, t, l2, N, M, alpha, H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Step 4: the 12 numbers of C_xyz, rows 36 to 47 of t, and l2 (H, M), from l1 (H + 3, M), its last rows the normals."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    V1, Vx = kept(W1, H, H, H + 3, KEEP, P), kept(W1 + H, H, 3, H + 3, KEEP, P)
-    V2, V3 = kept(W2, H, H, H, KEEP, P), kept(W3, 12, H, H, KEEP, P)
-    V4 = kept(W3 + 12 * H, H, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
-        z = layer(by_column(l1, r, h, M, H), V1, b1, H, H, H + 3, KEEP, P)
+        z = layer(by_column(l1, r, h, M, H), W1, b1, H, H, H + 3)
         x = by_column(l1 + H * M, r, c, M, 3)
-        z, _ = silu(z + times(x, Vx, H, 3, H + 3, KEEP, P))
-        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
-        y = layer(z, V3, b3, 12, H, H, KEEP, P)
+        z, _ = silu(z + times(x, W1 + H, H, 3, H + 3))
+        z, _ = silu(layer(z, W2, b2, H, H, H))
+        y = layer(z, W3, b3, 12, H, H)
         store_by_column(t + 36 * M, alpha * tanh(y), r, c, M, 12)
-        y = layer(z, V4, b3 + 12, H, H, H, KEEP, P)
+        y = layer(z, W3 + 12 * H, b3 + 12, H, H, H)
         store_by_column(l2, alpha * tanh(y), r, h, M, H)
 
 
 @triton.jit(do_not_specialize=["N"])
 def theta_forward(
     l2, w, s2, moved, W1, b1, W2, b2, W3, b3, post, b, N, M, scale, bound,
-    BOUNDED: tl.constexpr, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    BOUNDED: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Step 5: post (6, M); b (6, M) = moved + post."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    V1, Vx = kept(W1, H, H, H + 12, KEEP, P), kept(W1 + H, H, 12, H + 12, KEEP, P)
-    V2, V3 = kept(W2, H, H, H, KEEP, P), kept(W3, 6, H, H, KEEP, P)
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
-        z = layer(by_column(l2, r, h, M, H), V1, b1, H, H, H + 12, KEEP, P)
+        z = layer(by_column(l2, r, h, M, H), W1, b1, H, H, H + 12)
         x = network_input(w, s2, w, r, N, M, scale, False)
-        z, _ = silu(z + times(x, Vx, H, 12, H + 12, KEEP, P))
-        z, _ = silu(layer(z, V2, b2, H, H, H, KEEP, P))
-        y = layer(z, V3, b3, 6, H, H, KEEP, P)
+        z, _ = silu(z + times(x, W1 + H, H, 12, H + 12))
+        z, _ = silu(layer(z, W2, b2, H, H, H))
+        y = layer(z, W3, b3, 6, H, H)
         if BOUNDED:
             y = bound * tanh(y)
         store_by_column(post, y, r, c, M, 6)

@@ -40,18 +40,17 @@ LANES = 128
 BLOCK = 64
 """Rows a program takes at once."""
 INTERPRETED_PROGRAMS = 2
-REGISTERS, PROGRAMS = 168, 3
-"""Of a thread in the forward kernels, and programs a multiprocessor, which that many registers leave room for."""
+REGISTERS = 168
+"""Of a thread in the forward kernels: three programs a multiprocessor have room."""
 
 
 class Settings(NamedTuple):
-    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: tf32x3 | tf32."""
+    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`."""
 
     alpha: float
     l_max: float | None
     scale: float
     rest_free: bool
-    precision: str = "tf32x3"
 
 
 class _Buffers(NamedTuple):
@@ -68,50 +67,26 @@ class _Buffers(NamedTuple):
     moved: Tensor
 
 
-def hopper(device: torch.device) -> bool:
-    return torch.cuda.get_device_capability(device)[0] == 9
-
-
 class _Launch:
     """How the kernels of networks of one width are launched for one number of particles."""
 
-    def __init__(self, settings: Settings, n: int, hidden: int, device: torch.device) -> None:
+    def __init__(self, n: int, hidden: int, device: torch.device) -> None:
         self.n, self.hidden, self.device = n, hidden, device
         # the particles, the state at rest, and as many more of these as fill the last one
         self.rows = -(-(n + 1) // LANES) * LANES
         self.lanes = (self.rows // LANES,)
-        precision = settings.precision
-        # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
-        self.small = (
-            precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
-        )
-        self.size = {"H": hidden, "P": precision}
         self.warps = 8 if hidden > 64 else 4  # a warp group for 64 rows of 64 columns
+        self.grid = (self.rows // BLOCK,)
+        self.size = {"H": hidden, "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
+        self.forward = self.size | ({"maxnreg": REGISTERS} if hidden <= 64 else {})
 
-    def programs(self, block: int, per_multiprocessor: int) -> int:
-        """Programs that go through all tiles of `block` rows."""
-        tiles = self.rows // block
+    @property
+    def programs(self) -> int:
+        """Of the sums, one a multiprocessor, which go through all tiles."""
         if self.device.type != "cuda":
-            return min(tiles, INTERPRETED_PROGRAMS)
-        multiprocessors = torch.cuda.get_device_properties(self.device).multi_processor_count
-        return min(tiles, per_multiprocessor * multiprocessors)
-
-    def forward(self) -> tuple[tuple[int], dict]:
-        tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
-        options = {"KEEP": self.small, "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
-        return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
-
-    def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
-        inside = self.small and wanted
-        sums = "inside" if inside else "outside" if wanted else "none"
-        block, warps = (2 * BLOCK, 8) if inside else (BLOCK, self.warps)
-        tiles = self.programs(block, 1) if inside else self.rows // block
-        return (tiles,), self.size | {
-            "SUMS": sums,
-            "BLOCK": block,
-            "num_warps": warps,
-            "num_stages": 1,
-        }
+            return min(self.grid[0], INTERPRETED_PROGRAMS)
+        found = torch.cuda.get_device_properties(self.device).multi_processor_count
+        return min(self.grid[0], found)
 
 
 def _evaluate(
@@ -121,7 +96,7 @@ def _evaluate(
     n, m, hidden = launch.n, launch.rows, launch.hidden
     b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
-    grid, size = launch.forward()
+    grid, size = launch.grid, launch.forward
     phi_forward[grid](
         w, s, unit, *weights[:6], b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size
     )  # fmt: skip
@@ -141,7 +116,7 @@ def _evaluate_all(
     n, m, bound = launch.n, launch.rows, settings.l_max or 0.0
     b = _evaluate(launch, w, s, unit, settings, weights, G)
     post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
-    grid, size = launch.forward()
+    grid, size = launch.grid, launch.forward
     theta_forward[grid](
         b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
     )  # fmt: skip
@@ -155,7 +130,7 @@ class _FusedOperator(torch.autograd.Function):
         w, s = w.contiguous(), s.contiguous()
         weights = tuple(weight.contiguous() for weight in weights)
         n = len(w)
-        launch = _Launch(settings, n, weights[0].shape[0], w.device)
+        launch = _Launch(n, weights[0].shape[0], w.device)
         G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
         stored = backward_at_hand()
         with torch.cuda.device_of(w):
@@ -195,36 +170,33 @@ def _backward(
     """Adjoints of w, s (N, 6) and, where wanted, of the weights. post (6, M), b: of the forward pass; seeds: adjoints of the
     outputs; extra: of the last three too."""
     n, m, hidden = launch.n, launch.rows, launch.hidden
-    grid, size = launch.backward(wanted)
-    inside = size["SUMS"] == "inside"
+    grid, size = launch.grid, launch.size | {"WANTED": wanted}
     # of one network after the other
-    h1, h2, g1, g2 = (w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4))
+    h1, h2, g1, g2 = (w.new_empty(hidden if wanted else 0, m) for _ in range(4))
     scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
     flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
-    programs = grid[0] if inside else launch.programs(BLOCK, 1)
-    partial = w.new_empty(programs, sum(p.numel() for p in weights) if wanted else 0)
+    partial = w.new_empty(launch.programs, sum(p.numel() for p in weights) if wanted else 0)
     first = [sum(p.numel() for p in weights[:k]) for k in range(len(weights))]
 
     def empty(rows: int) -> Tensor:
         return w.new_empty(rows, m)
 
-    def sums(layer: int, inputs: Tensor, outputs: Tensor, more: tuple | None = None, jobs: int = 5) -> None:  # fmt: skip
-        """Gradients of the network whose first weight is weights[layer]; jobs=2: of its last layer."""
+    def sums(layer: int, inputs: Tensor, outputs: Tensor, more: tuple | None = None) -> None:
+        """Gradients of the network whose first weight is weights[layer]."""
         g4, x4 = more or (outputs, inputs)
-        weight_gradients[(programs, jobs)](
+        weight_gradients[(launch.programs, 5)](
             g1, inputs, g2, h1, outputs, h2, g4, x4, partial, first[layer], partial.shape[1], m, IN1=weights[layer].shape[1],
             OUT3=weights[layer + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=max(64, hidden), BLOCK=BLOCK // 2,
-            P=size["P"], num_warps=launch.warps,
+            num_warps=launch.warps,
         )  # fmt: skip
 
-    outside = wanted and not inside
     rest = seeds["h"].sum(0) if settings.rest_free else seeds["h"]
     gl2, gw_theta, gs2, out = empty(hidden), empty(6), empty(6), empty(6)
     theta_backward[grid](
-        b.l2, w, b.s2, post, seeds["h"], rest, unit, seeds["post"], *weights[20:], h1, h2, g1, g2, out, partial, gl2, gw_theta, gs2,
-        first[20], partial.shape[1], n, m, scale, bound, RESTED=settings.rest_free, **flags, **size,
+        b.l2, w, b.s2, post, seeds["h"], rest, unit, seeds["post"], *weights[20:], h1, h2, g1, g2, out, gl2, gw_theta, gs2,
+        n, m, scale, bound, RESTED=settings.rest_free, **flags, **size,
     )  # fmt: skip
-    if outside:
+    if wanted:
         sums(20, b.l2, out)
     gt, gs1, gmoved = torch.empty_like(b.t), empty(6), empty(6)
     assemble_adjoint[launch.lanes](
@@ -232,32 +204,29 @@ def _backward(
         EXTRA=extra, BLOCK=LANES,
     )  # fmt: skip
     gl1, out = empty(hidden + 3), empty(12 + hidden)
-    h2 = empty(hidden) if inside else h2
     psi2_backward[grid](
-        b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, partial, gl1, first[14], partial.shape[1], n, m, alpha,
-        **size,
+        b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, gl1, n, m, alpha, **size,
     )  # fmt: skip
     if wanted:
-        sums(14, b.l1, out, jobs=2 if inside else 5)
+        sums(14, b.l1, out)
     del gl2  # what the rest needs goes where this was
     normals_adjoint[launch.lanes](b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES)
-    x, gplanes, out = (empty(rows if outside else 0) for rows in (12, 36, hidden))
+    x, gplanes, out = (empty(rows if wanted else 0) for rows in (12, 36, hidden))
     gw_psi, gs_psi = empty(6), empty(6)
     psi1_backward[grid](
-        w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, partial, gw_psi, gs_psi, first[6],
-        partial.shape[1], n, m, scale, alpha, **size,
+        w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, gw_psi, gs_psi,
+        n, m, scale, alpha, **size,
     )  # fmt: skip
-    if outside:
+    if wanted:
         sums(6, x, out, (gplanes, b.l1))
     gw, gs, out = torch.empty_like(w), torch.empty_like(s), empty(6)
     phi_backward[grid](
-        w, s, unit, b.pre, gmoved, seeds["pre"], gs1, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, partial, gw,
-        gs, first[0], partial.shape[1], n, m, scale, bound, **flags, **size,
+        w, s, unit, b.pre, gmoved, seeds["pre"], gs1, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, gw,
+        gs, n, m, scale, bound, **flags, **size,
     )  # fmt: skip
-    if outside:
-        sums(0, x, out)
     if not wanted:
         return gw, gs, [None] * len(weights)
+    sums(0, x, out)
     parts = partial.sum(0).split([p.numel() for p in weights])
     return gw, gs, [part.view_as(p) for part, p in zip(parts, weights, strict=True)]
 

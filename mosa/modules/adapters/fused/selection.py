@@ -11,9 +11,6 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.adapters.progressive import ProgressiveOperator
 
-PRECISIONS = {"accurate": "tf32x3", "tf32": "tf32"}
-"""How products are made on tensor cores: three of tf32 with the rounding errors carried along, or one."""
-
 
 def interpreted() -> bool:
     """Whether Triton's kernels run on CPU tensors, slowly, in its interpreter: for tests."""

@@ -1,68 +1,15 @@
-"""Triton kernels and functions for sums over the rows: the gradients of the networks' weights.
-
-`weight_gradients` is the kernel of those that adjoint_kernels.py leaves outside; the functions are for sums inside of a kernel.
-"""
+"""Triton kernel for sums over the rows: the gradients of the networks' weights, of what adjoint_kernels.py leaves."""
 
 import triton
 import triton.language as tl
 
-from mosa.modules.adapters.fused.network_kernels import by_column, factor, product
-
-
-@triton.jit
-def outer(g, x, P: tl.constexpr):
-    """g^T x, summed over the rows."""
-    return product(tl.trans(g), factor(x, P), P)
-
-
-@triton.jit
-def ones_column(BLOCK: tl.constexpr):
-    """(BLOCK, 16): ones, then zeros."""
-    return tl.where(tl.arange(0, 16)[None, :] == 0, tl.full((BLOCK, 16), 1.0, tl.float32), 0.0)
-
-
-@triton.jit
-def with_ones(x, column: tl.constexpr):
-    """x (BLOCK, 16) with ones in a column that is not used."""
-    return tl.where(tl.arange(0, 16)[None, :] == column, 1.0, x)
-
-
-@triton.jit
-def store_square(at, D, IN: tl.constexpr, H: tl.constexpr):
-    """The sums (H, H) of a weight (H, IN), or of its first columns."""
-    h = tl.arange(0, H)
-    tl.store(at + h[:, None] * IN + h[None, :], D)
-
-
-@triton.jit
-def store_columns(
-    at, D, row: tl.constexpr, column: tl.constexpr, first: tl.constexpr, count: tl.constexpr, H: tl.constexpr
-):  # fmt: skip
-    """Columns `first` to `first + count` of the sums (H, 16), `row` and `column` numbers apart."""
-    h, c = tl.arange(0, H)[:, None], tl.arange(0, 16)[None, :]
-    tl.store(
-        at + h * row + (c - first) * column, D, mask=(c >= first) & (c < first + count) & (h >= 0)
-    )
-
-
-@triton.jit
-def store_hidden(at, Dx, D2, d2, IN: tl.constexpr, COUNT: tl.constexpr, H: tl.constexpr):
-    """The last COUNT columns of the first weight (H, IN) from Dx (H, 16), its bias from the column after them, and the second
-    layer; returns where the third begins."""
-    store_columns(at + IN - COUNT, Dx, IN, 1, 0, COUNT, H)
-    at += H * IN
-    store_columns(at, Dx, 1, 0, COUNT, 1, H)
-    at += H
-    store_square(at, D2, H, H)
-    at += H * H
-    store_columns(at, d2, 1, 0, 0, 1, H)
-    return at + H
+from mosa.modules.adapters.fused.network_kernels import by_column, product
 
 
 @triton.jit
 def layer_gradient(
     g, x, at, M, OUT: tl.constexpr, IN: tl.constexpr, ROW: tl.constexpr, COLUMN: tl.constexpr,
-    TILE: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The tile (TILE, TILE) from (ROW, COLUMN) of g x^T, to a weight (OUT, IN) at `at`, and of the bias behind it."""
     out, into, k = ROW + tl.arange(0, TILE), COLUMN + tl.arange(0, TILE), tl.arange(0, BLOCK)
@@ -70,7 +17,7 @@ def layer_gradient(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + k
         e = tl.load(g + out[:, None] * M + r[None, :], mask=out[:, None] < OUT, other=0.0)
-        weight += product(e, factor(by_column(x, r, into, M, IN), P), P)
+        weight += product(e, by_column(x, r, into, M, IN))
         bias += tl.sum(e, 1)
     inside = (out[:, None] < OUT) & (into[None, :] < IN)
     tl.store(at + out[:, None] * IN + into[None, :], weight, mask=inside)
@@ -81,7 +28,7 @@ def layer_gradient(
 @triton.jit(do_not_specialize=["start"])
 def weight_gradients(
     g1, x1, g2, h1, g3, h2, g4, x4, partial, start, size, M, IN1: tl.constexpr, OUT3: tl.constexpr, OUT4: tl.constexpr,
-    H: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    H: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Three layers of a network and, where OUT4 > 0, one more that reads x4 (H, M): weights and biases in order, from `start` of
     the program's row of `partial` (programs, size). Tiles of weights are spread over the second axis of the grid."""
@@ -90,16 +37,16 @@ def weight_gradients(
     at2 = at + H * IN1 + H
     at3 = at2 + H * H + H
     if which == 0:
-        layer_gradient(g3, h2, at3, M, OUT3, H, 0, 0, TILE, BLOCK, P)
+        layer_gradient(g3, h2, at3, M, OUT3, H, 0, 0, TILE, BLOCK)
     elif which == 1:
         if OUT3 > TILE:
-            layer_gradient(g3, h2, at3, M, OUT3, H, TILE, 0, TILE, BLOCK, P)
+            layer_gradient(g3, h2, at3, M, OUT3, H, TILE, 0, TILE, BLOCK)
     elif which == 2:
-        layer_gradient(g2, h1, at2, M, H, H, 0, 0, TILE, BLOCK, P)
+        layer_gradient(g2, h1, at2, M, H, H, 0, 0, TILE, BLOCK)
     elif which == 3:
-        layer_gradient(g1, x1, at, M, H, IN1, 0, 0, TILE, BLOCK, P)
+        layer_gradient(g1, x1, at, M, H, IN1, 0, 0, TILE, BLOCK)
     elif which == 4:
         if IN1 > TILE:
-            layer_gradient(g1, x1, at, M, H, IN1, 0, TILE, TILE, BLOCK, P)
+            layer_gradient(g1, x1, at, M, H, IN1, 0, TILE, TILE, BLOCK)
         if OUT4 > 0:
-            layer_gradient(g4, x4, at3 + OUT3 * H + OUT3, M, OUT4, H, 0, 0, TILE, BLOCK, P)
+            layer_gradient(g4, x4, at3 + OUT3 * H + OUT3, M, OUT4, H, 0, 0, TILE, BLOCK)

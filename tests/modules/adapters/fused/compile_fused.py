@@ -1,7 +1,7 @@
-"""Compiles the fused kernels for Hopper with the options they are launched with, without a GPU; prints a line of JSON for each
-precision: what each kernel takes.
+"""Compiles the fused kernels for Hopper with the options they are launched with, without a GPU; prints as JSON what
+each kernel takes.
 
-A program of its own: in the tests' process Triton only interprets. python compile_fused.py HIDDEN PRECISION ...
+A program of its own: in the tests' process Triton only interprets. python compile_fused.py HIDDEN
 """
 
 import importlib
@@ -13,7 +13,7 @@ import torch
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, compile
 
-from mosa.modules.adapters.fused.operation import LANES, Settings, _Launch
+from mosa.modules.adapters.fused.operation import LANES, _Launch
 
 FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
 BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
@@ -44,12 +44,11 @@ def compiled(module: str, name: str, options: dict) -> dict:
     }
 
 
-def main(hidden: int, precision: str) -> None:
-    launch = _Launch(Settings(0.1, 0.1, 10.0, True, precision), 1000, hidden, torch.device("cpu"))
-    found = {name: compiled("network_kernels", name, launch.forward()[1]) for name in FORWARD}
-    found |= {
-        name: compiled("adjoint_kernels", name, launch.backward(True)[1]) for name in BACKWARD
-    }
+def main(hidden: int) -> None:
+    launch = _Launch(1000, hidden, torch.device("cpu"))
+    found = {name: compiled("network_kernels", name, launch.forward) for name in FORWARD}
+    options = launch.size | {"WANTED": True}
+    found |= {name: compiled("adjoint_kernels", name, options) for name in BACKWARD}
     found |= {
         name: compiled("assembly_kernels", name, {"BLOCK": LANES, "num_warps": 4})
         for name in BETWEEN
@@ -58,5 +57,4 @@ def main(hidden: int, precision: str) -> None:
 
 
 if __name__ == "__main__":
-    for asked in sys.argv[2:]:
-        main(int(sys.argv[1]), asked)
+    main(int(sys.argv[1]))
