@@ -60,13 +60,6 @@ class InteractionNetwork(Adapter):
         self.net = TwoHiddenLayers(3, 2, hidden)
         zero_outputs(self.net[-1])
         self.register_buffer("scale", torch.tensor(SCALE), persistent=False)
-        self._dynamics: tuple[float, object, float, Interactions] | None = (
-            None  # the last one, with what it was asked for
-        )
-
-    def __getstate__(self) -> dict:
-        # it holds graphs, which can be neither copied nor pickled
-        return {**super().__getstate__(), "_dynamics": None}
 
     def settle(self, rest: Tensor, volume: Tensor) -> None:
         """Choose nodes and bonds of a body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError for too few particles."""
@@ -85,41 +78,26 @@ class InteractionNetwork(Adapter):
         )
         i, j = np.unique(pairs, axis=0).T
         L = np.linalg.norm(X[nodes][j] - X[nodes][i], axis=1)
-        total = np.bincount(i, weights=L, minlength=count) + np.bincount(
-            j, weights=L, minlength=count
-        )
+
+        def summed(weights: np.ndarray | None = None) -> np.ndarray:
+            """(M,) sums over the bonds of each node."""
+            return sum(np.bincount(end, weights=weights, minlength=count) for end in (i, j))
+
         # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
-        share = 6 * V_nodes / total
+        share = 6 * V_nodes / summed(L)
         area = share[i] + share[j]
-        bond = area / L
-        rate = (
-            np.bincount(i, weights=bond, minlength=count)
-            + np.bincount(j, weights=bond, minlength=count)
-        ) / V_nodes
-        degree = np.bincount(i, minlength=count) + np.bincount(j, minlength=count)
         followed, weight, center, inverse = following(X, X[nodes], tree)
         found = {
-            "nodes": nodes,
-            "i": i,
-            "j": j,
-            "length": L,
-            "area": area,
-            "node_volume": V_nodes,
-            "degree": degree.astype(float),
-            "followed": followed,
-            "weight": weight,
-            "center": center,
-            "inverse": inverse,
-            "node_rest": X[nodes],
-            "rest": X,
-        }
+            "nodes": nodes, "i": i, "j": j, "length": L, "area": area, "node_volume": V_nodes, "degree": summed().astype(float),
+            "followed": followed, "weight": weight, "center": center, "inverse": inverse, "node_rest": X[nodes], "rest": X,
+        }  # fmt: skip
         for name, value in found.items():
             self.register_buffer(name, torch.as_tensor(value).to(rest.device), persistent=False)
         for name, value in self.named_buffers():
             if value.is_floating_point() and name not in ("E_ref", "poisson"):
                 setattr(self, name, value.to(rest.dtype))
         # bound of the nodes' frequencies, times sqrt(E_ref/density)
-        self.fastest = float(np.sqrt(2 * rate.max()))
+        self.fastest = float(np.sqrt(2 * (summed(area / L) / V_nodes).max()))
         self.radius = 0.5 * float(V.mean()) ** (1 / 3)
 
     def tension(
@@ -167,15 +145,7 @@ class InteractionNetwork(Adapter):
     def simulator(self, density: float, world, frame_dt: float) -> Interactions:
         """What rolls the nodes out in a world, in place of the body's `Simulator`. Errors: ConfigError."""
         self.check_on()
-        last = self._dynamics
-        if last is None or (last[0], last[2]) != (density, frame_dt) or last[1] is not world:
-            self._dynamics = last = (
-                density,
-                world,
-                frame_dt,
-                Interactions(self, density, world, frame_dt),
-            )
-        return last[3]
+        return Interactions(self, density, world, frame_dt)
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         raise ConfigError(

@@ -1,14 +1,12 @@
 """How nodes move under learned pair forces (`interaction.py`): symplectic Euler over frames, with an adjoint of each frame.
 
-A substep is some forty small operations on a few thousand bonds, so that on a GPU what takes the time is launching them. Both
-passes of a frame therefore read and write buffers that stay, and become CUDA graphs once they have run; on a CPU they run as they
-are. Only the nodes at the frames are kept: the adjoint runs the frame again.
+Only the nodes at the frames are kept: the adjoint runs the frame again.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -16,8 +14,6 @@ from torch.autograd.function import once_differentiable
 from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.physics.engine.capture import ATTEMPTS, Graphs, TorchCapture
-from mosa.physics.launching import same_memory
 from mosa.types import ParticleState, Rollout
 
 
@@ -37,7 +33,6 @@ class Interactions:
         # half of the limit of stability, 2/fastest, for bonds at their stiffest
         self.substeps = math.ceil(frame_dt * fastest)
         self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt
-        self._passes: FramePasses | None = None
 
     def rollout(
         self, state: ParticleState, *, frames: int, parameters=None, volume=None, density=None, adapter=None, stride=None,
@@ -51,9 +46,9 @@ class Interactions:
         x, v = state.x[network.nodes], state.v[network.nodes]
         C = state.C_affine
         recorded = [(state.x, state.v, state.F)]
-        passes, weights = self.passes(x), tuple(network.net.parameters())
+        names, weights = zip(*network.net.named_parameters())
         for frame in range(1, frames):
-            x, v = Frame.apply(passes, x, v, *weights)
+            x, v = Frame.apply(self, names, x, v, *weights)
             if not bool(torch.isfinite(x).all()):
                 raise SimulationDiverged(
                     f"adapter=interaction: a position is not finite in frame {frame}; lower "
@@ -78,22 +73,10 @@ class Interactions:
             "adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step"
         )
 
-    def passes(self, x: Tensor) -> FramePasses:
-        """Those of nodes like x, with the network's weights as they are now."""
-        if (
-            self._passes is None
-            or self._passes.x.device != x.device
-            or self._passes.x.dtype != x.dtype
-        ):
-            self._passes = FramePasses(self, x)
-        self._passes.follow()
-        return self._passes
-
-    def frame(
-        self, x: Tensor, v: Tensor, gravity: Tensor, up: Tensor, net: Callable[[Tensor], Tensor]
-    ) -> tuple[Tensor, Tensor]:
+    def frame(self, x: Tensor, v: Tensor, net: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         """(x, v) (M, 3) of the nodes one frame later; net: the network."""
         network, dt = self.network, self.frame_dt / self.substeps
+        gravity, up = (t.detach().to(x) for t in (self.world.gravity, self.world.up))
         mass = self.density * network.node_volume[:, None]
         for _ in range(self.substeps):
             v = v + dt * (network.forces(x, v, self.density, net) / mass + gravity)
@@ -118,90 +101,27 @@ class Interactions:
         return torch.where(touching, kept * tangent, v)
 
 
-class FramePasses:
-    """A frame of the nodes and its adjoint. They read x, v (M, 3) and their adjoints, and leave what follows in `after` and
-    `gradients` (of x, v and the weights)."""
-
-    def __init__(self, dynamics: Interactions, like: Tensor) -> None:
-        self.dynamics = dynamics
-        self.x, self.v, *self.seeds = (torch.zeros_like(like) for _ in range(4))
-        self.after = (torch.zeros_like(like), torch.zeros_like(like))
-        self.gravity, self.up = (
-            t.detach().to(like) for t in (dynamics.world.gravity, dynamics.world.up)
-        )
-        self.names, self.weights, self.gradients = [], [], []
-        failing = "adapter=interaction cannot be captured as a CUDA graph and runs uncaptured"
-        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if like.is_cuda else 0)
-        self._read: Sequence[Tensor] = ()
-
-    def follow(self) -> None:
-        """The network's weights as they are now. Graphs that read others, by their address, are dropped."""
-        network = self.dynamics.network
-        self.names, self.weights = (list(each) for each in zip(*network.net.named_parameters()))
-        read = [*self.weights, *network.buffers()]
-        if not same_memory(self._read, read):
-            self._read = [t.detach() for t in read]
-            self.gradients = [torch.zeros_like(t) for t in (self.x, self.v, *self.weights)]
-            self._graphs.drop()
-
-    def advance(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(x, v) (M, 3) one frame later. Also captures what has run once: the adjoint itself runs in a thread of autograd's own."""
-        bodies = {"forward": self._forward, "adjoint": self._adjoint}
-        for name in self._graphs.waiting():
-            if not self._graphs.capture(name, bodies[name]):
-                torch.cuda.synchronize()
-                break
-        self.x.copy_(x)
-        self.v.copy_(v)
-        self._graphs.play("forward", self._forward)
-        return self.after[0].clone(), self.after[1].clone()
-
-    def adjoint(self, x: Tensor, v: Tensor, seeds: Sequence[Tensor]) -> list[Tensor]:
-        """Gradients of x, v (M, 3) at the frame's start and of the weights; seeds: of x and v at its end."""
-        for into, value in zip((self.x, self.v, *self.seeds), (x, v, *seeds), strict=True):
-            into.copy_(value)
-        self._graphs.play("adjoint", self._adjoint)
-        return [t.clone() for t in self.gradients]
-
-    @torch.no_grad()
-    def _forward(self) -> None:
-        found = self.dynamics.frame(
-            self.x, self.v, self.gravity, self.up, self.dynamics.network.net
-        )
-        for into, value in zip(self.after, found, strict=True):
-            into.copy_(value)
-
-    def _adjoint(self) -> None:
-        with torch.enable_grad():
-            # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
-            leaves = [t.detach().requires_grad_() for t in (self.x, self.v, *self.weights)]
-            named = dict(zip(self.names, leaves[2:], strict=True))
-            found = self.dynamics.frame(
-                *leaves[:2],
-                self.gravity,
-                self.up,
-                lambda read: functional_call(self.dynamics.network.net, named, (read,)),
-            )
-            gradients = torch.autograd.grad(found, leaves, self.seeds)
-        for into, value in zip(self.gradients, gradients, strict=True):
-            into.copy_(value)
-
-
 class Frame(torch.autograd.Function):
-    """`FramePasses.advance`, with its adjoint."""
+    """`Interactions.frame` of nodes x, v (M, 3) and the network's weights, by their names."""
 
     @staticmethod
-    def forward(ctx, passes: FramePasses, x: Tensor, v: Tensor, *weights: Tensor):
-        ctx.passes = passes
+    def forward(
+        ctx, dynamics: Interactions, names: tuple[str, ...], x: Tensor, v: Tensor, *weights
+    ):
+        ctx.dynamics, ctx.names = dynamics, names
         # the weights too: a change of them before the adjoint is then an error
         ctx.save_for_backward(x, v, *weights)
-        return passes.advance(x, v)
+        return dynamics.frame(x, v, dynamics.network.net)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *seeds: Tensor):
-        x, v, *_ = ctx.saved_tensors
-        found = ctx.passes.adjoint(x, v, seeds)
-        return None, *(
-            g if needed else None for g, needed in zip(found, ctx.needs_input_grad[1:], strict=True)
-        )
+        with torch.enable_grad():
+            leaves = [t.detach().requires_grad_() for t in ctx.saved_tensors]
+            named, net = dict(zip(ctx.names, leaves[2:], strict=True)), ctx.dynamics.network.net
+            found = ctx.dynamics.frame(
+                *leaves[:2], lambda read: functional_call(net, named, (read,))
+            )
+            gradients = torch.autograd.grad(found, leaves, seeds)
+        needed = ctx.needs_input_grad[2:]
+        return None, None, *(g if own else None for g, own in zip(gradients, needed, strict=True))

@@ -273,11 +273,11 @@ def test_the_adjoint_of_its_frames_is_that_of_their_substeps():
     )
     dynamics = body.adapter.simulator(1000.0, WORLD, FRAME_DT)
     dynamics.substeps = 5
-    weights = tuple(body.adapter.net.parameters())
-    passes = dynamics.passes(x)
-    moved = Frame.apply(passes, *Frame.apply(passes, x, v, *weights), *weights)
-    around = passes.gravity, passes.up, body.adapter.net
-    there = dynamics.frame(*dynamics.frame(x, v, *around), *around)
+    net = body.adapter.net
+    names, weights = zip(*net.named_parameters())
+    moved = Frame.apply(dynamics, names, x, v, *weights)
+    moved = Frame.apply(dynamics, names, *moved, *weights)
+    there = dynamics.frame(*dynamics.frame(x, v, net), net)
     torch.testing.assert_close(moved, there, rtol=0, atol=0)
     found, expected = (
         torch.autograd.grad(each[0].square().sum() + each[1].sum(), [x, v, *weights])
