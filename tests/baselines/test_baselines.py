@@ -243,7 +243,7 @@ def test_its_rollout_has_gradients():
 
 
 def rolled(body: Body, device: str, rollouts: int) -> list[torch.Tensor]:
-    """Positions and gradients of the last of several rollouts, the weights stepped after each: on CUDA the last are graphs."""
+    """Positions and gradients of the last of several rollouts, the weights stepped after each."""
     body, world = (
         body.to(device),
         replace(

@@ -4,16 +4,14 @@ An adapter of the state is asked every few substeps. Done one by one, each answe
 the host, which on CUDA take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. On a
 CPU there is nothing to save: the adapter is asked between the segments, and autograd adds the gradients up, in another order.
 
-The backward pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time
-with a graph, and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's
-weights. Between the passes all states are kept where there is memory for them, else only the chain's start, from which they are
-made again. That asks the adapter too: where there is memory for the graphs of all the chain's evaluations (`graphs`), they are
-kept beside the states and nothing is asked a third time.
+The backward pass goes back through the states of all substeps, kept where there is memory for them, else made again from the
+chain's start: the adapter is asked at the start of a segment with a graph, through which what the segment's adjoint leaves on its
+answer goes to the state and to the adapter's weights.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -35,14 +33,6 @@ from mosa.physics.launching import same_memory, warp_stream
 
 MOST_GRAPHS = 24
 """Of a chain, whose graphs have memory of their own for an evaluation: two or three for each time step."""
-
-
-class _Evaluation(NamedTuple):
-    """leaves: F, C, parameters and weights as the graph's ends, [] without a graph."""
-
-    leaves: list[Tensor]
-    answer: dict[str, Tensor | None]
-    statistics: tuple[Tensor, ...]
 
 
 class Learned(NamedTuple):
@@ -70,13 +60,12 @@ class Chain:
     ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
     differentiable; into: as `material_state`.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
-    graphs: where states are made again, keep the graphs of the evaluations with them.
     An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
     """
 
     def __init__(
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int, worlds: int,
-        lengths: Sequence[int], *, learned: Learned, plastic_adapted: bool, collects: bool, graphs: bool,
+        lengths: Sequence[int], *, learned: Learned, plastic_adapted: bool, collects: bool,
     ) -> None:  # fmt: skip
         self.numerics = numerics
         self.adapter = adapter
@@ -101,7 +90,6 @@ class Chain:
         )
         self._held: tuple = ()  # what graphs have by value,
         self._read: Sequence[Tensor] = ()  # and by address
-        self.again = "graphs" if graphs else "states"
 
     def workspace(self, full: bool) -> Workspace:
         """full: of the backward pass, which are made when they are first needed."""
@@ -139,8 +127,9 @@ class Chain:
         self._kind = type(statistics)
         return answer, tuple(statistics)
 
-    def _evaluate(self, step: int, collects: bool) -> _Evaluation:
-        """The adapter's answer to the state in slot `step`; its graph adds the state's gradient to the segment's adjoint."""
+    def _evaluate(self, step: int, collects: bool) -> tuple[list[Tensor], dict, tuple[Tensor, ...]]:
+        """(F, C, parameters and weights as the ends of a graph, the adapter's answer to the state in slot `step`, its statistics);
+        the graph adds the state's gradient to the segment's adjoint."""
         work, slot = self.full, step % 2
         into = (work.adj_F[slot], work.adj_C_affine[slot], work.adj_held["parameters"])
         with torch.enable_grad(), at_hand():
@@ -152,52 +141,39 @@ class Chain:
             )
             # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
             leaves = [t.detach().requires_grad_() for t in inputs]
-            return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
-
-    @torch.no_grad()
-    def _answer(self, work: Workspace, collects: bool, step: int) -> _Evaluation:
-        """The same without a graph, in either workspace."""
-        slot = step % len(work.x)
-        return _Evaluation(
-            [], *self._ask(work.F[slot], work.C_affine[slot], work.held["parameters"], collects)
-        )
+            return leaves, *self._ask(*leaves[:3], collects, leaves[3:], into)
 
     def _forward(self, full: bool) -> None:
-        work = self.workspace(full)
-        collected = [
-            each.statistics
-            for each in self._segments(work, partial(self._answer, work, self.collects))
-        ]
+        collected = self._segments(self.workspace(full), self.collects)
         self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
 
-    def _segments(
-        self, work: Workspace, evaluate: Callable[[int], _Evaluation]
-    ) -> Iterator[_Evaluation]:
-        """Launches all segments, one after each answer of `evaluate` to the state at its start, and passes the answers on."""
+    @torch.no_grad()
+    def _segments(self, work: Workspace, collects: bool) -> list[tuple[Tensor, ...]]:
+        """Launches all segments, one after each answer to the state at its start; the statistics of the answers."""
         work.flags.fill_(NO_EVENT)
-        step = 0
+        step, found = 0, []
         for length in self.lengths:
-            evaluation = evaluate(step)
-            work.point(evaluation.answer)
+            slot = step % len(work.x)
+            state = work.F[slot], work.C_affine[slot], work.held["parameters"]
+            answer, statistics = self._ask(*state, collects)
+            work.point(answer)
             with warp_stream(self.numerics.device):
                 work.advance_steps(step, length)
             step += length
-            yield evaluation
+            found.append(statistics)
+        return found
 
-    def _adjoint(self, source: str, penalised: bool) -> None:
-        """source: of the states, tape | states | graphs: loaded, or made again, without or with the evaluations' graphs."""
-        work, step, made = self.full, self.substeps, []
-        if source == "graphs":
-            made = list(self._segments(work, partial(self._evaluate, collects=penalised)))
-        elif source == "states":
-            for _ in self._segments(work, partial(self._answer, work, False)):
-                pass
+    def _adjoint(self, again: bool, penalised: bool) -> None:
+        """again: the states are made again, else they are loaded."""
+        work, step = self.full, self.substeps
+        if again:
+            self._segments(work, False)
         work.adj_held["parameters"].zero_()
         if self.adj_weights:
             torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
-            leaves, answer, statistics = made.pop() if made else self._evaluate(step, penalised)
+            leaves, answer, statistics = self._evaluate(step, penalised)
             work.point(answer)
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index], more=True)
@@ -298,7 +274,7 @@ class ChainOfSegments(Stretch):
         weights, tensors = tuple(acting[1:]), tensors_of(self.chain.adapter)
         # another rollout may have gone forward since
         self.chain.follow(work, Learned(self.learned.names, weights, tensors))
-        self.chain.play(work.steps, "adjoint", self.chain.again if again else "tape", penalised)
+        self.chain.play(work.steps, "adjoint", again, penalised)
 
     def adjoint_of(self, work: Workspace, acting: Sequence[Tensor]) -> list[Tensor | None]:
         return [work.adj_held["parameters"], *self.chain.adj_weights]

@@ -9,16 +9,15 @@ from mosa.physics.engine.workspace import Workspace
 
 
 class Buffers:
-    """Workspaces and chains, with the graphs that are captured on them: scratch only, nothing in them outlives a stretch of motion.
-    They go when this object goes, and nothing else holds them.
+    """Workspaces and chains, with the graphs that are captured on them: scratch only, nothing in them
+    outlives a stretch of motion. They go when this object goes, and nothing else holds them.
 
-    chains: those of `Chains`; probes: what is known of adapters, by adapter and number of particles (`Chains`);
-    ran: kinds of passes that have run; the first of its kind compiles and loads kernels, which threads must not do at once."""
+    chains: those of `Chains`; ran: kinds of passes that have run; the first of its kind compiles and
+    loads kernels, which threads must not do at once."""
 
     def __init__(self) -> None:
         self.ran: set[tuple] = set()
         self.chains: dict[tuple, Any] = {}
-        self.probes: dict[tuple, tuple[bool, int]] = {}
         self._pools: list[dict[tuple, Workspace]] = [{}]
 
     def take(self) -> dict[tuple, Workspace]:

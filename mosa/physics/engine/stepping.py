@@ -42,7 +42,7 @@ LONGEST_KEPT = 96
 @dataclass
 class Pace:
     """How one motion is cut into stretches. alone: substeps of a segment, at most, where no adapter
-    cuts it; chained: plan of the chains and weights of their adapter, () where there are none;
+    cuts it; chained: most substeps of a chain and weights of the adapter, () where there are none;
     most_ahead: substeps that are launched before the host looks, fewer once that failed; done:
     states after the next frames, where these were launched already."""
 
@@ -131,8 +131,7 @@ class Prepared:
         if gives:
             self.give_memory(substeps, wanted)
         if learned is not None:
-            plan = self.chains.plan(state, substeps, self.stride, wanted)
-            return Pace(SEGMENT, (plan, learned))
+            return Pace(SEGMENT, (self.chains.limit(state, substeps, wanted), learned))
         if self.gathers and not variable and not wanted:
             return Pace(AHEAD, ())
         if self.gathers and not variable and self.lanes.room:
