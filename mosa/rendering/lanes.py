@@ -140,14 +140,8 @@ def add_sums(dtype: type, channels: int, exact: bool = False):
 
     @wp.func_native(ADD_SUMS.replace("TO_MEMORY", EXACT if exact else PLAIN))
     def function(
-        thread: int,
-        moment: moments,
-        scale: dtype,
-        direction: vecc,
-        records: to_records,
-        i: int,
-        features: to_features,
-        f: int,
-    ): ...
+        thread: int, moment: moments, scale: dtype, direction: vecc, records: to_records, i: int,
+        features: to_features, f: int,
+    ): ...  # fmt: skip
 
     return function

@@ -114,21 +114,13 @@ def projection_kernels(dtype: type):
 
     @wp.kernel(enable_backward=False, module="unique")
     def project(
-        means: wp.array(dtype=vec3),
-        covariances: wp.array(dtype=mat33),
-        opacities: wp.array(dtype=dtype),
-        opacity_stride: int,
-        K: wp.array(dtype=mat33),
-        w2c: wp.array(dtype=mat44),
-        state_index: wp.array(dtype=wp.int32),
-        settings: vec3,
-        count: int,
-        width: int,
-        height: int,
+        means: wp.array(dtype=vec3), covariances: wp.array(dtype=mat33),
+        opacities: wp.array(dtype=dtype), opacity_stride: int, K: wp.array(dtype=mat33),
+        w2c: wp.array(dtype=mat44), state_index: wp.array(dtype=wp.int32), settings: vec3,
+        count: int, width: int, height: int,
         # out
-        records: wp.array(dtype=record),
-        depths: wp.array(dtype=dtype),
-    ):
+        records: wp.array(dtype=record), depths: wp.array(dtype=dtype),
+    ):  # fmt: skip
         b, n = wp.tid()
         i = b * count + n
         s = state_index[b] * count + n
@@ -165,24 +157,14 @@ def projection_kernels(dtype: type):
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_backward(
-        means: wp.array(dtype=vec3),
-        covariances: wp.array(dtype=mat33),
-        opacity_stride: int,
-        K: wp.array(dtype=mat33),
-        w2c: wp.array(dtype=mat44),
-        state_index: wp.array(dtype=wp.int32),
-        settings: vec3,
-        count: int,
-        width: int,
-        height: int,
-        images: int,
-        records: wp.array(dtype=record),
-        moments: wp.array(dtype=record),
+        means: wp.array(dtype=vec3), covariances: wp.array(dtype=mat33), opacity_stride: int,
+        K: wp.array(dtype=mat33), w2c: wp.array(dtype=mat44), state_index: wp.array(dtype=wp.int32),
+        settings: vec3, count: int, width: int, height: int, images: int,
+        records: wp.array(dtype=record), moments: wp.array(dtype=record),
         # out, zero at first
-        grad_means: wp.array(dtype=vec3),
-        grad_covariances: wp.array(dtype=mat33),
+        grad_means: wp.array(dtype=vec3), grad_covariances: wp.array(dtype=mat33),
         grad_opacities: wp.array(dtype=dtype),
-    ):
+    ):  # fmt: skip
         # one thread per Gaussian goes through all images: sums over images without atomics, the same at every run
         n = wp.tid()
         gm = vec3()

@@ -47,19 +47,13 @@ def raster_kernels(dtype: type, channels: int):
 
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
-        order: wp.array(dtype=wp.int32),
-        records: wp.array(dtype=record),
-        features: wp.array(dtype=vecc),
-        feature_stride: int,
-        alpha_max: dtype,
-        count: int,
-        width: int,
-        height: int,
+        order: wp.array(dtype=wp.int32), records: wp.array(dtype=record),
+        features: wp.array(dtype=vecc), feature_stride: int, alpha_max: dtype, count: int,
+        width: int, height: int,
         # out; transmittance starts at 1, image at 0, ends at `count`
-        transmittance: wp.array(dtype=dtype),
-        image: wp.array(dtype=vecc),
+        transmittance: wp.array(dtype=dtype), image: wp.array(dtype=vecc),
         ends: wp.array(dtype=wp.int32),
-    ):
+    ):  # fmt: skip
         b = wp.tid()
         base = b * width * height
         for rank in range(count):
@@ -95,23 +89,14 @@ def raster_kernels(dtype: type, channels: int):
 
     @wp.kernel(enable_backward=False, module="unique")
     def backward(
-        order: wp.array(dtype=wp.int32),
-        records: wp.array(dtype=record),
-        features: wp.array(dtype=vecc),
-        feature_stride: int,
-        alpha_max: dtype,
-        count: int,
-        width: int,
-        height: int,
-        ends: wp.array(dtype=wp.int32),
-        grad_image: wp.array(dtype=vecc),
+        order: wp.array(dtype=wp.int32), records: wp.array(dtype=record),
+        features: wp.array(dtype=vecc), feature_stride: int, alpha_max: dtype, count: int,
+        width: int, height: int, ends: wp.array(dtype=wp.int32), grad_image: wp.array(dtype=vecc),
         # changed: final transmittance on entry; `behind` is dL/dT_final T_final on entry
-        transmittance: wp.array(dtype=dtype),
-        behind: wp.array(dtype=dtype),
+        transmittance: wp.array(dtype=dtype), behind: wp.array(dtype=dtype),
         # out
-        moments: wp.array(dtype=record),
-        grad_features: wp.array(dtype=vecc),
-    ):
+        moments: wp.array(dtype=record), grad_features: wp.array(dtype=vecc),
+    ):  # fmt: skip
         b = wp.tid()
         base = b * width * height
         for back in range(count):

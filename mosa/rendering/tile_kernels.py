@@ -126,20 +126,13 @@ def tile_kernels(dtype: type, channels: int, exact: bool = False):
 
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
-        entries: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        records: wp.array(dtype=record),
-        features: wp.array(dtype=vecc),
-        feature_stride: int,
-        alpha_max: dtype,
-        count: int,
-        width: int,
-        height: int,
+        entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32),
+        records: wp.array(dtype=record), features: wp.array(dtype=vecc), feature_stride: int,
+        alpha_max: dtype, count: int, width: int, height: int,
         # out; ends: behind the last entry of the list that the pixel counts
-        transmittance: wp.array(dtype=dtype),
-        image: wp.array(dtype=vecc),
+        transmittance: wp.array(dtype=dtype), image: wp.array(dtype=vecc),
         ends: wp.array(dtype=wp.int32),
-    ):
+    ):  # fmt: skip
         thread = wp.tid()
         b, tile, left, top = block_of(thread, width, height)
         x = left + thread % BLOCK_WIDTH
@@ -183,23 +176,14 @@ def tile_kernels(dtype: type, channels: int, exact: bool = False):
 
     @wp.kernel(enable_backward=False, module="unique")
     def backward(
-        entries: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        records: wp.array(dtype=record),
-        features: wp.array(dtype=vecc),
-        feature_stride: int,
-        alpha_max: dtype,
-        count: int,
-        width: int,
-        height: int,
-        ends: wp.array(dtype=wp.int32),
-        grad_image: wp.array(dtype=vecc),
-        transmittance: wp.array(dtype=dtype),
+        entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32),
+        records: wp.array(dtype=record), features: wp.array(dtype=vecc), feature_stride: int,
+        alpha_max: dtype, count: int, width: int, height: int, ends: wp.array(dtype=wp.int32),
+        grad_image: wp.array(dtype=vecc), transmittance: wp.array(dtype=dtype),
         grad_alpha: wp.array(dtype=dtype),
         # out, zero at first
-        moments: to_records,
-        grad_features: to_features,
-    ):
+        moments: to_records, grad_features: to_features,
+    ):  # fmt: skip
         thread = wp.tid()
         b, tile, left, top = block_of(thread, width, height)
         x = left + thread % BLOCK_WIDTH

@@ -38,27 +38,21 @@ def list_kernels(dtype: type):
 
     @wp.kernel(enable_backward=False, module="unique")
     def count(
-        order: wp.array(dtype=wp.int32),
-        records: wp.array(dtype=record),
+        order: wp.array(dtype=wp.int32), records: wp.array(dtype=record),
         numbers: wp.array(dtype=wp.int32),
-    ):
+    ):  # fmt: skip
         k = wp.tid()
         tiles = touched(load(records, order[k]))
         numbers[k] = (tiles[1] - tiles[0]) * (tiles[3] - tiles[2])
 
     @wp.kernel(enable_backward=False, module="unique")
     def emit(
-        order: wp.array(dtype=wp.int32),
-        records: wp.array(dtype=record),
-        numbers: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int64),
-        gaussians: int,
-        columns: int,
-        rows: int,
+        order: wp.array(dtype=wp.int32), records: wp.array(dtype=record),
+        numbers: wp.array(dtype=wp.int32), ends: wp.array(dtype=wp.int64), gaussians: int,
+        columns: int, rows: int,
         # out
-        keys: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-    ):
+        keys: wp.array(dtype=wp.int32), entries: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
         k = wp.tid()
         if numbers[k] > 0:
             i = order[k]

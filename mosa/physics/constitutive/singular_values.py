@@ -18,11 +18,9 @@ _VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
 def _make(matrix, vector):
     @wp.kernel(module="unique", enable_backward=False)
     def factorise(
-        F: wp.array(dtype=matrix),
-        U: wp.array(dtype=matrix),
-        S: wp.array(dtype=vector),
+        F: wp.array(dtype=matrix), U: wp.array(dtype=matrix), S: wp.array(dtype=vector),
         V: wp.array(dtype=matrix),
-    ):
+    ):  # fmt: skip
         i = wp.tid()
         u, s, v = svd(wp.mat33d(F[i]))
         U[i] = matrix(u)

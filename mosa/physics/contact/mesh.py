@@ -38,12 +38,9 @@ class SignedDistanceField:
 
 @wp.kernel(module="mosa.physics.contact.mesh", enable_backward=False)
 def _nearest(
-    mesh: wp.uint64,
-    points: wp.array(dtype=wp.vec3),
-    reach: wp.float32,
-    face: wp.array(dtype=int),
+    mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: wp.float32, face: wp.array(dtype=int),
     sign: wp.array(dtype=wp.float32),
-):
+):  # fmt: skip
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
     face[i] = -1

@@ -163,10 +163,9 @@ def touch_kernels(scalar) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def loosen(
-        adj_springs: wp.array(dtype=scalar),
-        slopes: wp.array2d(dtype=scalar),
+        adj_springs: wp.array(dtype=scalar), slopes: wp.array2d(dtype=scalar),
         adj_parameters: wp.array2d(dtype=scalar),
-    ):
+    ):  # fmt: skip
         """Adds what springs (N,) with `slopes` (N, S) in packed parameters add to the adjoint of these."""
         p = wp.tid()
         for i in range(slopes.shape[1]):
