@@ -16,8 +16,7 @@ class DirectAdapter(Adapter):
     """tau_hat = tau + E_ref R mat(l_max tanh net(w, s)) R^T, exactly the prior at initialisation.
 
     l_max: bound in units of E_ref, None for an unbounded network; rest_free, input_scale, hidden: as `StressAdapter`.
-    Errors: ConfigError naming the key for values out of range.
-    """
+    Errors: ConfigError naming the key for values out of range."""
 
     def __init__(
         self,

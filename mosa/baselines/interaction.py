@@ -45,8 +45,7 @@ class InteractionNetwork(Adapter):
     """Pair forces between nodes of the rest shape. It brings its own dynamics (`simulator`), and answers no law.
 
     hidden: width of the network; nodes: at most; neighbours: bonds of a node, at least; stiffer: bound of |log g|.
-    Errors: ConfigError naming the key.
-    """
+    Errors: ConfigError naming the key."""
 
     replaces_law = True
     own_dynamics = True

@@ -45,8 +45,7 @@ def vech_of(A: Tensor) -> Tensor:
 def invariants(W: Tensor) -> Tensor:
     """(N, 13) singular values - 1, F^T F - I, det F - 1 of right stretches W (N, 3, 3), with gradient.
 
-    A singular value is v^T W v: to first order its change is that of W alone, so v needs no gradient, also where two are equal.
-    """
+    A singular value is v^T W v: to first order its change is that of W alone, so v needs no gradient, also where two are equal."""
     V = singular_value_decomposition(W)[2]
     S = torch.einsum("nia,nij,nja->na", V, W, V)
     C = W @ W - torch.eye(3).to(W)
@@ -87,8 +86,7 @@ class NeuralLaw(Adapter):
 
     hidden: width of both layers; start: prior | random; plastic: needs prior=von_mises, whose own return mapping is then off;
     plastic_rate [1/s]: of the plastic network's outputs. The prior's tangent serves between two evaluations (`simulation.stride`).
-    Errors: ConfigError naming the key.
-    """
+    Errors: ConfigError naming the key."""
 
     replaces_law = True
 
@@ -164,8 +162,7 @@ def pretrain(
     """Fit an elastic network to a law's stress over random Hencky strains up to `strain`; (relative RMS error left).
 
     unit [Pa]: of the network's stress. Adam with errors relative to each stress, so that the stiffness at rest counts as much as
-    that at large strain; then the last layer by linear least squares. The same weights for the same law and seed.
-    """
+    that at large strain; then the last layer by linear least squares. The same weights for the same law and seed."""
     device, inner = net[0].weight.device, net[0].weight.dtype
     generator = torch.Generator().manual_seed(seed)
 

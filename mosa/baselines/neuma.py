@@ -47,8 +47,7 @@ def low_rank(net: nn.Sequential, rank: int, scaling: float) -> nn.Sequential:
 class LowRankLaw(NeuralLaw):
     """`NeuralLaw` of which only a low-rank change is learned. rank, scaling: of the change; the rest as `NeuralLaw`.
 
-    Errors: ConfigError naming the key.
-    """
+    Errors: ConfigError naming the key."""
 
     def __init__(
         self,

@@ -70,8 +70,7 @@ def object_geometry(
     """The body of `scene.body`, or the one inside the visual hull, by settings.geometry; cached apart from the stages that depend
     on the particles' spacing.
 
-    Errors: DataError (empty mattes, empty hull).
-    """
+    Errors: DataError (empty mattes, empty hull)."""
 
     def found() -> Geometry:
         if scene.body is not None:
@@ -207,8 +206,7 @@ def imported_splats(path: str, scene: Scene) -> Appearance:
     """Gaussians of a 3DGS PLY inside the scene's box, with their harmonics.
 
     Errors: DataError where the file is not one, fewer than eight of its Gaussians lie in the box, or they are not where the mattes
-    of frame 0 show the object.
-    """
+    of frame 0 show the object."""
     splats, harmonics = load_ply(path)
     inside = ((splats.means > scene.box[0]) & (splats.means < scene.box[1])).all(1)
     if int(inside.sum()) < 8:
@@ -273,8 +271,7 @@ def reconstruct(
     scene: only its training cameras and training frames are read, never its truth. spacing [m] of the particles;
     cache_dir: root of the cache, None for no cache. A stopped run goes on with the first stage that is
     not stored. Returns tensors on the CPU; cues cover the training frames, in order.
-    Errors: DataError (empty mattes, empty hull), ConfigError.
-    """
+    Errors: DataError (empty mattes, empty hull), ConfigError."""
     if spacing <= 0:
         raise ConfigError(f"reconstruct: spacing must be positive, found {spacing}")
     views, frames = scene.training_cameras, scene.training_frames
@@ -384,8 +381,7 @@ def follow(
     pose (rotation (3, 3) about rest_center, center (3,) [m]) that frame 0 of `scene` shows.
 
     Same body, other cues: positions are in the world, rotation and stretch relative to that pose, as those of the first
-    sequence are to its frame 0. Cached under the key of both scenes and the pose. Errors: DataError (empty mattes).
-    """
+    sequence are to its frame 0. Cached under the key of both scenes and the pose. Errors: DataError (empty mattes)."""
     views, frames = scene.training_cameras, scene.training_frames
     _first_frame(scene)
     pose = (rotation, center, rest_center)

@@ -16,8 +16,7 @@ from mosa.types import Cameras
 def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Pixels (V, N, 2) and depths (V, N) [m] of world points (N, 3) or, one set a camera, (V, N, 3).
 
-    A point nearer than 1e-6 m or behind the camera has a pixel without meaning: look at the depth first.
-    """
+    A point nearer than 1e-6 m or behind the camera has a pixel without meaning: look at the depth first."""
     w2c, K = cameras.w2c.to(points), cameras.K.to(points)
     seen = points @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]
     pixels = seen @ K.transpose(1, 2)
@@ -54,8 +53,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """World-to-camera matrices (..., 4, 4) of cameras at `eye` looking at `target`, all (..., 3); image y points
     against `up`.
 
-    Raises ConfigError where the line of sight is zero or parallel to `up`.
-    """
+    Raises ConfigError where the line of sight is zero or parallel to `up`."""
     forward = target - eye
     right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
     if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()):
@@ -111,8 +109,7 @@ def crop_boxes(
     mattes: (V, T, H, W). The size is the largest over the views of the box of all pixels above 0 in any
     frame, plus `margin` on each side, rounded up to `multiple`, at most the image; windows are centred on their box
     and moved inside the image. A view that never sees the object gets a window in the middle.
-    Raises DataError where no view sees it.
-    """
+    Raises DataError where no view sees it."""
     views, _, H, W = mattes.shape
     seen = (mattes > 0).any(1)
     empty = ~seen.flatten(1).any(1)

@@ -64,8 +64,7 @@ def project_gaussians(
 
     means: (B, N, 3) [m]; covariances: (B, N, 3, 3) [m^2]. The same map as the rasteriser's (`projection_kernels`): J from
     the clamped, the centre from the unclamped direction. Gaussians nearer than 0.01 m, which are never drawn, are
-    treated as if at 0.01 m so that everything stays finite.
-    """
+    treated as if at 0.01 m so that everything stays finite."""
     K, w2c = cameras.K.to(means), cameras.w2c.to(means)
     R, t = w2c[:, None, :3, :3], w2c[:, None, :3, 3]
     x, y, z = ((means[..., None, :] * R).sum(-1) + t).unbind(-1)
@@ -93,8 +92,7 @@ def square_root(M: Tensor) -> Tensor:
     """Principal square root of symmetric positive definite 2x2 matrices, (..., 3) as (xx, xy, yy).
 
     Closed form (M + sqrt(det M) I) / sqrt(tr M + 2 sqrt(det M)): its gradient is finite where both eigenvalues are
-    equal, unlike that of a root through eigenvectors.
-    """
+    equal, unlike that of a root through eigenvectors."""
     xx, xy, yy = M.unbind(-1)
     s = (xx * yy - xy * xy).sqrt()
     t = (xx + yy + 2 * s).sqrt()
@@ -105,8 +103,7 @@ def matrix_to_quaternion(R: Tensor) -> Tensor:
     """Unit quaternions (..., 4), order w x y z with w >= 0, of rotation matrices (..., 3, 3).
 
     The largest of the four components is computed from the trace or a diagonal entry, the others by division with it, so
-    that no rotation is near a singularity (Shepperd 1978). Not meant to be differentiated.
-    """
+    that no rotation is near a singularity (Shepperd 1978). Not meant to be differentiated."""
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
     # 4 w^2, 4 x^2, 4 y^2, 4 z^2
     signs = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
@@ -131,8 +128,7 @@ def scales_and_rotations(covariances: Tensor) -> tuple[Tensor, Tensor]:
     """Standard deviations (..., 3) [m], ascending, and quaternions (..., 4) wxyz of covariances (..., 3, 3) [m^2].
 
     The inverse of `covariance_from` up to the order and sign of the axes; of the symmetric part, eigenvalues below 0
-    (rounding) taken as 0. Not meant to be differentiated.
-    """
+    (rounding) taken as 0. Not meant to be differentiated."""
     values, vectors = torch.linalg.eigh(0.5 * (covariances + covariances.transpose(-1, -2)))
     turn = torch.linalg.det(vectors).sign()
     vectors = torch.cat((vectors[..., :2], vectors[..., 2:] * turn[..., None, None]), -1)

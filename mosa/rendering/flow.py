@@ -28,8 +28,7 @@ def flow_features(
 
     means: (B, N, 3) [m] and covariances: (B, N, 3, 3) [m^2] at the first (a) and second (b) frame, one camera per
     batch entry. With `detach_first` the first frame is a constant: the loss then asks where things go, not where
-    they were.
-    """
+    they were."""
     if detach_first:
         means_a, covariances_a = means_a.detach(), covariances_a.detach()
     middle = means_a.new_tensor([cameras.width / 2, cameras.height / 2])

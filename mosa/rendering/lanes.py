@@ -128,8 +128,7 @@ def add_sums(dtype: type, channels: int, exact: bool = False):
 
     Instead of summing one number after the other over all lanes, which takes five exchanges each, the lanes share out the
     numbers (up to 32 at a time): 16 numbers take 16 exchanges, lane 2 k ends with the sum of number k, and one instruction
-    adds all of them to memory that lies together. exact: to exact sums (8 records, COLUMNS), (channels features, COLUMNS).
-    """
+    adds all of them to memory that lies together. exact: to exact sums (8 records, COLUMNS), (channels features, COLUMNS)."""
     moments = wp.types.vector(length=6, dtype=dtype)
     vecc = wp.types.vector(length=channels, dtype=dtype)
 

@@ -26,8 +26,7 @@ def projection_kernels(dtype: type):
     """(project, project_backward) for one Warp scalar type.
 
     Arrays are flat: `means`, `covariances` over S * N, records and their moments (records.py) over B * N. `settings` holds
-    near plane, clamp margin (0.3) and largest extent in standard deviations.
-    """
+    near plane, clamp margin (0.3) and largest extent in standard deviations."""
     vec2 = wp.types.vector(length=2, dtype=dtype)
     vec3 = wp.types.vector(length=3, dtype=dtype)
     vec4 = wp.types.vector(length=4, dtype=dtype)

@@ -98,8 +98,7 @@ def rasterize(
 
     Returns image (B, H, W, C) = sum_i w_i c_i + (1 - alpha) background and alpha (B, H, W), with gradients to the
     first four. Errors: ConfigError naming the argument of wrong shape, dtype or device.
-    Source: Kerbl et al. 2023; conventions of gsplat (Ye et al. 2024).
-    """
+    Source: Kerbl et al. 2023; conventions of gsplat (Ye et al. 2024)."""
     if scan not in (None, "gaussian", "tile"):
         raise ConfigError(f"rasterize: unknown scan '{scan}', expected gaussian or tile")
     _check(means, covariances, opacities, features, cameras, state_index)

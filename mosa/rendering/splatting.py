@@ -53,8 +53,7 @@ class Geometry:
 class Splat(torch.autograd.Function):
     """(means, covariances, opacities, features, K (B, 3, 3), w2c (B, 4, 4), geometry) -> image (B, H, W, C), alpha (B, H, W).
 
-    Shapes as in `mosa.rendering.rasterizer.rasterize`, which checks them.
-    """
+    Shapes as in `mosa.rendering.rasterizer.rasterize`, which checks them."""
 
     @staticmethod
     def forward(ctx, means, covariances, opacities, features, K, w2c, geometry: Geometry):

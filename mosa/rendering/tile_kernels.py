@@ -45,8 +45,7 @@ def tile_threads(images: int, width: int, height: int) -> int:
 def reach_function(dtype: type):
     """reaches(record, x, y, width, height): may alpha be ALPHA_MIN or more at some pixel of a rectangle, whose first is (x, y)?
 
-    Never false where it is, rounding included.
-    """
+    Never false where it is, rounding included."""
     record = record_type(dtype)
     *_, pixels = record_functions(dtype)
 

@@ -71,8 +71,7 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     """(entries, starts), int32: those of tile k, entries[starts[k] : starts[k + 1]], are places in `records` by depth.
 
     depths: (2 B N,), of which the first half counts and all is overwritten: sorting needs the room; records: (B, N, 8).
-    Tiles are counted row by row, image by image. Waits once for the GPU, to learn how many entries there are.
-    """
+    Tiles are counted row by row, image by image. Waits once for the GPU, to learn how many entries there are."""
     images, gaussians, _ = records.shape
     number, columns, rows = images * gaussians, -(-width // TILE), -(-height // TILE)
     last, remedy = images * rows * columns, "render fewer images at once"

@@ -36,8 +36,7 @@ class Adapter(nn.Module):
     about it: `forward(state: MaterialState) -> AdapterOperator`, the operator at N states, held until it is asked again:
     G (N, 6, 6), h (N, 6) [Pa], of the states' type and device. Errors: ConfigError before `switch_on`.
 
-    E_ref: () [Pa], the unit of its stress, and poisson: () of the prior, both fixed by `switch_on`, not numbers before.
-    """
+    E_ref: () [Pa], the unit of its stress, and poisson: () of the prior, both fixed by `switch_on`, not numbers before."""
 
     E_ref: Tensor
     poisson: Tensor

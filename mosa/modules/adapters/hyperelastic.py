@@ -74,8 +74,7 @@ def root_stiffness(poisson: Tensor) -> Tensor:
 class HyperelasticAdapter(Adapter):
     """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
 
-    Fluids have no shear modulus that it could be a multiple of: it is left out there.
-    """
+    Fluids have no shear modulus that it could be a multiple of: it is left out there."""
 
     energetic = True
     few_numbers = True

@@ -55,8 +55,7 @@ def lu_factors(numbers: Tensor) -> tuple[Tensor, Tensor]:
 def correction(numbers: Tensor) -> Tensor:
     """C = (I + L)(I + U) - I, (..., 3, 3) from (..., 12), exactly 0 at 0.
 
-    det(I + C) >= (1 - alpha)^6 where all numbers are within alpha < 1.
-    """
+    det(I + C) >= (1 - alpha)^6 where all numbers are within alpha < 1."""
     L, U = lu_factors(numbers)
     return L + U + L @ U
 
@@ -99,8 +98,7 @@ def with_normal(T: Tensor, normal: Tensor) -> Tensor:
 def stepwise_planes(stress: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     """(n (N, 3), shears (N, 3) yz, zx, xy) of stress (N, 6) on the three planes, in the paper's order (step 3).
 
-    planes: corrections C (N, 3, 3, 3). For tests and for reading: `plane_operator` is what runs.
-    """
+    planes: corrections C (N, 3, 3, 3). For tests and for reading: `plane_operator` is what runs."""
     xx, yy, zz, yz, zx, xy = stress.unbind(-1)
     C_x, C_y, C_z = planes.unbind(1)
 

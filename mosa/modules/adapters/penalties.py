@@ -14,8 +14,7 @@ class OperatorStatistics(NamedTuple):
 
     mean_abs_C: over particles, the four matrices and all entries of |C|. mean, within: (48,) mean and variance over particles
     (after `pool`: over evaluations too) of each entry of C_x, C_y, C_z, C_xyz (36), L_pre (6), L_post (6). Of an adapter without
-    these: of the entries that it notes.
-    """
+    these: of the entries that it notes."""
 
     mean_abs_C: Tensor
     mean: Tensor

@@ -34,8 +34,7 @@ class ProgressiveOperator(nn.Module):
     state_dependence: full | constant (the four matrices are learned numbers, not functions of the state);
     major_symmetry: (A + C0 A^T C0^-1)/2 in place of A, needs `poisson` of C0;
     no_prior_stress: s1 = L_pre instead of s + L_pre.
-    The output is exactly 0 at initialisation; with printed factors it is 1e-4 of the stress there.
-    """
+    The output is exactly 0 at initialisation; with printed factors it is 1e-4 of the stress there."""
 
     def __init__(
         self, *, alpha: float, l_max: float | None, input_scale: float, hidden: int, no_C: bool, no_pre: bool, no_post: bool,

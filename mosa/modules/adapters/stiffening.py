@@ -21,8 +21,7 @@ def worst_stiffening(alpha: float) -> float:
 
     The modulus of an operator is linear in each of its numbers, so the largest is at a corner of the box, where all are alpha (by
     search; `acoustic_stiffening` of it is exact). (1 + alpha)^6.45 is above that for nu <= 0.38 and alpha from 0.1 to 0.3, and
-    below it by at most 6 % of the modulus, 3 % of the step, at nu = 0.49; it is 1.85 at 0.1, 2.46 at 0.15, 3.24 at 0.2.
-    """
+    below it by at most 6 % of the modulus, 3 % of the step, at nu = 0.49; it is 1.85 at 0.1, 2.46 at 0.15, 3.24 at 0.2."""
     return max(ADAPTER_MARGIN, ADAPTER_MARGIN ** (math.log1p(alpha) / math.log1p(0.1)))
 
 
@@ -31,8 +30,7 @@ def acoustic_stiffening(G: Tensor, poisson: Tensor | float) -> float:
     """Largest acoustic modulus n m : (I + G) C0 : n m over unit vectors n, m, in units of the prior's, lam + 2 mu.
 
     G: (..., 6, 6) A - I on vech; poisson: of the isotropic C0. The symmetric part of (I + G) C0 alone counts: the projection to
-    major symmetry changes nothing of it. 1000 directions n: 0.5 % at most below the true maximum.
-    """
+    major symmetry changes nothing of it. 1000 directions n: 0.5 % at most below the true maximum."""
     G = G.detach().double().cpu()
     scale, C0 = (
         torch.tensor(MANDEL, dtype=torch.float64),

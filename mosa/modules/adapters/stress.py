@@ -35,8 +35,7 @@ class StressAdapter(Adapter):
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
     factors: residual | printed, how the 12 numbers make a matrix (`microplane.CORRECTIONS`);
-    no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
-    """
+    no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range."""
 
     def __init__(
         self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: Positive | None = 0.1, input_scale: Positive = 10.0,
@@ -72,8 +71,7 @@ class StressAdapter(Adapter):
     def stiffening(self, poisson: Tensor | float) -> float:
         """That of the operator itself where there is only one, else the bound of all that alpha allows; `ADAPTER_MARGIN` at least.
 
-        What networks add (L_pre, L_post) is held between evaluations, as the operator is, and stiffens nothing meanwhile.
-        """
+        What networks add (L_pre, L_post) is held between evaluations, as the operator is, and stiffens nothing meanwhile."""
         if self.operator.no_C or self.operator.no_prior_stress:
             return ADAPTER_MARGIN
         if not self.operator.constant:
@@ -125,8 +123,7 @@ class StressAdapter(Adapter):
     def forward(self, state: MaterialState) -> AdapterOperator:
         """Operator held by the simulator until it asks again; inputs of any float type, networks in their own.
 
-        Errors: ConfigError before `switch_on`.
-        """
+        Errors: ConfigError before `switch_on`."""
         self.check_on()
         outer, inner = state.w.dtype, self.E_ref.dtype
         w = state.w.to(inner)

@@ -38,8 +38,7 @@ def warm_start(
     adapter: a `StressAdapter`, which calls this; states: of `mosa.modules.body.material.material_states`. Linear least squares of
     relative errors, so that the stiffness at rest counts as much as that at large strain, with L_pre(0, 0) = 0. To be called after
     `switch_on`, before any training.
-    Errors: ConfigError for an adapter that has the prior stress or no E_ref.
-    """
+    Errors: ConfigError for an adapter that has the prior stress or no E_ref."""
     if not adapter.operator.no_prior_stress:
         raise ConfigError(
             "warm_start: expected an adapter with no_prior_stress=true; the others start from the prior as it is"

@@ -43,8 +43,7 @@ every change of the modulus would need new ones in nearly every step of a fit.""
 
 class Body(nn.Module):
     """N particles with a law. Buffers: rest (N, 3) [m], volume (N,) [m^3], colors (N, 3), opacities (N,), covariances (N, 3, 3).
-    splats: what its images show, None where that is the particles; a fit to images looks at the particles.
-    """
+    splats: what its images show, None where that is the particles; a fit to images looks at the particles."""
 
     rest: Tensor
     volume: Tensor
@@ -146,8 +145,7 @@ class Body(nn.Module):
     def initial_state(self, start: Start, dt: float, gravity: Tensor) -> ParticleState:
         """Particles at `start`: x = Q (X - X_c) + x_c, F = F_tot = Q, C_affine = [omega]_x.
 
-        The velocity is taken half a substep of gravity early: symplectic Euler then follows the parabola exactly at any dt.
-        """
+        The velocity is taken half a substep of gravity early: symplectic Euler then follows the parabola exactly at any dt."""
         Q = start.rotation.to(self.rest)
         arm = (self.rest - self.center) @ Q.T
         velocity = start.velocity - 0.5 * dt * gravity
@@ -206,8 +204,7 @@ class Body(nn.Module):
         and a number; at every frame the velocities are corrected towards what was seen, but for what was `unseen` of the positions
         in a frame (`ready.corrected_rollout`). substeps: of
         every frame, where differences hold them fixed; None: as many as the time step bound asks for.
-        Errors: SimulationDiverged, ConfigError (time step).
-        """
+        Errors: SimulationDiverged, ConfigError (time step)."""
         ready = self.ready(
             start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps
         )

@@ -21,8 +21,7 @@ class ContactOffset(nn.Module):
     A B-spline grid stops a body a fraction of dx before it touches a wall, by an amount that depends on dx and on the stencil's
     place; without this one number the stiffness absorbs it, differently on every grid.
 
-    dx [m] of its methods: spacing of the grid that it is asked for.
-    """
+    dx [m] of its methods: spacing of the grid that it is asked for."""
 
     START, GRID = 0.3, 0.15
     """What a grid does to balls, the bird and the rabbit, and its standard deviation [cells]."""

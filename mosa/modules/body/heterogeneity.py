@@ -13,8 +13,7 @@ from mosa.modules.body.settings import HeterogeneitySettings
 class StiffnessField(nn.Module):
     """What every field has; `forward` gives eta (N,) at rest positions X (N, 3) [m], 0 at initialisation.
 
-    low, high: (3,) [m] corners of the object's box. Errors: ConfigError for a box without volume.
-    """
+    low, high: (3,) [m] corners of the object's box. Errors: ConfigError for a box without volume."""
 
     low: Tensor
     high: Tensor

@@ -153,8 +153,7 @@ class Material(nn.Module):
     (`constitutive.damping`). friction_cone: of `friction_alpha`. candidates: laws among which a calibration chooses, with law=auto;
     until then it is the first. Each reads those of `parameters` that it has. A parameter that starts on
     a bound of its range is held there.
-    Errors: ConfigError naming the parameter, what was expected and what was found.
-    """
+    Errors: ConfigError naming the parameter, what was expected and what was found."""
 
     def __init__(
         self,
@@ -326,8 +325,7 @@ class Material(nn.Module):
     def per_particle(self, factor: Tensor | float = 1.0) -> dict[str, Tensor]:
         """Values the simulator takes, by the law's own names; factor: (N,) heterogeneity of the modulated parameters, or 1.
 
-        Modulated values are (N,), directions (3,), the others ().
-        """
+        Modulated values are (N,), directions (3,), the others ()."""
         parts = {f"{name}_{axis}" for name in self.directions for axis in Direction.AXES}
         values = {n: v * factor if n in self.modulated else v for n, v in self.physical().items()}
         result = {n: v for n, v in values.items() if n not in GIVES and n not in parts}
@@ -367,8 +365,7 @@ def material_states(
 ) -> Callable[[Tensor], MaterialState]:
     """Function of F (M, 3, 3) float64 to what an adapter reads there (in float64), under `law` with scalar `parameters`.
 
-    parameters: physical values by the law's own names (`Material.per_particle()`).
-    """
+    parameters: physical values by the law's own names (`Material.per_particle()`)."""
     simulator = Simulator(
         law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, options=options
     )

@@ -23,8 +23,7 @@ class Ready:
     """A body at its start, and what a simulation of it takes; or, by `stack`, the same in B worlds.
 
     state: in the simulator's type, higher by `lift` (3,) [m], the contact's offset, than where the body is seen; arguments: of
-    `Simulator.rollout`; timing: of substeps that vary, None where they are fixed.
-    """
+    `Simulator.rollout`; timing: of substeps that vary, None where they are fixed."""
 
     simulator: Simulator
     state: ParticleState
@@ -129,8 +128,7 @@ def corrected_rollout(
     In a free rollout the errors of grid and contact accumulate through the bounce, and a law is
     bent to undo them. A prediction error method (Ljung, System Identification, chapter 3) asks
     less: from what was seen up to a frame, predict the next. Here the observer is Luenberger's
-    with a fixed gain on the velocities; positions and deformation gradients stay the simulation's.
-    """
+    with a fixed gain on the velocities; positions and deformation gradients stay the simulation's."""
     parts: list[Rollout] = []
     current = state
     for frame in range(1, len(observed)):

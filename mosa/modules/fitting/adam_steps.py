@@ -140,8 +140,7 @@ class GradientSteps:
         """Adds the gradient of one sequence's loss, times `weight`, to `total`; the loss, its terms and what else is logged, not
         weighted. own: its `SequenceBatch`.
 
-        One graph at a time: memory is that of one sequence.
-        """
+        One graph at a time: memory is that of one sequence."""
         take = self.takes[own.index]
         frames = self.active_frames(stage, iteration, take)
         gains = (0.0,) if stage.calibrates else self.criterion.gains

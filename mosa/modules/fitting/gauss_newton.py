@@ -83,8 +83,7 @@ class Seat:
 class Posterior:
     """mean (D,), covariance (D, D) float64 of the numbers of `names`; `determined` (D,) in [0, 1]: the share of each number's
     precision that comes from the data and not from its prior; model_error [m]: distance of the identified model from what was seen;
-    rivals: numbers (D,) at which laws of another form explain the data too, by name.
-    """
+    rivals: numbers (D,) at which laws of another form explain the data too, by name."""
 
     __repr__ = in_brief
 
@@ -270,8 +269,7 @@ class GaussNewton:
         there, where they are known; J: (R, D) a Jacobian that serves again, None for a new one.
 
         Returns cost before and after, the way that was gone over the length of the first step (0: no step improved), that length in
-        standard deviations of the posterior, and each learned block's factor. Errors: SimulationDiverged where a column fails.
-        """
+        standard deviations of the posterior, and each learned block's factor. Errors: SimulationDiverged where a column fails."""
         seat = self.seats[0]
         numbers = seat.read()
         for other in self.seats[1:]:
@@ -361,8 +359,7 @@ class GaussNewton:
         """MacKay's fixed point of each learned block's factor: theta^2/sd^2 sums to the number of well determined directions.
 
         theta is where the linear problem leads under the factors, not where the iteration stands, and the search begins at 1: a
-        block that has not moved yet, or that an earlier noise had closed, is judged by what the data say now.
-        """
+        block that has not moved yet, or that an earlier noise had closed, is judged by what the data say now."""
         sizes = [b.size for b in self.blocks]
         for b in self.blocks:
             b.factor = 1.0 if b.learned else b.factor

@@ -79,8 +79,7 @@ class Identification:
 
     parts: those of `search.parts` that the law may have; known: what another experiment said of its
     numbers, in place of the prior of those that are learned; progress: called after every column of
-    a Jacobian; seats: rollouts side by side; None: as many as the machine has room for.
-    """
+    a Jacobian; seats: rollouts side by side; None: as many as the machine has room for."""
 
     def __init__(
         self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,

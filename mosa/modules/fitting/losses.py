@@ -34,8 +34,7 @@ def mask_loss(alpha: Tensor, mattes: Tensor) -> Tensor:
 def flow_loss(simulated: Tensor, seen: Tensor, image_width: int) -> Tensor:
     """L_flow: mean L1 of flow maps (V, T - 1, H, W, 2) [px], in image widths.
 
-    In pixels the term would drown the others and grow with the resolution. image_width: of the whole image, not of a crop.
-    """
+    In pixels the term would drown the others and grow with the resolution. image_width: of the whole image, not of a crop."""
     return (simulated - seen).abs().mean(-1).mean() / image_width
 
 
@@ -94,8 +93,7 @@ def rotation_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, start: Tensor) -> 
     """L_r: mean over particles and frames of |R_cue - R(F_tot) Q^T|_F^2, in [0, 8].
 
     F_tot, cue: (T, N, 3, 3), frame 0 first; weight: (T, N); start: Q (3, 3), the rotation the sequence started with.
-    Frame 0 and inverted particles have no weight.
-    """
+    Frame 0 and inverted particles have no weight."""
     # a NaN stays in, so that the loss shows it
     positive = ~(torch.linalg.det(F_tot.detach()) <= FLAT)
     eye = torch.eye(3, dtype=F_tot.dtype, device=F_tot.device)
@@ -128,8 +126,7 @@ class _Stretches(torch.autograd.Function):
 def shared_where_equal(seed: Tensor, values: Tensor, tolerance: float) -> Tensor:
     """Gradients (..., 3) by sorted `values`, averaged over those that coincide.
 
-    Their axes are then arbitrary: the average is the one choice that does not depend on them (and the shortest subgradient).
-    """
+    Their axes are then arbitrary: the average is the one choice that does not depend on them (and the shortest subgradient)."""
     first, second = (
         (values[..., i] - values[..., i + 1]).abs() <= tolerance * values[..., 0].abs()
         for i in (0, 1)
@@ -146,8 +143,7 @@ def shared_where_equal(seed: Tensor, values: Tensor, tolerance: float) -> Tensor
 def stretches(F: Tensor) -> Tensor:
     """Descending singular values (..., 3) of F (..., 3, 3), the smallest with the sign of det F.
 
-    Where values coincide the gradient is that of their sum, shared among them.
-    """
+    Where values coincide the gradient is that of their sum, shared among them."""
     return _Stretches.apply(F)
 
 
@@ -155,8 +151,7 @@ def stretch_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, floor: float = STRA
     """L_s: mean squared difference of norm(Lambda_cue - 1) and norm(Lambda - 1), sorted, norm(a) = a/(|a| + floor).
 
     F_tot: (T, N, 3, 3), frame 0 first; cue: (T, N, 3) stretches dS/S_0 + 1, descending; weight: (T, N). No weight at
-    frame 0 and where the cue's largest |Lambda - 1| is below `floor`.
-    """
+    frame 0 and where the cue's largest |Lambda - 1| is below `floor`."""
     seen = cue - 1
     weight = weight * (seen.abs().amax(-1) > floor)
 

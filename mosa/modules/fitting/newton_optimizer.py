@@ -14,8 +14,7 @@ class GaussNewtonOptimizer(torch.optim.Optimizer):
     """A step is one iteration of the identification of a body's few numbers (`identification.py`).
 
     The closure evaluates the residuals at the numbers as they stand and returns the cost; no gradient is asked for, as the
-    iteration finds its Jacobian by differences. `lr` is 1: a whole step, which the iteration itself shortens where it must.
-    """
+    iteration finds its Jacobian by differences. `lr` is 1: a whole step, which the iteration itself shortens where it must."""
 
     def __init__(
         self, parameters: Iterable[Tensor], identification: Callable[[], Identification]

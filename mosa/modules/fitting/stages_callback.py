@@ -17,8 +17,7 @@ class Stages(Checkpoint):
     `LitMosa` brings it along (`configure_callbacks`). A stage has an optimiser and a schedule of its own. Callbacks that stop a
     training (`EarlyStopping`) end the running stage; the next one begins with their counters at zero.
 
-    It is a `Checkpoint` only because Lightning calls these after the callbacks that stop a training; it saves nothing.
-    """
+    It is a `Checkpoint` only because Lightning calls these after the callbacks that stop a training; it saves nothing."""
 
     def __init__(self) -> None:
         self.begun = -1  # number of the stage that has begun in this process

@@ -60,8 +60,7 @@ class Chain:
     ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
     differentiable; into: as `material_state`.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
-    An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
-    """
+    An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning."""
 
     def __init__(
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int, worlds: int,

@@ -29,8 +29,7 @@ class AdapterOperator(NamedTuple):
 
     G: (N, 6, 6), h: (N, 6) [Pa]: tau_hat = tau + R mat(G vech(R^T tau R) + h) R^T. plastic_G: (N, 6, 6), plastic_h: (N, 6), both or
     neither: the yield function takes |dev(mat((I + plastic_G) vech(E) + plastic_h))| for |E|.
-    Where G and h are the same for all particles, views of one row (`expand`) cost neither memory nor its traffic.
-    """
+    Where G and h are the same for all particles, views of one row (`expand`) cost neither memory nor its traffic."""
 
     G: Tensor
     h: Tensor

@@ -24,8 +24,7 @@ _ONE = wp.constant(wp.float64(1.0))
 def lame(E: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
     """(mu, lam) [Pa] from Young's modulus [Pa] and Poisson's ratio, of any one shape.
 
-    mu = E/(2 (1 + nu)), lam = E nu/((1 + nu)(1 - 2 nu)).
-    """
+    mu = E/(2 (1 + nu)), lam = E nu/((1 + nu)(1 - 2 nu))."""
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
 
 
@@ -39,8 +38,7 @@ def linear(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     """sym(P G^T), P = mu (G + G^T - 2I) + lam tr(G - I) I with G = F F_0^T, the deformation since the sequence's start.
 
     Not frame indifferent: for small rotations only. Energy of G: mu |sym(G) - I|^2 + lam/2 tr(G - I)^2; P G^T is its stress
-    and not symmetric, of which the symmetric part is taken.
-    """
+    and not symmetric, of which the symmetric part is taken."""
     F0 = wp.mat33d(p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10])
     G = F * wp.transpose(F0)
     P = p[0] * (G + wp.transpose(G) - _TWO * eye()) + p[1] * (wp.trace(G) - wp.float64(3.0)) * eye()

@@ -23,8 +23,7 @@ def isochoric_squares(S: wp.vec3d, c: wp.float64):
 
     With b_i = J^(-2/3) S_i^2 and d_i = c (b_i - mean b), q_i = J^(2/3) (d_i + beta), beta the largest real root of
     (d_0 + beta)(d_1 + beta)(d_2 + beta) = 1. It lies below 1 - min d, from where Newton's iteration descends to it: the product
-    is increasing and convex there.
-    """
+    is increasing and convex there."""
     volume = wp.pow(S[0] * S[1] * S[2], _TWO * _THIRD)
     b = wp.vec3d(S[0] * S[0], S[1] * S[1], S[2] * S[2]) / volume
     m = _THIRD * (b[0] + b[1] + b[2])

@@ -34,8 +34,7 @@ class Law:
     modulus: torch function (**parameters) -> P wave modulus M at rest [Pa] for the time step, elementwise; None: lam + 2 mu or
     kappa + 4 mu/3, whichever the parameters give.
     viscosity: torch function (**parameters) -> viscosity mu [Pa s] of a stress mu J sym(C_affine), for the time step, elementwise;
-    None: the stress does not take C_affine, or a flow that is integrated implicitly.
-    """
+    None: the stress does not take C_affine, or a flow that is integrated implicitly."""
 
     name: str
     stress: Callable
@@ -127,8 +126,7 @@ def register_law(
 
     Example: a fibre family a (rest direction), tau = mu (F F^T - I) + lam log(J) I + 2 kf (I4 - 1) (F a)(F a)^T, takes
     `parameters={"mu": 1, "lam": 1, "kf": 1, "a": 3}` and reads `wp.vec3d(p[3], p[4], p[5])`.
-    Errors: ConfigError if `name` is taken by another law.
-    """
+    Errors: ConfigError if `name` is taken by another law."""
     if not isinstance(parameters, dict):
         parameters = dict.fromkeys(parameters, 1)
     law = Law(name, stress, dict(parameters), **options)

@@ -85,8 +85,7 @@ def stress_kernel(
 
     energetic: the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is added is the stress of the energy
     mu E : G : E, E Green's strain, to 1 + h[0] times the prior's. shear: place of mu among the law's parameters.
-    G and h of one row are those of all particles, each of which adds to a row of its own of their gradients.
-    """
+    G and h of one row are those of all particles, each of which adds to a row of its own of their gradients."""
     field33, field6, field66, fieldp = field_types(scalar)
     energetic = adapted and energetic
     own = particle_access(scalar, SLOTS)
@@ -124,8 +123,7 @@ def stress_kernel(
 def return_kernel(return_map, scalar, adapted: bool):
     """F of the next substep: the return mapping of (I + dt C_affine) F.
 
-    adapted: |E'| of the yield function is that of dev(mat((I + G) vech(E) + h)), E = dev(log W) of the trial.
-    """
+    adapted: |E'| of the yield function is that of dev(mat((I + G) vech(E) + h)), E = dev(log W) of the trial."""
     field33, field6, field66, fieldp = field_types(scalar)
     own = particle_access(scalar, SLOTS)
 

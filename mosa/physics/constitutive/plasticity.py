@@ -32,8 +32,7 @@ def friction_alpha(angle: Tensor, cone: str = "klar") -> Tensor:
     """Slope of the Drucker-Prager cone from the friction angle [degrees]: sqrt(2/3) 2 sin/(3 - sin).
 
     cone: klar (Klar et al. 2016) | printed: the square root over the whole fraction, as the paper
-    prints it: a misprint, by which 30 degrees yield as 46 do.
-    """
+    prints it: a misprint, by which 30 degrees yield as 46 do."""
     s = torch.sin(torch.deg2rad(angle))
     if cone == "printed":
         return (2.0 / 3.0 * 2 * s / (3 - s)) ** 0.5

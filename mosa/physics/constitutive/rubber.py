@@ -43,8 +43,7 @@ def isochoric_left(F: wp.mat33d):
 def mooney_rivlin(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     """mu dev((1 - s) b_bar + s (I1 b_bar - b_bar^2)) and the volumetric part, s = second_share.
 
-    Energy c1 (I1 - 3) + c2 (I2 - 3) of b_bar, c1 = mu (1 - s)/2, c2 = mu s/2 (Mooney 1940, Rivlin 1948).
-    """
+    Energy c1 (I1 - 3) + c2 (I2 - 3) of b_bar, c1 = mu (1 - s)/2, c2 = mu s/2 (Mooney 1940, Rivlin 1948)."""
     b = isochoric_left(F)
     second = wp.trace(b) * b - b * b
     return p[0] * deviator((_ONE - p[2]) * b + p[2] * second) + volumetric(F, p)
@@ -54,8 +53,7 @@ def mooney_rivlin(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParamet
 def yeoh(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     """mu (1 + 2 r2 x + 3 r3 x^2) dev(b_bar) and the volumetric part, x = tr b_bar - 3.
 
-    Energy mu/2 (x + r2 x^2 + r3 x^3): Yeoh's (1993) with C20 = r2 C10, C30 = r3 C10; r2, r3: yeoh_2, yeoh_3.
-    """
+    Energy mu/2 (x + r2 x^2 + r3 x^3): Yeoh's (1993) with C20 = r2 C10, C30 = r3 C10; r2, r3: yeoh_2, yeoh_3."""
     b = isochoric_left(F)
     x = wp.trace(b) - _THREE
     return p[0] * (_ONE + _TWO * p[2] * x + _THREE * p[3] * x * x) * deviator(b) + volumetric(F, p)
@@ -74,8 +72,7 @@ def ogden(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     """sum over k of 2 mu_k/alpha_k dev(b_bar^(alpha_k/2)) and the volumetric part (Ogden 1972).
 
     Energy sum of 2 mu_k/alpha_k^2 (sum_i l_i^alpha_k - 3), l_i = J^(-1/3) S_i. mu_2 = s2 mu, mu_3 = s3 (mu - mu_2) and mu_1 the
-    rest, with the shares s2 and s3 (share_2, share_3): 0 leaves a term out.
-    """
+    rest, with the shares s2 and s3 (share_2, share_3): 0 leaves a term out."""
     U, S, V = svd(F)
     rest = p[0] * (_ONE - p[3])
     T = ogden_term(F, U, S, V, rest * (_ONE - p[5]), p[2]) + volumetric(F, p)

@@ -37,8 +37,7 @@ _KERNELS = {dtype: _make(_MATRIX[dtype], _VECTOR[dtype]) for dtype in _MATRIX}
 def singular_value_decomposition(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(U (..., 3, 3), S (..., 3), V (..., 3, 3)) with F = U diag(S) V^T, without gradient; F: finite, float32 or float64.
 
-    det U = det V = 1, S descending, the last one carries the sign of det F (`kinematics`). Computed in float64.
-    """
+    det U = det V = 1, S descending, the last one carries the sign of det F (`kinematics`). Computed in float64."""
     flat = F.detach().reshape(-1, 3, 3).contiguous()
     U, V, S = torch.empty_like(flat), torch.empty_like(flat), flat.new_empty(len(flat), 3)
     if len(flat):

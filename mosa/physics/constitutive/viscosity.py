@@ -61,8 +61,7 @@ def flow_fraction(
 def herschel_bulkley(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     """kappa/2 (J^2 - 1) I + mu dev(b_bar), b_bar = J^(-2/3) F F^T; J > 0 only. The paper's variant.
 
-    Energy kappa/2 ((J^2 - 1)/2 - log J) + mu/2 (tr b_bar - 3) (Simo, Hughes 1998).
-    """
+    Energy kappa/2 ((J^2 - 1)/2 - log J) + mu/2 (tr b_bar - 3) (Simo, Hughes 1998)."""
     J = wp.determinant(F)
     b = wp.pow(J, -_TWO * _THIRD) * (F * wp.transpose(F))
     return _HALF * p[1] * (J * J - _ONE) * eye() + p[0] * deviator(b)
@@ -76,8 +75,7 @@ def herschel_bulkley_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d
     mu, and b_bar gets the trace with which its determinant stays 1.
 
     p: mu, kappa, yield_stress, viscosity. An adapter that corrects the strain adds 2 mu (|E'| - |E|) to |s_trial|: dev(b_bar) is
-    2 E at small strain, and a factor |E'|/|E| would have no derivative where E vanishes. norm_eps is under the root [Pa^2].
-    """
+    2 E at small strain, and a factor |E'|/|E| would have no derivative where E vanishes. norm_eps is under the root [Pa^2]."""
     A = F
     yielded = int(0)
     J = wp.determinant(F)
@@ -126,8 +124,7 @@ def newtonian(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters)
     """kappa (J - J^-6) I + mu sym(C_affine) J: Tait-like pressure p = kappa (J^-7 - 1) and a viscous stress. p: mu, kappa.
 
     The viscous term is half of the usual 2 mu D, not deviatoric, and takes the last C_affine; kept so that published values of mu
-    can be compared. tau(I) = 0 for C_affine = 0.
-    """
+    can be compared. tau(I) = 0 for C_affine = 0."""
     J = wp.determinant(F)
     x = _ONE / J
     x3 = x * x * x

@@ -19,8 +19,7 @@ class ColliderBuffers:
     poses, adj_poses: position (S, W K, 3), rotation (S, W K, 3, 3), linear, angular (S, W K, 3) of W worlds, one after another;
     struck: velocities after `strike`; reaction_arrays: what particles add their forces and torques
     to; reaction: force [N] and torque [N m] about the collider's origin (S, W K, 3), as the body exerts them on the collider in
-    world axes.
-    """
+    world axes."""
 
     def __init__(
         self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool

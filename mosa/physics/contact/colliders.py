@@ -62,8 +62,7 @@ class Box:
 @dataclass(frozen=True, eq=False)
 class Particles:
     """No solid: particles of the body itself, which the motion holds (`driven`). indices: (n,),
-    None where the simulator is told them with each rollout. Such colliders come after all solids.
-    """
+    None where the simulator is told them with each rollout. Such colliders come after all solids."""
 
     indices: Tensor | None = None
 
@@ -89,8 +88,7 @@ class Collider:
 
     mode: how a particle that touches it slides: `sticky` not at all, `slip` freely, `separate` and `touch` with Coulomb
     `friction`. In all modes a body comes off freely. `touch` is a ground's mode of that name, softer than the others: a body loses
-    less of its bounce, and plates press with too little force (docs/verification.md).
-    """
+    less of its bounce, and plates press with too little force (docs/verification.md)."""
 
     shape: Shape
     mode: str = "sticky"
@@ -220,8 +218,7 @@ def colliders_from_config(
     Each: type: plane | sphere | capsule | cylinder | box | mesh, with radius, length [m], size (3 edges) [m], or path (OBJ, PLY, or
     STL, which needs trimesh; with spacing [m] of the lattice, and scale); plane takes `normal` instead of rotation; mode, friction,
     name; position (3,) [m]; rotation (ax, ay, az, degrees); motion: {velocity, angular_velocity [rad/s], times} or
-    {waypoints: [{time, position, rotation}, ...]}. Errors: ConfigError naming the entry and the field.
-    """
+    {waypoints: [{time, position, rotation}, ...]}. Errors: ConfigError naming the entry and the field."""
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
         raise ConfigError(f"{field_name}: expected a list of colliders, found {items!r}")
     return tuple(

@@ -45,8 +45,7 @@ class Driven:
     (n, 3) [m], each of which means the particle nearest to it. None with `Points`: those places
     are the points. held: False for a load alone, which goes with its particles. mass [kg]: fixed
     to them, each has its share by volume. place: motion whose pose at t = 0 is the region's, None
-    for `motion`. Errors: ConfigError.
-    """
+    for `motion`. Errors: ConfigError."""
 
     region: Shape | Tensor | Sequence[int] | None
     motion: Motion | Trajectory | Points = field(default_factory=Motion)
@@ -176,8 +175,7 @@ def driven_from_config(
     Each: the region as a collider's shape (type with its keys, position, rotation or normal),
     `indices`, or `points`; motion as a collider's, or times (T,) [s] and points (T, n, 3) [m], as
     {path: an npz} or as lists; mass [kg]; held; name. Errors: ConfigError naming the entry and
-    the field, DataError naming the file.
-    """
+    the field, DataError naming the file."""
     if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
         raise ConfigError(f"{field_name}: expected a list of driven sets, found {items!r}")
     return tuple(

@@ -16,8 +16,7 @@ class DrivenBuffers:
     poses and reactions are theirs.
 
     mass_wp: (N,) [kg] with which particles go to the grid; paths, adj_paths: (S, W P, 3) places [m]
-    and rates [m/s] of the P points of W worlds.
-    """
+    and rates [m/s] of the P points of W worlds."""
 
     def __init__(self, colliders, scalar, substeps: int, points: int, work) -> None:
         self.colliders, self.count = colliders, points

@@ -75,8 +75,7 @@ def field_of_triangles(
 
     spacing [m] of the lattice (None: the longest extent over 48); margin [m] beyond the mesh, at least two
     spacings (None: a sixth of the longest extent).
-    Errors: ConfigError: shapes, indices, no area, not closed, lattice too large.
-    """
+    Errors: ConfigError: shapes, indices, no area, not closed, lattice too large."""
     points, index = np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
     if points.shape[1:] != (3,) or index.shape[1:] != (3,) or not len(index):
         raise ConfigError(
@@ -144,8 +143,7 @@ def _welded(points: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (P, 3) and triangles (T, 3) of an OBJ, PLY or STL file; faces with more corners are cut into fans.
 
-    Errors: ConfigError naming the file.
-    """
+    Errors: ConfigError naming the file."""
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"mesh: no file {path}")
@@ -175,8 +173,7 @@ def field_of_mesh(
 ) -> SignedDistanceField:
     """Signed distances to the mesh of a file (`read_mesh`), times `scale` to metres.
 
-    Errors: ConfigError naming the file.
-    """
+    Errors: ConfigError naming the file."""
     vertices, triangles = read_mesh(path)
     try:
         return field_of_triangles(scale * vertices, triangles, spacing, margin)

@@ -37,8 +37,7 @@ def exponential(vectors: Tensor) -> Tensor:
 def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
     """(..., 3, 3) float64 of rotation vectors (..., 3) [rad] or matrices, with `leading` dimensions before. Differentiable.
 
-    Errors: ConfigError for another shape, or matrices that are not rotations (1e-4).
-    """
+    Errors: ConfigError for another shape, or matrices that are not rotations (1e-4)."""
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.ndim == leading + 1 and value.shape[-1] == 3:
         return exponential(value)
@@ -127,8 +126,7 @@ class Motion:
     position: (3,) [m]; rotation: (3,) rotation vector [rad] or (3, 3); velocity, angular_velocity: (3,) for always or (K, 3),
     [m/s], [rad/s], world axes. times: (K,) [s] start of each piece, ascending; at rest before the first, and the last one never
     ends. Without times K is 1, the number of frame intervals, or the number of substeps of the rollout. Numbers or tensors;
-    differentiable in all but times.
-    """
+    differentiable in all but times."""
 
     position: Tensor | Sequence[float] = (0.0, 0.0, 0.0)
     rotation: Tensor | Sequence = (0.0, 0.0, 0.0)
@@ -147,8 +145,7 @@ class Motion:
 
         positions: (K, 3) [m]; rotations: (K, 3) or (K, 3, 3), turned by less than half a turn from one to the next, or by more
         where vectors about one axis say so (`turning`).
-        Errors: ConfigError naming the field.
-        """
+        Errors: ConfigError naming the field."""
         times = torch.as_tensor(times, dtype=torch.float64)
         positions = _vectors("waypoints: positions", positions)
         count = len(times)
@@ -240,8 +237,7 @@ class Motion:
         """The same motion with `times` said: what one velocity per frame interval means, whatever the substeps.
 
         frames: intervals of the rollout, None where there may be any number of them.
-        Errors: ConfigError for another number of velocities without times: substeps of varying length have no such list.
-        """
+        Errors: ConfigError for another number of velocities without times: substeps of varying length have no such list."""
         if self.times is not None:
             return self
         count = max(
@@ -300,8 +296,7 @@ class Points:
 
     Each driven particle keeps its place relative to the point that is nearest to it at the start.
     Differentiable in the points. The pose is that of their mean, without rotation: torques are
-    about it. Errors: ConfigError naming the field.
-    """
+    about it. Errors: ConfigError naming the field."""
 
     times: Tensor
     points: Tensor
@@ -372,8 +367,7 @@ def sample_frame(
     """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
 
     first, count: of its substeps; replayed: whether counts were given beforehand. A trajectory fits given counts alone.
-    Errors: ConfigError.
-    """
+    Errors: ConfigError."""
     dt, sampled = frame_dt / count, []
     for motion in motions:
         if not isinstance(motion, Trajectory):
@@ -399,8 +393,7 @@ def sample_poses(
 ) -> Poses:
     """Poses (float64, CPU) of all colliders at every substep of `frames` frame intervals, from the `first` one after time `start`.
 
-    Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
-    """
+    Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing)."""
     what, each = "substeps of all frames and colliders", 3 * 8 * (3 + 9 + 3 + 3)
     counted(what, (frames, substeps, len(motions)), "take fewer", each=each)
     return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions])

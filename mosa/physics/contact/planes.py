@@ -47,8 +47,7 @@ class Plane:
     """A half space {y: (y - point).normal <= 0} that is solid. point: (3,) [m]; normal: (3,) outward, any length.
 
     mode: sticky | slip | separate | touch; friction: Coulomb coefficient, for separate and touch; thickness [m]: over this
-    distance above the plane the contact with what is slow fades in; None: `THICKNESS` cells where there is friction, else 0.
-    """
+    distance above the plane the contact with what is slow fades in; None: `THICKNESS` cells where there is friction, else 0."""
 
     point: Triple
     normal: Triple

@@ -34,8 +34,7 @@ def shape_functions(scalar) -> SimpleNamespace:
     """Warp functions signed_distance -> (phi, gradient) and curvature -> Hessian of phi times a vector, for float32 or float64.
 
     Arguments: shape k, point q (3,) in its axes [m], packed shapes (K, 11), codes (K, 5) and fields (flat lattice values, z
-    fastest). Sizes: sphere radius; capsule and cylinder radius, half length; box half edges.
-    """
+    fastest). Sizes: sphere radius; capsule and cylinder radius, half length; box half edges."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
 

@@ -18,8 +18,7 @@ class Lanes:
     same launches, and one for each world on a CPU, where as many of them as there are cores advance at a time, each on a grid of
     its own.
 
-    buffers: of the simulator, whose workspaces a solver uses while it runs.
-    """
+    buffers: of the simulator, whose workspaces a solver uses while it runs."""
 
     def __init__(self, solvers: Sequence[SegmentSolver], buffers: Buffers) -> None:
         self.solvers, self.buffers = list(solvers), buffers

@@ -101,8 +101,7 @@ def material_state(
 
     w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.
     into: add the gradients of F, C_affine and parameters to these contiguous tensors, and give autograd none. That of the
-    parameters begins at a multiple of 16 bytes.
-    """
+    parameters begins at a multiple of 16 bytes."""
     scalar = SCALARS[F.dtype]
     mat33, vec6, _, vecp = field_types(scalar)
     kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)

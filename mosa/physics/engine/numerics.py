@@ -80,8 +80,7 @@ class Steps(NamedTuple):
     """Times [s] of a segment's substeps: each moves particles by `dt`; the first one's forces act for `kick`, the others' for dt.
 
     Velocities lie between positions, half a substep back. Where dt changes, the way from the middle of the last substep to that
-    of the next is the mean of the two: with that kick the scheme stays the leapfrog that it is at a constant dt.
-    """
+    of the next is the mean of the two: with that kick the scheme stays the leapfrog that it is at a constant dt."""
 
     kick: float
     dt: float

@@ -274,8 +274,7 @@ def advance_segment(
     """(state after `substeps`, reactions), differentiable in state, everything in `held`, and poses.
 
     poses: of K colliders at the segment's S substeps, () where there are none; reactions: as a `Stretch` leaves them. steps: times
-    of the substeps, the numerics' dt by default.
-    """
+    of the substeps, the numerics' dt by default."""
     steps = steps or Steps(lanes.numerics.dt, lanes.numerics.dt)
     done, most, reactions = 0, substeps, []
     while done < substeps:

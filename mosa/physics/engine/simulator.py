@@ -100,8 +100,7 @@ class Simulator:
     None for no limit. It computes in axes of its own (`axes`): planes that nodes meet have to be at right angles.
     energetic: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E of Green's strain that is added to
     1 + h[0] times the prior's; else an operator on the prior's stress. options: how the law is taken.
-    Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
-    """
+    Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts."""
 
     @typed
     def __init__(
@@ -180,8 +179,7 @@ class Simulator:
 
         rotation: (N, 3, 3), fills the law's reference rotation. worlds: (W N, SLOTS), one world's after the other's; values may
         then also be (W, N) or (W, 1), vectors (W, N, k) or (W, 1, k). Errors: ConfigError naming a missing, unknown or misshapen
-        one.
-        """
+        one."""
         shape = (particles,) if worlds is None else (worlds, particles)
         like = self.numerics.planes  # of its type and on its device
         factor = YIELD_CONVENTIONS[self.options.yield_convention]
@@ -233,8 +231,7 @@ class Simulator:
         all of them on a CUDA device, where they fill it, and one on a CPU, where as many worlds as there are cores advance at a
         time; it divides B. The result has x (T, B, N, 3) and so on, reactions (T - 1, substeps, B, K, 6): `Rollout.worlds` parts
         it. On a CPU each world has the bits of its own rollout, where gradients of what worlds share are summed over them.
-        SimulationDiverged names the world: none of the others is returned.
-        """
+        SimulationDiverged names the world: none of the others is returned."""
         asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held,
                        frames, collect, start_time)  # fmt: skip
         stepper, start = self._stepper(state, asked)
@@ -297,8 +294,7 @@ class Simulator:
         """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout`.
 
         timing: choose the substeps of every frame. steps: for which there shall be memory to keep all states, where a gradient is
-        wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError.
-        """
+        wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError."""
         asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held)  # fmt: skip
         stepper, moment = self._stepper(state, asked)
         stepper.prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())

@@ -45,8 +45,7 @@ class SegmentSolver:
     budget: for the states of all substeps, between the passes; segments that do not fit are run
     again in the backward pass. gravities: of every world [m/s^2], among which the particles are shared in equal parts;
     None: one world with the numerics' own. first_world: number of the first one, for messages, None
-    where there is but one. driven: particles of all worlds, None for none.
-    """
+    where there is but one. driven: particles of all worlds, None for none."""
 
     def __init__(
         self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float,

@@ -245,8 +245,7 @@ class Stepper:
 
     prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; clock: how many substeps
     the steps take; motions: of the `solids`, of every world; axes: of the moments' states. `axes.world.state` has them in the
-    world, as poses and reactions are here.
-    """
+    world, as poses and reactions are here."""
 
     prepared: Prepared
     worlds: int | None
@@ -265,8 +264,7 @@ class Stepper:
 
         poses: of K colliders at the step's S substeps, (S, K, ...) or, of B worlds, (S, B, K, ...), or a function of S and their
         dt [s]; None: of their own motions. speed: bound of the colliders' speeds [m/s] for substeps that are chosen, None for
-        that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError.
-        """
+        that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError."""
         state, frame = self.enter(moment, moment.substeps == 0, speed)
         along = self._poses(moment, frame, poses)
         pace = self.prepared.begin(state, along, frame.count, self.clock.varies)

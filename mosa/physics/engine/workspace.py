@@ -49,8 +49,7 @@ class Workspace:
 
     worlds: among which the particles are shared in equal parts, one world's after the other's; adapted, plastic_adapted: whether a
     stress operator and a plastic operator act; shared: the stress operator is the same for all particles, with gradients by
-    particle; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators, which only `point` gives.
-    """
+    particle; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators, which only `point` gives."""
 
     @torch.inference_mode(False)
     def __init__(

@@ -46,8 +46,7 @@ def grid_window(
     """(lowest node, nodes per axis) (..., 3) that hold the stencils of all particles of each world for `time` seconds.
 
     x, v: (..., N, 3); bounds: their extent, where the host has it already; name: of a world, for messages. Errors:
-    SimulationDiverged for non-finite input or particles of a world spread over more than 2^23 nodes.
-    """
+    SimulationDiverged for non-finite input or particles of a world spread over more than 2^23 nodes."""
     # the only transfer to the host
     bounds = extent(x, v).numpy(force=True) if bounds is None else bounds
     rows = np.reshape(bounds, (-1, 12))

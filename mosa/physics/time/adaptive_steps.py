@@ -48,8 +48,7 @@ def current_modulus(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -
 
     Largest over the principal axes n of F F^T of d tau_nn/d log(lambda_n) + max(-tau_nn, 0), by central differences of the law's
     stress at fixed C_affine. The first term is the material's, the second that of the moving particles (the acoustic tensor has
-    -tau_nn in tension too, where it softens; that is not relied on). F: (N, 3, 3); parameters: packed, (N, SLOTS).
-    """
+    -tau_nn in tension too, where it softens; that is not relied on). F: (N, 3, 3); parameters: packed, (N, SLOTS)."""
     axes = torch.linalg.eigh((F @ F.mT).double()).eigenvectors.to(F.dtype)
     tau = kirchhoff_stress(law, F, C_affine, parameters)
     result = torch.full_like(F[:, 0, 0], -math.inf)
@@ -70,8 +69,7 @@ class StepChooser:
     """Decides the substeps of the frames of one rollout.
 
     parameters: physical values by name; packed: (N, SLOTS); density: number or (N,) [kg/m^3]; frame_dt [s]; collider_speed [m/s]:
-    bound of the speed of any collider's surface.
-    """
+    bound of the speed of any collider's surface."""
 
     def __init__(
         self, control: StepControl, numerics: Numerics, parameters: dict[str, Tensor], packed: Tensor,
@@ -92,8 +90,7 @@ class StepChooser:
         """Substeps from frame - 1 to `frame`. state: at frame - 1; collider_speed [m/s]: in this frame, None for the bound in any.
 
         A law that softens in compression is not followed below its stiffness at rest: it may be back there within the frame.
-        Errors: SimulationDiverged for a state that is not finite; ConfigError where more than the maximum would be needed.
-        """
+        Errors: SimulationDiverged for a state that is not finite; ConfigError where more than the maximum would be needed."""
         control, dx, (_, v, C_affine, F, _) = self.control, self.numerics.dx, state
         finite = torch.isfinite(torch.cat([F, C_affine, v[..., None]], -1)).flatten(1).all(1)
         if not bool(finite.all()):

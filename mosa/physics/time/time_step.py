@@ -15,8 +15,7 @@ Pa s, kappa 1e4 and 1e5 Pa, dx 0.04 m) it decays at the bound and at steps a qua
 def wave_speed(modulus_max: float, density: float, factor: float = 1.0) -> float:
     """Speed bound c = sqrt(factor M / rho) [m/s]. modulus_max: M = lam + 2 mu [Pa]; density [kg/m^3].
 
-    factor: what the adapter (1.85 at alpha 0.1, 2.45 at 0.15) and heterogeneity (1.2) may stiffen the body by.
-    """
+    factor: what the adapter (1.85 at alpha 0.1, 2.45 at 0.15) and heterogeneity (1.2) may stiffen the body by."""
     return math.sqrt(factor * modulus_max / density)
 
 
@@ -26,8 +25,7 @@ def step_rate(
     """1/dt [1/s] of the largest stable step. speed: wave speed c [m/s]; viscosity [Pa s] of a stress mu sym(C_affine).
 
     max(c/(courant dx) + viscosity/(VISCOUS_NUMBER rho dx^2), v_max/(dx/2)). The first two add up: with the damping of the last
-    substep the limit of an oscillator is (2/omega)(sqrt(1 + zeta^2) - zeta) >= (2/omega)/(1 + 2 zeta).
-    """
+    substep the limit of an oscillator is (2/omega)(sqrt(1 + zeta^2) - zeta) >= (2/omega)/(1 + 2 zeta)."""
     return max(
         speed / (courant * dx) + viscosity / (VISCOUS_NUMBER * density * dx) / dx,
         v_max / (0.5 * dx),
@@ -43,8 +41,7 @@ def required_substeps(
 
     viscosity [Pa s]: physical value of the largest one that acts explicitly (`Law.viscosity`), see `step_rate`.
     limited_by: the argument that sets `limit`.
-    Errors: ConfigError when an argument is not positive, or when more than `limit` substeps would be needed.
-    """
+    Errors: ConfigError when an argument is not positive, or when more than `limit` substeps would be needed."""
     values = {"modulus_max": modulus_max, "density": density, "frame_dt": frame_dt, "dx": dx}
     values |= {"factor": factor, "courant": courant}
     for name, value in values.items():

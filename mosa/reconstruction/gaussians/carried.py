@@ -123,8 +123,7 @@ def fit_carried(
 
     static: Gaussians at rest, where the fit starts; particles: (N, 3) at rest and positions: (T, N, 3) [m] of the frames 0 to T - 1
     that `windows` show. Each splat follows the motion's affine part where the static one lies. The same bits for the same seed on
-    a CPU.
-    """
+    a CPU."""
     generator = torch.Generator().manual_seed(seed)
     gaussians = RestGaussians(static, surface_normals(static.means, particles), settings)
     carried, eyes = bind(static.means, particles).carry(positions), centers(windows.cameras)

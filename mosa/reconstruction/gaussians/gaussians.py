@@ -32,8 +32,7 @@ class FreeGaussians:
     """N Gaussians as free numbers: position [m], log of the scale(s), logits of opacity and colour, quaternion where anisotropic.
 
     Starts isotropic, with the mean scale of each of `splats`. smallest, largest: bounds of a scale in units of its start;
-    axis_ratio: bound of the largest scale over the smallest. `first_colors` (N, 3) are the colours at the start.
-    """
+    axis_ratio: bound of the largest scale over the smallest. `first_colors` (N, 3) are the colours at the start."""
 
     def __init__(
         self,

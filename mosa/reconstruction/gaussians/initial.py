@@ -42,8 +42,7 @@ def sampled_windows(points: Tensor, windows: Windows) -> Tensor:
 def projected_colors(points: Tensor, normals: Tensor, windows: Windows) -> Tensor:
     """Colours (N, 3) of surface points: mean over the views that face them, weighted by the cosine to the fourth power.
 
-    Occlusion by other parts is not looked at; the fit corrects it.
-    """
+    Occlusion by other parts is not looked at; the fit corrects it."""
     sampled, centre = sampled_windows(points, windows), centers(windows.cameras)
     cosine = (F.normalize(centre[:, None] - points, dim=-1) * normals).sum(-1).clamp(min=0)
     weight = (cosine + 0.02) ** 4

@@ -35,8 +35,7 @@ def fit_splats(
     """Gaussians fitted to windows of ONE frame: colours, opacities, scales, rotations where anisotropic, positions with `move`.
 
     They start isotropic, of the mean scale of `splats`. With `move` and StaticSettings vanished ones are moved onto opaque
-    ones. The same bits for the same seed on a CPU.
-    """
+    ones. The same bits for the same seed on a CPU."""
     generator = torch.Generator().manual_seed(seed)
     every = settings.relocate_every if move and isinstance(settings, StaticSettings) else 0
     unit = float(splats.scales.mean(1).mean())

@@ -11,8 +11,7 @@ class UniformAdam(torch.optim.Optimizer):
 
     Source: Nicolet et al. 2021, "Large steps in inverse rendering of geometry", where one serves all numbers.
     Directions keep the proportions that the gradient gives them, so a preconditioned parametrisation (smooth modes with units
-    that fall with their wave number) stays preconditioned; plain Adam would equalise all of them.
-    """
+    that fall with their wave number) stays preconditioned; plain Adam would equalise all of them."""
 
     def __init__(self, params, lr: float, betas: tuple[float, float] = (0.9, 0.99)) -> None:
         super().__init__(params, {"lr": lr, "betas": betas})

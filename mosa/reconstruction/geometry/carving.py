@@ -123,8 +123,7 @@ def votes(body: Volume, views: Windows) -> Tensor:
 def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
     """`kept` with the body's voxels given back on rays of the mattes that nothing kept covers any more: no part is ever lost.
 
-    A bin beside a covered one counts as covered: a surface may move by the width of one, a limb cannot vanish.
-    """
+    A bin beside a covered one counts as covered: a surface may move by the width of one, a limb cannot vanish."""
     inside = body.values > 0.5
     points, held = body.points()[inside], kept[inside]
     missing = torch.zeros_like(held)
@@ -149,8 +148,7 @@ def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
 def carve(body: Volume, views: Windows) -> Volume:
     """The body (values 0 or 1) without the voxels that the colours show to be air; views: windows of one pose of the body.
 
-    Ends before `PASSES` rounds where one changes less than a thousandth of the body.
-    """
+    Ends before `PASSES` rounds where one changes less than a thousandth of the body."""
     for _ in range(PASSES):
         inside = body.values > 0.5
         air = smooth(votes(body, views), 1.0) >= VOTES

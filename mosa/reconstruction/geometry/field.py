@@ -38,8 +38,7 @@ def bell(sigma: float, like: Tensor) -> Tensor:
 def smooth(values: Tensor, sigma: float, dims: tuple[int, ...] = (-3, -2, -1)) -> Tensor:
     """Gaussian mean over the last axes named by `dims`; beyond the border the values of the border.
 
-    By sums of shifted copies and not by a convolution, whose rounding depends on the device.
-    """
+    By sums of shifted copies and not by a convolution, whose rounding depends on the device."""
     weights = bell(sigma, values).tolist()
     reach = len(weights) // 2
     for dim in dims:
@@ -87,8 +86,7 @@ def first_crossing(
 ) -> Tensor:
     """Way (M,) [m] along rays (M, 3) to where a distance (negative inside) first falls below 0; infinite where it never does.
 
-    start: (M,) ways before which nothing is looked for; nan: from the grid's border.
-    """
+    start: (M,) ways before which nothing is looked for; nan: from the grid's border."""
     centre, radius = span(distance)
     middle = ((centre - origin) * direction).sum(-1)
     first = middle - radius

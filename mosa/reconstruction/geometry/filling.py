@@ -49,8 +49,7 @@ def _keep_thin_features(
 ) -> None:  # fmt: skip
     """Keeps further cells, the fullest first, until no voxel is farther than `reach` from a kept cell's centre.
 
-    kept, count: per cell; cell: (M,) cell of each voxel; voxels: (M, 3); centres: of all cells. Changes `kept`.
-    """
+    kept, count: per cell; cell: (M,) cell of each voxel; voxels: (M, 3); centres: of all cells. Changes `kept`."""
     far = np.flatnonzero(~kept[cell])
     far = far[cKDTree(centres[kept]).query(voxels[far])[0] > reach] if len(far) else far
     while len(far):
@@ -66,8 +65,7 @@ def fill(volume: Volume, *, spacing: float) -> Particles:
     Each voxel of the body belongs to the particle of its cell or, where that has none, to the nearest one; a particle's
     volume is that of its voxels and it sits at their centroid: so total volume, centre of mass and, nearly, moments of
     inertia are those of the body, and the interior is a regular lattice.
-    Features thinner than the lattice keep particles of their own. Raises DataError for an empty volume.
-    """
+    Features thinner than the lattice keep particles of their own. Raises DataError for an empty volume."""
     body = _body(volume)
     origin = volume.origin.double().cpu().numpy()
     voxels = np.argwhere(body) * volume.pitch + origin

@@ -123,8 +123,7 @@ def color_information(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Information [1/m^2] and information times displacement [1/m] along the outward normal, (N,) each, of surface points (N, 3).
 
-    doubt: divided by the square of the residual's chi^2, where that is larger than 1.
-    """
+    doubt: divided by the square of the residual's chi^2, where that is larger than 1."""
     cameras = group.views.cameras
     slopes = gradient(distance.values, distance.pitch)
     normal = F.normalize(sample(slopes, (points - distance.origin) / distance.pitch), dim=-1)
@@ -174,8 +173,7 @@ def outline_information(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Points (M, 3) where rays of an outline's pixels pass nearest, information [1/m^2], information times displacement [1/m].
 
-    width: of a pixel at the body [m].
-    """
+    width: of a pixel at the body [m]."""
     origin = group.centres[group.outline.nonzero()[:, 0]]
     direction, matte = group.directions[group.outline], group.views.mattes[group.outline]
     best, way = nearest_passing(distance, origin, direction)

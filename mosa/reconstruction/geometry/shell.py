@@ -89,8 +89,7 @@ def solid_of(
     """The solid that Gaussians (CPU) enclose, occupancy in [0, 1].
 
     resolution: voxels along the longest side; share: of 26 directions that have to end at the shell; up: (3,), given where the
-    underside is open: directions that fall count as closed. Errors: DataError where nothing is enclosed.
-    """
+    underside is open: directions that fall count as closed. Errors: DataError where nothing is enclosed."""
     low, high = splats.means.amin(0), splats.means.amax(0)
     extent = float((high - low).max())
     if not 0 < extent < np.inf:

@@ -26,8 +26,7 @@ class Neighbourhood:
     """Linear estimate of the deformation gradient from positions: F_i = sum_k (x_j - x_i) (x) gradient_ik, j = index_ik.
 
     index: (N, k) long; gradient: (N, k, 3) [1/m]; weight: (N,) 1 where the moment matrix is well conditioned, else 0;
-    kernel: (N, k) the least-squares weights; offset: (N, k, 3) [m] rest vectors to the neighbours.
-    """
+    kernel: (N, k) the least-squares weights; offset: (N, k, 3) [m] rest vectors to the neighbours."""
 
     index: Tensor
     gradient: Tensor
@@ -47,8 +46,7 @@ def neighbourhood(rest: Tensor, *, neighbours: int = 20) -> Neighbourhood:
     Minimises sum_k w_k |d_k - F D_k|^2, D rest vector, d deformed vector, w = (1 - r^2/r_max^2)^2 with r_max 1.2 times the
     distance of the farthest neighbour. Where the moment matrix has a condition number above `CONDITION_LIMIT` (neighbours in a
     plane or on a line) the weight is 0 and the gradient that of F = 0: such particles must not be used.
-    Raises DataError for fewer than 5 particles.
-    """
+    Raises DataError for fewer than 5 particles."""
     points = rest.detach().cpu().double().numpy()
     if len(points) < 5:
         raise DataError(
@@ -76,8 +74,7 @@ def neighbourhood(rest: Tensor, *, neighbours: int = 20) -> Neighbourhood:
 def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (..., 3, 3) with det +1 and descending singular values (..., 3) of deformation gradients, not differentiable.
 
-    The smallest singular value carries the sign of the determinant. Computed in float64.
-    """
+    The smallest singular value carries the sign of the determinant. Computed in float64."""
     U, S, Vh = torch.linalg.svd(deformation.detach().double())
     sign = torch.ones_like(S)
     sign[..., 2] = torch.where(torch.linalg.det(U) * torch.linalg.det(Vh) < 0, -1.0, 1.0)
@@ -102,8 +99,7 @@ def gaussian_cues(
 ) -> MotionCues:
     """The paper's cues: change of each Gaussian's own scale and rotation since frame 0.
 
-    scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1.
-    """
+    scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1."""
     rest = quaternion_to_matrix(splats.rotations)
     rotation = quaternion_to_matrix(rotations) @ rest.transpose(-1, -2)
     stretch = (scales / splats.scales).sort(-1, descending=True).values

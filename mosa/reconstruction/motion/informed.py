@@ -63,8 +63,7 @@ def informed_motion(
 
     predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one; judging: the
     Gaussians by which the two motions are compared in the end, those that were not fitted as `seen` carried them: it would win by
-    that alone. None: those of the target.
-    """
+    that alone. None: those of the target."""
     scaffold, windows, offsets = target.scaffold, target.windows, target.offsets
     motion = target.modal()
     every = torch.arange(len(offsets), device=offsets.device)

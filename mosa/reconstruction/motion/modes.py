@@ -46,8 +46,7 @@ class Modes:
     def at(self, points: Tensor, rest: Tensor) -> Modes:
         """The same modes at other points (M, 3) [m]: first-order expansions around the nearest particles, blended by distance.
 
-        rest: (N, 3) [m] the particles' rest positions. Affine motions stay exact.
-        """
+        rest: (N, 3) [m] the particles' rest positions. Affine motions stay exact."""
         tree, places = cKDTree(rest.cpu().numpy()), points.detach().cpu().numpy()
         distance, index = tree.query(places, k=min(NEAREST, len(rest)))
         weight = 1 / (distance**2 + (0.3 * distance.max(1, keepdims=True)) ** 2 + 1e-12)

@@ -17,8 +17,7 @@ from mosa.types import Splats
 class MotionSample:
     """S frames of a moving Gaussian set. positions: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2]; deformation: (S, N, 3, 3);
     scales: (S, N, 3) [m]; rotations: (S, N, 4) quaternions wxyz of the Gaussians, None where their shape follows the
-    deformation. deformation is None where the network is evaluated without neighbourhoods.
-    """
+    deformation. deformation is None where the network is evaluated without neighbourhoods."""
 
     positions: Tensor
     covariances: Tensor
@@ -37,8 +36,7 @@ class ModalMotion(nn.Module):
     Frame 0 is the rest frame. With `free_shape` the Gaussians' scale and rotation have amplitudes of their own (the
     paper's free scale and rotation); otherwise A_t = F_t A_0 F_t^T with F_t the deformation gradient, as in the
     simulation.
-    offsets: (T, 3) [m] first guess of the translation of each frame.
-    """
+    offsets: (T, 3) [m] first guess of the translation of each frame."""
 
     def __init__(
         self,
@@ -131,8 +129,7 @@ class MotionBasisNetwork(nn.Module):
     of these numbers. Both read the time through a small network, from `time_frequencies` sines and
     cosines, and positions as `space_frequencies` of them. The value at t = 0 is subtracted, so that
     frame 0 is the rest frame. Scale and rotation are free. Skip and widths are those of GIC (Cai et al.
-    2024), which has 10 and 6 frequencies, one scale and no rotation; the paper frees both.
-    """
+    2024), which has 10 and 6 frequencies, one scale and no rotation; the paper frees both."""
 
     SKIP, CLOCK = 4, (256, 30)
 

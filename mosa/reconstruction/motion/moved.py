@@ -141,8 +141,7 @@ class SecondLook:
     own.
 
     reconstruction: of `scene`; seed: of the order in which views are drawn; plastic: whether the body yields or flows,
-    asked when images are first looked at (which law a body has may be found by its fit).
-    """
+    asked when images are first looked at (which law a body has may be found by its fit)."""
 
     scene: Scene
     reconstruction: Reconstruction

@@ -61,8 +61,7 @@ def object_windows(
     """Windows around the mattes of the given views and frames, `margin` px wider on each side, sides a multiple of `multiple`.
 
     A window may reach beyond the image: there it shows the background and an empty matte.
-    Raises DataError where a matte is empty.
-    """
+    Raises DataError where a matte is empty."""
     mattes = scene.mattes[views][:, frames].flatten(0, 1)
     view = torch.tensor(views).repeat_interleave(len(frames))
     frame = torch.tensor(frames).repeat(len(views))

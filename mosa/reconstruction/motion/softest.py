@@ -81,8 +81,7 @@ def softest_vectors(
 
     matrix: (N, N) symmetric, no eigenvalue below 0; points: (N, 3), over which the vectors are smooth; known: (N, k) orthonormal
     eigenvectors; its device is where the work is done. None where MOST_FILTERS do not reach TOLERANCE, or where there is no room
-    for the guard vectors beside the known ones.
-    """
+    for the guard vectors beside the known ones."""
     points, known = points.to(known), known.double()
     last = count + max(8, round(GUARD * count))
     if last + known.shape[1] > len(points):

@@ -61,8 +61,7 @@ def matte_centres(mattes: Tensor, cameras: Cameras, size: float | None = None) -
 
     Views where the matte is empty or runs over the image's border are left out where two others remain. size: side [m] of a square
     as large as the silhouettes of a known body, by which a single camera tells how far it is. Raises DataError where fewer than
-    two views see the object, or one of a body of unknown size.
-    """
+    two views see the object, or one of a body of unknown size."""
     x, y = (
         torch.arange(side, dtype=mattes.dtype, device=mattes.device) + 0.5
         for side in (cameras.width, cameras.height)
@@ -210,8 +209,7 @@ def register_pose(
     (N, 3) of the splats at rest, None where the light is not to be told from the colours; light: (8,) what is known of it.
     `rotations` are tried at about 28 px with at most `coarse_views` views, the best `starts` refined there, the best 3
     at about 56 px, the best at full resolution with all views. Errors: DataError where fewer than two views see the
-    object.
-    """
+    object."""
     # about which the body turns while searching, wherever X_c is
     middle = splats.means.detach().mean(0)
     body = RigidBody.of(splats, middle, normals)
@@ -293,8 +291,7 @@ def initial_velocity(
     (V, T, H, W, 3); mattes: (V, T, H, W); times: (T,) [s]; gravity: (3,) [m/s^2]. All frames are fitted at once; a
     small correction of the pose is fitted along and dropped, so that what offsets the first frame does not turn
     into velocity. exact: at full resolution in the end; False: at about 40 px alone, a third of the time.
-    Errors: DataError for fewer than two frames or views.
-    """
+    Errors: DataError for fewer than two frames or views."""
     if images.shape[1] < 2:
         raise DataError(
             f"initial velocity: {images.shape[1]} frame of free flight, at least 2 are needed"

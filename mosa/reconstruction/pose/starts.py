@@ -88,8 +88,7 @@ def sequence_start(
 
     The free frames are found on the way: a rough velocity from the first two frames predicts the contact, the frames before it
     give the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is
-    kept that frames after its own contact went into. Errors: DataError where contact comes before the second frame.
-    """
+    kept that frames after its own contact went into. Errors: DataError where contact comes before the second frame."""
     if scene.markers is not None:
         return start_at_rest(scene, body.center)
     cameras = scene.training_cameras

@@ -93,8 +93,7 @@ def bind(splats: Tensor, particles: Tensor) -> Binding:
     The fit at a splat's rest position X weighs neighbour i with w = (1 - r^2 / r_max^2)^2, r_max the distance of the farthest: a
     neighbour that leaves has no weight, so that the interpolated motion is continuous. Its value is sum_i c_i(X) x_i; the gradients
     of the coefficients are those of the interpolation itself, weights and r_max included, so that A is the derivative of where the
-    centre goes.
-    """
+    centre goes."""
     if len(particles) < 8:
         raise DataError(
             f"bind: expected at least 8 particles to carry splats, found {len(particles)}"

@@ -72,8 +72,7 @@ def rotated(coefficients: Tensor, rotation: Tensor) -> Tensor:
 
     Degree by degree, as a rotation mixes the harmonics of one degree alone. Its matrix (Wigner's, of real harmonics) is found by
     projection, Y(d)^+ Y(R^T d) over `DIRECTIONS` directions d: exact to rounding for every R, as degree l is closed under rotation,
-    and without Euler angles or recursion. Gradients to both. Errors: ConfigError for another K.
-    """
+    and without Euler angles or recursion. Gradients to both. Errors: ConfigError for another K."""
     degree = degree_of(coefficients)
     parts = [
         coefficients[..., :1, :].expand(

@@ -277,8 +277,7 @@ def seed_of_b(gh, rest, unit, r, N, i: tl.constexpr, RESTED: tl.constexpr):
 def moved_adjoint(v, r, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C, k0, k1, k2, g):
     """Of out = (I + G) v, seen from plane p. g: adjoint of out; k: column p of C_xyz.
 
-    Returns the normal traction n, the seeds of the plane's tractions, its components of v, and the adjoints of these components.
-    """
+    Returns the normal traction n, the seeds of the plane's tractions, its components of v, and the adjoints of these components."""
     y0 = g[p] + k0 * g[0] + k1 * g[1] + k2 * g[2]
     y1, y2 = 0.5 * g[c1], 0.5 * g[c2]
     a, b, c = components(v, r, M, p, c1, c2)

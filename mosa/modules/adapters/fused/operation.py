@@ -239,6 +239,5 @@ def fused_operator(
     s and h are in multiples of unit (1,), which gets no gradient: h = unit (b - b at rest), without the second where not rest_free,
     b = (I + G) L_pre + L_post of s / unit. numbers: what `microplane.correction` takes, 12 for each of C_x, C_y, C_z, C_xyz.
     weights: weight and bias of the layers of Phi, Psi1, the planes, Psi2 and Theta (26 tensors), all of one hidden width, a power
-    of two from 16.
-    """
+    of two from 16."""
     return _FusedOperator.apply(settings, unit, w, s, *weights)

@@ -125,8 +125,7 @@ def choose_ground(
 
     known: height of the ground and its accuracy; calibration: of the body on a ground. The body that
     sticks is calibrated first, with the search of a calibration; it is taken unless another contact
-    is clearly nearer (`taken_of`). Errors: SimulationDiverged where it cannot be simulated.
-    """
+    is clearly nearer (`taken_of`). Errors: SimulationDiverged where it cannot be simulated."""
     distances: dict[str, float] = {}
     grounds: dict[str, Ground] = {}
     numbers: dict[str, dict] = {}
