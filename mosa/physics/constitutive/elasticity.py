@@ -7,12 +7,7 @@ tau = (dPsi/dF) F^T and tau(I) = 0. Parameters: mu, lam, the Lamé parameters [P
 import warp as wp
 from torch import Tensor
 
-from mosa.physics.constitutive.energies import (
-    corotated_energy,
-    linear_energy,
-    neo_hookean_energy,
-    stvk_energy,
-)
+from mosa.physics.constitutive import energies
 from mosa.physics.constitutive.kinematics import hencky_spatial, svd
 from mosa.physics.constitutive.laws import LawParameters, law_named, register_law
 
@@ -88,9 +83,15 @@ def wave_modulus(law: str, parameters: dict[str, Tensor]) -> Tensor:
 
 _LAME = {"mu": 1, "lam": 1}
 register_law(
-    "linear", linear, {**_LAME, "reference": 9}, reference="reference", energy=linear_energy
+    "linear",
+    linear,
+    {**_LAME, "reference": 9},
+    reference="reference",
+    energy=energies.linear_energy,
 )
-register_law("neo_hookean", neo_hookean, _LAME, needs_positive_J=True, energy=neo_hookean_energy)
-register_law("corotated", corotated, _LAME, uses_rotation=True, energy=corotated_energy)
-register_law("stvk", stvk, _LAME, energy=stvk_energy)
+register_law(
+    "neo_hookean", neo_hookean, _LAME, needs_positive_J=True, energy=energies.neo_hookean_energy
+)
+register_law("corotated", corotated, _LAME, uses_rotation=True, energy=energies.corotated_energy)
+register_law("stvk", stvk, _LAME, energy=energies.stvk_energy)
 register_law("stvk_paper", stvk_paper, _LAME, uses_rotation=True)

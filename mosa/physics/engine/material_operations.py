@@ -7,13 +7,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from mosa.physics.constitutive import material_kernels
 from mosa.physics.constitutive.laws import Law
-from mosa.physics.constitutive.material_kernels import (
-    field_types,
-    return_kernel,
-    state_kernel,
-    stress_kernel,
-)
 from mosa.physics.engine.numerics import Numerics
 from mosa.physics.launching import SCALARS, aligned, launch, warp_stream, zeros_in_one
 
@@ -44,8 +39,8 @@ def _zeros(tensors: list[Tensor]) -> list[Tensor]:
 def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> Tensor:
     """tau (N, 3, 3) [Pa] of the law alone, without an adapter. No gradient."""
     scalar = SCALARS[F.dtype]
-    mat33, vec6, mat66, vecp = field_types(scalar)
-    kernel = stress_kernel(law.stress, law.uses_rotation, scalar, False)
+    mat33, vec6, mat66, vecp = material_kernels.field_types(scalar)
+    kernel = material_kernels.stress_kernel(law.stress, law.uses_rotation, scalar, False)
     blank, tau = F.new_zeros(1, 6, 6), torch.empty_like(F, memory_format=torch.contiguous_format)
     with warp_stream(F.device):
         arrays = _arrays(
@@ -103,8 +98,8 @@ def material_state(
     into: add the gradients of F, C_affine and parameters to these contiguous tensors, and give autograd none. That of the
     parameters begins at a multiple of 16 bytes."""
     scalar = SCALARS[F.dtype]
-    mat33, vec6, _, vecp = field_types(scalar)
-    kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
+    mat33, vec6, _, vecp = material_kernels.field_types(scalar)
+    kernel = material_kernels.state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
     # the kernel writes all of them; a law that does not yield has no e
     outputs = [F.new_empty(rows, 6) for rows in (len(F), len(F), len(F) if law.plastic else 1)]
     kinds = [mat33, mat33, vecp, vec6, vec6, vec6]
@@ -118,8 +113,8 @@ def first_advance(numerics: Numerics, F: Tensor, C_affine: Tensor, parameters: T
     if not numerics.law.plastic:
         return advanced(F, C_affine, numerics.dt)
     scalar = SCALARS[F.dtype]
-    mat33, vec6, mat66, vecp = field_types(scalar)
-    kernel = return_kernel(numerics.law.return_map, scalar, G is not None)
+    mat33, vec6, mat66, vecp = material_kernels.field_types(scalar)
+    kernel = material_kernels.return_kernel(numerics.law.return_map, scalar, G is not None)
     operator = (F.new_zeros(1, 6, 6), F.new_zeros(1, 6)) if G is None else (G, h)
     constants = [numerics.dt, numerics.norm_eps, int(numerics.rebuild)]
     mapped = torch.empty_like(F, memory_format=torch.contiguous_format)

@@ -26,20 +26,9 @@ from mosa.physics.contact.colliders import Collider, Particles, pack_colliders, 
 from mosa.physics.contact.driven import Held, hold, stack_held
 from mosa.physics.contact.motion import Points
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
+from mosa.physics.engine import inputs
 from mosa.physics.engine.axes import Axes, ends_of, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
-from mosa.physics.engine.inputs import (
-    check_above,
-    check_state,
-    checked_density,
-    corners,
-    count_of_worlds,
-    gravity_of_worlds,
-    motions_of_worlds,
-    pack_parameters,
-    polar_rotation,
-    vector,
-)
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.material_operations import material_state
@@ -122,8 +111,8 @@ class Simulator:
         options: Annotated[LawOptions, InstanceOf, Expected("LawOptions")] = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
-        vector("gravity", gravity)
-        vector("up", gravity if up is None else up)
+        inputs.vector("gravity", gravity)
+        inputs.vector("up", gravity if up is None else up)
         if energetic and not self.law.sheared:
             raise ConfigError(
                 f"energetic: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
@@ -147,9 +136,9 @@ class Simulator:
             raise ConfigError("colliders: expected sets of driven particles after all solids")
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
-        box = corners(box, float(dx) if touching else 0.0)
+        box = inputs.corners(box, float(dx) if touching else 0.0)
         # one askew is looked at by `Stepper.through`
-        low, high = box if axes.turn is None else corners(None)
+        low, high = box if axes.turn is None else inputs.corners(None)
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt,
             gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes.to(self.device), plane_count=len(all_planes),
@@ -183,7 +172,7 @@ class Simulator:
         shape = (particles,) if worlds is None else (worlds, particles)
         like = self.numerics.planes  # of its type and on its device
         factor = YIELD_CONVENTIONS[self.options.yield_convention]
-        return pack_parameters(
+        return inputs.pack_parameters(
             self.law, parameters, shape, like, rotation=rotation, yield_factor=factor
         )
 
@@ -303,7 +292,7 @@ class Simulator:
     def _stepper(self, state: ParticleState, asked: _Asked) -> tuple[Stepper, Moment]:
         """Errors: ConfigError."""
         gravity, timing, held = asked.gravity, asked.timing, asked.held
-        worlds = None if state.x.ndim == 2 else count_of_worlds(state, asked.together)
+        worlds = None if state.x.ndim == 2 else inputs.count_of_worlds(state, asked.together)
         if worlds is not None and timing is not None:
             raise ConfigError(
                 "timing: expected None with many worlds, which take the same substeps"
@@ -312,8 +301,8 @@ class Simulator:
             raise ConfigError(
                 "gravity and together: expected None without worlds; gravity is the simulator's"
             )
-        check_state(self.numerics, state, asked.volume)
-        each = motions_of_worlds(asked.motions, self.colliders, worlds)
+        inputs.check_state(self.numerics, state, asked.volume)
+        each = inputs.motions_of_worlds(asked.motions, self.colliders, worlds)
         if self.numerics.driven:
             held = self._held(held, state.x, each, asked.start_time)
         ends = ends_of(state.x)
@@ -322,10 +311,10 @@ class Simulator:
         axes = self._axes
         state = axes.state(state, self.dtype)
         if not asked.started:
-            check_above(self._walls, ends if axes == Axes() else ends_of(state.x), state.x)
+            inputs.check_above(self._walls, ends if axes == Axes() else ends_of(state.x), state.x)
         gravities = None
         if worlds is not None:
-            gravities = gravity_of_worlds(gravity, worlds, self.numerics.gravity)
+            gravities = inputs.gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         if gravity is not None:
             turned = axes.vectors(torch.tensor(gravities, dtype=torch.float64))
             gravities = tuple(map(tuple, turned.tolist()))
@@ -371,9 +360,9 @@ class Simulator:
         counted("particles of all frames", every, "take fewer", each=each)
         volume, adapter, stride = asked.volume.detach().contiguous(), asked.adapter, asked.stride
         F = state.F if worlds is None else state.F.flatten(0, 1)
-        rotation = polar_rotation(F) if self.law.reference is not None else None
+        rotation = inputs.polar_rotation(F) if self.law.reference is not None else None
         packed = self.pack(asked.parameters, len(volume), rotation, worlds)
-        density, mean_mass = checked_density(asked.density, volume, self.law, packed)
+        density, mean_mass = inputs.checked_density(asked.density, volume, self.law, packed)
         cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass

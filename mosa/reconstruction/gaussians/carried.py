@@ -18,14 +18,9 @@ from mosa.reconstruction.gaussians.photometric import image_loss
 from mosa.reconstruction.gaussians.static import OPACITY_RATE, ROTATION_RATE, SMALLEST
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import CarriedSettings
+from mosa.rendering.appearance import spherical_harmonics
 from mosa.rendering.appearance.carrying import bind
 from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_basis
-from mosa.rendering.appearance.spherical_harmonics import (
-    Y0,
-    colors_in,
-    constant_coefficients,
-    mean_colors,
-)
 from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
@@ -45,7 +40,7 @@ class RestGaussians:
         self.shift = torch.zeros_like(splats.means)
         self.log_scale, self.quaternion = splats.scales.log(), splats.rotations.clone()
         self.logit = torch.logit(splats.opacities.clamp(0.01, 0.99))
-        self.first = constant_coefficients(splats.colors)
+        self.first = spherical_harmonics.constant_coefficients(splats.colors)
         self.constant = self.first.clone()
         self.higher = splats.means.new_zeros(len(splats.means), extra, 3)
         self.light = splats.means.new_zeros(LIGHT)
@@ -75,7 +70,9 @@ class RestGaussians:
         """Sum over the splats of the squares by which their colours, in the mean over directions and channels, left the first ones,
         each weighted by what it counts for."""
         both = self.constant - self.first, self.higher
-        constant, higher = ((Y0 * moved).square().mean(2).sum() for moved in both)
+        constant, higher = (
+            (spherical_harmonics.Y0 * moved).square().mean(2).sum() for moved in both
+        )
         return self.settings.keep * constant + self.settings.keep_harmonics * higher
 
     def step(self, loss: Tensor, factor: float) -> None:
@@ -103,7 +100,7 @@ class RestGaussians:
             self.log_scale.detach().exp(),
             normalize(self.quaternion.detach(), dim=-1),
             torch.sigmoid(self.logit.detach()),
-            mean_colors(harmonics),
+            spherical_harmonics.mean_colors(harmonics),
         )
         return Appearance(splats, harmonics, self.normals, self.light.detach())
 
@@ -139,7 +136,7 @@ def fit_carried(
         # seen from the body: R^T d
         directions = (means.detach() - eyes[chosen][:, None])[..., None, :] @ turn
         shades = (turns[batch.frame] @ gaussians.light).exp()[..., None]
-        colors = colors_in(gaussians.harmonics, directions[..., 0, :]) * shades
+        colors = spherical_harmonics.colors_in(gaussians.harmonics, directions[..., 0, :]) * shades
         image, alpha = rasterize(
             means, A @ gaussians.covariances @ A.mT, torch.sigmoid(gaussians.logit), colors, batch.cameras,
             torch.arange(len(batch), device=means.device), background,

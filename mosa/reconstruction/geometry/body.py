@@ -15,14 +15,8 @@ from torch import Tensor
 
 from mosa.data.hull import Volume, shave_ridges
 from mosa.errors import DataError
+from mosa.reconstruction.geometry import refinement
 from mosa.reconstruction.geometry.carving import carve, keep_silhouettes
-from mosa.reconstruction.geometry.refinement import (
-    BORDER,
-    refine,
-    signed_distance,
-    surface_information,
-    voxels,
-)
 from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pose.flight import free_motions
 from mosa.reconstruction.settings import GeometrySection
@@ -142,7 +136,7 @@ def find_geometry(
         body = shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma)
         return Geometry(body, volume, torch.empty(0), 1)
 
-    if not holds_matter(signed_distance(whole)):
+    if not holds_matter(refinement.signed_distance(whole)):
         raise DataError(
             f"scene {scene.name}: expected a visual hull with an inside, found {int(whole.values.sum())} voxels of "
             f"{1e3 * hull.pitch:.3g} mm: take more voxels (reconstruction.resolution) or more pixels (scene.scale), "
@@ -154,22 +148,22 @@ def find_geometry(
     windows = object_windows(scene, scene.training_cameras, frames, margin=margin).to(device)
     seen = [windows.of_frame(t) for t in frames]
     solid = Volume(whole.values.to(device), whole.origin.to(device), whole.pitch)
-    bound = signed_distance(solid)
+    bound = refinement.signed_distance(solid)
     start = carve(solid, seen[0])
     # of the whole hull: rounding would widen what was carved by mistake
     rounded = shave_ridges(solid, cameras, passes=ridge_passes, sigma=sigma)
     start = replace(start, values=torch.minimum(start.values, rounded.values))
-    distance = refine(signed_distance(start), bound, seen[:1], FIRST)
+    distance = refinement.refine(refinement.signed_distance(start), bound, seen[:1], FIRST)
     if not holds_matter(distance):
         return nothing_left(scene, of_hull())
     motions = free_motions(scene, distance, seen)
     moved = [seen[0], *(motion.windows(views) for motion, views in zip(motions, seen[1:]))]
-    distance = refine(distance, bound, moved, THEN)
+    distance = refinement.refine(distance, bound, moved, THEN)
     if not holds_matter(distance):
         return nothing_left(scene, of_hull())
-    information = surface_information(distance, moved, THEN[-1][1])
-    inner = slice(BORDER, -BORDER)
-    kept = keep_silhouettes(voxels(distance, solid).values > 0.5, solid, seen[0])
+    information = refinement.surface_information(distance, moved, THEN[-1][1])
+    inner = slice(refinement.BORDER, -refinement.BORDER)
+    kept = keep_silhouettes(refinement.voxels(distance, solid).values > 0.5, solid, seen[0])
     deviation = OPTIMISM * information[inner, inner, inner].rsqrt()
     body = Volume(kept.float().cpu(), solid.origin.cpu(), solid.pitch)
     return Geometry(body, volume, deviation.cpu(), len(moved))

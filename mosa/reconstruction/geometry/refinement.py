@@ -26,16 +26,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from mosa.data.hull import Volume
-from mosa.reconstruction.geometry.field import (
-    at,
-    first_crossing,
-    gradient,
-    nearest_passing,
-    sample,
-    scatter,
-    smooth,
-    span,
-)
+from mosa.reconstruction.geometry import field
 from mosa.reconstruction.motion.observed import Windows
 from mosa.rendering.cameras import centers, rays, sample_images
 
@@ -66,7 +57,7 @@ def signed_distance(inside: Volume) -> Volume:
     solid = F.pad(inside.values > 0.5, (BORDER,) * 6).cpu().numpy()
     cells = ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)
     values = inside.pitch * torch.as_tensor(cells, dtype=torch.float32, device=inside.values.device)
-    return Volume(smooth(values, 0.7), inside.origin - BORDER * inside.pitch, inside.pitch)
+    return Volume(field.smooth(values, 0.7), inside.origin - BORDER * inside.pitch, inside.pitch)
 
 
 def voxels(distance: Volume, like: Volume) -> Volume:
@@ -77,7 +68,7 @@ def voxels(distance: Volume, like: Volume) -> Volume:
 
 def blurred(views: Windows, sigma: float) -> Tensor:
     """Colour, its slopes along columns and rows [1/px] and matte, (B, 10, h, w); colours are means inside of the matte alone."""
-    stacked = smooth(views.masked(), sigma, (-2, -1))
+    stacked = field.smooth(views.masked(), sigma, (-2, -1))
     color = stacked[:, :3] / stacked[:, 3:].clamp(min=0.05)
     rows, columns = torch.gradient(color, dim=(2, 3))
     return torch.cat([color, columns, rows, stacked[:, 3:]], 1)
@@ -111,7 +102,7 @@ def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:
     window = seen.nonzero()[:, 0]
     way = torch.full_like(group.views.mattes, float("inf"))
     centres, directions = group.centres[window], group.directions[seen]
-    way[seen] = first_crossing(distance, centres, directions, group.start[seen])
+    way[seen] = field.first_crossing(distance, centres, directions, group.start[seen])
     met = way.isfinite()
     # the next round looks from a little before this one's surface: it moves by less than a voxel
     group.start = torch.where(met, way - 3 * distance.pitch, float("nan"))
@@ -125,8 +116,8 @@ def color_information(
 
     doubt: divided by the square of the residual's chi^2, where that is larger than 1."""
     cameras = group.views.cameras
-    slopes = gradient(distance.values, distance.pitch)
-    normal = F.normalize(sample(slopes, (points - distance.origin) / distance.pitch), dim=-1)
+    slopes = field.gradient(distance.values, distance.pitch)
+    normal = F.normalize(field.sample(slopes, (points - distance.origin) / distance.pitch), dim=-1)
     height, width = ways.shape[1:]
     reach = F.max_pool2d(torch.where(ways.isfinite(), ways, 0.0)[:, None], 3, 1, 1)[:, 0]
     weights, colors, changes, variances = [], [], [], []
@@ -176,7 +167,7 @@ def outline_information(
     width: of a pixel at the body [m]."""
     origin = group.centres[group.outline.nonzero()[:, 0]]
     direction, matte = group.directions[group.outline], group.views.mattes[group.outline]
-    best, way = nearest_passing(distance, origin, direction)
+    best, way = field.nearest_passing(distance, origin, direction)
     share = (0.5 - best / width).clamp(0, 1)
     told = ((share > 0) | (matte > 0.02)) & ((share < 1) | (matte < 0.98))
     information = (told & (best < 4 * distance.pitch)) / (OUTLINE * width) ** 2
@@ -185,7 +176,7 @@ def outline_information(
 
 def pixel_width(distance: Volume, views: Windows) -> float:
     """Width [m] of a pixel at the middle of a grid, mean over the cameras."""
-    middle, _ = span(distance)
+    middle, _ = field.span(distance)
     return float(((middle - centers(views.cameras)).norm(dim=1) / views.cameras.K[:, 0, 0]).mean())
 
 
@@ -214,16 +205,16 @@ def refine(
                 [torch.cat([about, edge_about]) * pitch**2, torch.cat([pull, edge_pull]) * pitch], 1
             )
             index = (torch.cat([points, edges]) - distance.origin) / pitch
-            known, pulled = area * smooth(scatter(shape, index, values), PATCH)
+            known, pulled = area * field.smooth(field.scatter(shape, index, values), PATCH)
             step = pulled / (known + (pitch / (1e-3 * STEP)) ** 2)
             values = distance.values - pitch * step.clamp(-0.6, 0.6)
-            once = smooth(values, 1.5)
-            flat = 2 * once - smooth(once, 1.5)
+            once = field.smooth(values, 1.5)
+            flat = 2 * once - field.smooth(once, 1.5)
             share = BEND / (BEND + known * (0.5e-3 / pitch) ** 2)
             values = torch.maximum(values + share * (flat - values), floor)
             turn += 1
             if turn % 3 == 0:  # keep it a distance near the surface
-                slope = gradient(values, pitch).norm(dim=0).clamp(0.5, 2)
+                slope = field.gradient(values, pitch).norm(dim=0).clamp(0.5, 2)
                 values = torch.where(values.abs() < 3 * pitch, values / slope, values)
             distance = replace(distance, values=values)
     return distance
@@ -236,7 +227,7 @@ def surface_information(distance: Volume, frames: list[Windows], blur: float) ->
     surface is only where it touches it in one place: along a flat side, or over a hollow that it spans, it tells how high and not
     where."""
     width, total = pixel_width(distance, frames[0]), torch.zeros_like(distance.values)
-    _, radius = span(distance)
+    _, radius = field.span(distance)
     # half: nothing is said of what lies far from a rim
     patch, shape = 0.5 * PATCH, tuple(distance.values.shape)
     area = 2 * math.pi * patch**2
@@ -252,7 +243,7 @@ def surface_information(distance: Volume, frames: list[Windows], blur: float) ->
         edge_about = edge_about * (touching < LOCAL * radius)
         index = (torch.cat([points, edges]) - distance.origin) / distance.pitch
         values = torch.cat([about, edge_about])[:, None] * distance.pitch**2
-        total += area * smooth(scatter(shape, index, values), patch)[0]
+        total += area * field.smooth(field.scatter(shape, index, values), patch)[0]
     return total / distance.pitch**2
 
 
@@ -260,11 +251,11 @@ def _touching(
     distance: Volume, origin: Tensor, direction: Tensor, nearest: Tensor, within: float
 ) -> Tensor:
     """Length [m] of rays (M, 3) on which the distance is less than `within` [m] above the one at their nearest points (M, 3)."""
-    centre, radius = span(distance)
-    limit = at(distance, nearest) + within
+    centre, radius = field.span(distance)
+    limit = field.at(distance, nearest) + within
     middle = ((centre - origin) * direction).sum(-1)
     count = torch.zeros_like(limit)
     for k in range(int(2 * radius / distance.pitch) + 1):
         here = middle - radius + k * distance.pitch
-        count += at(distance, origin + here[:, None] * direction) < limit
+        count += field.at(distance, origin + here[:, None] * direction) < limit
     return count * distance.pitch

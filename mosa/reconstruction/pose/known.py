@@ -17,6 +17,7 @@ from torch import Tensor
 from mosa.data.hull import Volume
 from mosa.errors import DataError
 from mosa.reconstruction.geometry.known import Solid, known_solid
+from mosa.reconstruction.pose import registration
 from mosa.reconstruction.pose.outlines import (
     STILL,
     Rays,
@@ -25,12 +26,6 @@ from mosa.reconstruction.pose.outlines import (
     fitted,
     outline_rays,
     overlaps,
-)
-from mosa.reconstruction.pose.registration import (
-    flight,
-    flight_jacobian,
-    matte_centres,
-    spread_rotations,
 )
 from mosa.reconstruction.pose.rigid import Poses, descend
 from mosa.rendering.cameras import centers
@@ -179,13 +174,15 @@ def middle_of(
     """A place (3,) [m] and a size [m] of the solid's unit to begin with. area: of its silhouettes,
     in units squared; size: where it is known."""
     single = len(cameras) == 1
-    center = scene.box.mean(0) if single else matte_centres(mattes[:, None], cameras)[0]
+    center = (
+        scene.box.mean(0) if single else registration.matte_centres(mattes[:, None], cameras)[0]
+    )
     if size is None:
         depth = (center - centers(cameras)).norm(dim=1)
         seen = mattes.sum((1, 2)) * (depth / cameras.K[:, 0, 0]).square()
         size = float((seen.mean() / area).sqrt())
     if single:
-        center = matte_centres(mattes[:, None], cameras, size * area**0.5)[0]
+        center = registration.matte_centres(mattes[:, None], cameras, size * area**0.5)[0]
     return center, size
 
 
@@ -199,7 +196,9 @@ def searched(
     area = sum(float(inside.any(a).sum()) for a in range(3)) / 3 * solid.distance.pitch**2
     center, begin = middle_of(scene, cameras, mattes, area, size)
     sizes = torch.full((ROTATIONS,), begin)
-    found = Similarities(spread_rotations(ROTATIONS), center.expand(ROTATIONS, 3), sizes)
+    found = Similarities(
+        registration.spread_rotations(ROTATIONS), center.expand(ROTATIONS, 3), sizes
+    )
     for count, iterations, keep in ((24, 3, 96), (40, 6, 32), (80, 10, 12)):
         found, cost = fitted(solid, found, rays.some(count), iterations, sized=sized)
         found = found.take(cost.argsort()[:keep])
@@ -374,7 +373,9 @@ def joint(
 
     def placed(motion: Tensor) -> Similarities:
         sizes = first.size * (motion[12] / (first.size * reach)).exp()
-        poses = flight(Poses(first.rotation, first.center), motion[:12], times, gravity)
+        poses = registration.flight(
+            Poses(first.rotation, first.center), motion[:12], times, gravity
+        )
         return Similarities(poses.rotation, poses.center, sizes.expand(len(times)))
 
     def evaluate(motion: Tensor) -> tuple[Tensor, ...]:
@@ -382,7 +383,7 @@ def joint(
         own = [equations(solid, at.take(torch.tensor([t])), each) for t, each in enumerate(rays)]
         cost, vector, matrix, off = (torch.cat(part) for part in zip(*own))
         J = torch.zeros(len(times), 7, 13)
-        J[:, :6, :12] = flight_jacobian(motion[:12], times, float(at.size[0]) * reach)
+        J[:, :6, :12] = registration.flight_jacobian(motion[:12], times, float(at.size[0]) * reach)
         J[:, 6, 12] = at.size[0] / first.size[0]
         gradient = torch.einsum("tij,ti->j", J, vector) / len(times)
         curvature = torch.einsum("tij,tik,tkl->jl", J, matrix, J) / len(times)

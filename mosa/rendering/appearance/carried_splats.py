@@ -9,13 +9,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from mosa.rendering.appearance import spherical_harmonics
 from mosa.rendering.appearance.carrying import Binding, Carried, bind
 from mosa.rendering.appearance.lighting import LIGHT, shading
-from mosa.rendering.appearance.spherical_harmonics import (
-    colors_in,
-    constant_coefficients,
-    mean_colors,
-)
 from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.observer import deformed_covariances, repeat_cameras
@@ -92,11 +88,13 @@ class Seen:
         for v in range(len(cameras)):
             camera = cameras.select([v])
             if self.rotations is None:
-                colors = colors_in(self.harmonics, torch.ones_like(self.means[:1]))
+                colors = spherical_harmonics.colors_in(
+                    self.harmonics, torch.ones_like(self.means[:1])
+                )
             else:
                 lines = self.means - centers(camera).to(self.means)
                 turned = lines[..., None, :] @ self.rotations  # R^T d
-                colors = colors_in(self.harmonics, turned[..., 0, :])
+                colors = spherical_harmonics.colors_in(self.harmonics, turned[..., 0, :])
             if self.shades is not None:
                 colors = colors * self.shades[..., None]
             views = repeat_cameras(camera, frames)
@@ -106,7 +104,7 @@ class Seen:
 
     def colors(self) -> Tensor:
         """(T, M, 3) in [0, 1], averaged over all directions, in each frame's light."""
-        constant = mean_colors(self.harmonics)
+        constant = spherical_harmonics.mean_colors(self.harmonics)
         shades = self.means.new_ones(self.means.shape[:2]) if self.shades is None else self.shades
         return (constant * shades[..., None]).clamp(0, 1)
 
@@ -129,7 +127,12 @@ def seen(body: HasAppearance, positions: Tensor, F_tot: Tensor | None) -> Seen:
         if F_tot is None:
             raise ValueError("seen: a body without splats needs F_tot")
         shapes = deformed_covariances(F_tot, body.covariances)
-        return Seen(positions, shapes, body.opacities, constant_coefficients(body.colors))
+        return Seen(
+            positions,
+            shapes,
+            body.opacities,
+            spherical_harmonics.constant_coefficients(body.colors),
+        )
     carried = splats.carry(positions)
     shapes = carried.covariances(covariance_from(splats.scales, splats.rotations))
     turns = carried.rotations if splats.harmonics.shape[1] > 1 else None

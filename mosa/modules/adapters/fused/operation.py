@@ -13,25 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mosa.modules.adapters.fused.adjoint_kernels import (
-    phi_backward,
-    psi1_backward,
-    psi2_backward,
-    theta_backward,
-)
-from mosa.modules.adapters.fused.assembly_kernels import (
-    assemble,
-    assemble_adjoint,
-    finish,
-    normals,
-    normals_adjoint,
-)
-from mosa.modules.adapters.fused.network_kernels import (
-    phi_forward,
-    psi1_forward,
-    psi2_forward,
-    theta_forward,
-)
+from mosa.modules.adapters.fused import adjoint_kernels, assembly_kernels, network_kernels
 from mosa.modules.adapters.fused.sum_kernels import weight_gradients
 from mosa.physics.adapters.network_evaluation import backward_at_hand
 
@@ -97,13 +79,15 @@ def _evaluate(
     b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
     grid, size = launch.grid, launch.forward
-    phi_forward[grid](
+    network_kernels.phi_forward[grid](
         w, s, unit, *weights[:6], b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size
     )  # fmt: skip
-    psi1_forward[grid](w, b.s1, *weights[6:14], b.l1, b.t, n, m, scale, alpha, **size)
-    normals[launch.lanes](b.t, b.s1, b.l1[hidden:], m, scale, BLOCK=LANES)
-    psi2_forward[grid](b.l1, *weights[14:20], b.t, b.l2, n, m, alpha, **size)
-    assemble[launch.lanes](
+    network_kernels.psi1_forward[grid](
+        w, b.s1, *weights[6:14], b.l1, b.t, n, m, scale, alpha, **size
+    )
+    assembly_kernels.normals[launch.lanes](b.t, b.s1, b.l1[hidden:], m, scale, BLOCK=LANES)
+    network_kernels.psi2_forward[grid](b.l1, *weights[14:20], b.t, b.l2, n, m, alpha, **size)
+    assembly_kernels.assemble[launch.lanes](
         b.t, b.s1, b.pre, b.t if G is None else G, b.s2, b.moved, n, m, OPERATOR=G is not None, BLOCK=LANES
     )  # fmt: skip
     return b
@@ -117,10 +101,12 @@ def _evaluate_all(
     b = _evaluate(launch, w, s, unit, settings, weights, G)
     post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
     grid, size = launch.grid, launch.forward
-    theta_forward[grid](
+    network_kernels.theta_forward[grid](
         b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
     )  # fmt: skip
-    finish[launch.lanes](sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES)
+    assembly_kernels.finish[launch.lanes](
+        sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES
+    )
     return b, post
 
 
@@ -192,35 +178,37 @@ def _backward(
 
     rest = seeds["h"].sum(0) if settings.rest_free else seeds["h"]
     gl2, gw_theta, gs2, out = empty(hidden), empty(6), empty(6), empty(6)
-    theta_backward[grid](
+    adjoint_kernels.theta_backward[grid](
         b.l2, w, b.s2, post, seeds["h"], rest, unit, seeds["post"], *weights[20:], h1, h2, g1, g2, out, gl2, gw_theta, gs2,
         n, m, scale, bound, RESTED=settings.rest_free, **flags, **size,
     )  # fmt: skip
     if wanted:
         sums(20, b.l2, out)
     gt, gs1, gmoved = torch.empty_like(b.t), empty(6), empty(6)
-    assemble_adjoint[launch.lanes](
+    assembly_kernels.assemble_adjoint[launch.lanes](
         b.t, b.s1, b.pre, seeds["G"], seeds["h"], rest, unit, gs2, seeds["t"], gt, gs1, gmoved, n, m, RESTED=settings.rest_free,
         EXTRA=extra, BLOCK=LANES,
     )  # fmt: skip
     gl1, out = empty(hidden + 3), empty(12 + hidden)
-    psi2_backward[grid](
+    adjoint_kernels.psi2_backward[grid](
         b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, gl1, n, m, alpha, **size,
     )  # fmt: skip
     if wanted:
         sums(14, b.l1, out)
     del gl2  # what the rest needs goes where this was
-    normals_adjoint[launch.lanes](b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES)
+    assembly_kernels.normals_adjoint[launch.lanes](
+        b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES
+    )
     x, gplanes, out = (empty(rows if wanted else 0) for rows in (12, 36, hidden))
     gw_psi, gs_psi = empty(6), empty(6)
-    psi1_backward[grid](
+    adjoint_kernels.psi1_backward[grid](
         w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, gw_psi, gs_psi,
         n, m, scale, alpha, **size,
     )  # fmt: skip
     if wanted:
         sums(6, x, out, (gplanes, b.l1))
     gw, gs, out = torch.empty_like(w), torch.empty_like(s), empty(6)
-    phi_backward[grid](
+    adjoint_kernels.phi_backward[grid](
         w, s, unit, b.pre, gmoved, seeds["pre"], gs1, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, gw,
         gs, n, m, scale, bound, **flags, **size,
     )  # fmt: skip
