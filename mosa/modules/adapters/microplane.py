@@ -95,25 +95,6 @@ def with_normal(T: Tensor, normal: Tensor) -> Tensor:
     return torch.cat([T[..., :3, :] + block + normal @ T[..., :3, :], T[..., 3:, :]], -2)
 
 
-def stepwise_planes(stress: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
-    """(n (N, 3), shears (N, 3) yz, zx, xy) of stress (N, 6) on the three planes, in the paper's order (step 3).
-
-    planes: corrections C (N, 3, 3, 3). For tests and for reading: `plane_operator` is what runs."""
-    xx, yy, zz, yz, zx, xy = stress.unbind(-1)
-    C_x, C_y, C_z = planes.unbind(1)
-
-    def on_plane(C: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-        traction = torch.stack([a, b, c], -1)
-        return traction + (C @ traction[..., None])[..., 0]
-
-    t_x, t_y, t_z = on_plane(C_x, xx, xy, zx), on_plane(C_y, yy, yz, xy), on_plane(C_z, zz, zx, yz)
-    normals = torch.stack([t_x[:, 0], t_y[:, 0], t_z[:, 0]], -1)
-    shears = (
-        torch.stack([t_y[:, 1] + t_z[:, 2], t_x[:, 2] + t_z[:, 1], t_x[:, 1] + t_y[:, 2]], -1) / 2
-    )
-    return normals, shears
-
-
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
 """Entries of a tensor that are its six components xx, yy, zz, yz, zx, xy."""
 MANDEL = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)

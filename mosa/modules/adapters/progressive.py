@@ -132,15 +132,6 @@ class ProgressiveOperator(nn.Module):
         post = self.last(l2, kw, s1 + apply(G, s1)) if not self.no_post else torch.zeros_like(s)
         return Correction(G, pre, post, torch.cat([planes, normal[:, None]], 1))
 
-    def stepwise(self, w: Tensor, s: Tensor) -> Tensor:
-        """s3 (N, 6) in the paper's order, nothing assembled; without major_symmetry, which is one of the 6x6 operator."""
-        _, s1, kw = self.first(w, s)
-        planes, l1 = self.plane_corrections(kw, s1)
-        n, shears = microplane.stepwise_planes(s1, planes)
-        normal, l2 = self.normal_correction(l1, n)
-        s2 = torch.cat([n + (normal @ n[..., None])[..., 0], shears], -1)
-        return s2 + self.last(l2, kw, s2)
-
 
 def apply(G: Tensor, s: Tensor) -> Tensor:
     """G s per particle: (N, k) from (N, k, 6) and (N, 6)."""

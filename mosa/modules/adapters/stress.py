@@ -103,22 +103,10 @@ class StressAdapter(Adapter):
             G, b = torch.zeros_like(G), b - s
         return G, b, parts
 
-    def redistribution(self, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """(A (N, 6, 6), b (N, 6)) with d(w, s) = (A - I) s + b; w, s: (N, 6) dimensionless. b carries L_pre, L_post, rest."""
-        G, b, _ = self.affine(self.operator, w, s)
-        if self.operator.no_prior_stress:
-            return torch.zeros_like(G), b + s
-        return G + torch.eye(6).to(G), b
-
     def increment(self, w: Tensor, s: Tensor) -> Tensor:
-        """d(w, s) - [rest_free] d(0, 0), (N, 6), in the paper's order (steps 1 to 6); w, s: (N, 6) dimensionless."""
-        if self.operator.major_symmetry:
-            G, b, _ = self.affine(self.operator, w, s)
-            return apply(G, s) + b
-        zero = torch.zeros_like(w[:1])
-        s = torch.cat([s, zero])
-        d = self.operator.stepwise(torch.cat([w, zero]), s) - s
-        return d[:-1] - d[-1:] if self.rest_free else d[:-1]
+        """d(w, s) - [rest_free] d(0, 0), (N, 6) (steps 1 to 6); w, s: (N, 6) dimensionless."""
+        G, b, _ = self.affine(self.operator, w, s)
+        return apply(G, s) + b
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         """Operator held by the simulator until it asks again; inputs of any float type, networks in their own.

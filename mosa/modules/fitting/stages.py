@@ -48,16 +48,14 @@ class Stage(StageSettings):
     """One stage of the fit, as it runs."""
 
     name: Literal["prior", "prior_eta", "joint"]
+    looks_again: bool = False
+    """Whether it is a calibration that goes on from the one before, with the motion found once more about that one's result. What
+    flows or yields is seen too poorly by a reconstruction that knows no mechanics: the calibrated law says what images do not."""
 
     @property
     def calibrates(self) -> bool:
         """Whether the stage learns the global parameters alone, from free rollouts of which more and more frames count."""
         return self.name == "prior"
-
-    @property
-    def looks_again(self) -> bool:
-        """Whether it is a calibration that begins with the motion found once more, each time anew."""
-        return False
 
     @property
     def learns_heterogeneity(self) -> bool:
@@ -121,20 +119,11 @@ class Stage(StageSettings):
         return abs(last - before) < self.converged * abs(before)
 
 
-class Recalibration(Stage):
-    """A calibration that goes on from the one before, with the motion found once more about that one's result. What flows or yields
-    is seen too poorly by a reconstruction that knows no mechanics; each look lets the calibrated law say what images do not."""
-
-    @property
-    def looks_again(self) -> bool:
-        return True
-
-
 def recalibrations(stages: list[Stage]) -> list[Stage]:
     """With those that follow a calibration which is all there is, as many as it asks for."""
     if len(stages) != 1 or not stages[0].newton:
         return stages
-    return stages + [Recalibration(**dict(stages[0])) for _ in range(stages[0].looks)]
+    return stages + [stages[0].but(looks_again=True)] * stages[0].looks
 
 
 class FitSection(Settings):

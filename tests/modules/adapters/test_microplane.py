@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stepwise import stepwise_planes
 
 from mosa.modules.adapters import microplane
 
@@ -52,7 +53,7 @@ def test_assembled_operator_is_the_steps_written_out():
         ]
     )
     np.testing.assert_allclose((A @ s[..., None])[..., 0].numpy(), expected, rtol=0, atol=1e-14)
-    n, shears = microplane.stepwise_planes(s, C[:, :3])
+    n, shears = stepwise_planes(s, C[:, :3])
     n = n + (C[:, 3] @ n[..., None])[..., 0]
     np.testing.assert_allclose(torch.cat([n, shears], 1).numpy(), expected, rtol=0, atol=1e-14)
 
