@@ -19,13 +19,9 @@ class DirectAdapter(Adapter):
     Errors: ConfigError naming the key for values out of range."""
 
     def __init__(
-        self,
-        *,
-        l_max: Positive | None = 0.1,
-        input_scale: Positive = 10.0,
-        hidden: Width = 64,
+        self, *, l_max: Positive | None = 0.1, input_scale: Positive = 10.0, hidden: Width = 64,
         rest_free: bool = True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.l_max, self.scale, self.rest_free = l_max, input_scale, rest_free
         self.net = TwoHiddenLayers(12, 6, hidden)

@@ -91,13 +91,9 @@ class NeuralLaw(Adapter):
     replaces_law = True
 
     def __init__(
-        self,
-        *,
-        hidden: Width = 64,
-        start: Literal["prior", "random"] = "prior",
-        plastic: bool = False,
-        plastic_rate: Positive = 2.0,
-    ) -> None:
+        self, *, hidden: Width = 64, start: Literal["prior", "random"] = "prior",
+        plastic: bool = False, plastic_rate: Positive = 2.0,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.start, self.plastic_rate = start, plastic_rate
         self.elastic = network(hidden)

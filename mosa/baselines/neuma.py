@@ -50,14 +50,9 @@ class LowRankLaw(NeuralLaw):
     Errors: ConfigError naming the key."""
 
     def __init__(
-        self,
-        *,
-        hidden: Width = 64,
-        rank: Width = 16,
-        scaling: Positive = 16.0,
-        plastic: bool = False,
-        plastic_rate: Positive = 2.0,
-    ) -> None:
+        self, *, hidden: Width = 64, rank: Width = 16, scaling: Positive = 16.0,
+        plastic: bool = False, plastic_rate: Positive = 2.0,
+    ) -> None:  # fmt: skip
         super().__init__(hidden=hidden, plastic=plastic, plastic_rate=plastic_rate)
         self.hidden = hidden
         self.elastic = low_rank(self.elastic, rank, scaling)

@@ -111,15 +111,10 @@ FEW = 4000
 
 
 def spacing_for(
-    scene: Scene,
-    particles: int | None,
-    settings: ReconstructionSettings | None = None,
-    *,
-    per_cell: float = PER_CELL,
-    most: int = FEW,
-    cache_dir: str | Path | None = None,
+    scene: Scene, particles: int | None, settings: ReconstructionSettings | None = None, *,
+    per_cell: float = PER_CELL, most: int = FEW, cache_dir: str | Path | None = None,
     device: torch.device | str = "cpu",
-) -> float:
+) -> float:  # fmt: skip
     """Particle spacing [m] that fills the object of `scene` with about `particles` particles.
 
     particles: None for as many as resolve its thin parts on a grid of `per_cell` particles to a cell (`resolution`), from `FEW` to
@@ -143,13 +138,9 @@ def filling_spacing(
 
 
 def stored(
-    scene: Scene,
-    spacing: Callable[[], float],
-    settings: ReconstructionSettings,
-    *,
-    cache_dir: str | Path,
-    seed: int = 0,
-) -> bool:
+    scene: Scene, spacing: Callable[[], float], settings: ReconstructionSettings, *,
+    cache_dir: str | Path, seed: int = 0,
+) -> bool:  # fmt: skip
     """Whether the cache has the motion of `scene`, the last stage of its reconstruction. spacing: gives that of the particles [m],
     and is asked where the body it follows from is in the cache."""
     folder = _geometry_cache(scene, settings, cache_dir).folder
@@ -256,15 +247,9 @@ def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tenso
 
 
 def reconstruct(
-    scene: Scene,
-    *,
-    settings: ReconstructionSettings,
-    spacing: float,
-    cache_dir: str | Path | None,
-    seed: int = 0,
-    device: torch.device | str = "cpu",
-    progress: bool = True,
-) -> Reconstruction:
+    scene: Scene, *, settings: ReconstructionSettings, spacing: float, cache_dir: str | Path | None,
+    seed: int = 0, device: torch.device | str = "cpu", progress: bool = True,
+) -> Reconstruction:  # fmt: skip
     """Particles at frame 0 with their appearance, and their motion through the training frames, from images alone; and the splats
     that this motion carries, fitted to the same frames (imported ones stay as they are).
 
@@ -364,19 +349,10 @@ def posed(splats: Splats, rotation: Tensor, center: Tensor, rest_center: Tensor)
 
 
 def follow(
-    scene: Scene,
-    first: Scene,
-    reconstruction: Reconstruction,
-    *,
-    rotation: Tensor,
-    center: Tensor,
-    rest_center: Tensor,
-    settings: ReconstructionSettings,
-    cache_dir: str | Path | None,
-    seed: int = 0,
-    device: torch.device | str = "cpu",
-    progress: bool = True,
-) -> Reconstruction:
+    scene: Scene, first: Scene, reconstruction: Reconstruction, *, rotation: Tensor, center: Tensor,
+    rest_center: Tensor, settings: ReconstructionSettings, cache_dir: str | Path | None,
+    seed: int = 0, device: torch.device | str = "cpu", progress: bool = True,
+) -> Reconstruction:  # fmt: skip
     """The motion of a known body in another sequence: the particles that `reconstruction` found in the scene `first`, from the
     pose (rotation (3, 3) about rest_center, center (3,) [m]) that frame 0 of `scene` shows.
 

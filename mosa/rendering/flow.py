@@ -15,14 +15,9 @@ from mosa.types import Cameras
 
 
 def flow_features(
-    means_a: Tensor,
-    covariances_a: Tensor,
-    means_b: Tensor,
-    covariances_b: Tensor,
-    cameras: Cameras,
-    *,
-    detach_first: bool = True,
-) -> Tensor:
+    means_a: Tensor, covariances_a: Tensor, means_b: Tensor, covariances_b: Tensor,
+    cameras: Cameras, *, detach_first: bool = True,
+) -> Tensor:  # fmt: skip
     """Six channels per Gaussian, (B, N, 6): A - I row by row (4), then m_b - A m_a [px from the image centre], A =
     B_b B_a^-1.
 

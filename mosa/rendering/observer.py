@@ -33,15 +33,9 @@ def repeat_cameras(cameras: Cameras, frames: int) -> Cameras:
 
 
 def observe(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    cameras: Cameras,
-    background: Tensor,
-    *,
-    flow: bool = False,
-) -> Views:
+    means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor, cameras: Cameras,
+    background: Tensor, *, flow: bool = False,
+) -> Views:  # fmt: skip
     """Render T states from V cameras. means: (T, N, 3); covariances: (T, N, 3, 3); opacities: (N,); colors: (N, 3).
 
     With `flow`, six more channels carry the Gaussian flow from each frame to the next (`rendering.flow`); the last frame has none.

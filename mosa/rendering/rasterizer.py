@@ -22,13 +22,9 @@ from mosa.types import Cameras
 
 
 def _check(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    cameras: Cameras,
+    means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, cameras: Cameras,
     state_index: Tensor,
-) -> None:
+) -> None:  # fmt: skip
     """Shapes, types and devices of `rasterize`; ConfigError names the first that is off."""
     states, count = means.shape[:2] if means.dim() == 3 else (-1, -1)
     images, channels = len(cameras), features.shape[-1]
@@ -78,16 +74,9 @@ def _check(
 
 
 def rasterize(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    cameras: Cameras,
-    state_index: Tensor,
-    background: Tensor | None = None,
-    *,
-    scan: str | None = None,
-) -> tuple[Tensor, Tensor]:
+    means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, cameras: Cameras,
+    state_index: Tensor, background: Tensor | None = None, *, scan: str | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Composite N Gaussians in S states into B images of any number C of channels.
 
     means: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2], only the symmetric part counts (`covariance_from` makes

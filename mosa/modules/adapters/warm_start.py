@@ -26,13 +26,9 @@ def drawn_stretches(count: int, largest: float, generator: torch.Generator) -> T
 
 @torch.no_grad()
 def warm_start(
-    adapter: Adapter,
-    states: Callable[[Tensor], MaterialState],
-    *,
-    strain: float = 0.3,
-    samples: int = 8192,
-    seed: int = 0,
-) -> float:
+    adapter: Adapter, states: Callable[[Tensor], MaterialState], *, strain: float = 0.3,
+    samples: int = 8192, seed: int = 0,
+) -> float:  # fmt: skip
     """Fit the last layer of Phi to the prior's stress over random Hencky strains up to `strain`; (relative RMS error left).
 
     adapter: a `StressAdapter`, which calls this; states: of `mosa.modules.body.material.material_states`. Linear least squares of

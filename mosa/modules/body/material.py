@@ -156,14 +156,10 @@ class Material(nn.Module):
     Errors: ConfigError naming the parameter, what was expected and what was found."""
 
     def __init__(
-        self,
-        law: str,
-        parameters: Mapping[str, float | Sequence[float]],
-        frozen: Sequence[str] = (),
-        modulated: Sequence[str] | None = None,
-        candidates: Sequence[str] = (),
-        friction_cone: str = "klar",
-    ) -> None:
+        self, law: str, parameters: Mapping[str, float | Sequence[float]],
+        frozen: Sequence[str] = (), modulated: Sequence[str] | None = None,
+        candidates: Sequence[str] = (), friction_cone: str = "klar",
+    ) -> None:  # fmt: skip
         super().__init__()
         if (law == AUTO) != bool(candidates):
             raise ConfigError(

@@ -129,14 +129,9 @@ class GradientSteps:
             log.warning("stage %s: its last step is undone: %s", stage.name, error)
 
     def descend(
-        self,
-        stage: Stage,
-        iteration: int,
-        own,
-        weight: float,
-        learned: Sequence[Tensor],
+        self, stage: Stage, iteration: int, own, weight: float, learned: Sequence[Tensor],
         total: list[Tensor | None],
-    ) -> dict[str, Tensor]:
+    ) -> dict[str, Tensor]:  # fmt: skip
         """Adds the gradient of one sequence's loss, times `weight`, to `total`; the loss, its terms and what else is logged, not
         weighted. own: its `SequenceBatch`.
 
@@ -232,13 +227,9 @@ class GradientSteps:
                 for group in optimizer.param_groups}  # fmt: skip
 
     def report(
-        self,
-        stage: Stage,
-        iteration: int,
-        terms: dict[str, Tensor],
-        loss: Tensor,
+        self, stage: Stage, iteration: int, terms: dict[str, Tensor], loss: Tensor,
         norms: dict[str, float],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Scalars of one step, means over the takes: every term raw and weighted, parameters, mean |C|, gradient norms."""
         values = {
             "loss/total": loss,

@@ -64,15 +64,9 @@ def warn_of_ends(material: Material) -> None:
 
 
 def blocks_of(
-    body: Body,
-    *,
-    adapter: bool,
-    heterogeneity: bool,
-    settings: IdentificationSettings,
-    ground: Ground | None = None,
-    free: bool = False,
-    calibrating: bool = False,
-) -> list[Block]:
+    body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,
+    ground: Ground | None = None, free: bool = False, calibrating: bool = False,
+) -> list[Block]:  # fmt: skip
     """The numbers that are learned, in the order of `tensors_of`. ground: what the body falls on; free: whether only free rollouts
     are compared."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER

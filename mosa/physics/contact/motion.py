@@ -384,13 +384,9 @@ def sample_frame(
 
 
 def sample_poses(
-    motions: Sequence[Motion | Trajectory],
-    frames: int,
-    substeps: int,
-    dt: float,
-    start: float,
+    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float,
     first: int = 0,
-) -> Poses:
+) -> Poses:  # fmt: skip
     """Poses (float64, CPU) of all colliders at every substep of `frames` frame intervals, from the `first` one after time `start`.
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing)."""

@@ -263,14 +263,9 @@ def advance(
 
 
 def advance_segment(
-    lanes: Lanes,
-    state: State,
-    held: dict,
-    substeps: int,
-    first: int,
-    poses: tuple[Tensor, ...] = (),
-    steps: Steps | None = None,
-) -> tuple[State, tuple[Tensor, ...]]:
+    lanes: Lanes, state: State, held: dict, substeps: int, first: int,
+    poses: tuple[Tensor, ...] = (), steps: Steps | None = None,
+) -> tuple[State, tuple[Tensor, ...]]:  # fmt: skip
     """(state after `substeps`, reactions), differentiable in state, everything in `held`, and poses.
 
     poses: of K colliders at the segment's S substeps, () where there are none; reactions: as a `Stretch` leaves them. steps: times

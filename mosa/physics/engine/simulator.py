@@ -93,23 +93,14 @@ class Simulator:
 
     @typed
     def __init__(
-        self,
-        law: Text,
-        *,
-        dx: Positive,
-        substeps: Substeps,
-        frame_dt: Positive,
+        self, law: Text, *, dx: Positive, substeps: Substeps, frame_dt: Positive,
         gravity: Sequence[float] | Tensor = (0.0, -9.8, 0.0),
         ground: Annotated[Ground, InstanceOf, Expected("a Ground")] | None = None,
-        up: Sequence[float] | Tensor | None = None,
-        planes: Planes = (),
-        colliders: Colliders = (),
-        box: Tensor | None = None,
-        dtype: Scalar = torch.float32,
-        device: torch.device | str = "cpu",
-        energetic: bool = False,
+        up: Sequence[float] | Tensor | None = None, planes: Planes = (), colliders: Colliders = (),
+        box: Tensor | None = None, dtype: Scalar = torch.float32,
+        device: torch.device | str = "cpu", energetic: bool = False,
         options: Annotated[LawOptions, InstanceOf, Expected("LawOptions")] = AS_USUAL,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.law = law_named(law)
         inputs.vector("gravity", gravity)
         inputs.vector("up", gravity if up is None else up)
@@ -178,24 +169,13 @@ class Simulator:
 
     @typed
     def rollout(
-        self,
-        state: State,
-        parameters: Values,
-        volume: Array,
-        density: float | Tensor,
-        frames: Count,
-        adapter: Asked | None = None,
-        stride: Count | None = 1,
-        progress: Callable[[int], None] | None = None,
-        started: bool = False,
-        motions: Motions | None = None,
-        start_time: Number = 0.0,
-        timing: Timing | None = None,
-        collect: Callable[[Any], None] | None = None,
-        gravity: Tensor | Sequence | None = None,
-        together: int | None = None,
-        held: Handed | None = None,
-    ) -> Rollout:
+        self, state: State, parameters: Values, volume: Array, density: float | Tensor,
+        frames: Count, adapter: Asked | None = None, stride: Count | None = 1,
+        progress: Callable[[int], None] | None = None, started: bool = False,
+        motions: Motions | None = None, start_time: Number = 0.0, timing: Timing | None = None,
+        collect: Callable[[Any], None] | None = None, gravity: Tensor | Sequence | None = None,
+        together: int | None = None, held: Handed | None = None,
+    ) -> Rollout:  # fmt: skip
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated), of a body, or of B worlds at once.
 
         state: particles at frame 0, x (N, 3) and so on, their F and F_tot not yet advanced by C_affine, unless `started` (the
@@ -264,22 +244,12 @@ class Simulator:
 
     @typed
     def stepper(
-        self,
-        state: State,
-        parameters: Values,
-        volume: Array,
-        density: float | Tensor,
-        adapter: Asked | None = None,
-        stride: Count | None = 1,
-        *,
-        started: bool = False,
-        motions: Motions | None = None,
-        gravity: Tensor | Sequence | None = None,
-        together: int | None = None,
-        timing: Timing | None = None,
-        steps: Count = 30,
+        self, state: State, parameters: Values, volume: Array, density: float | Tensor,
+        adapter: Asked | None = None, stride: Count | None = 1, *, started: bool = False,
+        motions: Motions | None = None, gravity: Tensor | Sequence | None = None,
+        together: int | None = None, timing: Timing | None = None, steps: Count = 30,
         held: Handed | None = None,
-    ) -> tuple[Stepper, Moment]:
+    ) -> tuple[Stepper, Moment]:  # fmt: skip
         """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout`.
 
         timing: choose the substeps of every frame. steps: for which there shall be memory to keep all states, where a gradient is

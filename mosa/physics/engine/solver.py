@@ -66,14 +66,9 @@ class SegmentSolver:
         return len(self.gravities)
 
     def workspace(
-        self,
-        pool: dict[tuple, Workspace],
-        substeps: int,
-        adapted: bool,
-        plastic_adapted: bool,
-        with_adjoint: bool,
-        shared: bool = False,
-    ) -> Workspace:
+        self, pool: dict[tuple, Workspace], substeps: int, adapted: bool, plastic_adapted: bool,
+        with_adjoint: bool, shared: bool = False,
+    ) -> Workspace:  # fmt: skip
         """Of a pool that is this thread's alone (`Buffers.take`)."""
         n = len(self.volume)
         key = n, substeps, adapted, plastic_adapted, with_adjoint, self.worlds, shared

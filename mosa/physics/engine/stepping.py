@@ -116,13 +116,9 @@ class Prepared:
             self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds))
 
     def begin(
-        self,
-        state: State,
-        poses: tuple[Tensor, ...],
-        substeps: int,
-        variable: bool,
+        self, state: State, poses: tuple[Tensor, ...], substeps: int, variable: bool,
         gives: bool = False,
-    ) -> Pace:
+    ) -> Pace:  # fmt: skip
         """Before a motion of `substeps` substeps: how it is cut. gives: also memory, as above."""
         self.settle(state)
         learned = None if self.chains is None else learned_of(self.chains.adapter)
@@ -283,14 +279,9 @@ class Stepper:
         return self.prepared.first_advance(state, frame.dt) if begins else state, frame
 
     def through(
-        self,
-        moment: Moment,
-        state: State,
-        frame: Frame,
-        poses: tuple[Tensor, ...],
-        pace: Pace,
+        self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], pace: Pace,
         alike: int = 0,
-    ) -> Step:
+    ) -> Step:  # fmt: skip
         """The frame that `enter` found, of all particles one world's after the other's. Other
         arguments: as `Prepared.frame`."""
         state, forces = self.prepared.frame(state, frame, poses, pace, alike)
@@ -416,13 +407,9 @@ class Stepper:
         return moved.expand_as(part) if same else moved
 
     def sample(
-        self,
-        moment: Moment,
-        count: int,
-        dt: float,
-        motions: Sequence[Motion | Trajectory],
+        self, moment: Moment, count: int, dt: float, motions: Sequence[Motion | Trajectory],
         after: int = 0,
-    ) -> Poses:
+    ) -> Poses:  # fmt: skip
         """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
         `moment`, at the times at which a rollout takes them."""
         frame_dt = self.clock.frame_dt

@@ -106,16 +106,9 @@ class RestGaussians:
 
 
 def fit_carried(
-    static: Splats,
-    particles: Tensor,
-    positions: Tensor,
-    windows: Windows,
-    background: Tensor,
-    settings: CarriedSettings,
-    *,
-    seed: int,
-    progress: Callable[[int], None] | None = None,
-) -> Appearance:
+    static: Splats, particles: Tensor, positions: Tensor, windows: Windows, background: Tensor,
+    settings: CarriedSettings, *, seed: int, progress: Callable[[int], None] | None = None,
+) -> Appearance:  # fmt: skip
     """The splats of a body that its particles carry, fitted to windows of all frames.
 
     static: Gaussians at rest, where the fit starts; particles: (N, 3) at rest and positions: (T, N, 3) [m] of the frames 0 to T - 1

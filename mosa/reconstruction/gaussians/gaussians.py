@@ -35,16 +35,9 @@ class FreeGaussians:
     axis_ratio: bound of the largest scale over the smallest. `first_colors` (N, 3) are the colours at the start."""
 
     def __init__(
-        self,
-        splats: Splats,
-        rates: Rates,
-        *,
-        move: bool,
-        anisotropic: bool,
-        smallest: float,
-        largest: float,
-        axis_ratio: float,
-    ) -> None:
+        self, splats: Splats, rates: Rates, *, move: bool, anisotropic: bool, smallest: float,
+        largest: float, axis_ratio: float,
+    ) -> None:  # fmt: skip
         scale = splats.scales.mean(1)
         self.parameters = {
             "means": splats.means.clone(),

@@ -23,15 +23,9 @@ OPACITY_RATE, COLOR_RATE, ROTATION_RATE = 0.05, 0.08, 0.02
 
 
 def fit_splats(
-    splats: Splats,
-    windows: Windows,
-    background: Tensor,
-    settings: FitSettings,
-    *,
-    move: bool,
-    seed: int,
-    progress: Callable[[int], None] | None = None,
-) -> Splats:
+    splats: Splats, windows: Windows, background: Tensor, settings: FitSettings, *, move: bool,
+    seed: int, progress: Callable[[int], None] | None = None,
+) -> Splats:  # fmt: skip
     """Gaussians fitted to windows of ONE frame: colours, opacities, scales, rotations where anisotropic, positions with `move`.
 
     They start isotropic, of the mean scale of `splats`. With `move` and StaticSettings vanished ones are moved onto opaque

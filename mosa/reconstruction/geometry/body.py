@@ -114,15 +114,9 @@ def nothing_left(scene: Scene, hull: Geometry) -> Geometry:
 
 
 def find_geometry(
-    scene: Scene,
-    hull: Volume,
-    settings: GeometrySection,
-    *,
-    ridge_passes: int,
-    sigma: float,
-    margin: int,
-    device: torch.device | str,
-) -> Geometry:
+    scene: Scene, hull: Volume, settings: GeometrySection, *, ridge_passes: int, sigma: float,
+    margin: int, device: torch.device | str,
+) -> Geometry:  # fmt: skip
     """The body of `scene` inside its visual hull (occupancy of frame 0, training cameras only), read from training frames alone;
     the hull's where they leave nothing of it. Errors: DataError where the hull has no inside.
 

@@ -39,13 +39,8 @@ class ModalMotion(nn.Module):
     offsets: (T, 3) [m] first guess of the translation of each frame."""
 
     def __init__(
-        self,
-        offsets: Tensor,
-        energies: Tensor,
-        *,
-        reach: float,
-        free_shape: bool = False,
-    ) -> None:
+        self, offsets: Tensor, energies: Tensor, *, reach: float, free_shape: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__()
         frames, count = len(offsets), len(energies)
         self.reach = reach
@@ -134,18 +129,10 @@ class MotionBasisNetwork(nn.Module):
     SKIP, CLOCK = 4, (256, 30)
 
     def __init__(
-        self,
-        offsets: Tensor,
-        *,
-        centre: Tensor,
-        reach: float,
-        bases: int = 10,
-        hidden: int = 256,
-        basis_layers: int = 8,
-        coefficient_layers: int = 3,
-        space_frequencies: int = 4,
+        self, offsets: Tensor, *, centre: Tensor, reach: float, bases: int = 10, hidden: int = 256,
+        basis_layers: int = 8, coefficient_layers: int = 3, space_frequencies: int = 4,
         time_frequencies: int = 5,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.register_buffer("offsets", offsets - offsets[0])
         self.register_buffer("centre", centre)

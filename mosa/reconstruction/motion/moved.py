@@ -43,18 +43,12 @@ class MovingParts:
 
     splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both
     fits; place: of a body of known shape in frame 0; lit: the static ones' normals in frame 0 and the
-    light, where it is known.
-    """
+    light, where it is known."""
 
     def __init__(
-        self,
-        scene: Scene,
-        splats: Splats,
-        static: Splats,
-        settings: ReconstructionSettings,
-        place: Similarities | None = None,
-        lit: tuple[Tensor, ...] = (),
-    ) -> None:
+        self, scene: Scene, splats: Splats, static: Splats, settings: ReconstructionSettings,
+        place: Similarities | None = None, lit: tuple[Tensor, ...] = (),
+    ) -> None:  # fmt: skip
         self.scene, self.splats, self.static, self.settings = scene, splats, static, settings
         self.place, self.lit = place, lit
 

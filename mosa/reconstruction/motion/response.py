@@ -171,14 +171,9 @@ def measured(
 
 
 def response_of(
-    modes: Modes,
-    matrices: Tensor,
-    about: Tensor,
-    found: Tensor,
-    other_about: Tensor,
-    other_found: Tensor,
-    first_contact: int,
-) -> tuple[Response, float, float]:
+    modes: Modes, matrices: Tensor, about: Tensor, found: Tensor, other_about: Tensor,
+    other_found: Tensor, first_contact: int,
+) -> tuple[Response, float, float]:  # fmt: skip
     """(the response, a over its unit, what it leaves unexplained) of a motion `found` about a prediction, from the one that was
     found about another; all (T, N, 3) [m]. matrices: `image_matrices`. Until first contact predictions do not differ."""
     count = matrices.shape[-1] // 3

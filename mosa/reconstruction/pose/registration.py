@@ -189,20 +189,10 @@ def light_of(
 
 
 def register_pose(
-    splats: Splats,
-    images: Tensor,
-    mattes: Tensor,
-    cameras: Cameras,
-    *,
-    background: Tensor,
-    rest_center: Tensor,
-    normals: Tensor | None = None,
-    light: Tensor | None = None,
-    rotations: int = 600,
-    starts: int = 24,
-    coarse_views: int = 6,
-    seed: int = 0,
-) -> Registered:
+    splats: Splats, images: Tensor, mattes: Tensor, cameras: Cameras, *, background: Tensor,
+    rest_center: Tensor, normals: Tensor | None = None, light: Tensor | None = None,
+    rotations: int = 600, starts: int = 24, coarse_views: int = 6, seed: int = 0,
+) -> Registered:  # fmt: skip
     """Rigid pose of a known body in one frame: Q (3, 3) and centre x_c (3,) [m], x = Q (X - X_c) + x_c.
 
     splats: the body at rest; images: (V, H, W, 3) on `background` (3,); mattes: (V, H, W); rest_center: X_c (3,) [m]; normals:
@@ -273,18 +263,9 @@ def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
 
 
 def initial_velocity(
-    splats: Splats,
-    pose: tuple[Tensor, Tensor],
-    images: Tensor,
-    mattes: Tensor,
-    cameras: Cameras,
-    *,
-    times: Tensor,
-    gravity: Tensor,
-    background: Tensor,
-    rest_center: Tensor,
-    exact: bool = True,
-) -> tuple[Tensor, Tensor]:
+    splats: Splats, pose: tuple[Tensor, Tensor], images: Tensor, mattes: Tensor, cameras: Cameras,
+    *, times: Tensor, gravity: Tensor, background: Tensor, rest_center: Tensor, exact: bool = True,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Velocity (3,) [m/s] and angular velocity (3,) [rad/s, world axes] at the first of T >= 2 frames of free flight.
 
     x_c(t) = x_c + v t + g t^2 / 2, R(t) = exp([omega]_x t) Q, with `pose` = (Q, x_c) at the first frame. images:

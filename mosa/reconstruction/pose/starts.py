@@ -75,13 +75,9 @@ def appearance_of(body: RestShape) -> Appearance:
 
 
 def sequence_start(
-    body: RestShape,
-    appearance: Appearance,
-    scene: Scene,
-    *,
-    register: bool,
+    body: RestShape, appearance: Appearance, scene: Scene, *, register: bool,
     place: Similarities | None = None,
-) -> Start:
+) -> Start:  # fmt: skip
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
     rest shape's own. A film that starts at rest has no velocity. appearance: at rest, of `appearance_of`; place: of a body of known
     shape in frame 0 of the training sequence, whose outlines then give what their rendering hardly tells from a single camera.
