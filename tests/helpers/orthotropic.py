@@ -109,7 +109,7 @@ def orthotropic_modulus(axes: Tensor, **moduli: Tensor) -> Tensor:
 
 register_law(
     ORTHOTROPIC, orthotropic_linear, {**dict.fromkeys(MODULI, 1), "axes": 3}, uses_rotation=True, needs_positive_J=True,
-    energy=orthotropic_energy, modulus=orthotropic_modulus,
+    modulus=orthotropic_modulus,
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 from bodies import NU, E, eyes, is_fluid, parameters_of, random_adapter, rotations
+from energies import ENERGIES
 from torch import Tensor
 
 from mosa.physics.constitutive.laws import law_named
@@ -66,7 +67,7 @@ def frame_error(law: str, adapted: bool) -> float:
 def energy_error(law: str) -> float:
     """Largest |tau - dPsi/dF F^T| / max |tau| over 200 deformations; of `linear` the symmetric part."""
     F = deformations(200, 6).requires_grad_()
-    (P,) = torch.autograd.grad(law_named(law).energy(F, **parameters_of(law)).sum(), F)
+    (P,) = torch.autograd.grad(ENERGIES[law](F, **parameters_of(law)).sum(), F)
     tau = P @ F.detach().mT
     tau = 0.5 * (tau + tau.mT) if law == "linear" else tau
     return float((stress(law, F.detach()) - tau).abs().max() / tau.abs().max())

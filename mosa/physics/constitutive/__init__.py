@@ -1,4 +1,4 @@
-"""What a particle's material does: laws, their energies, return mappings, kinematics, and the kernels that evaluate them.
+"""What a particle's material does: laws, return mappings, kinematics, and the kernels that evaluate them.
 
 Importing it registers the built-in laws."""
 

@@ -33,11 +33,10 @@ def register_damped(name: str, laws: Sequence[Law]) -> Law:
             f"law {name!r}: expected a law without a viscosity of its own, found {law.name!r}"
         )
     parameters = law.parameters | dict.fromkeys(DAMPING, 1)
-    energy = None if law.energy is None else _undamped(law.energy)
     return register_law(
         name, _stress(law.stress, sum(law.parameters.values())), parameters, return_map=law.return_map,
         uses_rotation=law.uses_rotation, reference=law.reference, needs_positive_J=law.needs_positive_J,
-        energy=energy, modulus=_undamped(lambda **p: law.wave_modulus(p)), viscosity=viscosity,
+        modulus=lambda **p: law.wave_modulus({k: v for k, v in p.items() if k not in DAMPING}), viscosity=viscosity,
     )  # fmt: skip
 
 
@@ -46,15 +45,6 @@ def viscosity(damping: Tensor, bulk_damping: Tensor, **unused: Tensor) -> Tensor
     eta/3 + zeta along a wave."""
     damping, bulk_damping = torch.as_tensor(damping), torch.as_tensor(bulk_damping)
     return torch.maximum(2 * damping, 4 / 3 * damping + bulk_damping)
-
-
-def _undamped(function: Callable) -> Callable:
-    """The same function of a law's parameters, which does not read the viscosities."""
-
-    def of_rest(*args: Tensor, **parameters: Tensor) -> Tensor:
-        return function(*args, **{k: v for k, v in parameters.items() if k not in DAMPING})
-
-    return of_rest
 
 
 def _stress(law_stress: Callable, slot: int) -> Callable:

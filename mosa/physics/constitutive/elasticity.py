@@ -1,4 +1,4 @@
-"""Hyperelastic laws: Kirchhoff stress tau(F) [Pa] (the paper's appendix on constitutive models); their energies are in `energies`.
+"""Hyperelastic laws: Kirchhoff stress tau(F) [Pa] (the paper's appendix on constitutive models).
 
 Every law is a Warp function of F built on `kinematics`, so that its adjoint is exact; R is the polar rotation where it is used.
 tau = (dPsi/dF) F^T and tau(I) = 0. Parameters: mu, lam, the Lamé parameters [Pa].
@@ -7,7 +7,6 @@ tau = (dPsi/dF) F^T and tau(I) = 0. Parameters: mu, lam, the Lamé parameters [P
 import warp as wp
 from torch import Tensor
 
-from mosa.physics.constitutive import energies
 from mosa.physics.constitutive.kinematics import hencky_spatial, svd
 from mosa.physics.constitutive.laws import LawParameters, law_named, register_law
 
@@ -87,11 +86,8 @@ register_law(
     linear,
     {**_LAME, "reference": 9},
     reference="reference",
-    energy=energies.linear_energy,
 )
-register_law(
-    "neo_hookean", neo_hookean, _LAME, needs_positive_J=True, energy=energies.neo_hookean_energy
-)
-register_law("corotated", corotated, _LAME, uses_rotation=True, energy=energies.corotated_energy)
-register_law("stvk", stvk, _LAME, energy=energies.stvk_energy)
+register_law("neo_hookean", neo_hookean, _LAME, needs_positive_J=True)
+register_law("corotated", corotated, _LAME, uses_rotation=True)
+register_law("stvk", stvk, _LAME)
 register_law("stvk_paper", stvk_paper, _LAME, uses_rotation=True)

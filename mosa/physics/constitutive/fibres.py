@@ -1,4 +1,4 @@
-"""Families of fibres in an isotropic matrix: Holzapfel-Gasser-Ogden, with and without dispersion, and the energy [J/m^3].
+"""Families of fibres in an isotropic matrix: Holzapfel-Gasser-Ogden, with and without dispersion; the energy [J/m^3].
 
 The matrix is the split neo-Hookean solid (`rubber`). A family of unit rest direction a adds k1/(2 k2) (exp(k2 <e>^2) - 1) with
 
@@ -10,18 +10,12 @@ k2: fibre_exponent, d: dispersion, from 0 (all aligned) to 1/3 (isotropic). Poly
 e is convex in F, and the energy is convex and increasing in <e> (Balzani et al. 2006).
 """
 
-import torch
 import warp as wp
 from torch import Tensor
 
 from mosa.physics.constitutive.laws import LawParameters, register_law
 from mosa.physics.constitutive.material_kernels import deviator
-from mosa.physics.constitutive.rubber import (
-    isochoric_invariants,
-    isochoric_left,
-    volumetric,
-    volumetric_energy,
-)
+from mosa.physics.constitutive.rubber import isochoric_left, volumetric
 
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
@@ -54,29 +48,6 @@ def hgo_two(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     return matrix + one + family(F, wp.vec3d(p[9], p[10], p[11]), p[3], p[4], p[5])
 
 
-def family_energy(F: Tensor, fibre: Tensor, k1: Tensor, k2: Tensor, d: Tensor) -> Tensor:
-    """k1/(2 k2) (exp(k2 <e>^2) - 1)."""
-    fibre = torch.as_tensor(fibre).to(F)
-    length = (F @ fibre[..., None]).square().sum((-2, -1))
-    e = (d * F.square().sum((-2, -1)) + (1 - 3 * d) * length - 1).clamp_min(0)
-    return 0.5 * k1 / k2 * torch.expm1(k2 * e**2)
-
-
-def hgo_energy(F: Tensor, mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, fibre_exponent: Tensor, dispersion: Tensor,
-               fibre: Tensor) -> Tensor:  # fmt: skip
-    """Of the matrix and one family."""
-    J, I1, _ = isochoric_invariants(F)
-    fibres = family_energy(F, fibre, fibre_stiffness, fibre_exponent, dispersion)
-    return 0.5 * mu * (I1 - 3) + volumetric_energy(J, mu, lam) + fibres
-
-
-def hgo_two_energy(F: Tensor, mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, second_fibre_stiffness: Tensor,
-                   fibre_exponent: Tensor, dispersion: Tensor, fibre: Tensor, second_fibre: Tensor) -> Tensor:  # fmt: skip
-    """Of the matrix and two families."""
-    one = hgo_energy(F, mu, lam, fibre_stiffness, fibre_exponent, dispersion, fibre)
-    return one + family_energy(F, second_fibre, second_fibre_stiffness, fibre_exponent, dispersion)
-
-
 def stretched_modulus(
     mu: Tensor, lam: Tensor, fibre_stiffness: Tensor, dispersion: Tensor, **others: Tensor
 ) -> Tensor:
@@ -90,9 +61,8 @@ _TWO_FAMILIES = dict.fromkeys(
     ("mu", "lam", "fibre_stiffness", "second_fibre_stiffness", "fibre_exponent", "dispersion"), 1
 )
 register_law(
-    "hgo", hgo, _ONE_FAMILY | {"fibre": 3}, needs_positive_J=True, energy=hgo_energy, modulus=stretched_modulus
-)  # fmt: skip
+    "hgo", hgo, _ONE_FAMILY | {"fibre": 3}, needs_positive_J=True, modulus=stretched_modulus
+)
 register_law(
-    "hgo_two", hgo_two, _TWO_FAMILIES | {"fibre": 3, "second_fibre": 3}, needs_positive_J=True,
-    energy=hgo_two_energy, modulus=stretched_modulus,
+    "hgo_two", hgo_two, _TWO_FAMILIES | {"fibre": 3, "second_fibre": 3}, needs_positive_J=True, modulus=stretched_modulus,
 )  # fmt: skip

@@ -30,7 +30,6 @@ class Law:
     `plasticity`.
     reference: name of a 9-number parameter that the simulator fills with the rotation of the start's F, or None.
     needs_positive_J: the law has no value at det F <= 0, which is then an error.
-    energy: torch function (F (..., 3, 3), **parameters) -> energy per rest volume [J/m^3], or None; see `energies`.
     modulus: torch function (**parameters) -> P wave modulus M at rest [Pa] for the time step, elementwise; None: lam + 2 mu or
     kappa + 4 mu/3, whichever the parameters give.
     viscosity: torch function (**parameters) -> viscosity mu [Pa s] of a stress mu J sym(C_affine), for the time step, elementwise;
@@ -43,7 +42,6 @@ class Law:
     uses_rotation: bool = False
     reference: str | None = None
     needs_positive_J: bool = False
-    energy: Callable | None = None
     modulus: Callable | None = None
     viscosity: Callable | None = None
     offsets: dict[str, int] = field(init=False)

@@ -56,7 +56,7 @@ def register_mixture(name: str, laws: Sequence[Law]) -> Law:
     return register_law(
         name, stress, parameters, return_map=mapping, uses_rotation=any(law.uses_rotation for law in laws),
         reference=next(iter(references), None), needs_positive_J=any(law.needs_positive_J for law in laws),
-        energy=None, modulus=_by_law(laws, Law.wave_modulus), viscosity=_by_law(laws, Law.explicit_viscosity),
+        modulus=_by_law(laws, Law.wave_modulus), viscosity=_by_law(laws, Law.explicit_viscosity),
     )  # fmt: skip
 
 

@@ -15,7 +15,6 @@ import warp as wp
 from torch import Tensor
 
 from mosa.physics.constitutive.elasticity import stvk
-from mosa.physics.constitutive.energies import stvk_energy
 from mosa.physics.constitutive.kinematics import contract
 from mosa.physics.constitutive.laws import LawParameters, register_law
 
@@ -83,10 +82,7 @@ def drucker_prager_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d, 
     return A, yielded
 
 
-register_law(
-    "von_mises", stvk, {"mu": 1, "lam": 1, "yield_stress": 1}, return_map=von_mises_return, energy=stvk_energy
-)  # fmt: skip
+register_law("von_mises", stvk, {"mu": 1, "lam": 1, "yield_stress": 1}, return_map=von_mises_return)
 register_law(
     "drucker_prager", stvk, {"mu": 1, "lam": 1, "friction_alpha": 1, "cohesion": 1}, return_map=drucker_prager_return,
-    energy=stvk_energy,
 )  # fmt: skip

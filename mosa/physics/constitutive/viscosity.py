@@ -14,7 +14,6 @@ Return mappings have the signature of `plasticity`.
 import warp as wp
 from torch import Tensor
 
-from mosa.physics.constitutive import energies
 from mosa.physics.constitutive.elasticity import eye
 from mosa.physics.constitutive.isochoric import clamped_squares, isochoric_contract
 from mosa.physics.constitutive.kinematics import (
@@ -154,13 +153,11 @@ def newtonian_viscosity(mu: Tensor, **unused: Tensor) -> Tensor:
 _SOLID = {"mu": 1, "kappa": 1, "yield_stress": 1, "viscosity": 1}
 register_law(
     "herschel_bulkley", herschel_bulkley, _SOLID, return_map=herschel_bulkley_return, needs_positive_J=True,
-    energy=energies.herschel_bulkley_energy,
 )  # fmt: skip
 register_law(
     "herschel_bulkley_hencky", herschel_bulkley_hencky, _SOLID, return_map=herschel_bulkley_hencky_return,
-    energy=energies.herschel_bulkley_hencky_energy,
 )  # fmt: skip
 register_law(
-    "newtonian", newtonian, {"mu": 1, "kappa": 1}, return_map=newtonian_return, energy=energies.newtonian_energy,
+    "newtonian", newtonian, {"mu": 1, "kappa": 1}, return_map=newtonian_return,
     modulus=newtonian_modulus, viscosity=newtonian_viscosity,
 )  # fmt: skip

@@ -6,6 +6,7 @@ import pytest
 import substep_reference as reference
 import torch
 import warp as wp
+from energies import ENERGIES
 from mpmath import mpf
 
 from mosa.errors import ConfigError
@@ -219,7 +220,7 @@ def loop_work(energetic, G, size, points=400):
     parameters[:, 0], parameters[:, 1] = mu, lam
     tau = launch(flat, parameters, G.expand(len(flat), 6, 6), energetic)
     P = (tau @ torch.linalg.inv(flat).mT).reshape(F.shape)
-    peak = law_named(LAW).energy(F, mu, lam).amax(0)
+    peak = ENERGIES[LAW](F, mu, lam).amax(0)
     return float(((P * rate).sum((0, 2, 3)).abs() / peak).max())
 
 

@@ -27,14 +27,6 @@ def fibre_neo_hookean(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawPar
     return matrix + volumetric + fibre
 
 
-def fibre_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) -> Tensor:
-    """mu/2 (|F|^2 - 3) - mu log J + lam/2 (log J)^2 + kf/2 (|F a|^2 - 1)^2 [J/m^3]; F: (..., 3, 3), fibre: (..., 3)."""
-    log_J = torch.log(torch.linalg.det(F))
-    stretch = ((F @ fibre[..., None])[..., 0] ** 2).sum(-1)
-    matrix = 0.5 * mu * ((F * F).sum((-2, -1)) - 3) - mu * log_J + 0.5 * lam * log_J**2
-    return matrix + 0.5 * kf * (stretch - 1) ** 2
-
-
 @wp.func
 def fibre_corotated(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
     """2 mu sym((F - R) F^T) + lam (J - 1) J I + 2 kf (I4 - 1) exp(2 (I4 - 1)^2) (F a)(F a)^T.
@@ -54,17 +46,9 @@ def fibre_corotated(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParam
     return matrix + two * p[2] * e * wp.exp(two * e * e) * wp.outer(fa, fa)
 
 
-def corotated_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) -> Tensor:
-    """mu |S - I|^2 + lam/2 (J - 1)^2 + kf/4 (exp(2 (|F a|^2 - 1)^2) - 1) [J/m^3]; (..., 3, 3)."""
-    S = torch.linalg.svdvals(F)
-    stretch = ((F @ fibre[..., None])[..., 0] ** 2).sum(-1)
-    matrix = mu * ((S - 1) ** 2).sum(-1) + 0.5 * lam * (S.prod(-1) - 1) ** 2
-    return matrix + 0.25 * kf * (torch.exp(2 * (stretch - 1) ** 2) - 1)
-
-
 NEEDS = {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}
-register_law("fibre_corotated", fibre_corotated, NEEDS, uses_rotation=True, energy=corotated_energy)
-register_law(LAW, fibre_neo_hookean, NEEDS, needs_positive_J=True, energy=fibre_energy)
+register_law("fibre_corotated", fibre_corotated, NEEDS, uses_rotation=True)
+register_law(LAW, fibre_neo_hookean, NEEDS, needs_positive_J=True)
 FORMS = {LAW: 1.0, "fibre_corotated": 3.0}
 """Laws of this material, each with how much stiffer its fibres get than at rest, for the time step."""
 

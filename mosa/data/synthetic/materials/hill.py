@@ -10,7 +10,6 @@ import warp as wp
 
 from mosa.data.synthetic.materials.axes import axes_rotation
 from mosa.physics.constitutive.elasticity import stvk
-from mosa.physics.constitutive.energies import stvk_energy
 from mosa.physics.constitutive.kinematics import growth, svd_value
 from mosa.physics.constitutive.laws import LawParameters, register_law
 from mosa.physics.constitutive.material_kernels import deviator
@@ -154,5 +153,4 @@ def hill_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d, R: wp.mat3
 
 register_law(
     HILL, stvk, {"mu": 1, "lam": 1, "yield_stress": 1, **dict.fromkeys(COEFFICIENTS, 1), "axes": 3}, return_map=hill_return,
-    energy=stvk_energy,
 )  # fmt: skip

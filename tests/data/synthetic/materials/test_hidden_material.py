@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 import warp as wp
+from energies import ENERGIES
 
 from mosa.data.synthetic.bodies.objects import OBJECTS, PEANUT, RABBIT
 from mosa.data.synthetic.materials.hidden_material import (
@@ -74,7 +75,7 @@ def test_stress_is_the_gradient_of_the_energy(states, material, form):
     rest = torch.rand(len(states), 3, dtype=torch.float64)
     parameters = material.parameters(rest)
     F = states.clone().requires_grad_()
-    (P,) = torch.autograd.grad(law_named(form).energy(F, **parameters).sum(), F)
+    (P,) = torch.autograd.grad(ENERGIES[form](F, **parameters).sum(), F)
     expected = P @ states.mT
     found = stress(states, parameters, form)
     assert (found - expected).abs().max() < 1e-12 * expected.abs().max()
