@@ -80,7 +80,8 @@ class InteractionNetwork(Adapter):
 
         def summed(weights: np.ndarray | None = None) -> np.ndarray:
             """(M,) sums over the bonds of each node."""
-            return sum(np.bincount(end, weights=weights, minlength=count) for end in (i, j))
+            at_i, at_j = (np.bincount(end, weights=weights, minlength=count) for end in (i, j))
+            return at_i + at_j
 
         # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
         share = 6 * V_nodes / summed(L)

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.warm_start import SMALLEST_STRAIN, drawn_stretches
+from mosa.modules.fitting.losses import cofactors
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.settings import Positive, Width
@@ -69,15 +70,12 @@ def symmetric_output(net: nn.Module, W: Tensor) -> Tensor:
     return 0.5 * (raw + raw.mT)
 
 
-def polar_rotation(F: Tensor, iterations: int = 8) -> Tensor:
+def polar_rotation(F: Tensor) -> Tensor:
     """(N, 3, 3) polar rotation of F (N, 3, 3) with det F > 0, with gradient: Newton's iteration R <- (R + R^-T)/2 (Higham 1986)."""
     R = F
-    for _ in range(iterations):
-        a, b, c = R.unbind(-2)
-        cofactor = torch.stack(
-            [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2
-        )
-        R = 0.5 * (R + cofactor / (a * cofactor[:, 0]).sum(-1)[:, None, None])
+    for _ in range(8):
+        cofactor = cofactors(R)
+        R = 0.5 * (R + cofactor / (R[:, 0] * cofactor[:, 0]).sum(-1)[:, None, None])
     return R
 
 

@@ -23,16 +23,12 @@ BLOCK = 64
 class Turns:
     """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches.
 
-    Itself the context of launches, which is entered for every one of them."""
+    Itself the context of launches, which is entered for every one of them, within this thread's own capture too."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._launching = 0
         self._capturing: int | None = None
-
-    def launching(self) -> Turns:
-        """Beside other launches; within this thread's own capture too."""
-        return self
 
     def __enter__(self) -> None:
         if self._capturing != threading.get_ident():
@@ -77,7 +73,7 @@ def filled(kind, *values):
 def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None
-    with NOTHING if device.is_cuda else ON_CPU.launching():
+    with NOTHING if device.is_cuda else ON_CPU:
         wp.launch(
             kernel, dim, inputs=inputs, adj_inputs=adj_inputs or [], adjoint=adj_inputs is not None, device=device,
             block_dim=block,

@@ -37,9 +37,13 @@ class Inside:
         self.thread.join(LONG)
 
 
+def turn_of(turns, kind):
+    return turns.capturing() if kind == "capturing" else turns
+
+
 def test_launches_run_beside_each_other():
     turns = Turns()
-    first, second = Inside(turns.launching), Inside(turns.launching)
+    first, second = Inside(lambda: turns), Inside(lambda: turns)
     assert first.entered.wait(LONG) and second.entered.wait(LONG)  # both inside at once
     first.end()
     second.end()
@@ -51,7 +55,7 @@ def test_a_capture_is_alone(waiting):
     turns = Turns()
     capture = Inside(turns.capturing)
     assert capture.entered.wait(LONG)
-    other = Inside(getattr(turns, waiting))
+    other = Inside(lambda: turn_of(turns, waiting))
     with (
         turns._changed
     ):  # nobody is counted as inside, and while the lock is held nobody can be about to be
@@ -64,7 +68,7 @@ def test_a_capture_is_alone(waiting):
 
 def test_a_capture_waits_for_launches_that_have_begun():
     turns = Turns()
-    launches = [Inside(turns.launching) for _ in range(2)]
+    launches = [Inside(lambda: turns) for _ in range(2)]
     assert all(each.entered.wait(LONG) for each in launches)
     capture = Inside(turns.capturing)
     launches[0].end()
@@ -78,9 +82,9 @@ def test_a_capture_waits_for_launches_that_have_begun():
 
 def test_a_capture_launches_itself():
     turns = Turns()
-    with turns.capturing(), turns.launching(), turns.launching():
+    with turns.capturing(), turns, turns:
         assert turns._launching == 0  # it does not wait for itself
-    after = Inside(turns.launching)
+    after = Inside(lambda: turns)
     assert after.entered.wait(LONG)
     after.end()
 
@@ -88,10 +92,10 @@ def test_a_capture_launches_itself():
 @pytest.mark.parametrize("turn", ["launching", "capturing"])
 def test_a_failure_inside_lets_the_others_in(turn):
     turns = Turns()
-    with pytest.raises(RuntimeError, match="burst"), getattr(turns, turn)():
+    with pytest.raises(RuntimeError, match="burst"), turn_of(turns, turn):
         raise RuntimeError("burst")
     for name in ("capturing", "launching"):
-        other = Inside(getattr(turns, name))
+        other = Inside(lambda name=name: turn_of(turns, name))
         assert other.entered.wait(LONG)
         other.end()
 
@@ -103,7 +107,7 @@ def test_many_threads_never_launch_into_a_capture():
     def work(number):
         for i in range(100):
             capturing = (i + number) % 5 == 0
-            with turns.capturing() if capturing else turns.launching():
+            with turns.capturing() if capturing else turns:
                 with lock:
                     inside.append((number, capturing))
                     if capturing:

@@ -47,12 +47,8 @@ class IdentificationSettings(Settings):
     operator_sd: Positive = 0.1
     """prior standard deviation of the adapter's numbers, before the evidence finds their size"""
     stiffness_sd: Positive = 0.12
-    """prior standard deviation of the stiffness modes; it falls with the wave number k as (1 +
-    (k/2)^2)^(-smoothness/2)"""
-    smoothness: Weight = 1.0
-    """exponent of this fall"""
-    evidence: bool = True
-    """find both prior standard deviations from the data (MacKay)"""
+    """prior standard deviation of the stiffness modes, as `operator_sd`; it falls with the wave
+    number k as (1 + (k/2)^2)^(-1/2)"""
     known: Text | None = None
     """checkpoint of another fit, or material.json of mosa-material: what it says of the law's
     numbers is their prior (docs/several_recordings.md)"""

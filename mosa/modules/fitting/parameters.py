@@ -82,11 +82,11 @@ def blocks_of(
     if adapter:
         zero = torch.zeros(body.adapter.numbers.numel())
         sd = zero + settings.operator_sd
-        blocks.append(Block("operator", zero, sd, step, learned=settings.evidence))
+        blocks.append(Block("operator", zero, sd, step, learned=True))
     if heterogeneity:
-        falls = (1 + (body.heterogeneity.size / 2) ** 2) ** (-settings.smoothness / 2)
+        falls = (1 + (body.heterogeneity.size / 2) ** 2) ** -0.5
         sd, step = settings.stiffness_sd * falls, step / body.heterogeneity.settings.amplitude
-        blocks.append(Block("stiffness", 0 * falls, sd, step, learned=settings.evidence))
+        blocks.append(Block("stiffness", 0 * falls, sd, step, learned=True))
     return blocks
 
 

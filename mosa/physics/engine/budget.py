@@ -1,9 +1,6 @@
 """How much memory a rollout may take between its forward and its backward pass."""
 
-from collections.abc import Sequence
-
 import torch
-from torch import Tensor
 
 from mosa.physics.engine.numerics import Numerics
 from mosa.system.limits import machine_memory
@@ -12,25 +9,6 @@ KEPT_SHARE = 0.25
 """Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
 KEPT_ON_CPU = 2**30
 """Bytes, for the same on a CPU: 4000 particles in 20 000 nodes over 900 substeps."""
-
-
-class Budget:
-    """room: bytes that one solver may still keep between the passes."""
-
-    def __init__(self) -> None:
-        self.room = 0.0
-
-    def keep(self, tape: list[Tensor]) -> list[Tensor]:
-        """The tape where there is room for it, else []: windows of more nodes than `substep_bytes` knows of."""
-        size = sum(t.nbytes for t in tape)
-        if size > self.room:
-            return []
-        self.room -= size
-        return tape
-
-    def used(self, tape: Sequence[Tensor]) -> None:
-        """A tape that was kept is about to be freed."""
-        self.room += sum(t.nbytes for t in tape)
 
 
 def substep_bytes(numerics: Numerics, particles: int) -> int:

@@ -62,7 +62,7 @@ class WarpCapture:
         graph = captured.graph
 
         def replay() -> None:
-            with NOTHING if self.cuda else ON_CPU.launching():
+            with NOTHING if self.cuda else ON_CPU:
                 wp.capture_launch(graph, stream=self._stream())
 
         return replay

@@ -31,12 +31,12 @@ class Lanes:
     @property
     def room(self) -> float:
         """[bytes] left, see `give`."""
-        return sum(solver.budget.room for solver in self.solvers)
+        return sum(solver.room for solver in self.solvers)
 
     def give(self, room: float) -> None:
         """Memory [bytes] for the states of all substeps of all worlds."""
         for solver in self.solvers:
-            solver.budget.room = room / len(self.solvers)
+            solver.room = room / len(self.solvers)
 
     def piece(self, state: State, left: int, most: int, dt: float) -> int:
         """As `SegmentSolver.piece`, the fewest of any."""

@@ -172,7 +172,7 @@ class Stretch:
                 fastest = int(work.flags[WINDOW])
                 raise LeftWindow if self.cut else solver.error(WINDOW, fastest, self.first, dt)
             left = [] if work.colliders is None else work.colliders.reaction
-            tape = solver.budget.keep(work.tape()) if kept else []
+            tape = solver.keep(work.tape()) if kept else []
             return final, copies([*left, *self.statistics(work)]), Kept(windows, tape)
 
         finals, left, kept = zip(
@@ -190,7 +190,7 @@ class Stretch:
         def run(solver, pool, kept: Kept, state: State, acting, poses, seeds, other_seeds):
             work = self._loaded(solver, pool, state, acting, poses, kept.windows, True)
             tape = kept.take()
-            solver.budget.used(tape)
+            solver.room += sum(t.nbytes for t in tape)
             if tape:
                 work.rewind(tape)
             slots, statistics = work.adj_states, self.statistics_seeds()

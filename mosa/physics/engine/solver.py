@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.contact.driven import Held
-from mosa.physics.engine.budget import Budget, substep_bytes
+from mosa.physics.engine.budget import substep_bytes
 from mosa.physics.engine.numerics import Numerics, State
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
@@ -42,7 +42,7 @@ class SegmentSolver:
     """Runs the segments of one rollout, of one world or of several in the same launches. volume:
     (N,) [m^3]; density: number or (N,) [kg/m^3]; cutoff: node mass [kg].
 
-    budget: for the states of all substeps, between the passes; segments that do not fit are run
+    room: bytes for the states of all substeps, between the passes; segments that do not fit are run
     again in the backward pass. gravities: of every world [m/s^2], among which the particles are shared in equal parts;
     None: one world with the numerics' own. first_world: number of the first one, for messages, None
     where there is but one. driven: particles of all worlds, None for none."""
@@ -54,7 +54,7 @@ class SegmentSolver:
     ) -> None:  # fmt: skip
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass, self.driven = density * volume, driven
-        self.budget = Budget()
+        self.room = 0.0
         self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)
         self._pull = np.array(self.gravities)
         self._first_world = first_world
@@ -84,7 +84,7 @@ class SegmentSolver:
         """The stretches inside begin at `state` and take `time` seconds in all; they have the same windows, and the host looks at
         them once, afterwards: until then it launches one after the other and waits for none. Errors: LeftWindow for any event;
         the stretches one by one say which."""
-        room, self._shared = self.budget.room, _Shared(self.windows(state, time, margin, True))
+        room, self._shared = self.room, _Shared(self.windows(state, time, margin, True))
         try:
             yield
             with torch.no_grad():
@@ -93,7 +93,7 @@ class SegmentSolver:
         finally:
             self._shared = None
         if not fine:
-            self.budget.room = room
+            self.room = room
             raise LeftWindow
 
     def piece(self, state: State, left: int, most: int, dt: float) -> int:
@@ -155,7 +155,15 @@ class SegmentSolver:
 
     def has_room(self, substeps: int) -> bool:
         """Whether the states of so many substeps may be kept."""
-        return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.budget.room
+        return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.room
+
+    def keep(self, tape: list[Tensor]) -> list[Tensor]:
+        """The tape where there is room for it, else []: windows of more nodes than `substep_bytes` knows of."""
+        size = sum(t.nbytes for t in tape)
+        if size > self.room:
+            return []
+        self.room -= size
+        return tape
 
     def bounds(self, state: State) -> np.ndarray:
         """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from mosa.reconstruction.gaussians.gaussians import OPACITY_RATE, ROTATION_RATE, SMALLEST
 from mosa.reconstruction.gaussians.photometric import image_loss
-from mosa.reconstruction.gaussians.static import OPACITY_RATE, ROTATION_RATE, SMALLEST
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import CarriedSettings
 from mosa.rendering.appearance import spherical_harmonics
@@ -118,11 +118,9 @@ def fit_carried(
     gaussians = RestGaussians(static, surface_normals(static.means, particles), settings)
     carried, eyes = bind(static.means, particles).carry(positions), centers(windows.cameras)
     turns = turned_basis(gaussians.normals, carried.rotations)
-    order = torch.empty(0, dtype=torch.long)
+    draw = windows.draws(settings.views, generator)
     for step in range(settings.iterations):
-        while len(order) < settings.views:
-            order = torch.cat([order, torch.randperm(len(windows), generator=generator)])
-        chosen, order = order[: settings.views], order[settings.views :]
+        chosen = next(draw)
         batch = windows.select(chosen.to(windows.frame.device))
         A, turn = carried.gradients[batch.frame], carried.rotations[batch.frame]
         means = carried.means[batch.frame] + (A @ gaussians.shift[..., None])[..., 0]

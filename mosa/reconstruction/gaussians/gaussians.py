@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from mosa.reconstruction.settings import FitSettings
 from mosa.rendering.covariance import covariance_from
 from mosa.types import Splats
 
-
-@dataclass(frozen=True)
-class Rates:
-    """Adam's steps: of positions [m], of the others per number that is free of constraints."""
-
-    means: float
-    log_scale: float
-    opacity: float
-    color: float
-    rotation: float
+SMALLEST = 0.25
+"""Bound of a scale in units of its start."""
+OPACITY_RATE, COLOR_RATE, ROTATION_RATE = 0.05, 0.08, 0.02
+"""Adam's steps of the logits of opacities and colours, and of quaternions."""
 
 
 def isotropic_covariances(scale: Tensor) -> Tensor:
@@ -31,14 +25,13 @@ def isotropic_covariances(scale: Tensor) -> Tensor:
 class FreeGaussians:
     """N Gaussians as free numbers: position [m], log of the scale(s), logits of opacity and colour, quaternion where anisotropic.
 
-    Starts isotropic, with the mean scale of each of `splats`. smallest, largest: bounds of a scale in units of its start;
-    axis_ratio: bound of the largest scale over the smallest. `first_colors` (N, 3) are the colours at the start."""
+    Starts isotropic, with the mean scale of each of `splats`. move: positions too. `first_colors` (N, 3) are the colours at the
+    start."""
 
-    def __init__(
-        self, splats: Splats, rates: Rates, *, move: bool, anisotropic: bool, smallest: float,
-        largest: float, axis_ratio: float,
-    ) -> None:  # fmt: skip
-        scale = splats.scales.mean(1)
+    def __init__(self, splats: Splats, settings: FitSettings, *, move: bool) -> None:
+        scale, anisotropic = splats.scales.mean(1), settings.shape == "anisotropic"
+        rates = {"means": settings.lr_positions * float(scale.mean()), "log_scale": settings.lr_scales,
+                 "opacity": OPACITY_RATE, "color": COLOR_RATE, "rotation": ROTATION_RATE}  # fmt: skip
         self.parameters = {
             "means": splats.means.clone(),
             "log_scale": scale.log(),
@@ -48,10 +41,10 @@ class FreeGaussians:
         if anisotropic:
             self.parameters["log_scale"] = scale.log()[:, None].repeat(1, 3)
             self.parameters["rotation"] = splats.rotations.clone()
-        self.fixed = {"lower": (scale * smallest).log(), "upper": (scale * largest).log(), "rotations": splats.rotations,
+        self.fixed = {"lower": (scale * SMALLEST).log(), "upper": (scale * settings.largest).log(), "rotations": splats.rotations,
                       "first_colors": splats.colors}  # fmt: skip
-        self.anisotropic, self.axis_ratio = anisotropic, axis_ratio
-        groups = [{"params": [p.requires_grad_(True)], "start": getattr(rates, name), "name": name}
+        self.anisotropic, self.axis_ratio = anisotropic, settings.axis_ratio
+        groups = [{"params": [p.requires_grad_(True)], "start": rates[name], "name": name}
                   for name, p in self.parameters.items() if move or name != "means"]  # fmt: skip
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
 

@@ -8,18 +8,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
+from mosa.reconstruction.gaussians.gaussians import FreeGaussians
 from mosa.reconstruction.gaussians.photometric import image_loss
 from mosa.reconstruction.gaussians.relocation import UNTIL, relocate
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import FitSettings, StaticSettings
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats
-
-SMALLEST = 0.25
-"""Bound of a scale in units of its start."""
-OPACITY_RATE, COLOR_RATE, ROTATION_RATE = 0.05, 0.08, 0.02
-"""Adam's steps of the logits of opacities and colours, and of quaternions."""
 
 
 def fit_splats(
@@ -32,17 +27,10 @@ def fit_splats(
     ones. The same bits for the same seed on a CPU."""
     generator = torch.Generator().manual_seed(seed)
     every = settings.relocate_every if move and isinstance(settings, StaticSettings) else 0
-    unit = float(splats.scales.mean(1).mean())
-    rates = Rates(settings.lr_positions * unit, settings.lr_scales, OPACITY_RATE, COLOR_RATE, ROTATION_RATE)  # fmt: skip
-    gaussians = FreeGaussians(
-        splats, rates, move=move, anisotropic=settings.shape == "anisotropic", smallest=SMALLEST, largest=settings.largest,
-        axis_ratio=settings.axis_ratio,
-    )  # fmt: skip
-    order = torch.empty(0, dtype=torch.long)
+    gaussians = FreeGaussians(splats, settings, move=move)
+    draw = windows.draws(settings.views, generator)
     for step in range(settings.iterations):
-        while len(order) < settings.views:
-            order = torch.cat([order, torch.randperm(len(windows), generator=generator)])
-        batch, order = windows.select(order[: settings.views]), order[settings.views :]
+        batch = windows.select(next(draw))
         gaussians.anneal(0.55 + 0.45 * math.cos(math.pi * step / settings.iterations))
         means, shapes = gaussians.parameters["means"][None], gaussians.covariances()[None]
         colors, state = gaussians.colors[None], torch.zeros_like(batch.frame)

@@ -21,11 +21,10 @@ SMALLEST_PIECE = 0.02
 
 @dataclass(frozen=True)
 class Particles:
-    """positions: (N, 3) [m]; volume: (N,) [m^3]; surface: (N,) bool, True in the outermost layer of cells; spacing [m]."""
+    """positions: (N, 3) [m]; volume: (N,) [m^3]; spacing [m]."""
 
     positions: Tensor
     volume: Tensor
-    surface: Tensor
     spacing: float
 
 
@@ -93,13 +92,9 @@ def fill(volume: Volume, *, spacing: float) -> Particles:
     held = np.bincount(owner, minlength=len(names))
     sums = [np.bincount(owner, voxels[:, a], len(names)) for a in range(3)]
     positions = np.stack(sums, -1) / held[:, None]
-    solid = np.zeros(shape + 2, bool)
-    solid[1:-1, 1:-1, 1:-1] = kept.reshape(shape)
-    inner = ndimage.binary_erosion(solid, np.ones((3, 3, 3), bool))[1:-1, 1:-1, 1:-1].ravel()
     device = volume.values.device
     return Particles(
         torch.as_tensor(positions, dtype=torch.float32, device=device),
         torch.as_tensor(held * volume.pitch**3, dtype=torch.float32, device=device),
-        torch.as_tensor(~inner[names], device=device),
         spacing,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import torch
@@ -30,6 +31,15 @@ class Windows:
         parts = self.images, self.mattes, self.view, self.frame
         images, mattes, view, frame = (part[chosen] for part in parts)
         return Windows(images, mattes, self.cameras.select(chosen.tolist()), view, frame)
+
+    def draws(self, count: int, generator: torch.Generator) -> Iterator[Tensor]:
+        """Indices of `count` windows at a time: all are drawn before one is again."""
+        order = torch.empty(0, dtype=torch.long)
+        while True:
+            while len(order) < count:
+                order = torch.cat([order, torch.randperm(len(self), generator=generator)])
+            yield order[:count]
+            order = order[count:]
 
     def of_frame(self, frame: int) -> Windows:
         return self.select((self.frame == frame).nonzero()[:, 0])

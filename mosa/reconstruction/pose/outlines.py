@@ -16,8 +16,7 @@ from torch import Tensor
 from mosa.reconstruction.geometry.field import sample
 from mosa.reconstruction.geometry.known import Solid
 from mosa.reconstruction.geometry.refinement import edges
-from mosa.reconstruction.pose.registration import choose
-from mosa.reconstruction.pose.rigid import damped, rotation_exp
+from mosa.reconstruction.pose.rigid import descend_each, rotation_exp
 from mosa.rendering.cameras import rays as camera_rays
 from mosa.types import Cameras
 
@@ -172,27 +171,11 @@ def fitted(
 ) -> tuple[Similarities, Tensor]:
     """Each of K similarities after Levenberg-Marquardt steps, with its cost (K,) [px^2]. sized:
     whether the size is fitted too."""
-    free = slice(0, 7 if sized else 6)
-    damping = torch.full_like(at.size, 1e-2)
-    best, state = at, equations(solid, at, rays)[:3]
-    trial = best
-    for k in range(iterations + 1):
-        if k:
-            found = equations(solid, trial, rays)[:3]
-            better = found[0] < state[0]
-            damping = torch.where(better, damping / 3, damping * 6)
-            pairs = zip(vars(trial).values(), vars(best).values())
-            best = Similarities(*(choose(better, new, old) for new, old in pairs))
-            cost, vector, matrix = (choose(better, new, old) for new, old in zip(found, state))
-            state = cost, vector, matrix
-        step = torch.zeros_like(state[1])
-        step[:, free] = damped(state[1][:, free], state[2][:, free, free], damping)
-        most = 0.4 * best.size * solid.reach
-        step = step * (most / step.norm(dim=-1).clamp(min=1e-12)).clamp(max=1)[:, None]
-        trial = best.moved(step, solid.reach)
-        if float((step.norm(dim=-1) / most).max()) < STILL:
-            break
-    return best, state[0]
+    return descend_each(
+        lambda trial: equations(solid, trial, rays)[:3], lambda at, step: at.moved(step, solid.reach), at,
+        iterations=iterations + 1, most=lambda at: 0.4 * at.size * solid.reach, free=slice(0, 7 if sized else 6),
+        small=lambda step, most: float((step.norm(dim=-1) / most).max()) < STILL,
+    )  # fmt: skip
 
 
 def overlaps(solid: Solid, at: Similarities, mattes: Tensor, cameras: Cameras) -> list[float]:

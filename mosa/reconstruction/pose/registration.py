@@ -23,8 +23,8 @@ from mosa.reconstruction.pose.rigid import (
     Level,
     Poses,
     RigidBody,
-    damped,
     descend,
+    descend_each,
     huber,
     left_jacobian,
     light_columns,
@@ -89,35 +89,17 @@ def matte_centres(mattes: Tensor, cameras: Cameras, size: float | None = None) -
     return torch.linalg.solve(P.sum(0), (P @ origins[:, None, :, None]).sum(0))[..., 0]
 
 
-def choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """`new` where the mask (K,) is set, else `old`, both (K, ...)."""
-    return torch.where(mask.view(-1, *[1] * (new.dim() - 1)), new, old)
-
-
 def refine(
     body: RigidBody, level: Level, poses: Poses, *, iterations: int, central: bool = False
 ) -> tuple[Poses, Tensor]:
     """Each of K poses after a few Levenberg-Marquardt steps, with its cost (K,)."""
     frame = torch.zeros(len(poses.center), dtype=torch.long, device=poses.center.device)
-    damping = torch.full((len(frame),), 1e-2).to(poses.center)
-    best, trial, state = poses, poses, None
-    for _ in range(iterations):
-        found = normal_equations(body, level, trial, frame, central=central)
-        if state is None:
-            state = found
-        else:
-            better = found[0] < state[0]
-            damping = torch.where(better, damping / 3, damping * 6)
-            pairs = zip(vars(trial).values(), vars(best).values())
-            best = Poses(*(choose(better, new, old) for new, old in pairs))
-            state = tuple(choose(better, new, old) for new, old in zip(found, state))
-        step = damped(state[1], state[2], damping)
-        length = step.norm(dim=-1, keepdim=True)
-        step = step * (0.6 * body.radius / length.clamp(min=1e-12)).clamp(max=1)
-        trial = best.moved(step[:, :3], step[:, 3:] / body.radius)
-        if float(step.norm(dim=-1).max()) < 2e-3 * level.pixel:
-            break
-    return best, state[0]
+    most = torch.full_like(poses.center[:, 0], 0.6 * body.radius)
+    return descend_each(
+        lambda at: normal_equations(body, level, at, frame, central=central),
+        lambda at, step: at.moved(step[:, :3], step[:, 3:] / body.radius), poses, iterations=iterations,
+        most=lambda _: most, small=lambda step, _: float(step.norm(dim=-1).max()) < 2e-3 * level.pixel,
+    )  # fmt: skip
 
 
 def coarse_poses(body: RigidBody, level: Level, center: Tensor, rotations: int, keep: int) -> Poses:

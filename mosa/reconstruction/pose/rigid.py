@@ -223,6 +223,39 @@ def damped(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
     return -torch.linalg.solve(system, gradient.double()[..., None])[..., 0].to(gradient)
 
 
+def choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """`new` where the mask (K,) is set, else `old`, both (K, ...)."""
+    return torch.where(mask.view(-1, *[1] * (new.dim() - 1)), new, old)
+
+
+def descend_each(
+    evaluate: Callable[[Any], tuple[Tensor, ...]], moved: Callable[[Any, Tensor], Any], start: Any, *, iterations: int,
+    most: Callable[[Any], Tensor], small: Callable[[Tensor, Tensor], bool], free: slice = slice(None),
+) -> tuple[Any, Tensor]:  # fmt: skip
+    """As `descend`, of K numbers each for itself, a dataclass of tensors (K, ...), with their costs (K,). most: (K,) longest steps;
+    small: whether steps (K, D), of at most that, are the last."""
+    damping, best, trial, state = torch.full_like(start.center[:, 0], 1e-2), start, start, None
+    for _ in range(iterations):
+        found = evaluate(trial)
+        if state is None:
+            state = found
+        else:
+            better = found[0] < state[0]
+            damping = torch.where(better, damping / 3, damping * 6)
+            pairs = zip(vars(trial).values(), vars(best).values())
+            best = type(start)(*(choose(better, new, old) for new, old in pairs))
+            state = tuple(choose(better, new, old) for new, old in zip(found, state))
+        step, longest = torch.zeros_like(state[1]), most(best)
+        step[:, free] = damped(state[1][:, free], state[2][:, free, free], damping)
+        length = step.norm(dim=-1).clamp(min=1e-12)
+        step = step * (longest / length).clamp(max=1)[:, None]
+        trial = moved(best, step)
+        if small(step, longest):
+            break
+    assert state is not None
+    return best, state[0]
+
+
 def descend(
     evaluate: Callable[[Any], tuple[Tensor, ...]], moved: Callable[[Any, Tensor], Any], start: Any, *, damping: float,
     iterations: int, small: Callable[[Tensor, float], bool], free: slice = slice(None),

@@ -1,4 +1,4 @@
-"""The parts that segments and chains share: graphs, budget, clock, what is known of tensors."""
+"""The parts that segments and chains share: graphs, room, clock, what is known of tensors."""
 
 import ast
 import warnings
@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import mosa.physics
-from mosa.physics.engine.budget import Budget
 from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs
+from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.launching import same_memory
 from mosa.physics.time.adaptive_steps import StepControl
 from mosa.physics.time.clock import Adaptive, Clock, Moment, Replay
@@ -72,13 +72,12 @@ def test_there_are_never_many_more_graphs_than_allowed(most):
     assert len(graphs) > 1
 
 
-def test_a_budget_is_spent_and_comes_back():
-    budget, tape = Budget(), [torch.zeros(10), torch.zeros(30)]  # 160 bytes
-    assert budget.keep(tape) == []
-    budget.room = 200.0
-    assert budget.keep(tape) is tape and budget.room == 40 and budget.keep(tape) == []
-    budget.used(tape)
-    assert budget.room == 200
+def test_room_for_states_is_spent():
+    solver = SegmentSolver.__new__(SegmentSolver)
+    solver.room, tape = 0.0, [torch.zeros(10), torch.zeros(30)]  # 160 bytes
+    assert solver.keep(tape) == []
+    solver.room = 200.0
+    assert solver.keep(tape) is tape and solver.room == 40 and solver.keep(tape) == []
 
 
 def test_velocities_lie_between_the_positions_of_steps_that_vary():

@@ -151,6 +151,6 @@ def test_frames_are_launched_before_the_host_looks_at_them(leaves, make_block, l
         gradients(state, long, monkeypatch, **options) for long in (True, False)
     )
     assert looks[0] == 8 and (len(looks) > 1) == leaves
-    assert [solver.budget.room for solver in solvers] == [2**30] * 2
+    assert [solver.room for solver in solvers] == [2**30] * 2
     for a, b in zip(long, short, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-11 * float(b.abs().max()))

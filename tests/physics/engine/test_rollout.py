@@ -485,7 +485,7 @@ def test_a_tape_of_many_more_nodes_than_particles_is_not_kept_beyond_its_room(
     kept, asked = [], SegmentSolver.has_room
 
     def spied(self, substeps):
-        kept.append(self.budget.room)
+        kept.append(self.room)
         return asked(self, substeps)
 
     monkeypatch.setattr(SegmentSolver, "has_room", spied)

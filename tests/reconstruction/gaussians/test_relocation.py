@@ -9,19 +9,17 @@ import torch
 
 from mosa.data.hull import visual_hull
 from mosa.errors import ConfigError
-from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
+from mosa.reconstruction.gaussians.gaussians import FreeGaussians
 from mosa.reconstruction.gaussians.initial import initial_splats
 from mosa.reconstruction.gaussians.relocation import relocate
 from mosa.reconstruction.gaussians.static import fit_splats
 from mosa.reconstruction.motion.observed import object_windows
-from mosa.reconstruction.settings import StaticSettings, build_settings
+from mosa.reconstruction.settings import FitSettings, StaticSettings, build_settings
 from mosa.rendering.covariance import covariance_from, quaternion_to_matrix
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats
 
 WHITE = torch.ones(3)
-RATES = Rates(means=1e-3, log_scale=0.02, opacity=0.05, color=0.08, rotation=0.02)
-BOUNDS = {"smallest": 0.25, "largest": 2.0, "axis_ratio": 10.0}
 
 
 def rendered(splats, windows, background=WHITE):
@@ -57,7 +55,8 @@ def some_splats(count=6, seed=0):
 
 
 def free(splats, anisotropic=False):
-    return FreeGaussians(splats, RATES, move=True, anisotropic=anisotropic, **BOUNDS)
+    shape = "anisotropic" if anisotropic else "isotropic"
+    return FreeGaussians(splats, FitSettings(shape=shape), move=True)
 
 
 def pull(gaussians, weights):
@@ -138,15 +137,8 @@ def test_anisotropic_gaussians_fit_a_rod_better(monkeypatch):
 
 
 def test_the_axis_ratio_is_bounded():
-    gaussians = FreeGaussians(
-        some_splats(),
-        RATES,
-        move=True,
-        anisotropic=True,
-        smallest=0.01,
-        largest=5.0,
-        axis_ratio=3.0,
-    )
+    settings = FitSettings(shape="anisotropic", largest=5.0, axis_ratio=3.0)
+    gaussians = FreeGaussians(some_splats(), settings, move=True)
     gaussians.parameters["log_scale"].data += torch.tensor([2.0, 0.0, -2.0])
     gaussians.bound()
     scales = gaussians.splats().scales

@@ -93,23 +93,6 @@ def _evaluate(
     return b
 
 
-def _evaluate_all(
-    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor, h: Tensor,
-) -> tuple[_Buffers, Tensor]:  # fmt: skip
-    """(buffers, post (6, M)); fills G (N, 6, 6) and h (N, 6)."""
-    n, m, bound = launch.n, launch.rows, settings.l_max or 0.0
-    b = _evaluate(launch, w, s, unit, settings, weights, G)
-    post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
-    grid, size = launch.grid, launch.forward
-    network_kernels.theta_forward[grid](
-        b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
-    )  # fmt: skip
-    assembly_kernels.finish[launch.lanes](
-        sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES
-    )
-    return b, post
-
-
 class _FusedOperator(torch.autograd.Function):
     @staticmethod
     def forward(ctx, settings: Settings, unit: Tensor, w: Tensor, s: Tensor, *weights: Tensor):
@@ -120,7 +103,19 @@ class _FusedOperator(torch.autograd.Function):
         G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
         stored = backward_at_hand()
         with torch.cuda.device_of(w):
-            buffers, post = _evaluate_all(launch, w, s, unit, settings, weights, G, h)
+            buffers = _evaluate(launch, w, s, unit, settings, weights, G)
+            post, sums, m = (
+                torch.empty_like(buffers.pre),
+                torch.empty_like(buffers.pre),
+                launch.rows,
+            )
+            network_kernels.theta_forward[launch.grid](
+                buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, sums, n, m, settings.scale, settings.l_max or 0.0,
+                BOUNDED=settings.l_max is not None, **launch.forward,
+            )  # fmt: skip
+            assembly_kernels.finish[launch.lanes](
+                sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES
+            )
         ctx.settings, ctx.launch = settings, launch
         ctx.buffers = buffers if stored else None
         ctx.save_for_backward(unit, w, s, post, *weights)

@@ -20,13 +20,8 @@ def interpreted() -> bool:
 def why_not(operator: ProgressiveOperator, w: Tensor) -> str | None:
     """What keeps the kernels from evaluating `operator` on w (N, 6); None where they can."""
     hidden = operator.psi1[0].out_features
-    if (
-        operator.constant
-        or operator.no_C
-        or operator.no_pre
-        or operator.no_post
-        or operator.no_prior_stress
-    ):
+    ablations = "constant", "no_C", "no_pre", "no_post", "no_prior_stress"
+    if any(getattr(operator, name) for name in ablations):
         return "the kernels have all four networks, and no ablation of them"
     if operator.alpha_normal != operator.alpha:
         return "the kernels have one alpha for all four matrices"

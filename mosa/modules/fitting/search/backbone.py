@@ -39,8 +39,6 @@ STRIDES = {
 range and 17 degrees in that of the angle's."""
 FINEST = 0.2
 """Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
-COMPASS = 40
-"""About how many rollouts it takes in three or four numbers."""
 MANY = 4
 """Learned numbers from which a law has several valleys (a stiff and viscous one beside a soft one that yields early): there
 Gauss-Newton is begun at several starts, as a search in one number after the other goes down the wrong one."""
