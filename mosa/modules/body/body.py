@@ -6,7 +6,7 @@ One module for fitting, evaluation and later use, so that what is learned is wha
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.rotations import skew
 from mosa.physics.time.adaptive_steps import StepControl
-from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.clock import Adaptive
 from mosa.physics.time.time_step import required_substeps
 from mosa.physics.world import Start, World
 from mosa.rendering.appearance.carried_splats import CarriedSplats
@@ -194,20 +194,18 @@ class Body(nn.Module):
         self, start: Start, world: World, frames: int, frame_dt: float, *,
         model: Model | None = None, collect: Callable | None = None,
         progress: Callable[[int], None] | None = None,
-        counts: Sequence[int] | None = None, observed: Tensor | None = None, gain: float = 0.0,
+        observed: Tensor | None = None, gain: float = 0.0,
         unseen: Callable[[Tensor, int], Tensor] | None = None, substeps: int | None = None,
     ) -> Rollout:  # fmt: skip
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
         model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
-        adapter (penalties, mean |C|). counts: of substeps, to replay those of an adaptive rollout. observed, gain: (T, N, 3) [m]
+        adapter (penalties, mean |C|). observed, gain: (T, N, 3) [m]
         and a number; at every frame the velocities are corrected towards what was seen, but for what was `unseen` of the positions
         in a frame (`ready.corrected_rollout`). substeps: of
         every frame, where differences hold them fixed; None: as many as the time step bound asks for.
         Errors: SimulationDiverged, ConfigError (time step)."""
-        ready = self.ready(
-            start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps
-        )
+        ready = self.ready(start, world, frames, frame_dt, model=model, substeps=substeps)
         return ready.simulate(
             frames, world.solids, collect=collect, progress=progress, observed=observed, gain=gain,
             unseen=unseen,
@@ -215,7 +213,7 @@ class Body(nn.Module):
 
     def ready(
         self, start: Start, world: World, frames: int, frame_dt: float, *, model: Model | None = None,
-        counts: Sequence[int] | None = None, substeps: int | None = None, enough: bool = False,
+        substeps: int | None = None, enough: bool = False,
     ) -> Ready:  # fmt: skip
         """The body at `start`, ready to be simulated; arguments and errors as `simulate`.
         enough: check that `substeps`, which a user gave, are as many as the bound asks for."""
@@ -228,11 +226,10 @@ class Body(nn.Module):
         parameters = material.per_particle(factor)
         gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
         timing = None
-        if self.settings.adaptive or counts is not None:
+        if self.settings.adaptive:
             # every variant takes the substeps its own states ask for; velocities at frame 0 itself: the rollout starts with half a
             # kick, whatever its first substep
-            control = self.step_control(self.adapter is not None)
-            timing = Adaptive(control, lag=0.0) if counts is None else Replay(counts, lag=0.0)
+            timing = Adaptive(self.step_control(self.adapter is not None), lag=0.0)
             substeps = self.settings.max_substeps
             state = self.initial_state(start, 0.0, gravity)
         elif substeps is not None and not enough:

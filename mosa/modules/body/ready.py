@@ -14,7 +14,7 @@ from mosa.physics.adapters.interface import answer
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import stack_held
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.clock import Adaptive
 from mosa.types import ParticleState, Rollout
 
 
@@ -29,7 +29,7 @@ class Ready:
     state: ParticleState
     lift: Tensor
     arguments: dict
-    timing: Adaptive | Replay | None
+    timing: Adaptive | None
 
     def simulate(
         self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,

@@ -81,12 +81,7 @@ def wave_modulus(law: str, parameters: dict[str, Tensor]) -> Tensor:
 
 
 _LAME = {"mu": 1, "lam": 1}
-register_law(
-    "linear",
-    linear,
-    {**_LAME, "reference": 9},
-    reference="reference",
-)
+register_law("linear", linear, {**_LAME, "reference": 9}, reference="reference")
 register_law("neo_hookean", neo_hookean, _LAME, needs_positive_J=True)
 register_law("corotated", corotated, _LAME, uses_rotation=True)
 register_law("stvk", stvk, _LAME)

@@ -361,25 +361,19 @@ def pose_at(motion: Motion | Trajectory | Points, start: float = 0.0) -> tuple[T
 
 
 def sample_frame(
-    motions: Sequence[Motion | Trajectory], frame: int, frames: int, first: int, count: int, frame_dt: float, start: float,
-    replayed: bool,
+    motions: Sequence[Motion | Trajectory], frame: int, frames: int, count: int, frame_dt: float, start: float,
 ) -> Poses:  # fmt: skip
     """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
 
-    first, count: of its substeps; replayed: whether counts were given beforehand. A trajectory fits given counts alone.
-    Errors: ConfigError."""
+    count: of its substeps. Errors: ConfigError for a trajectory, which fits counts that are known alone."""
     dt, sampled = frame_dt / count, []
     for motion in motions:
-        if not isinstance(motion, Trajectory):
-            timed, begins = motion.timed(frames, frame_dt), start + frame * frame_dt
-            sampled.append(timed.sample(1, count, dt, begins))
-        elif replayed and start == 0:
-            sampled.append(motion.sample(1, count, dt, first=first))
-        else:
+        if isinstance(motion, Trajectory):
             raise ConfigError(
-                "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps "
-                f"or start_time {start}; use a Motion with times or waypoints, or replay with counts"
+                "trajectory: it gives poses substep by substep, found adaptive substeps; use a Motion with times or waypoints"
             )
+        timed, begins = motion.timed(frames, frame_dt), start + frame * frame_dt
+        sampled.append(timed.sample(1, count, dt, begins))
     return _poses(sampled)
 
 

@@ -36,8 +36,7 @@ from mosa.physics.engine.numerics import Numerics, flat
 from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.engine.stepping import Prepared, Stepper
 from mosa.physics.launching import SCALARS
-from mosa.physics.time.adaptive_steps import StepChooser, check_counts
-from mosa.physics.time.clock import Adaptive, Clock, Moment, Replay
+from mosa.physics.time.clock import Adaptive, Clock, Moment
 from mosa.physics.time.time_step import MOST_SUBSTEPS
 from mosa.settings import Count, Expected, Number, Positive, Text, shown, such, typed
 from mosa.system.limits import counted, named_device
@@ -53,7 +52,7 @@ Values = Annotated[dict[str, Any], Expected("values of a law by their names")]
 Array = Annotated[Tensor, InstanceOf, such(dense), Expected("a dense tensor")]
 Asked = Annotated[Callable[[MaterialState], AdapterOperator] | Sequence[Callable[..., Any]],
                   Expected("a function of a MaterialState, or one for each world")]  # fmt: skip
-Timing = Annotated[InstanceOf[Adaptive] | InstanceOf[Replay], Expected("an Adaptive or a Replay")]
+Timing = Annotated[Adaptive, InstanceOf, Expected("an Adaptive")]
 Scalar = Annotated[torch.dtype, InstanceOf, such(lambda t: t in SCALARS),
                    Expected("torch.float32 or torch.float64")]  # fmt: skip
 Handed = Annotated[Held, InstanceOf, Expected("a Held")]
@@ -73,7 +72,7 @@ class _Asked(NamedTuple):
     motions: Sequence | None
     gravity: Tensor | Sequence | None
     together: int | None
-    timing: Adaptive | Replay | None
+    timing: Adaptive | None
     started: bool
     held: Held | None
     frames: int | None = None
@@ -188,7 +187,7 @@ class Simulator:
         flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned. On CUDA gradients reach the
         parameters of an adapter that is a torch module, not other tensors that it may use.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
-        timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
+        timing: substeps that are chosen for each frame, instead of `substeps` in all (see `clock`).
         held: particles that the last colliders, sets of `Particles`, drive; None: their own
         indices, from where they are in `state`.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
@@ -204,7 +203,7 @@ class Simulator:
         asked = _Asked(parameters, volume, density, adapter, stride, motions, gravity, together, timing, started, held,
                        frames, collect, start_time)  # fmt: skip
         stepper, start = self._stepper(state, asked)
-        poses, all_known = stepper.poses_of(frames, start_time, isinstance(timing, Replay))
+        poses, all_known = stepper.poses_of(frames, start_time)
         prepared, moment, varies = stepper.prepared, start, stepper.clock.varies
         current, frame = stepper.enter(start, not started)
         recorded = [flat(start.state)]
@@ -290,20 +289,15 @@ class Simulator:
             gravities = tuple(map(tuple, turned.tolist()))
         prepared = self._prepare(state, asked, worlds, gravities, held)
         choose = None
-        if isinstance(timing, Replay):
-            counts = check_counts(timing.counts, asked.frames)
-            choose = lambda frame, *_: counts[frame - 1]  # noqa: E731
-        elif timing is not None:
+        if timing is not None:
             solids = max(
                 (m.max_speed(reach(c.shape)) for m, c in zip(each[0], self.colliders)), default=0.0
             )
             density = asked.density
             density = density if isinstance(density, Tensor) and density.ndim else float(density)
-            chooser = StepChooser(
-                timing.control, self.numerics, asked.parameters, prepared.packed, density,
-                self.frame_dt, solids,
-            )  # fmt: skip
-            choose = chooser.choose
+            choose = timing.chooser(
+                self.numerics, asked.parameters, prepared.packed, density, self.frame_dt, solids
+            )
         clock = Clock(self.frame_dt, self.substeps, None if asked.frames == 1 else choose)
         moment = Moment(
             self._begun(state, asked.started), lag=0.0 if timing is None else timing.lag

@@ -329,18 +329,19 @@ class Stepper:
         return (*poses, *self._paths(moment, frame))
 
     def poses_of(
-        self, frames: int, start: float, replayed: bool
+        self, frames: int, start: float
     ) -> tuple[Callable[[int, Frame], tuple[Tensor, ...]], tuple[Tensor, ...]]:
         """(what tells those of a rollout's frame intervals, all of them where these are known beforehand). start [s]: of the
-        motions; replayed: whether counts of substeps were given."""
+        motions."""
         clock, each = self.clock, self.motions
         if not self.solids:
             return lambda *_: (), ()
         if clock.varies:
 
             def chosen(number: int, frame: Frame) -> tuple[Tensor, ...]:
-                sampled = sample_frame(each[0], number, frames - 1, frame.first, frame.count, clock.frame_dt, start,
-                                       replayed)  # fmt: skip
+                sampled = sample_frame(
+                    each[0], number, frames - 1, frame.count, clock.frame_dt, start
+                )
                 led = self.led(frame.count, frame.dt, start + number * clock.frame_dt)
                 return (*self.taken(sampled, frame.dt), *led)
 

@@ -2,9 +2,8 @@
 
 The count of a frame is a step function of the state and so of the parameters: between its jumps it is constant, the rollout is one
 fixed sequence of substeps, and its gradient is exact for the counts taken. They are decided once, going forward, without gradient;
-segments recomputed in the backward pass carry their time step with them. `Rollout.counts` records them, and a rollout given those
-counts replays the same substeps whatever the parameters: that is what differences must hold fixed. Across a jump of a count the
-loss itself jumps by the integrator's error, which no gradient sees.
+segments recomputed in the backward pass carry their time step with them. `Rollout.counts` records them. Across a jump of a count
+the loss itself jumps by the integrator's error, which no gradient sees.
 """
 
 import math
@@ -17,7 +16,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.constitutive.laws import Law
 from mosa.physics.engine.material_operations import kirchhoff_stress
 from mosa.physics.engine.numerics import Numerics, State
-from mosa.physics.time.time_step import MOST_SUBSTEPS, VISCOUS_NUMBER, step_rate
+from mosa.physics.time.time_step import VISCOUS_NUMBER, step_rate
 
 STRETCH = 1e-3
 """Relative stretch of the differences that measure the stiffness: exact to 1e-6 of it in float64, 1e-4 in float32."""
@@ -130,16 +129,3 @@ class StepChooser:
             )
         wanted = max(needed, control.minimum)
         return min(-(-wanted // control.multiple) * control.multiple, control.maximum)
-
-
-def check_counts(counts, frames: int) -> list[int]:
-    """Given counts of the frames - 1 intervals, as integers. Errors: ConfigError."""
-    values = list(counts)
-    if len(values) != frames - 1 or any(
-        isinstance(c, bool) or not 1 <= c <= MOST_SUBSTEPS or int(c) != c for c in values
-    ):
-        raise ConfigError(
-            f"counts: expected {frames - 1} positive whole numbers, one for each frame interval (Rollout.counts of an earlier "
-            f"rollout), found {values}"
-        )
-    return [int(c) for c in values]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from mosa.physics.engine.numerics import State, Steps
-from mosa.physics.time.adaptive_steps import StepControl
+from mosa.physics.time.adaptive_steps import StepChooser, StepControl
 from mosa.types import ParticleState
 
 
@@ -21,15 +21,9 @@ class Adaptive:
     control: StepControl
     lag: float | None = None
 
-
-@dataclass(frozen=True)
-class Replay:
-    """Given counts of the frames - 1 intervals, those of an earlier rollout (`Rollout.counts`): differences hold them fixed.
-
-    lag: as `Adaptive`."""
-
-    counts: Sequence[int]
-    lag: float | None = None
+    def chooser(self, *of_rollout) -> Callable[[int, State, float | None], int]:
+        """What a `Clock` asks; of_rollout: what a `StepChooser` takes beside the control."""
+        return StepChooser(self.control, *of_rollout).choose
 
 
 class Moment(NamedTuple):

@@ -1,9 +1,11 @@
 """Adaptive substeps of a learned body: from the configuration to the twin."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from replay import Replay
 
 from mosa.config.build import build_body, build_world
 from mosa.config.record import BodyRecord
@@ -58,10 +60,8 @@ def test_the_twin_records_and_replays_its_counts():
     alone = one.simulate(frames=8)
     assert alone.substeps == math.ceil(sum(alone.counts) / 7)
     start, world = one.training_start, one.world
-    replayed = twin(SOFT["material"], adaptive=False).body.simulate(
-        start, world, 8, 0.02, counts=alone.counts
-    )
-    assert torch.equal(replayed.x, alone.x)
+    ready = replace(one.body.ready(start, world, 8, 0.02), timing=Replay(alone.counts, lag=0.0))
+    assert torch.equal(ready.simulate(8, world.solids).x, alone.x)
     fixed = twin(**SOFT, adaptive=False).simulate(frames=8, colliders=[PLATE])
     assert set(fixed.counts) == {fixed.reactions.shape[1]}
     # sticking and sliding of single nodes differ with the step
@@ -99,7 +99,10 @@ def test_gradient_through_the_body_is_that_of_the_replay():
     )
 
     def value(counts=None):
-        rollout = body.simulate(start, one.world, 5, 0.02, counts=counts)
+        ready = body.ready(start, one.world, 5, 0.02)
+        if counts is not None:
+            ready = replace(ready, timing=Replay(counts, lag=0.0))
+        rollout = ready.simulate(5, one.world.solids)
         return (probe * rollout.x[-1]).sum() + rollout.F[-1].square().sum(), rollout.counts
 
     result, counts = value()

@@ -6,6 +6,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from replay import Replay
 from torch import nn
 from torch.func import functional_call
 
@@ -23,7 +24,7 @@ from mosa.physics.engine.capture import ATTEMPTS
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.adaptive_steps import StepControl
-from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.clock import Adaptive
 from mosa.types import Ground, ParticleState
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from replay import Replay
 
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Box, Collider, HalfSpace, Particles, Sphere
@@ -12,7 +13,7 @@ from mosa.physics.contact.driven import Driven, driven_from_config, hold, loads
 from mosa.physics.contact.motion import Motion, Points, exponential
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.adaptive_steps import StepControl
-from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.clock import Adaptive
 from mosa.types import ParticleState
 
 DX, SPACING, DENSITY, SUBSTEPS, FRAME_DT = 0.04, 0.02, 1000.0, 20, 4e-3

@@ -12,7 +12,7 @@ from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs
 from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.launching import same_memory
 from mosa.physics.time.adaptive_steps import StepControl
-from mosa.physics.time.clock import Adaptive, Clock, Moment, Replay
+from mosa.physics.time.clock import Adaptive, Clock, Moment
 
 
 class Counted:
@@ -93,7 +93,7 @@ def test_velocities_lie_between_the_positions_of_steps_that_vary():
     assert found == [pytest.approx(e) for e in expected]
     late = Clock(0.1, 5, lambda *_: 4).frame(Moment(None, lag=None), None)
     assert late.steps.kick == late.steps.dt == late.dt == 0.1 / 4
-    assert Adaptive(StepControl()).lag is None and Replay([3]).lag is None
+    assert Adaptive(StepControl()).lag is None
 
 
 def test_memory_is_the_same_whoever_views_it():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from replay import Replay
 
 from mosa.errors import ConfigError
 from mosa.physics.adapters.interface import AdapterOperator
@@ -12,7 +13,7 @@ from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion, Trajectory
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.adaptive_steps import StepControl, current_modulus
-from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.clock import Adaptive
 from mosa.physics.time.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 
@@ -431,9 +432,6 @@ def test_errors(make_block):
         ConfigError, match=r"simulation\.min_substeps: expected at most .*\(5\), found 6"
     ):
         StepControl(minimum=6, maximum=5)
-    for counts in ([5], [5, 0], [5, 2.5]):
-        with pytest.raises(ConfigError, match="counts: expected 2 positive whole numbers"):
-            roll(counts=counts)
     still = torch.zeros(9, 3, dtype=torch.float64)
     path = Trajectory(still + 5, still, still, still)
     bound = simulator(
@@ -441,9 +439,6 @@ def test_errors(make_block):
     )
     with pytest.raises(ConfigError, match=r"trajectory: .*adaptive substeps"):
         roll(bound, control=StepControl())
-    with pytest.raises(ConfigError, match=r"poses and velocities of substeps 5 to 11, found \[9, "):
-        roll(bound, counts=[5, 6])
-    assert roll(bound, counts=[5, 4]).counts == (5, 4)
     steps = Motion(velocity=torch.zeros(10, 3))
     with pytest.raises(ConfigError, match=r"expected 1 or 2 .*give times"):
         roll(
