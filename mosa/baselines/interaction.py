@@ -148,9 +148,7 @@ class InteractionNetwork(Adapter):
         return Interactions(self, density, world, frame_dt)
 
     def forward(self, state: MaterialState) -> AdapterOperator:
-        raise ConfigError(
-            "adapter=interaction: pair forces have no stress; expected a rollout by `Body.simulate`"
-        )
+        raise ConfigError("adapter=interaction has no stress; expected `Body.simulate`")
 
 
 def spread(X: np.ndarray, count: int) -> np.ndarray:

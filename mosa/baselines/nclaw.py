@@ -102,9 +102,7 @@ class NeuralLaw(Adapter):
     def check_law(self, law: str) -> None:
         """Errors: ConfigError for a plastic network beside a prior that does not keep the elastic part of F apart."""
         if self.plastic is not None and law != "von_mises":
-            raise ConfigError(
-                f"adapter.plastic: expected prior=von_mises, which keeps the elastic part of F apart, found {law}"
-            )
+            raise ConfigError(f"adapter.plastic: expected prior=von_mises, found {law}")
 
     def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:
         self.check_law(law)

@@ -22,9 +22,7 @@ class Interactions:
 
     def __init__(self, network, density: float, world, frame_dt: float) -> None:
         if world.planes or world.colliders or world.driven:
-            raise ConfigError(
-                "adapter=interaction: expected a world with a ground alone, found world.walls, world.colliders or world.driven"
-            )
+            raise ConfigError("adapter=interaction: expected a world with a ground alone")
         fastest = (
             network.fastest
             * math.sqrt(float(network.E_ref) / density)
@@ -69,9 +67,7 @@ class Interactions:
         return Rollout(xs, vs, Fs, Fs, times, final, inverted=inverted, counts=counts)
 
     def stepper(self, *_, **__) -> None:
-        raise ConfigError(
-            "adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step"
-        )
+        raise ConfigError("adapter=interaction: expected a whole rollout (Twin.simulate)")
 
     def frame(self, x: Tensor, v: Tensor, net: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         """(x, v) (M, 3) of the nodes one frame later; net: the network."""

@@ -46,9 +46,7 @@ CACHE_VERSION = 3
 
 def _first_frame(scene: Scene) -> tuple[Tensor, Any]:
     if not scene.training_cameras or scene.training_frames[:1] != [0]:
-        raise DataError(
-            f"scene {scene.name}: reconstruction needs frame 0 and at least one training camera"
-        )
+        raise DataError(f"scene {scene.name}: expected frame 0 and a training camera")
     return scene.mattes[scene.training_cameras, 0], scene.cameras.select(scene.training_cameras)
 
 

@@ -57,9 +57,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     forward = target - eye
     right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
     if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()):
-        raise ConfigError(
-            "look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up"
-        )
+        raise ConfigError("look_at: eye and target coincide, or their line is parallel to up")
     forward = forward / forward.norm(dim=-1, keepdim=True)
     right = right / right.norm(dim=-1, keepdim=True)
     R = torch.stack((right, torch.linalg.cross(forward, right), forward), -2)
@@ -74,9 +72,7 @@ def scale_cameras(cameras: Cameras, factor: float) -> Cameras:
     pixel."""
     width, height = round(cameras.width * factor), round(cameras.height * factor)
     if width < 1 or height < 1:
-        raise ConfigError(
-            f"scale_cameras: factor {factor} makes images of {cameras.width}x{cameras.height} px vanish"
-        )
+        raise ConfigError(f"scale_cameras: factor {factor} makes images vanish")
     K = cameras.K.clone()
     K[:, 0] *= width / cameras.width
     K[:, 1] *= height / cameras.height
@@ -114,9 +110,7 @@ def crop_boxes(
     seen = (mattes > 0).any(1)
     empty = ~seen.flatten(1).any(1)
     if bool(empty.all()):
-        raise DataError(
-            f"crop_boxes: none of the {views} mattes has a pixel above 0; the object is not seen at all"
-        )
+        raise DataError(f"crop_boxes: none of {views} mattes has a pixel above 0")
     starts, sizes = [], []
     for axis, limit in ((1, W), (2, H)):  # columns are occupied where any row is, and so on
         occupied, index = seen.any(axis), torch.arange(limit, device=mattes.device)

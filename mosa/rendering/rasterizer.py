@@ -43,9 +43,7 @@ def _check(
                 f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty"
             )
         if value.device != means.device:
-            raise ConfigError(
-                f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device"
-            )
+            raise ConfigError(f"rasterize: {name} is on {value.device}, means on {means.device}")
         if name in numbers and (value.dtype != means.dtype or value.dtype not in SCALARS):
             raise ConfigError(
                 f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all"
@@ -55,9 +53,7 @@ def _check(
     for (name, value), size in zip(numbers.items(), torch.stack(sizes).tolist()):
         if not math.isfinite(size):
             where = (~value.detach().isfinite()).nonzero()[0].tolist()
-            raise DataError(
-                f"rasterize: {name}{where} is not finite; it would silently vanish from the image"
-            )
+            raise DataError(f"rasterize: {name}{where} is not finite; the image would lack it")
     for name, value, size in (("K", cameras.K, 3), ("w2c", cameras.w2c, 4)):
         if tuple(value.shape) != (images, size, size):
             raise ConfigError(

@@ -316,7 +316,7 @@ def test_walls_and_colliders_are_refused():
     walled = replace(WORLD, planes=(Plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),))
     with pytest.raises(ConfigError, match=r"adapter=interaction.*walls"):
         body.simulate(start(), walled, 3, FRAME_DT)
-    with pytest.raises(ConfigError, match=r"adapter=interaction.*step by step"):
+    with pytest.raises(ConfigError, match=r"adapter=interaction.*whole rollout"):
         body.ready(start(), WORLD, 3, FRAME_DT).simulator.stepper()
 
 

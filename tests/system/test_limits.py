@@ -84,7 +84,7 @@ def far_apart(size: float) -> Splats:
     (lambda: tetrahedron(margin=1e300), "nodes at spacing"),
     (lambda: fill(cube(), spacing=1e-7), "voxels of the object"),
     (lambda: fill(cube(), spacing=1e-25), "voxels of the object"),
-    (lambda: solid_of(far_apart(3e38)), "an extent of inf"),
+    (lambda: solid_of(far_apart(3e38)), "extent inf"),
     (lambda: solid_of(far_apart(1e-30)), "expected Gaussians that enclose something"),  # each of them reaches over 1e32 voxels
     (lambda: pictures(60_000, 100), "rasterize: numbers"),
     (lambda: tile_lists(torch.zeros(2), torch.zeros(1, 1, 8), 2**20, 2**20), "tiles, of all images"),

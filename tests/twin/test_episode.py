@@ -496,7 +496,7 @@ def test_errors_of_starts_and_states():
         ):
             made.worlds(2, laws)
     with pytest.raises(
-        ConfigError, match="gravity: expected numbers without gradients"
+        ConfigError, match="gravity: expected no gradients"
     ):  # found a small part of them
         made.worlds(2).reset(gravity=torch.zeros(2, 3, requires_grad=True), differentiable=True)
     worlds = made.worlds(2)

@@ -137,9 +137,7 @@ class Adapter(nn.Module):
         if self.E_ref.is_cuda and torch.cuda.is_current_stream_capturing():
             return  # a capture may not look; the pass ran before it was captured
         if not self.is_on:
-            raise ConfigError(
-                "adapter: no reference modulus; call switch_on(E) with the calibrated prior's before simulating"
-            )
+            raise ConfigError("adapter: no reference modulus yet; call switch_on(E)")
 
     def note(self, entries: Tensor) -> None:
         """Keep what the answer departs from the prior by, (N, K) dimensionless numbers that are 0 at the prior: penalties and
@@ -154,9 +152,7 @@ class Adapter(nn.Module):
     def statistics(self) -> OperatorStatistics:
         """Of the last evaluation, with its graph. Errors: ConfigError before the first, unless it is `steady`."""
         if self._last is None:
-            raise ConfigError(
-                "adapter: statistics are those of the last evaluation, and there was none yet"
-            )
+            raise ConfigError("adapter: statistics are of the last evaluation, and there was none")
         if isinstance(self._last, Tensor):
             return statistics_of(self._last)
         C, pre, post = self._last

@@ -27,9 +27,7 @@ def register_adapter(name: str, place: str) -> None:
 
     Errors: ConfigError if another adapter has the name."""
     if ADAPTERS.setdefault(name, place) != place:
-        raise ConfigError(
-            f"adapter.name: there is an adapter {name!r} already; choose another name"
-        )
+        raise ConfigError(f"adapter.name: {name!r} is there already; choose another name")
 
 
 def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:

@@ -46,9 +46,7 @@ class StressAdapter(Adapter):
     ) -> None:  # fmt: skip
         super().__init__()
         if no_prior_stress and no_pre:
-            raise ConfigError(
-                "adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone"
-            )
+            raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false)")
         self.rest_free, self.recompute, self.fused = rest_free, recompute, fused
         shape: dict[str, Any] = {
             "alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden,

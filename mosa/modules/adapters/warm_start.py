@@ -36,9 +36,7 @@ def warm_start(
     `switch_on`, before any training.
     Errors: ConfigError for an adapter that has the prior stress or no E_ref."""
     if not adapter.operator.no_prior_stress:
-        raise ConfigError(
-            "warm_start: expected an adapter with no_prior_stress=true; the others start from the prior as it is"
-        )
+        raise ConfigError("warm_start: expected an adapter with no_prior_stress=true")
     adapter.check_on()
     generator = torch.Generator().manual_seed(seed)
     network, k = adapter.operator.phi, adapter.operator.scale

@@ -219,9 +219,7 @@ class Material(nn.Module):
                     f"found {', '.join(strange)}"
                 )
         if ("E" in parameters) != ("nu" in parameters):
-            raise ConfigError(
-                f"prior.parameters: E and nu go together, found {', '.join(parameters)}"
-            )
+            raise ConfigError(f"prior.parameters: E goes with nu, found {', '.join(parameters)}")
         if "E" not in parameters and "kappa" not in parameters:
             raise ConfigError(
                 f"prior.parameters: expected E with nu, or kappa with mu, found {', '.join(parameters)}"
@@ -266,9 +264,7 @@ class Material(nn.Module):
     def _add_direction(self, name: str, value: Sequence[float], learned: bool) -> None:
         numbers = list(value) if isinstance(value, (list, tuple)) else []
         if len(numbers) != 3 or not all(map(is_number, numbers)) or not any(numbers):
-            raise ConfigError(
-                f"prior.parameters.{name}: expected a direction [x, y, z], found {value!r}"
-            )
+            raise ConfigError(f"prior.parameters.{name}: expected [x, y, z], found {value!r}")
         # where the angles begin is the configuration's, as `begins` of the numbers is: no part of what is learned
         self.register_buffer(f"frame_{name}", Direction.frame(numbers).float(), persistent=False)
         for coordinate in Direction.coordinates(name):

@@ -50,9 +50,7 @@ class Ready:
             rollout = roll(self.state, frames=frames, progress=progress, **timing)
         else:
             if self.timing:
-                raise ConfigError(
-                    "simulation.adaptive: expected false where a criterion corrects the prediction frame by frame"
-                )
+                raise ConfigError("simulation.adaptive: expected false with criterion=corrected")
             seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
             hidden = (
                 None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)
@@ -94,7 +92,7 @@ class Ready:
         counts = sorted({part.simulator.substeps for part in parts})
         if len(counts) > 1 or any(part.timing for part in parts):
             raise ConfigError(
-                f"worlds: expected the same fixed substeps in all, found {counts}; give substeps"
+                f"worlds: expected equal fixed substeps, found {counts}; give substeps"
             )
         each = [part.arguments for part in parts]
         sizes = first.simulator.law.parameters

@@ -279,9 +279,7 @@ class GaussNewton:
         J = self.columns = self.jacobian(numbers, r) if J is None else J
         H, g = normal_equations(J, r)
         if not bool(torch.isfinite(H).all()):
-            raise SimulationDiverged(
-                "Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior"
-            )
+            raise SimulationDiverged("Gauss-Newton: no finite Jacobian; start from another prior")
         away = numbers - self.mean()
         if learn:
             self._evidence(away, H, g)

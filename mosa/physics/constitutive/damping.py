@@ -29,9 +29,7 @@ def register_damped(name: str, laws: Sequence[Law]) -> Law:
     """`name` = a~damped of one law a. Errors: ConfigError for a law that is viscous itself."""
     (law,) = laws
     if law.viscosity is not None:
-        raise ConfigError(
-            f"law {name!r}: expected a law without a viscosity of its own, found {law.name!r}"
-        )
+        raise ConfigError(f"law {name!r}: expected a law without viscosity, found {law.name!r}")
     parameters = law.parameters | dict.fromkeys(DAMPING, 1)
     return register_law(
         name, _stress(law.stress, sum(law.parameters.values())), parameters, return_map=law.return_map,

@@ -52,9 +52,7 @@ class Law:
             offsets[name] = total
             total += size
         if total > SLOTS:
-            raise ConfigError(
-                f"law {self.name!r}: expected at most {SLOTS} numbers per particle, found {total}"
-            )
+            raise ConfigError(f"law {self.name!r}: expected at most {SLOTS} numbers, found {total}")
         object.__setattr__(self, "offsets", offsets)
 
     @property

@@ -198,9 +198,7 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
             raise ConfigError(f"{where}.motion: expected path alone, or times and points")
         moved = _points(item.pop("motion"), where)
         if own:
-            raise ConfigError(
-                f"{where}: {next(iter(own))} and motion.path: expected a type, or none"
-            )
+            raise ConfigError(f"{where}: {next(iter(own))} and motion.path: expected type, or none")
     if not more.get("held", True) and (not more.get("mass") or "motion" in item):
         raise ConfigError(
             f"{where}: expected a mass and no motion with held: false, found {sorted(item | more)}"
@@ -244,9 +242,7 @@ def _points(given: Mapping[str, Any], where: str) -> Points:
         raise ConfigError(f"{where}.motion.path: expected an npz file, found {path!r}")
     arrays = read_npz(Path(path))
     if missing := [key for key in ("times", "points") if key not in arrays]:
-        raise DataError(
-            f"{path}: expected arrays times (T,) and points (T, n, 3), found no {missing[0]}"
-        )
+        raise DataError(f"{path}: expected times (T,) and points (T, n, 3), found no {missing[0]}")
     try:
         return Points(*(torch.as_tensor(arrays[key]).double() for key in ("times", "points")))
     except ConfigError as error:

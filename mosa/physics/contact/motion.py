@@ -166,9 +166,7 @@ class Motion:
             turning(rotations[:-1], rotations[1:]) if told else rotation_vector(R[1:] @ R[:-1].mT)
         )
         if not told and bool((turns.detach().norm(dim=-1) > 3.04).any()):
-            raise ConfigError(
-                "motion: waypoints: rotations: expected less than half a turn between two, put one in between"
-            )
+            raise ConfigError("motion: waypoints: expected less than half a turn between two")
         interval, rest = times.diff()[:, None], torch.zeros(1, 3, dtype=torch.float64)
         velocity = torch.cat([(positions[1:] - positions[:-1]) / interval, rest])
         angular = torch.cat([turns / interval, rest])
@@ -195,9 +193,7 @@ class Motion:
         times, count = self._pieces(frames, substeps, dt, max(len(linear), len(angular)))
         for name, value in (("velocity", linear), ("angular_velocity", angular)):
             if len(value) not in (1, count):
-                raise ConfigError(
-                    f"motion: {name}: expected 1 or {count} vectors, found {len(value)}"
-                )
+                raise ConfigError(f"motion: {name}: expected 1 or {count} rows, found {len(value)}")
         linear, angular = linear.expand(count, 3), angular.expand(count, 3)
         interval = times.diff()[:, None]
         knots = torch.cat([position, position + ((linear[:-1] * interval).cumsum(0))])
@@ -221,9 +217,7 @@ class Motion:
             times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
             ascending = times.ndim == 1 and len(times) and bool((times.diff() > 0).all())
             if not ascending or not bool(torch.isfinite(times).all()):
-                raise ConfigError(
-                    f"motion: times: expected ascending numbers, found {times.tolist()}"
-                )
+                raise ConfigError(f"motion: times: expected ascending ones, found {times.tolist()}")
             return times, len(times)
         length = {1: 0.0, frames: substeps * dt, frames * substeps: dt}
         if count not in length:
@@ -369,9 +363,7 @@ def sample_frame(
     dt, sampled = frame_dt / count, []
     for motion in motions:
         if isinstance(motion, Trajectory):
-            raise ConfigError(
-                "trajectory: it gives poses substep by substep, found adaptive substeps; use a Motion with times or waypoints"
-            )
+            raise ConfigError("trajectory: not with adaptive substeps; use a Motion with times")
         timed, begins = motion.timed(frames, frame_dt), start + frame * frame_dt
         sampled.append(timed.sample(1, count, dt, begins))
     return _poses(sampled)

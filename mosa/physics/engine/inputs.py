@@ -171,9 +171,7 @@ def checked_density(
         own["lam"] = float((lam + 2 / 3 * mu).min())
     for name, value in own.items():
         if value < 0:
-            raise ConfigError(
-                f"parameters.{name}: expected {MODULI[name]} for all particles, found {value:g}"
-            )
+            raise ConfigError(f"parameters.{name}: expected {MODULI[name]}, found {value:g}")
     return density, mass
 
 
@@ -196,9 +194,7 @@ def gravity_of_worlds(
     shape = (worlds, 3)
     gravity = numbers("gravity", gravity, f"finite numbers {shape}", shape, dtype=torch.float64)
     if gravity.requires_grad and torch.is_grad_enabled():
-        raise ConfigError(
-            "gravity: expected numbers without gradients, found a tensor that requires them: pass its detach()"
-        )
+        raise ConfigError("gravity: expected no gradients: pass its detach()")
     return tuple(map(tuple, gravity.tolist()))
 
 
@@ -211,7 +207,7 @@ def motions_of_worlds(
         motions = [motions] * (worlds or 1)
     elif len(motions) != worlds:
         raise ConfigError(
-            f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}"
+            f"motions: expected {worlds} sequences, one a world, found {len(motions)}"
         )
     for own in motions:
         if len(own) != len(colliders):

@@ -94,9 +94,7 @@ class StepChooser:
         finite = torch.isfinite(torch.cat([F, C_affine, v[..., None]], -1)).flatten(1).all(1)
         if not bool(finite.all()):
             bad = int((~finite).nonzero()[0])
-            raise SimulationDiverged(
-                f"frame {frame}: particle {bad} has a non-finite velocity or deformation at its start"
-            )
+            raise SimulationDiverged(f"frame {frame}: particle {bad} is not finite at its start")
         J = torch.linalg.det(F)
         law, rest = self.numerics.law, self.rest_modulus
         modulus = torch.maximum(current_modulus(law, F, C_affine, self.packed), rest)
@@ -114,9 +112,7 @@ class StepChooser:
         density = self.density
         density = float(density[stiffest] if isinstance(density, Tensor) else density)
         if not math.isfinite(c):
-            raise SimulationDiverged(
-                f"frame {frame}: the stress of particle {stiffest} is not finite at its start"
-            )
+            raise SimulationDiverged(f"frame {frame}: stress of particle {stiffest} is not finite")
         each = step_rate(c, mu, density, dx, fastest, control.courant)
         needed = max(1, math.ceil(min(1e9, self.frame_dt * each)))
         if needed > control.maximum:

@@ -79,9 +79,7 @@ def known_solid(body: KnownBody) -> Solid:
     """The solid in its file. Errors: DataError naming the file."""
     path = Path(body.shape)
     if not path.is_file():
-        raise DataError(
-            f"scene.body.shape: expected a file .ply, .obj or .stl, found none at {path}"
-        )
+        raise DataError(f"scene.body.shape: expected a .ply, .obj or .stl, found none at {path}")
     if path.suffix.lower() == ".ply":
         check_ply(path)
         elements = {e.name: e for e in PlyData.read(str(path)).elements}

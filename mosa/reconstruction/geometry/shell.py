@@ -93,9 +93,7 @@ def solid_of(
     low, high = splats.means.amin(0), splats.means.amax(0)
     extent = float((high - low).max())
     if not 0 < extent < np.inf:
-        raise DataError(
-            f"solid: expected Gaussians that fill a space, found an extent of {extent:.3g}"
-        )
+        raise DataError(f"solid: expected Gaussians that fill space, found extent {extent:.3g}")
     pitch = extent / resolution
     gap = float(np.median(cKDTree(splats.means.numpy()).query(splats.means.numpy(), k=5)[0][:, 4]))
     wider = WIDER * max(gap, pitch)

@@ -257,7 +257,7 @@ def initial_velocity(
     Errors: DataError for fewer than two frames or views."""
     if images.shape[1] < 2:
         raise DataError(
-            f"initial velocity: {images.shape[1]} frame of free flight, at least 2 are needed"
+            f"initial velocity: expected 2 frames of free flight, found {images.shape[1]}"
         )
     body = RigidBody.of(splats, rest_center)
     background, gravity = background.to(body.arm), gravity.to(body.arm)

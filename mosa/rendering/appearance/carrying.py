@@ -95,9 +95,7 @@ def bind(splats: Tensor, particles: Tensor) -> Binding:
     of the coefficients are those of the interpolation itself, weights and r_max included, so that A is the derivative of where the
     centre goes."""
     if len(particles) < 8:
-        raise DataError(
-            f"bind: expected at least 8 particles to carry splats, found {len(particles)}"
-        )
+        raise DataError(f"bind: expected at least 8 particles, found {len(particles)}")
     X, P = splats.detach().cpu().double(), particles.detach().cpu().double()
     count = min(NEIGHBOURS, len(P))
     index = cKDTree(P.numpy()).query(X.numpy(), k=np.arange(1, count + 1))[1]

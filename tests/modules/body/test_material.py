@@ -193,7 +193,7 @@ def test_unconstrained_form_and_back(name, place):
             ("corotated", {"E": 10**400, "nu": 0.4}),
             "prior.parameters.E: expected a number, found 10{199}[.]{3}$",
         ),
-        (("corotated", {"E": 1e5}), "E and nu go together"),
+        (("corotated", {"E": 1e5}), "E goes with nu"),
         (("corotated", {}), "expected E with nu, or kappa with mu"),
         (("von_mises", ELASTIC), "takes lam, mu, yield_stress"),
         (("corotated", {**ELASTIC, "yield_stress": 1e3}), "law corotated takes lam, mu"),
@@ -279,9 +279,7 @@ def test_a_frozen_direction_is_not_learned_and_another_start_is_no_part_of_what_
 
 @pytest.mark.parametrize("value", [1.0, [0, 0, 0], [1, 2], [1, None, 0], "x", [math.inf, 0, 0]])
 def test_what_is_no_direction_is_refused(fibred, value):
-    with pytest.raises(
-        ConfigError, match=r"prior.parameters.a: expected a direction \[x, y, z\], found"
-    ):
+    with pytest.raises(ConfigError, match=r"prior.parameters.a: expected \[x, y, z\], found"):
         Material("fibred", {**fibred, "a": value})
 
 

@@ -157,6 +157,6 @@ def test_laws_side_by_side_are_so_many_simulations():
                 assert torch.equal(own.x, other.x) and torch.equal(own.F, other.F)
             assert (expected[0].x - expected[1].x).abs().max() > 1e-5
     with pytest.raises(
-        ConfigError, match=r"worlds: expected the same fixed substeps in all, found \[12, 16\]"
+        ConfigError, match=r"worlds: expected equal fixed substeps, found \[12, 16\]"
     ):
         Ready.stack([parts[0], body.ready(begins, WORLD, 6, FRAME_DT, substeps=16)])

@@ -75,7 +75,7 @@ def test_files_that_hold_no_solid_are_refused(tmp_path):
     )
     with pytest.raises(DataError, match="expected a mesh with an extent near 0, found 1"):
         known_solid(body(open_mesh))
-    with pytest.raises(DataError, match=r"expected a file \.ply, \.obj or \.stl, found none"):
+    with pytest.raises(DataError, match=r"expected a \.ply, \.obj or \.stl, found none"):
         known_solid(body(tmp_path / "missing.ply"))
 
 

@@ -259,7 +259,7 @@ def test_too_little_to_go_by_is_an_error():
         register_pose(
             splats, images[:, 0], mattes[:, 0], cameras, background=WHITE, rest_center=REST_CENTER
         )
-    with pytest.raises(DataError, match="at least 2 are needed"):
+    with pytest.raises(DataError, match="expected 2 frames"):
         initial_velocity(
             splats,
             (torch.eye(3), REST_CENTER),
