@@ -131,12 +131,8 @@ class NeuralLaw(Adapter):
         if state.plastic_strain is None or self.plastic is None:
             return AdapterOperator(G, h.to(outer))  # the prior's own yield, where it has one
         # the strain in the prior's yield function becomes 0: it never yields, the network flows instead
-        return AdapterOperator(
-            G,
-            h.to(outer),
-            -torch.eye(6).to(G).expand(n, 6, 6).contiguous(),
-            torch.zeros_like(state.w),
-        )
+        none = -torch.eye(6).to(G).expand(n, 6, 6).contiguous()
+        return AdapterOperator(G, h.to(outer), none, torch.zeros_like(state.w))
 
     def flow(self, F: Tensor, time: float) -> Tensor:
         """F (N, 3, 3) after plastic flow for `time` [s]; F itself without a plastic network."""
@@ -186,11 +182,8 @@ def pretrain(
         features = fitted[:-1](x)
         basis = torch.eye(OUTPUTS).double()
         columns = torch.stack([stress_of(e.expand(len(W), -1), W) for e in basis], -1)  # (N, 6, 9)
-        rows = (
-            (weight[:, :, None, None] * columns[..., None] * features[:, None, None, :])
-            .flatten(2)
-            .flatten(0, 1)
-        )
+        rows = weight[:, :, None, None] * columns[..., None] * features[:, None, None, :]
+        rows = rows.flatten(2).flatten(0, 1)
         target = (weight * s).flatten()
         normal = rows.T @ rows
         ridge = 1e-9 * normal.diagonal().mean() * torch.eye(len(normal)).double()

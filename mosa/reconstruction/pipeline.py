@@ -184,11 +184,8 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 
 def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
     """What particles and their motion depend on."""
-    return {
-        name: value
-        for name, value in settings.plain().items()
-        if name not in ("carried", "informed")
-    }
+    plain = settings.plain()
+    return {name: plain[name] for name in plain if name not in ("carried", "informed")}
 
 
 def imported_splats(path: str, scene: Scene) -> Appearance:
@@ -272,14 +269,9 @@ def reconstruct(
 
     def fitted(start: Splats, how: FitSettings, name: str, title: str) -> dict[str, Tensor]:
         with bar(title, how.iterations) as steps:
+            moves = name == "static"
             found = fit_splats(
-                start,
-                still,
-                background,
-                how,
-                move=name == "static",
-                seed=seed,
-                progress=steps.update,
+                start, still, background, how, move=moves, seed=seed, progress=steps.update
             )
         cache.strip(name, still, _render_still(found, still, background))
         return _tensors(found)

@@ -209,11 +209,8 @@ class ReconstructionSettings(Settings):
     @property
     def looks_again(self) -> bool:
         """Whether the motion is found once more, informed by a simulation."""
-        return (
-            self.informed.iterations > 0
-            and self.cue == "neighbourhood"
-            and self.dynamic.model == "modes"
-        )
+        modes = self.cue == "neighbourhood" and self.dynamic.model == "modes"
+        return modes and self.informed.iterations > 0
 
     @model_validator(mode="after")
     def _together(self) -> ReconstructionSettings:

@@ -115,11 +115,8 @@ def composite(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image (B, H, W, C), final transmittance (B, H, W) and the place in its list where each pixel ended (B, H, W)."""
     images, count, _ = records.shape
-    channels, scalar, shape = (
-        features.shape[-1],
-        SCALARS[records.dtype],
-        (images, g.height, g.width),
-    )
+    channels, scalar = features.shape[-1], SCALARS[records.dtype]
+    shape = images, g.height, g.width
     transmittance, image = records.new_ones(shape), records.new_zeros(*shape, channels)
     ends = torch.full(shape, count, dtype=torch.int32, device=records.device)
     if g.scan == "tile":

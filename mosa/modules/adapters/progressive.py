@@ -114,11 +114,9 @@ class ProgressiveOperator(nn.Module):
 
     def last(self, l2: Tensor | None, kw: Tensor, s2: Tensor) -> Tensor:
         """Step 5: L_post (N, 6)."""
-        return (
-            torch.zeros_like(s2)
-            if self.no_post
-            else self.residual(self.theta, l2, kw, self.scale * s2)
-        )
+        if self.no_post:
+            return torch.zeros_like(s2)
+        return self.residual(self.theta, l2, kw, self.scale * s2)
 
     def forward(self, w: Tensor, s: Tensor, poisson: Tensor | None = None) -> Correction:
         """The assembled form. w, s: (N, 6); poisson: () of the prior, for major_symmetry."""

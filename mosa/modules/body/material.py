@@ -187,11 +187,9 @@ class Material(nn.Module):
         self.candidates, self.friction_cone = tuple(candidates), friction_cone
         self.law, self.given = laws[0], tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
-        self.modulated = (
-            tuple(modulated)
-            if modulated is not None
-            else tuple(n for n in STIFFNESS if n in parameters)
-        )
+        if modulated is None:
+            modulated = [n for n in STIFFNESS if n in parameters]
+        self.modulated = tuple(modulated)
         self.raw = nn.ParameterDict()
         self.begins: dict[str, float] = {}
         """Unconstrained values that the parameters start from, whatever is loaded later."""
@@ -204,11 +202,8 @@ class Material(nn.Module):
         known = law_named(law)
         if unknown := sorted(set(parameters) - set(FORMS)):
             own = [name for name in unknown if name in known.parameters]
-            hint = (
-                f" (law {law} takes {', '.join(own)}: give it a range with register_form)"
-                if own
-                else ""
-            )
+            hint = f" (law {law} takes {', '.join(own)}: give it a range with register_form)"
+            hint = hint if own else ""
             raise ConfigError(
                 f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}{hint}"
             )

@@ -93,12 +93,8 @@ class GradientSteps:
         except SimulationDiverged as error:
             if not self.retreat.back(self.running_optimizer, learned):
                 raise
-            log.warning(
-                "stage %s, iteration %d: the last step is undone, and steps are half as long from here: %s",
-                stage.name,
-                iteration,
-                error,
-            )
+            log.warning("stage %s, iteration %d: the last step is undone, and steps are half as long from here: %s",
+                        stage.name, iteration, error)  # fmt: skip
             self.taken_back = True
             return None
         return KnownGradient.apply(self.terms_of_step.pop("loss"), total, *learned)
@@ -217,12 +213,8 @@ class GradientSteps:
 
     def clip_networks(self, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Norm of the gradient by parameter group, before the networks' are clipped at fit.clip."""
-        bounds = {
-            group["name"]: self.clip
-            if group["name"] in ("heterogeneity", "adapter")
-            else float("inf")
-            for group in optimizer.param_groups
-        }
+        names, clipped = [g["name"] for g in optimizer.param_groups], ("heterogeneity", "adapter")
+        bounds = {name: self.clip if name in clipped else float("inf") for name in names}
         return {group["name"]: float(torch.nn.utils.clip_grad_norm_(group["params"], bounds[group["name"]]))
                 for group in optimizer.param_groups}  # fmt: skip
 

@@ -390,11 +390,8 @@ class GaussNewton:
         if wrong is not None:
             moved = covariance @ (share * (self.columns.T @ wrong.to(self.columns)).double().cpu())
             covariance = covariance + torch.outer(moved, moved)
-        kept = [
-            i
-            for i, nuisance in enumerate(self._vector(lambda b: float(b.nuisance)).tolist())
-            if not nuisance
-        ]
+        nuisance = self._vector(lambda b: float(b.nuisance)).tolist()
+        kept = [i for i, is_one in enumerate(nuisance) if not is_one]
         return Posterior(
             self.names(), self.seats[0].read()[kept], covariance[kept][:, kept], determined[kept]
         )

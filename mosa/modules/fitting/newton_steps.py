@@ -115,11 +115,7 @@ class NewtonSteps:
             return None
         own = self.identification.cost()
         law = law_named(self.body.material.law)
-        others = [
-            each
-            for each in self.compared
-            if each != law.name and law_named(each).plastic == law.plastic
-        ]
+        others = [n for n in self.compared if n != law.name and law_named(n).plastic == law.plastic]
         gains = {law: own - self.fitted_on(self.world.ground, stage, law)[0] for law in others}
         self.law_gains = {law: gain for law, gain in gains.items() if math.isfinite(gain)}
         best = max(self.law_gains, key=self.law_gains.get, default=None)

@@ -80,9 +80,5 @@ class Stages(Checkpoint):
         stage = pl_module.stage
         if isinstance(epochs, Epochs) and stage is not None:
             done = len(pl_module.losses)
-            epochs.begin(
-                whole=stage.newton,
-                step=pl_module.steps_done,
-                done=done,
-                left=max(1, stage.iterations - done),
-            )
+            left = max(1, stage.iterations - done)
+            epochs.begin(whole=stage.newton, step=pl_module.steps_done, done=done, left=left)

@@ -100,11 +100,9 @@ def position(step: Step) -> Tensor:
 
 
 def heterogeneity(step: Step) -> Tensor | None:
-    return (
-        losses.heterogeneity_loss(step.body.heterogeneity(step.body.rest))
-        if step.heterogeneous
-        else None
-    )
+    if not step.heterogeneous:
+        return None
+    return losses.heterogeneity_loss(step.body.heterogeneity(step.body.rest))
 
 
 TERMS: dict[str, Term] = {

@@ -101,11 +101,9 @@ class Chain:
 
     def named(self, statistics: Sequence[Tensor]) -> list:
         """One named tuple per evaluation, of tensors (K, ...)."""
-        return (
-            [self._kind(*parts) for parts in zip(*statistics, strict=True)]
-            if self._kind is not None
-            else []
-        )
+        if self._kind is None:
+            return []
+        return [self._kind(*parts) for parts in zip(*statistics, strict=True)]
 
     def _ask(
         self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
@@ -184,11 +182,8 @@ class Chain:
             outputs, seeds = zip(*pairs)
             # the first three leaves get theirs in place, see `_evaluate`
             found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)[3:]
-            sums = [
-                (total, part)
-                for total, part in zip(self.adj_weights, found, strict=True)
-                if part is not None
-            ]
+            pairs = zip(self.adj_weights, found, strict=True)
+            sums = [(total, part) for total, part in pairs if part is not None]
             if sums:
                 torch._foreach_add_(*zip(*sums))
 

@@ -185,11 +185,9 @@ def reach(shape: Shape) -> float:
         far = origin + shape.spacing * (torch.tensor(shape.values.shape) - 1)
         return float(torch.maximum(origin.abs(), far.abs()).norm())
     sizes = _sizes(shape)
-    return (
-        sum(sizes)
-        if isinstance(shape, Capsule)
-        else float(torch.tensor(sizes, dtype=torch.float64).norm())
-    )
+    if isinstance(shape, Capsule):
+        return sum(sizes)
+    return float(torch.tensor(sizes, dtype=torch.float64).norm())
 
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:

@@ -210,11 +210,9 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
             f"{where}: expected one of type (a shape), indices, points or motion.path, found {', '.join(item) or 'none'}"
         )
     region: Shape | Tensor | None = None
-    solid = (
-        collider_of({"type": "plane"} | item if own else item, where)
-        if own or "type" in item
-        else None
-    )
+    solid = None
+    if own or "type" in item:
+        solid = collider_of({"type": "plane"} | item if own else item, where)
     if own:
         key, value = next(iter(own.items()))
         kind = torch.int64 if key == "indices" else torch.float64

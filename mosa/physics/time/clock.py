@@ -70,9 +70,5 @@ class Clock:
             return Frame(moment.substeps, self.count, self.dt, None)
         count = self.choose(moment.frames + 1, state, speed)
         dt = self.frame_dt / count
-        return Frame(
-            moment.substeps,
-            count,
-            dt,
-            Steps(dt if moment.lag is None else 0.5 * (moment.lag + dt), dt),
-        )
+        kick = dt if moment.lag is None else 0.5 * (moment.lag + dt)
+        return Frame(moment.substeps, count, dt, Steps(kick, dt))

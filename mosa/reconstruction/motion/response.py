@@ -104,11 +104,8 @@ def image_matrices(
         shapes = carried_covariance(deformation, splats.scales, splats.rotations)
         cameras, states = window.cameras.select([0] * len(c)), torch.arange(len(c), device=device)
         colors, back = carried.colors(deformation), target.background
-        return some_of(
-            *rasterize(
-                splats.means + shift, shapes, splats.opacities, colors, cameras, states, back
-            )
-        )
+        at = splats.means + shift
+        return some_of(*rasterize(at, shapes, splats.opacities, colors, cameras, states, back))
 
     def some_of(colour: Tensor, alpha: Tensor) -> Tensor:
         values = torch.cat([colour, alpha[..., None]], -1).flatten(1)

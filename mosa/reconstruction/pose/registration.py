@@ -19,20 +19,8 @@ from torch import Tensor
 
 from mosa.data.hull import at_border
 from mosa.errors import DataError
-from mosa.reconstruction.pose.rigid import (
-    Level,
-    Poses,
-    RigidBody,
-    descend,
-    descend_each,
-    huber,
-    left_jacobian,
-    light_columns,
-    lit_equations,
-    make_level,
-    normal_equations,
-    rotation_exp,
-)
+from mosa.reconstruction.pose import rigid
+from mosa.reconstruction.pose.rigid import Level, Poses, RigidBody
 from mosa.rendering.appearance.lighting import LIGHT
 from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import quaternion_to_matrix
@@ -95,8 +83,8 @@ def refine(
     """Each of K poses after a few Levenberg-Marquardt steps, with its cost (K,)."""
     frame = torch.zeros(len(poses.center), dtype=torch.long, device=poses.center.device)
     most = torch.full_like(poses.center[:, 0], 0.6 * body.radius)
-    return descend_each(
-        lambda at: normal_equations(body, level, at, frame, central=central),
+    return rigid.descend_each(
+        lambda at: rigid.normal_equations(body, level, at, frame, central=central),
         lambda at, step: at.moved(step[:, :3], step[:, 3:] / body.radius), poses, iterations=iterations,
         most=lambda _: most, small=lambda step, _: float(step.norm(dim=-1).max()) < 2e-3 * level.pixel,
     )  # fmt: skip
@@ -110,7 +98,7 @@ def coarse_poses(body: RigidBody, level: Level, center: Tensor, rotations: int, 
     centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras, SILHOUETTE * body.radius)
     poses = Poses(R, center + center - centres)
     seen = level.weighed(body.render(poses, level.cameras, level.background))
-    return poses.take(huber(seen - level.target)[0].flatten(1).mean(-1).argsort()[:keep])
+    return poses.take(rigid.huber(seen - level.target)[0].flatten(1).mean(-1).argsort()[:keep])
 
 
 class Registered(NamedTuple):
@@ -140,9 +128,9 @@ def refine_lit(
     def evaluate(at: tuple[Poses, Tensor]) -> tuple[Tensor, ...]:
         nonlocal calls, columns
         if calls in RELIT:
-            columns = light_columns(body, level, *at)
+            columns = rigid.light_columns(body, level, *at)
         calls += 1
-        return lit_equations(body, level, *at, before, columns)
+        return rigid.lit_equations(body, level, *at, before, columns)
 
     def moved(at: tuple[Poses, Tensor], step: Tensor) -> tuple[Poses, Tensor]:
         return at[0].moved(step[None, :3], step[None, 3:6] / body.radius), at[1] + step[6:]
@@ -151,7 +139,7 @@ def refine_lit(
         return float(step[:6].norm()) < 2e-3 * level.pixel and float(step[6:].norm()) < 1e-3
 
     free = slice(0 if moves else 6, None)
-    return descend(
+    return rigid.descend(
         evaluate, moved, (pose, before), damping=1e-3, iterations=LIT, small=small, free=free
     )[0]
 
@@ -165,7 +153,7 @@ def light_of(
     body = RigidBody.of(splats, rest_center, normals)
     given = (images[:, None], mattes[:, None], background, *pose)
     images, mattes, background, Q, center = (x.to(body.arm) for x in given)
-    level = make_level(images, mattes, cameras.to(body.arm.device), background, center)
+    level = rigid.make_level(images, mattes, cameras.to(body.arm.device), background, center)
     before = torch.zeros(LIGHT).to(body.arm) if before is None else before.to(body.arm)
     return refine_lit(body, level, Poses(Q[None], center[None]), before, moves=False)[1]
 
@@ -192,14 +180,14 @@ def register_pose(
     count = min(coarse_views, len(cameras))
     chosen = torch.linspace(0, len(cameras) - 1, count).round().long().tolist()
     some = images[chosen], mattes[chosen], cameras.select(chosen), background, center
-    thin, level = body.thinned(400, seed), make_level(*some, 28, BRIGHTNESS)
+    thin, level = body.thinned(400, seed), rigid.make_level(*some, 28, BRIGHTNESS)
     poses = coarse_poses(thin, level, center, rotations, starts)
     for iterations, keep in ((4, max(3, starts // 3)), (6, 3)):
         poses, cost = refine(thin, level, poses, iterations=iterations)
         poses = poses.take(distinct(poses, cost, keep))
-    poses, cost = refine(body, make_level(*some, 56, BRIGHTNESS), poses, iterations=8)
+    poses, cost = refine(body, rigid.make_level(*some, 56, BRIGHTNESS), poses, iterations=8)
     best = poses.take(cost.argsort()[:1])
-    level, found = make_level(images, mattes, cameras, background, center), None
+    level, found = rigid.make_level(images, mattes, cameras, background, center), None
     if normals is None:
         best, _ = refine(body, level, best, iterations=8, central=True)
     else:
@@ -229,7 +217,7 @@ def flight(pose: Poses, motion: Tensor, times: Tensor, gravity: Tensor) -> Poses
     start = pose.moved(shift[None], angle[None])
     t = times[:, None]
     center = start.center + velocity * t + 0.5 * gravity * t**2
-    return Poses(rotation_exp(spin * t) @ start.rotation, center)
+    return Poses(rigid.rotation_exp(spin * t) @ start.rotation, center)
 
 
 def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
@@ -239,8 +227,8 @@ def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
     eye = torch.eye(3).to(motion)
     J[:, :3, :3] = eye
     J[:, :3, 6:9] = times[:, None, None] * eye
-    J[:, 3:, 3:6] = radius * rotation_exp(spin * times[:, None]) @ left_jacobian(angle)
-    J[:, 3:, 9:] = radius * times[:, None, None] * left_jacobian(spin * times[:, None])
+    J[:, 3:, 3:6] = radius * rigid.rotation_exp(spin * times[:, None]) @ rigid.left_jacobian(angle)
+    J[:, 3:, 9:] = radius * times[:, None, None] * rigid.left_jacobian(spin * times[:, None])
     return J
 
 
@@ -269,7 +257,7 @@ def initial_velocity(
     motion = torch.zeros(12).to(body.arm)
     motion[6:9] = (times @ fallen) / times.square().sum()
     for target_px, iterations in ((40, 8), (None, 6))[: 2 if exact else 1]:
-        level = make_level(images, mattes, cameras, background, start.center[0], target_px)
+        level = rigid.make_level(images, mattes, cameras, background, start.center[0], target_px)
         last = target_px is None
         path = lambda m: flight(start, m, times, gravity)  # noqa: E731
         motion = fit_flight(body, level, path, motion, times, iterations=iterations, central=last)
@@ -284,7 +272,9 @@ def fit_flight(
     frame = torch.arange(len(times), device=times.device)
 
     def evaluate(at: Tensor) -> tuple[Tensor, ...]:
-        cost, gradient, matrix = normal_equations(body, level, path(at), frame, central=central)
+        cost, gradient, matrix = rigid.normal_equations(
+            body, level, path(at), frame, central=central
+        )
         J = flight_jacobian(at, times, body.radius)
         turned = J.transpose(1, 2)
         gradient = (turned @ gradient[..., None]).sum(0)[:, 0]
@@ -296,4 +286,6 @@ def fit_flight(
         ways = step[:3].norm(), velocity.norm() * last, spin.norm() * last * body.radius
         return float(torch.stack(ways).max()) < 2e-3 * level.pixel
 
-    return descend(evaluate, torch.add, motion, damping=1e-3, iterations=iterations, small=small)[0]
+    return rigid.descend(
+        evaluate, torch.add, motion, damping=1e-3, iterations=iterations, small=small
+    )[0]

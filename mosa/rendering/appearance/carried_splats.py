@@ -127,12 +127,8 @@ def seen(body: HasAppearance, positions: Tensor, F_tot: Tensor | None) -> Seen:
         if F_tot is None:
             raise ValueError("seen: a body without splats needs F_tot")
         shapes = deformed_covariances(F_tot, body.covariances)
-        return Seen(
-            positions,
-            shapes,
-            body.opacities,
-            spherical_harmonics.constant_coefficients(body.colors),
-        )
+        colors = spherical_harmonics.constant_coefficients(body.colors)
+        return Seen(positions, shapes, body.opacities, colors)
     carried = splats.carry(positions)
     shapes = carried.covariances(covariance_from(splats.scales, splats.rotations))
     turns = carried.rotations if splats.harmonics.shape[1] > 1 else None

@@ -104,11 +104,8 @@ class _FusedOperator(torch.autograd.Function):
         stored = backward_at_hand()
         with torch.cuda.device_of(w):
             buffers = _evaluate(launch, w, s, unit, settings, weights, G)
-            post, sums, m = (
-                torch.empty_like(buffers.pre),
-                torch.empty_like(buffers.pre),
-                launch.rows,
-            )
+            post, sums = torch.empty_like(buffers.pre), torch.empty_like(buffers.pre)
+            m = launch.rows
             network_kernels.theta_forward[launch.grid](
                 buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, sums, n, m, settings.scale, settings.l_max or 0.0,
                 BOUNDED=settings.l_max is not None, **launch.forward,

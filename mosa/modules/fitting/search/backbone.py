@@ -136,11 +136,8 @@ def search(calibration: Calibration) -> float:
     if len(learned) >= MANY:
         multiples = WIDE if starts.modulated else (1.0,)
         stiffnesses = [starts.row(m, None, row.get(CONTACT)) for m in multiples]
-        wide = [
-            each | {n: each[n] + step for n, step in steps.items()}
-            for each in stiffnesses
-            for steps in moved(learned)
-        ]
+        moves = [(each, steps) for each in stiffnesses for steps in moved(learned)]
+        wide = [each | {n: each[n] + step for n, step in steps.items()} for each, steps in moves]
         begun = [row, *sorted(wide, key=starts.score)[:BEGUN]]
         return nearest_end(calibration, starts.begin_at, begun)
     if len(rows) > 1 and not further:
