@@ -136,11 +136,8 @@ class InteractionNetwork(Adapter):
         middle = (w * near).sum(1)
         F = torch.einsum("nka,nkb,nbc->nac", w * (near - middle[:, None]), arms, self.inverse)
         moved = middle + (F @ (self.rest - self.center)[..., None])[..., 0]
-        return (
-            moved.index_copy(0, self.nodes, x),
-            (w * v[self.followed]).sum(1).index_copy(0, self.nodes, v),
-            F,
-        )
+        v = (w * v[self.followed]).sum(1).index_copy(0, self.nodes, v)
+        return moved.index_copy(0, self.nodes, x), v, F
 
     def simulator(self, density: float, world, frame_dt: float) -> Interactions:
         """What rolls the nodes out in a world, in place of the body's `Simulator`. Errors: ConfigError."""

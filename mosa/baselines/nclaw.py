@@ -55,10 +55,8 @@ def invariants(W: Tensor) -> Tensor:
 
 def network(hidden: int) -> nn.Sequential:
     """13 to 9 through two hidden layers with GELU and without biases, Xavier's weights: an input of zeros answers zeros."""
-    layers = [
-        nn.Linear(a, b, bias=False)
-        for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, OUTPUTS))
-    ]
+    widths = ((INPUTS, hidden), (hidden, hidden), (hidden, OUTPUTS))
+    layers = [nn.Linear(a, b, bias=False) for a, b in widths]
     for layer in layers:
         nn.init.xavier_normal_(layer.weight)
     return nn.Sequential(layers[0], nn.GELU(), layers[1], nn.GELU(), layers[2])

@@ -23,11 +23,8 @@ class Interactions:
     def __init__(self, network, density: float, world, frame_dt: float) -> None:
         if world.planes or world.colliders or world.driven:
             raise ConfigError("adapter=interaction: expected a world with a ground alone")
-        fastest = (
-            network.fastest
-            * math.sqrt(float(network.E_ref) / density)
-            * math.exp(0.5 * network.stiffer)
-        )
+        fastest = network.fastest * math.sqrt(float(network.E_ref) / density)
+        fastest *= math.exp(0.5 * network.stiffer)
         # half of the limit of stability, 2/fastest, for bonds at their stiffest
         self.substeps = math.ceil(frame_dt * fastest)
         self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt

@@ -79,10 +79,8 @@ class World:
     def fastest(self, start: Start, size: float, time: float) -> float:
         """Bound of the speeds [m/s] of a body of this size [m] within `time` [s] from `start`: as far as it can fall, and what
         colliders add."""
-        up, gravity, center = (
-            v.detach().double().cpu()
-            for v in (self.up / self.up.norm(), self.gravity, start.center)
-        )
+        given = self.up / self.up.norm(), self.gravity, start.center
+        up, gravity, center = (v.detach().double().cpu() for v in given)
         first, spin = (
             float(v.detach().norm()) for v in (start.velocity, start.angular_velocity * size)
         )

@@ -236,9 +236,8 @@ def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tenso
     shapes = covariance_from(splats.scales, splats.rotations)[None]
     means, colors = splats.means[None], splats.colors[None]
     with torch.no_grad():
-        return rasterize(
-            means, shapes, splats.opacities, colors, windows.cameras, state, background
-        )[0]
+        seen = means, shapes, splats.opacities, colors, windows.cameras
+        return rasterize(*seen, state, background)[0]
 
 
 def reconstruct(

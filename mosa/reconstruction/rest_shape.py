@@ -45,7 +45,5 @@ class RestShape:
 
     def tensors(self) -> dict[str, Tensor]:
         """What `build_body` takes."""
-        return {
-            name: getattr(self, name)
-            for name in ("rest", "volume", "colors", "opacities", "covariances")
-        }
+        names = ("rest", "volume", "colors", "opacities", "covariances")
+        return {name: getattr(self, name) for name in names}

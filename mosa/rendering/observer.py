@@ -23,13 +23,9 @@ class Views:
 
 def repeat_cameras(cameras: Cameras, frames: int) -> Cameras:
     """Each of V cameras `frames` times in a row: image b = view * frames + frame."""
-    return Cameras(
-        cameras.K.repeat_interleave(frames, 0),
-        cameras.w2c.repeat_interleave(frames, 0),
-        cameras.width,
-        cameras.height,
-        tuple(name for name in cameras.names for _ in range(frames)),
-    )
+    K, w2c = (t.repeat_interleave(frames, 0) for t in (cameras.K, cameras.w2c))
+    names = tuple(name for name in cameras.names for _ in range(frames))
+    return Cameras(K, w2c, cameras.width, cameras.height, names)
 
 
 def observe(

@@ -72,8 +72,5 @@ def pool(parts: Sequence[OperatorStatistics]) -> OperatorStatistics:
     """Over evaluations of equally many particles: the variance is then over particles and time."""
     means, within = torch.stack([p.mean for p in parts]), torch.stack([p.within for p in parts])
     mean = means.mean(0)
-    return OperatorStatistics(
-        torch.stack([p.mean_abs_C for p in parts]).mean(),
-        mean,
-        (within + (means - mean).square()).mean(0),
-    )
+    size = torch.stack([p.mean_abs_C for p in parts]).mean()
+    return OperatorStatistics(size, mean, (within + (means - mean).square()).mean(0))

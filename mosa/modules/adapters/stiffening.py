@@ -32,10 +32,8 @@ def acoustic_stiffening(G: Tensor, poisson: Tensor | float) -> float:
     G: (..., 6, 6) A - I on vech; poisson: of the isotropic C0. The symmetric part of (I + G) C0 alone counts: the projection to
     major symmetry changes nothing of it. 1000 directions n: 0.5 % at most below the true maximum."""
     G = G.detach().double().cpu()
-    scale, C0 = (
-        torch.tensor(MANDEL, dtype=torch.float64),
-        isotropic_stiffness(torch.as_tensor(poisson).detach().double().cpu()),
-    )
+    scale = torch.tensor(MANDEL, dtype=torch.float64)
+    C0 = isotropic_stiffness(torch.as_tensor(poisson).detach().double().cpu())
     D = (torch.eye(6).double() + scale[:, None] * G / scale) @ C0
     B = strains(spread_directions(DIRECTIONS))
     acoustic = torch.einsum("nja,...ab,nlb->...njl", B, D, B)

@@ -168,10 +168,8 @@ class Material(nn.Module):
             )
         if any(name in parameters for name in DAMPING):
             parameters = dict.fromkeys(DAMPING, 0.0) | dict(parameters)
-            law, *candidates = (
-                each if each == AUTO or each.endswith(DAMPED) else each + DAMPED
-                for each in (law, *candidates)
-            )
+            undamped = lambda name: name != AUTO and not name.endswith(DAMPED)  # noqa: E731
+            law, *candidates = (n + DAMPED if undamped(n) else n for n in (law, *candidates))
         laws = tuple(candidates) or (law,)
         for each in laws:
             own = {n: parameters[n] for n in taken(each, parameters)} if candidates else parameters

@@ -22,8 +22,8 @@ class Model:
 
     def only(self, *, heterogeneity: bool = True, adapter: bool = True) -> Model:
         """Without the parts that are False."""
-        return replace(
-            self,
-            heterogeneity=self.heterogeneity if heterogeneity else None,
-            adapter=self.adapter if adapter else None,
+        field, own = (
+            self.heterogeneity if heterogeneity else None,
+            self.adapter if adapter else None,
         )
+        return replace(self, heterogeneity=field, adapter=own)

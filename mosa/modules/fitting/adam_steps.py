@@ -47,10 +47,8 @@ class GradientSteps:
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: stage.decay(step) * self.retreat.share
         )
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": schedule, "interval": "step", "name": "lr"},
-        }
+        rate = {"scheduler": schedule, "interval": "step", "name": "lr"}
+        return {"optimizer": optimizer, "lr_scheduler": rate}
 
     def groups(self, stage: Stage) -> list[dict]:
         """Parameter groups of a stage."""

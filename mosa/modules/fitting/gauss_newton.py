@@ -131,10 +131,8 @@ class Posterior:
         counted("draws", (count, len(self.mean)), "take fewer", each=3 * 8)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
         L = torch.linalg.cholesky(self.covariance)
-        return (
-            self.mean
-            + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T
-        )
+        z = torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64)
+        return self.mean + z @ L.T
 
 
 def _length(step: Tensor, matrix: Tensor) -> float:
@@ -147,10 +145,8 @@ def normal_equations(J: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
 
     Sums in float32 lose what films tell beside a measured force, whose residuals are thousands of times as steep: J^T J then has
     negative eigenvalues, and there is no posterior."""
-    H, g = (
-        J.new_zeros(J.shape[1], J.shape[1], dtype=torch.float64),
-        J.new_zeros(J.shape[1], dtype=torch.float64),
-    )
+    H = J.new_zeros(J.shape[1], J.shape[1], dtype=torch.float64)
+    g = H.new_zeros(J.shape[1])
     for rows, residuals in zip(J.split(ROWS), r.split(ROWS)):
         wide = rows.double()
         H += wide.T @ wide
@@ -207,10 +203,8 @@ class GaussNewton:
 
     def clamped(self, numbers: Tensor) -> Tensor:
         """Within the blocks' bounds."""
-        return torch.minimum(
-            torch.maximum(numbers, self._vector(lambda b: b.bounds[0])),
-            self._vector(lambda b: b.bounds[1]),
-        )
+        low, high = (self._vector(lambda b, i=i: b.bounds[i]) for i in (0, 1))
+        return torch.minimum(torch.maximum(numbers, low), high)
 
     def cost(self, numbers: Tensor, r: Tensor) -> float:
         """Minus the logarithm of the posterior, up to a constant."""

@@ -48,10 +48,8 @@ class Retreat:
         return True
 
     def written(self) -> dict[str, Any]:
-        return {
-            "halvings": self.halvings,
-            "before": None if self.before is None else [t.cpu() for t in self.before],
-        }
+        before = None if self.before is None else [t.cpu() for t in self.before]
+        return {"halvings": self.halvings, "before": before}
 
     def read(self, saved: Mapping[str, Any] | None, parameters: Sequence[Tensor]) -> None:
         """As it was written, for these parameters. Errors: DataError where it is another stage's."""

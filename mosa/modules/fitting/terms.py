@@ -138,9 +138,7 @@ def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor
     """Every term that has a weight, raw, in the order in which they are known; then the penalties of an adapter that is learned."""
     found = {name: term(step) for name, term in TERMS.items() if weights.get(name, 0.0) != 0}
     if step.operator is not None:
-        found |= {
-            name: penalty(step.operator, step.misfit)
-            for name, penalty in step.body.adapter.penalties.items()
-            if weights.get(name, 0.0) != 0
-        }
+        known = step.body.adapter.penalties
+        counted = [name for name in known if weights.get(name, 0.0) != 0]
+        found |= {name: known[name](step.operator, step.misfit) for name in counted}
     return {name: value for name, value in found.items() if value is not None}

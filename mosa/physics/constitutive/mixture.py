@@ -65,10 +65,8 @@ def _by_law(laws: Sequence[Law], quantity: Callable) -> Callable:
 
     def chosen(**parameters: Tensor) -> Tensor:
         index = torch.as_tensor(parameters[INDEX])
-        parts = [
-            quantity(law, {k: parameters[k] for k in law.parameters if k in parameters})
-            for law in laws
-        ]
+        taken = [{k: parameters[k] for k in law.parameters if k in parameters} for law in laws]
+        parts = [quantity(law, values) for law, values in zip(laws, taken)]
         result = torch.zeros(
             torch.broadcast_shapes(index.shape, *(p.shape for p in parts)), dtype=parts[0].dtype
         )

@@ -95,10 +95,8 @@ class ColliderBuffers:
             return
         settle = sum_functions(self.scalar).settle
         for target, (added, _) in zip(tensors, sums, strict=True):
-            flat = [
-                wp.from_torch(added.view(-1, COLUMNS)),
-                wp.from_torch(target.view(-1), dtype=self.scalar),
-            ]
+            rows = wp.from_torch(added.view(-1, COLUMNS))
+            flat = [rows, wp.from_torch(target.view(-1), dtype=self.scalar)]
             self._work.run(settle, target.numel(), flat)
 
     def _arguments(self, met: list, step: int, time: float) -> list:

@@ -151,11 +151,8 @@ def pack_colliders(
             fields.append(shape.values.double().cpu().reshape(-1))
             offset += shape.values.numel()
     values = torch.cat(fields)
-    return PackedColliders(
-        shapes.to(dtype=dtype, device=device),
-        codes.to(device),
-        values.to(dtype=dtype, device=device),
-    )
+    shapes, values = (t.to(dtype=dtype, device=device) for t in (shapes, values))
+    return PackedColliders(shapes, codes.to(device), values)
 
 
 def _sizes(shape: Shape) -> tuple[float, ...]:
@@ -271,10 +268,8 @@ def _motion(item: dict) -> Motion:
             raise ConfigError(
                 "motion: waypoints stand alone, without position, velocity or angular_velocity"
             )
-        turns = [
-            axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation
-            for p in points
-        ]
+        given = [p.get("rotation") for p in points]
+        turns = [rotation if turn is None else axis_degrees(turn) for turn in given]
         return Motion.waypoints(
             [p["time"] for p in points], [p["position"] for p in points], torch.stack(turns)
         )

@@ -101,10 +101,8 @@ def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> Non
     *worlds, n = state.x.shape[:-1]
     if not n:
         raise ConfigError("x: expected one particle at least, found none")
-    shapes = {
-        name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3)
-        for name in State._fields
-    }
+    point, matrix = (*worlds, n, 3), (*worlds, n, 3, 3)
+    shapes = {name: point if name in ("x", "v") else matrix for name in State._fields}
     values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {
         "volume": (volume, (n,))
     }

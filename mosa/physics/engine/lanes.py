@@ -41,10 +41,8 @@ class Lanes:
     def piece(self, state: State, left: int, most: int, dt: float) -> int:
         """As `SegmentSolver.piece`, the fewest of any."""
         parts = self.split(state)
-        return min(
-            solver.piece(part, left, most, dt)
-            for solver, part in zip(self.solvers, parts, strict=True)
-        )
+        each = zip(self.solvers, parts, strict=True)
+        return min(solver.piece(part, left, most, dt) for solver, part in each)
 
     def split(self, tensors: Iterable[Tensor | None], dim: int = 0) -> list[tuple]:
         """The solvers' parts of tensors of all particles, or of all worlds' colliders."""

@@ -99,10 +99,8 @@ class Stretch:
 
     def adjoint_of(self, work: Workspace, acting: Sequence[Tensor | None]) -> list[Tensor | None]:
         """Where `adjoint` leaves the gradients of what acts."""
-        return [
-            None if value is None else work.adj_held[name]
-            for name, value in zip(HELD, acting, strict=True)
-        ]
+        pairs = zip(HELD, acting, strict=True)
+        return [None if value is None else work.adj_held[name] for name, value in pairs]
 
     def full(self, differentiated: bool, kept: bool) -> bool:
         """Whether the forward pass runs in the buffers of the backward pass, which it has to where its states are kept."""
@@ -125,11 +123,8 @@ class Stretch:
         posed = len(Poses._fields) if numerics.colliders is not None else 0
         posed += 2 if numerics.points else 0  # paths and rates of driven points
         acting = len(others) - posed
-        return (
-            [State(*part) for part in split(state)],
-            split(others[:acting]),
-            split(others[acting:], 1),
-        )
+        states = [State(*part) for part in split(state)]
+        return states, split(others[:acting]), split(others[acting:], 1)
 
     def _kind(self, name: str, others: Sequence[Tensor | None]) -> tuple:
         """Of a pass: those of one kind run the same kernels."""

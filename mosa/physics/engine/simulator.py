@@ -376,10 +376,8 @@ class Simulator:
                 raise ConfigError("held: expected the particles of the driven sets, found None")
             places = [x] if x.ndim == 2 else list(x)
             own = motions if len(motions) == len(places) else list(motions) * len(places)
-            found = [
-                hold(indices, each[solids:], place, solids, start)
-                for each, place in zip(own, places, strict=True)
-            ]
+            pairs = zip(own, places, strict=True)
+            found = [hold(indices, each[solids:], place, solids, start) for each, place in pairs]
             held = found[0] if x.ndim == 2 else stack_held(found)
         shapes = [x.shape[:-1], x.shape, x.shape[:-1]]
         if not all(map(dense, held)) or [part.shape for part in held] != shapes:

@@ -350,10 +350,8 @@ class Stepper:
         joined = tuple(
             torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*sampled)
         )
-        found = (
-            *self.taken(joined, clock.dt),
-            *self.led((frames - 1) * clock.count, clock.dt, start),
-        )
+        led = self.led((frames - 1) * clock.count, clock.dt, start)
+        found = *self.taken(joined, clock.dt), *led
         return lambda _, frame: tuple(
             t[frame.first : frame.first + frame.count] for t in found
         ), found

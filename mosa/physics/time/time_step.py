@@ -26,10 +26,8 @@ def step_rate(
 
     max(c/(courant dx) + viscosity/(VISCOUS_NUMBER rho dx^2), v_max/(dx/2)). The first two add up: with the damping of the last
     substep the limit of an oscillator is (2/omega)(sqrt(1 + zeta^2) - zeta) >= (2/omega)/(1 + 2 zeta)."""
-    return max(
-        speed / (courant * dx) + viscosity / (VISCOUS_NUMBER * density * dx) / dx,
-        v_max / (0.5 * dx),
-    )
+    rate = speed / (courant * dx) + viscosity / (VISCOUS_NUMBER * density * dx) / dx
+    return max(rate, v_max / (0.5 * dx))
 
 
 def required_substeps(

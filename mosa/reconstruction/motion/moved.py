@@ -177,10 +177,8 @@ class SecondLook:
         log.info(
             "motion of %s: its bias towards the prediction is measured by a second prediction: the weight of the prediction is "
             "%.3g of the images' (median direction), which explains %.0f%% of the change",
-            self.scene.sequence,
-            strength,
-            100 * (1 - left),
-        )
+            self.scene.sequence, strength, 100 * (1 - left),
+        )  # fmt: skip
         return self.cues(positions), response if left < UNEXPLAINED else None
 
     def response(self, written: dict[str, Tensor] | None) -> Response | None:

@@ -45,11 +45,9 @@ class Similarities:
         """By steps (K, 7) [m]: of the centre, the angles times size and reach, the logarithm of the
         size times both."""
         arm = (self.size * reach)[:, None]
-        return Similarities(
-            rotation_exp(step[:, 3:6] / arm) @ self.rotation,
-            self.center + step[:, :3],
-            self.size * (step[:, 6] / arm[:, 0]).exp(),
-        )
+        rotation = rotation_exp(step[:, 3:6] / arm) @ self.rotation
+        size = self.size * (step[:, 6] / arm[:, 0]).exp()
+        return Similarities(rotation, self.center + step[:, :3], size)
 
     def turned(self, rotation: Tensor, center: Tensor, about: Tensor) -> Similarities:
         """Turned by `rotation` (3, 3) about a point (3,), which comes to lie at `center` (3,) [m]."""

@@ -65,11 +65,8 @@ def taken_of(distances: Mapping[str, float]) -> str:
 def alike(distances: Mapping[str, float], mode: str) -> list[float]:
     """Frictions of a mode, of distances [m] by `named`, that come about as near (by `NEARER`) as the nearest of all contacts with
     friction, in order: the isotropic law does not tell them apart. Empty where none does."""
-    sliding = {
-        name: distance
-        for name, distance in distances.items()
-        if contact(name)[0] in RUBBING and math.isfinite(distance)
-    }
+    finite = {name: distance for name, distance in distances.items() if math.isfinite(distance)}
+    sliding = {name: finite[name] for name in finite if contact(name)[0] in RUBBING}
     least = min(sliding.values(), default=math.inf)
     return sorted(friction for name, distance in sliding.items() for of, friction in [contact(name)]
                   if of == mode and NEARER * distance <= least)  # fmt: skip
