@@ -22,7 +22,9 @@ class Interactions:
 
     def __init__(self, network, density: float, world, frame_dt: float) -> None:
         if world.planes or world.colliders or world.driven:
-            raise ConfigError("adapter=interaction: expected a world with a ground alone")
+            raise ConfigError(
+                "adapter=interaction: expected a world with a ground alone, found world.walls, world.colliders or world.driven"
+            )
         fastest = network.fastest * math.sqrt(float(network.E_ref) / density)
         fastest *= math.exp(0.5 * network.stiffer)
         # half of the limit of stability, 2/fastest, for bonds at their stiffest

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Interval
 from pydantic import Field, model_validator
@@ -221,3 +221,8 @@ class ReconstructionSettings(Settings):
                 "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network"
             )
         return self
+
+
+def build_settings(**keys: Any) -> ReconstructionSettings:
+    """Settings from the plain keys of conf/reconstruction. Errors: ConfigError naming the key."""
+    return ReconstructionSettings.read(keys)

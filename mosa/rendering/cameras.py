@@ -57,7 +57,9 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     forward = target - eye
     right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
     if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()):
-        raise ConfigError("look_at: eye and target coincide, or their line is parallel to up")
+        raise ConfigError(
+            "look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up"
+        )
     forward = forward / forward.norm(dim=-1, keepdim=True)
     right = right / right.norm(dim=-1, keepdim=True)
     R = torch.stack((right, torch.linalg.cross(forward, right), forward), -2)
@@ -72,7 +74,9 @@ def scale_cameras(cameras: Cameras, factor: float) -> Cameras:
     pixel."""
     width, height = round(cameras.width * factor), round(cameras.height * factor)
     if width < 1 or height < 1:
-        raise ConfigError(f"scale_cameras: factor {factor} makes images vanish")
+        raise ConfigError(
+            f"scale_cameras: factor {factor} makes images of {cameras.width}x{cameras.height} px vanish"
+        )
     K = cameras.K.clone()
     K[:, 0] *= width / cameras.width
     K[:, 1] *= height / cameras.height

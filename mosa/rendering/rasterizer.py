@@ -43,7 +43,9 @@ def _check(
                 f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty"
             )
         if value.device != means.device:
-            raise ConfigError(f"rasterize: {name} is on {value.device}, means on {means.device}")
+            raise ConfigError(
+                f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device"
+            )
         if name in numbers and (value.dtype != means.dtype or value.dtype not in SCALARS):
             raise ConfigError(
                 f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all"

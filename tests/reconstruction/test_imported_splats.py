@@ -11,7 +11,7 @@ from mosa.reconstruction import pipeline
 from mosa.reconstruction.gaussians.initial import initial_splats
 from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pipeline import object_hull, reconstruct
-from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.reconstruction.settings import build_settings
 
 QUICK = {
     "resolution": 32, "ridge_passes": 4, "static": {"iterations": 3}, "appearance": {"iterations": 3},
@@ -21,7 +21,7 @@ QUICK = {
 
 def test_a_ply_replaces_the_static_stage(squashed, tmp_path, monkeypatch):
     """The particles get the file's colours, no static fit is run, and another file is another cache entry."""
-    settings = ReconstructionSettings.read({"splats": str(tmp_path / "own.ply"), **QUICK})
+    settings = build_settings(splats=str(tmp_path / "own.ply"), **QUICK)
     still = object_windows(squashed, squashed.training_cameras, [0], margin=6)
     splats = initial_splats(object_hull(squashed, settings), still, count=150, seed=0)
     green = replace(splats, colors=torch.tensor([0.1, 0.9, 0.2]).expand(150, 3))
@@ -62,9 +62,7 @@ def test_splats_of_another_world_are_refused(squashed, tmp_path):
     splats = pipeline.Splats(
         means, torch.full((20, 3), 0.1), rotations, torch.full((20,), 0.5), torch.rand(20, 3)
     )
-    settings = ReconstructionSettings.read(
-        {"splats": str(save_ply(tmp_path / "far.ply", splats)), **QUICK}
-    )
+    settings = build_settings(splats=str(save_ply(tmp_path / "far.ply", splats)), **QUICK)
     with pytest.raises(
         DataError, match=r"far.ply: expected Gaussians in the scene's box .*found 0 of 20"
     ):
@@ -77,7 +75,7 @@ def test_splats_of_another_world_are_refused(squashed, tmp_path):
 ])  # fmt: skip
 def test_splats_beside_the_object_are_refused(squashed, tmp_path, change, unit):
     """Inside of the scene's box, in another unit, with other axes, or elsewhere."""
-    settings = ReconstructionSettings.read({"splats": str(tmp_path / "own.ply"), **QUICK})
+    settings = build_settings(splats=str(tmp_path / "own.ply"), **QUICK)
     still = object_windows(squashed, squashed.training_cameras, [0], margin=6)
     splats = initial_splats(object_hull(squashed, settings), still, count=150, seed=0)
     save_ply(tmp_path / "own.ply", splats)

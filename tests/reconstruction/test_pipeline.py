@@ -15,16 +15,10 @@ from mosa.errors import ConfigError
 from mosa.reconstruction import pipeline
 from mosa.reconstruction.motion import moved
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
-from mosa.reconstruction.settings import InformedSettings, ReconstructionSettings
+from mosa.reconstruction.settings import InformedSettings, build_settings
 from mosa.rendering.appearance.lighting import shading, surface_normals
 
 CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
-
-
-def build_settings(**keys):
-    return ReconstructionSettings.read(keys)
-
-
 SETTINGS = build_settings(
     resolution=56, points=1200, static={"iterations": 120}, appearance={"iterations": 100},
     dynamic={"modes": 40, "track_iterations": 30, "track_views": 3, "iterations": 40}, carried={"iterations": 20},

@@ -97,7 +97,7 @@ def test_crop_boxes_hold_the_object_of_every_view():
         assert float(outside.max()) == 0
     assert x0[2] == (60 - width) // 2 and y0[2] == (40 - height) // 2
     assert crop_boxes(mattes, margin=100)[2:] == (60, 40)
-    with pytest.raises(DataError, match="none of 2 mattes"):
+    with pytest.raises(DataError, match="none of 3 mattes"):
         crop_boxes(0 * mattes)
 
 

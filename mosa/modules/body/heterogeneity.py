@@ -25,7 +25,9 @@ class StiffnessField(nn.Module):
     ) -> None:
         super().__init__()
         if not bool((high > low).all()):
-            raise ConfigError(f"heterogeneity: no volume from {low.tolist()} to {high.tolist()}")
+            raise ConfigError(
+                f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}"
+            )
         self.register_buffer("low", low.detach().clone())
         self.register_buffer("high", high.detach().clone())
         self.settings = settings or HeterogeneitySettings()

@@ -91,8 +91,10 @@ class GradientSteps:
         except SimulationDiverged as error:
             if not self.retreat.back(self.running_optimizer, learned):
                 raise
-            log.warning("stage %s, iteration %d: the last step is undone, and steps are half as long from here: %s",
-                        stage.name, iteration, error)  # fmt: skip
+            told = (
+                "stage %s, iteration %d: the last step is undone, later ones are half as long: %s"
+            )
+            log.warning(told, stage.name, iteration, error)
             self.taken_back = True
             return None
         return KnownGradient.apply(self.terms_of_step.pop("loss"), total, *learned)

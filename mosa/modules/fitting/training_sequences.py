@@ -67,8 +67,10 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
     else:
         cues, found = take.again.with_response(free, other, seen, take.first_contact)
     moved = float((cues.positions - seen).square().sum(-1).mean().sqrt())
-    log.info("motion of %s fitted again, from the calibrated law's prediction: changed by %.2g mm (root mean square)",
-             name, 1e3 * moved)  # fmt: skip
+    told = (
+        "motion of %s fitted again, from the calibrated law's prediction: changed by %.2g mm (rms)"
+    )
+    log.info(told, name, 1e3 * moved)
     return replace(take, cues=cues, response=found)
 
 

@@ -166,7 +166,9 @@ class Motion:
             turning(rotations[:-1], rotations[1:]) if told else rotation_vector(R[1:] @ R[:-1].mT)
         )
         if not told and bool((turns.detach().norm(dim=-1) > 3.04).any()):
-            raise ConfigError("motion: waypoints: expected less than half a turn between two")
+            raise ConfigError(
+                "motion: waypoints: rotations: expected less than half a turn between two, put one in between"
+            )
         interval, rest = times.diff()[:, None], torch.zeros(1, 3, dtype=torch.float64)
         velocity = torch.cat([(positions[1:] - positions[:-1]) / interval, rest])
         angular = torch.cat([turns / interval, rest])
