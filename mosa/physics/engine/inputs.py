@@ -169,7 +169,9 @@ def checked_density(
         own["lam"] = float((lam + 2 / 3 * mu).min())
     for name, value in own.items():
         if value < 0:
-            raise ConfigError(f"parameters.{name}: expected {MODULI[name]}, found {value:g}")
+            raise ConfigError(
+                f"parameters.{name}: expected {MODULI[name]} for all particles, found {value:g}"
+            )
     return density, mass
 
 
