@@ -30,14 +30,13 @@ from mosa.modules.fitting.search.parts import named as named_parts
 from mosa.modules.fitting.search.yielding import lasting
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.constitutive.laws import law_named
-from mosa.system.progress import tqdm
 from mosa.types import Ground
 
 log = logging.getLogger(__name__)
 
 
 class NewtonSteps:
-    """The part of `LitMosa` that runs stages by Gauss-Newton, under a trainer or, by `identify`, without one."""
+    """The part of `LitMosa` that runs stages by Gauss-Newton."""
 
     known: Posterior | None
 
@@ -186,20 +185,6 @@ class NewtonSteps:
         fewer = self.identifying(stage if kept else self.stages[0], parts=kept)
         fewer.iterate_until_converged(stage.iterations)
         return fewer
-
-    def identify(self) -> None:
-        """All stages by Gauss-Newton without a trainer: nothing is logged or kept. Errors: those of an iteration."""
-        while (stage := self.stage) is not None:
-            self.begin(stage)
-            self.identification = self.begun(stage)
-            for _ in tqdm(range(stage.iterations), f"stage {stage.name}", leave=False):
-                self.identification.iterate()
-                if self.identification.converged:
-                    break
-            if self.goes_back(stage):
-                continue
-            self.keep_posterior(stage)
-            self.end(stage)
 
     def identifying(
         self, stage: Stage, ground: Ground | None = None, parts: Sequence[str] = PARTS, body: Body | None = None

@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
+from without_trainer import identify
 
 from mosa.config.record import BodyRecord
 from mosa.modules.body.material import AUTO, Material
@@ -56,7 +57,7 @@ def test_the_fit_begins_again_about_the_backbone_that_explains_the_learned_law_b
         "begin",
         lambda stage: begun.append((stage.name, module.body.material.law)) or begin(stage),
     )
-    module.identify()
+    identify(module)
     again = [("prior", truth), ("joint", truth)] if truth != "corotated" else []
     assert begun == [("prior", "corotated"), ("joint", "corotated"), *again]
     assert (module.law_gains["neo_hookean"] > EXPLAINED) == bool(again)

@@ -7,6 +7,7 @@ import pytest
 import strangers
 import torch
 from small_bodies import FRAME_DT, NU, WORLD, E, small_body, start, take_of
+from without_trainer import identify
 
 from mosa.config.checkpoints import check_resumed
 from mosa.config.record import BodyRecord
@@ -297,7 +298,7 @@ def test_a_run_goes_on_with_the_ground_that_it_found():
     take.again = None
     module = fit_of(take)
     assert module.ground_is_sought
-    module.identify()
+    identify(module)
     assert (
         not module.ground_is_sought
         and module.world.ground == truth
@@ -374,7 +375,7 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     monkeypatch.setattr(ground_search, "NEARER", 0.0)
     module = learning(truth)
     begun = stages_begun(module, monkeypatch)
-    module.identify()
+    identify(module)
     sticks = Ground(0.0, "sticky")
     again = [("prior", truth), ("joint", truth)] if truth.mode != "sticky" else []
     assert begun == [("prior", sticks), ("joint", sticks), *again]
@@ -406,7 +407,7 @@ def test_a_fit_goes_to_a_friction_that_is_a_little_better(monkeypatch):
         self.settle_ground(Ground(0.0, "separate", 0.6))
 
     begun = stages_begun(module, monkeypatch)
-    module.identify()
+    identify(module)
     best = max(module.ground_gains, key=module.ground_gains.get)
     assert best == "separate_0.5" and 0 < module.ground_gains[best] and len(begun) == 2
     assert module.world.ground.friction == pytest.approx(
@@ -447,7 +448,7 @@ def test_a_fit_begins_again_with_the_friction_that_explains_the_learned_law_bett
     monkeypatch.setattr(ground_search, "BETWEEN", 1.0)
     module = learning(Ground(0.0, "separate", truth))
     begun = stages_begun(module, monkeypatch)
-    module.identify()
+    identify(module)
     slides, found = Ground(0.0, "separate", 0.6), Ground(0.0, "separate", 0.3)
     again = [("prior", found), ("joint", found)] if truth == 0.3 else []
     assert begun == [("prior", Ground(0.0, "sticky")), ("joint", slides), *again]

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from small_bodies import WORLD, E, small_body, start, take_of
+from without_trainer import identify
 
 from mosa.modules.fitting.gauss_newton import KNOWN, Posterior
 from mosa.modules.fitting.identification import Identification
@@ -122,7 +123,7 @@ def fitted(monkeypatch, errors: dict[str, float] | None) -> LitMosa:
                               background=torch.ones(3), weights={"position": 1.0}, stages=stages,
                               criterion=Criterion(name="corrected"),
                               settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
-    module.identify()
+    identify(module)
     return module
 
 
