@@ -611,7 +611,7 @@ class TestErrors:
         with pytest.raises(ConfigError, match=r"x: expected.*float64.*float32"):
             self.run(replace(state, x=state.x.float()))
         operator = AdapterOperator(torch.zeros(3, 6, 6).double(), torch.zeros(3, 6).double())
-        with pytest.raises(ConfigError, match=r"adapter: G: expected shape \(64, 6, 6\)"):
+        with pytest.raises(ConfigError, match=r"adapter output G: expected shape \(64, 6, 6\)"):
             simulator().rollout(
                 state, self.PARAMETERS, volume_of(state), DENSITY, 2, adapter=lambda _: operator
             )
