@@ -220,7 +220,7 @@ def test_the_world_that_diverges_is_named(together, make_block):
     ({"gravity": torch.zeros(3, 3)}, r"gravity: .*\(2, 3\), found shape \(3, 3\)"),
     ({"motions": [motions(0)] * 3}, r"motions: expected 2 sequences, one a world, found 3"),
     ({"motions": [motions(0), motions(0)[:1]]}, r"motions: expected one for each of 2 colliders, found 1"),
-    ({"adapter": [lambda s: s] * 3}, r"adapter: expected one, or 2 of worlds, found 3"),
+    ({"adapter": [lambda s: s] * 3}, r"adapter: expected one, or one for each of 2 worlds, found 3"),
     ({"together": 3}, r"together: expected a divisor of the 2 worlds, found 3"),
 ])  # fmt: skip
 def test_errors_say_what_was_expected(change, message, make_block):
@@ -328,5 +328,5 @@ def test_a_stepper_goes_on_from_a_state_with_poses_from_outside(make_block):
     )
     found = both.step(pair, given)
     assert found.reactions.shape == (SUBSTEPS, 2, 2, 6) and not torch.equal(*found.moment.state.x)
-    with pytest.raises(ConfigError, match="timing: expected None with worlds"):
+    with pytest.raises(ConfigError, match="timing: expected None with many worlds"):
         sim.stepper(pair.state, law, volume, 1000.0, timing=Adaptive(StepControl()))
