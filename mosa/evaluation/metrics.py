@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from kornia.filters import get_gaussian_kernel1d
 from kornia.metrics import ssim as kornia_ssim
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from mosa.errors import ConfigError
-from mosa.evaluation.assignment import assigned
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
 RIDGE = 1e-3
@@ -46,14 +46,10 @@ def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
 
     Errors: ConfigError if another metric has the name."""
     known = IMAGE_METRICS if images else MOTION_METRICS
-    if (
-        re.fullmatch(r"\w+", name) is None
-        or name in RESERVED
-        or known.setdefault(name, metric) != metric
-    ):
-        raise ConfigError(
-            f"metric {name!r}: expected a name of letters and digits that no figure has yet; choose another one"
-        )
+    free = re.fullmatch(r"\w+", name) is not None and name not in RESERVED
+    if not free or known.setdefault(name, metric) != metric:
+        said = "expected a name of letters and digits that no figure has yet; choose another one"
+        raise ConfigError(f"metric {name!r}: {said}")
 
 
 RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")
@@ -137,7 +133,7 @@ def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 
     """`emd_m`: mean distance [m] of the exact assignment between equally many random points of (N, 3) and (M, 3) [m]."""
     count = min(samples, len(a), len(b))
     cost = cdist(subsample(a, count, seed), subsample(b, count, seed + 1))
-    return float(np.take_along_axis(cost, assigned(cost)[:, None], 1).mean())
+    return float(cost[linear_sum_assignment(cost)].mean())
 
 
 def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
