@@ -56,10 +56,8 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
-LARGEST, MOST = 1e20, 10**9
-"""Of numbers and of whole numbers without limits of their own: single precision and an array's length hold them."""
-WIDEST = 4096
-"""Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
+LARGEST, MOST = 1e20, 10**9  # of numbers and whole numbers without limits of their own
+WIDEST = 4096  # of a network's layer: many times what any run has used
 
 
 Public = TypeVar("Public", bound=Callable[..., Any])

@@ -83,8 +83,7 @@ class Cameras:
         return moved(self, device)
 
 
-AUTO = "auto"
-"""Mode of a ground of which only the height is known: how it is touched is found with the law."""
+AUTO = "auto"  # mode of a ground: how it is touched is found with the law
 GROUND_MODES = ("sticky", "slip", "separate", "touch")
 RUBBING = ("separate", "touch")
 """Of these modes, those with friction: the body leaves the ground freely, and is met at nodes or at its own particles."""
@@ -103,8 +102,7 @@ class Ground:
     accuracy: float | None = None
 
 
-FALLING, REST = "falling", "rest"
-"""How a film starts."""
+FALLING, REST = "falling", "rest"  # how a film starts
 
 
 @dataclass(frozen=True)

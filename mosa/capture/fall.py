@@ -21,19 +21,13 @@ from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 from mosa.errors import DataError
 
-READOUT, READOUT_SD = 0.015, 0.010
-"""[s] Sensors of phones are read in 8 to 30 ms: what is assumed beside what the fall says."""
-SHIFT = 0.04
-"""Standard deviation of a silhouette's centre from the projected centre of mass, in radii of the object."""
-POSE = 1.5e-3
-"""[rad] of a phone's direction."""
-ROUGH = 0.05
-"""Radii of the object within which the triangulated centres of a fall lie on a parabola, clocks known to a quarter of a frame."""
-OUTLIER = 3.5
-"""Standard deviations from which on a frame at an end of the window is no free fall."""
+READOUT, READOUT_SD = 0.015, 0.010  # [s] prior: sensors of phones are read in 8 to 30 ms
+SHIFT = 0.04  # sd of a silhouette's centre from the projected centre of mass, in object radii
+POSE = 1.5e-3  # [rad] of a phone's direction
+ROUGH = 0.05  # radii of the object within which triangulated centres of a fall lie on a parabola
+OUTLIER = 3.5  # standard deviations from which on a frame at an end of the window is no free fall
 FEWEST = 5
-NOISE = 0.05
-"""[px] Least noise that is assumed of a centre."""
+NOISE = 0.05  # [px] Least noise that is assumed of a centre
 OUTLINE = 0.003
 """The same in radii of the object: what a hull leaves of the difference between an outline's centre and the body's. With it the
 errors of the two synthetic films of docs/capture.md are as large as is said."""

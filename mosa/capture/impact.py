@@ -19,16 +19,11 @@ from mosa.capture.fall import Fall, Knowledge, Problem
 from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 
-AFTER = 0.2
-"""[s] from the end of the free fall on that are read."""
-STEP = 0.006
-"""[s] between the knots of the curve: a body of some centimetres that strikes the ground is turned around within two or more."""
-OUTLINE = 0.016
-"""Radii by which the outline of a body that deforms is off from the common path, in the picture of one phone."""
-BEND = 0.3
-"""Radii of change in the curve's third differences from knot to knot, one standard deviation: collisions at 20 m/s are within."""
-LEAST = 4
-"""Frames of each phone after the free fall, below which there is no impact to be seen."""
+AFTER = 0.2  # [s] from the end of the free fall on that are read
+STEP = 0.006  # [s] between knots; a body of some centimetres turns around within two or more
+OUTLINE = 0.016  # radii by which a deforming body's outline leaves the common path
+BEND = 0.3  # sd of the curve's third differences from knot to knot [radii]: holds to 20 m/s
+LEAST = 4  # frames of each phone after the free fall, below which there is no impact to be seen
 
 
 class Impact(Problem):

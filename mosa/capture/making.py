@@ -46,15 +46,12 @@ log = logging.getLogger(__name__)
 
 READOUT_DIRECTIONS = {0: "down", 90: "left", 180: "up", 270: "right"}
 """Rotation of a video for display [degrees] -> direction of the sensor's readout in the displayed picture."""
-MAX_PHONE_OFFSET = 0.12
-"""Disagreement with the other phones, in object radii, above which a phone is reported."""
+MAX_PHONE_OFFSET = 0.12  # disagreement [object radii] above which a phone is reported
 CORRECTIONS = 4
 """Times that the fall is fitted again, with the outlines that its hull has. Each time the poses' errors become smaller, and with
 them those of the hull: of the rabbit's film 1.3 px at first, then 0.6, 0.5, 0.4 and 0.4."""
-FAR_OFF = 1.5
-"""Factor between a scale that is given and that of the fall from which on one of them is a mistake."""
-COARSE = 320
-"""Pixels of images in which the ground is looked for."""
+FAR_OFF = 1.5  # factor between a given scale and that of the fall that is a mistake
+COARSE = 320  # pixels of images in which the ground is looked for
 
 
 def make(cfg: DictConfig) -> dict[str, Any]:
@@ -307,8 +304,7 @@ def figures(
     }  # fmt: skip
 
 
-SIZES = 0.005, 0.75
-"""[m] of an object's radius that somebody lets fall: lengths go with the square of the clock."""
+SIZES = 0.005, 0.75  # [m] of an object's radius; lengths go with the square of the clock
 
 
 def warnings_of(

@@ -15,10 +15,8 @@ from mosa.data.images.matting import SPECK, matte_from_plate
 from mosa.data.images.reading import fill_holes
 from mosa.errors import ConfigError, DataError
 
-DARK = 0.1
-"""Plate values below say nothing about the exposure."""
-SMALLEST = 30
-"""Pixels of an object below which its centre is not a number to fit a fall to."""
+DARK = 0.1  # plate values below say nothing about the exposure
+SMALLEST = 30  # pixels of an object below which its centre is not a number to fit a fall to
 
 Matting = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(number of the frame, its picture (H, W, 3) in [0, 1]) -> straight colour (H, W, 3), matte (H, W)."""

@@ -16,15 +16,11 @@ from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 from mosa.system.limits import counted
 
-PITCH = 1 / 18
-"""Of the hull's grid, in radii of the object."""
+PITCH = 1 / 18  # of the hull's grid, in radii of the object
 REACH = 2.2
-VIEWS = 3
-"""Frames of each phone that carve it."""
-SAMPLES = 9
-"""Times of the fall at which the outline is looked at; a parabola in time goes through them."""
-MAX_CENTRE_OFFSET = 0.3
-"""Distance of an outline's centre from the body's, in radii, above which the hull is rejected."""
+VIEWS = 3  # frames of each phone that carve it
+SAMPLES = 9  # times of the fall at which the outline is seen; a parabola fits them
+MAX_CENTRE_OFFSET = 0.3  # outline's centre to body's [radii] above which the hull is rejected
 
 
 def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:

@@ -17,14 +17,11 @@ from mosa.data.io.colmap import is_model, read_model, read_points
 from mosa.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-FEWEST = 3
-"""Phones from which places and clocks can be told."""
-MOVED, TURNED = 0.01, 0.5
-"""Share of the distance between cameras, and degrees, by which poses of one phone may differ: it stands still."""
+FEWEST = 3  # phones from which places and clocks can be told
+MOVED, TURNED = 0.01, 0.5  # most by which one phone's poses may differ: share of extent, degrees
 
 
-FOCUS = 0.02
-"""Of the focal length, by which intrinsics of one phone may differ."""
+FOCUS = 0.02  # of the focal length, by which intrinsics of one phone may differ
 
 
 def read_phones(

@@ -17,8 +17,7 @@ from mosa.capture.resampling import Exposure
 from mosa.capture.world import World
 from mosa.system.whole_files import write_whole
 
-TILE, COLUMNS, SPARE = 1.8, 8, 10
-"""Inches of a picture on the contact sheet, pictures in a row, and pixels around the object."""
+TILE, COLUMNS, SPARE = 1.8, 8, 10  # inches of a picture, pictures in a row, pixels around it
 
 
 def write_report(

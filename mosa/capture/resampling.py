@@ -22,14 +22,10 @@ from mosa.data.images.reading import fill_holes
 from mosa.errors import DataError
 from mosa.system.limits import counted
 
-NEAR = 0.02
-"""Share of a frame within which a wanted time is that of a frame."""
-KNOTS = 2
-"""Of the common path in the shortest time between frames."""
-SMOOTH = 1e-3
-"""Weight of the change of its acceleration from knot to knot, where a line of sight's distance has 1."""
-AROUND = 0.6
-"""Radii of the object beside it in which flow is looked for."""
+NEAR = 0.02  # share of a frame within which a wanted time is that of a frame
+KNOTS = 2  # of the common path in the shortest time between frames
+SMOOTH = 1e-3  # weight of the change of acceleration between knots; a line of sight has 1
+AROUND = 0.6  # radii of the object beside it in which flow is looked for
 
 
 @dataclass(frozen=True)

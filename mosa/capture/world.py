@@ -20,16 +20,12 @@ from mosa.errors import DataError
 from mosa.system.whole_files import write_whole
 
 FILE = "capture.json"
-REACH, PITCH = 2.2, 1 / 20
-"""Radii of the object around its centre in which its lowest point is looked for, and steps of the search."""
-FOOT = 0.1
-"""Share of its widest level's area from which on a level of a hull is taken for the body's."""
+REACH, PITCH = 2.2, 1 / 20  # object radii in which the lowest point is sought, step of the search
+FOOT = 0.1  # share of its widest level's area from which on a hull's level is the body's
 AROUND, LAYER, FEWEST = 10.0, 0.06, 15
 """Radii around the landing in which points belong to the floor, half a layer's thickness in radii, and how many make one."""
-FLOOR = 3.0
-"""Radii of the object around where it lands: of the floor that phones see there one colour is expected."""
-GAIN = 3.0
-"""Largest factor between phones' colours that is still taken for exposure and white balance."""
+FLOOR = 3.0  # object radii around the landing in which the floor has one colour
+GAIN = 3.0  # largest factor between phones' colours that counts as exposure
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ from mosa.physics.world import solids_of
 from mosa.settings import call
 from mosa.types import AUTO, Ground, Scene
 
-HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
-"""heterogeneity.kind."""
+HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}  # heterogeneity.kind
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:

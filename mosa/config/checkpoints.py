@@ -45,12 +45,9 @@ BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "callbacks", "tra
           "scene.cache", "scene.root", "identification.threads", "extensions")  # fmt: skip
 """Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
 `scene.path` the last part counts."""
-NODES, DEPTH = 2_000_000, 40
-"""Entries and levels of a checkpoint's containers: losses of a fit of 10,000 steps are 10,000."""
-BRIGHTEST = 10.0
-"""Of a colour, which a fit may bring beyond 1."""
-SPACING = 0.02, 5.0
-"""Distance between particles, in cells: 1/64 to 50 of them in a cell's volume, with room."""
+NODES, DEPTH = 2_000_000, 40  # of a checkpoint's containers: entries, levels
+BRIGHTEST = 10.0  # of a colour, which a fit may bring beyond 1
+SPACING = 0.02, 5.0  # distance of particles in cells: 1/64 to 50 of them in a cell, with room
 
 
 @contextmanager

@@ -22,12 +22,9 @@ OWN = (
     "duration", "loads",
 )  # fmt: skip
 """What a sequence may have otherwise than the training one: not the world, of which there is one for all."""
-FILES = (".json", ".c3d", ".csv")
-"""Endings of a sequence that is a file, which are no part of its name."""
-DEPTH = 3
-"""Folders that a name is made of at most; what is then still called the same is numbered."""
-SHARED = 0.05
-"""Of a recording's pictures that may be another's to the bit."""
+FILES = (".json", ".c3d", ".csv")  # endings of a sequence that is one file
+DEPTH = 3  # folders that a name is made of at most; what is then still called the same is numbered
+SHARED = 0.05  # of a recording's pictures that may be another's to the bit
 NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 
 

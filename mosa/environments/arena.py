@@ -190,8 +190,7 @@ class Arena:
             )
 
 
-LOST = 5.0
-"""Loss of a trial whose simulation diverged: log(1 + 12^2)."""
+LOST = 5.0  # loss of a trial whose simulation diverged: log(1 + 12^2)
 
 
 def world_of(error: SimulationDiverged) -> int | None:

@@ -25,8 +25,7 @@ from mosa.system.limits import named_device
 
 log = logging.getLogger(__name__)
 
-AT_A_TIME = 8
-"""Worlds on a CPU: more would only wait for its cores."""
+AT_A_TIME = 8  # worlds on a CPU: more would only wait for its cores
 
 
 def setting_of(values: dict) -> EnvironmentsSettings:

@@ -20,15 +20,12 @@ from mosa.twin.rollout_file import pose
 from mosa.twin.shown_solids import OPACITY, WIDTH, lattice, shaded, surface
 from mosa.types import Cameras
 
-PITCH = 0.011
-"""[m] between the Gaussians of a solid."""
-GROUND, TILE = 0.6, 0.03
-"""Half width of the ground that is drawn [m], and its pitch."""
+PITCH = 0.011  # [m] between the Gaussians of a solid
+GROUND, TILE = 0.6, 0.03  # half width of the ground that is drawn [m], and its pitch
 COLORS = {"box": (0.96, 0.96, 0.95), "jaw left": (0.25, 0.45, 0.75), "jaw right": (0.25, 0.45, 0.75),
           "column": (0.45, 0.47, 0.52)}  # fmt: skip
 SKY = (0.80, 0.86, 0.92)
-MARK, THIN = (0.85, 0.20, 0.20), 0.004
-"""Colour of the target, and the pitch of its Gaussians [m]."""
+MARK, THIN = (0.85, 0.20, 0.20), 0.004  # colour of the target, and the pitch of its Gaussians [m]
 
 
 def solid_surface(collider: Collider, place: Tensor | None) -> Tensor:

@@ -189,10 +189,8 @@ class OutcomeModel(nn.Module):
 
 
 MEMBERS, HIDDEN = 5, 64
-FITTED, DESCENDED, IMAGINED = 400, 300, 512
-"""Steps of Adam on the model, steps on the policy, and situations drawn for those."""
-OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))
-"""Of a `View`: the numbers that a loss is made of."""
+FITTED, DESCENDED, IMAGINED = 400, 300, 512  # steps on model, on policy; situations
+OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))  # of a `View`
 
 
 def _outcome(view: View) -> Tensor:
@@ -290,5 +288,4 @@ def _clipped(gradient: Tensor, most: float) -> Tensor:
     return gradient * (most / gradient.norm(dim=1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
 
 
-SEARCHES = {"gradient": by_gradient, "model": by_model}
-"""By the name in `policy`."""
+SEARCHES = {"gradient": by_gradient, "model": by_model}  # by the name in `policy`

@@ -36,10 +36,8 @@ from mosa.system.whole_files import write_whole
 
 log = logging.getLogger(__name__)
 
-UNTRAINED = "none"
-"""The policy that a search begins from, which knows no simulator."""
-TEST_SEED = 20_000_000
-"""Of the tested trials: the same for all policies, and none that a search has drawn."""
+UNTRAINED = "none"  # the policy that a search begins from, which knows no simulator
+TEST_SEED = 20_000_000  # of the tested trials, the same for all policies
 
 
 class Bench:
@@ -308,8 +306,7 @@ def write_table(
     return page
 
 
-UNSAID = ("search", "options", "checkpoint")
-"""Of a setting: what a page says elsewhere, or what is a place on one machine."""
+UNSAID = ("search", "options", "checkpoint")  # said elsewhere, or of one machine
 
 
 def _listed(values: Mapping[str, Any]) -> str:

@@ -21,14 +21,11 @@ from mosa.physics.world import World
 from mosa.system.limits import counted
 from mosa.types import Ground
 
-ROOM = 5.0
-"""Half width [m] of the world: a body that rolls away is a failure, not an error."""
-LAST = 5
-"""Control steps at the end over which a reward is averaged: the body may still quiver."""
+ROOM = 5.0  # half width [m] of the world: a body that rolls away is a failure, not an error
+LAST = 5  # control steps at the end over which a reward is averaged: the body may still quiver
 
 
-CLEARANCE = 0.04
-"""Height [m] of the lowest particle above what it falls on at which the simulation begins; the flight before is a parabola."""
+CLEARANCE = 0.04  # [m] above what it falls on, where the simulation begins after a parabola
 
 
 Length = Annotated[float, Interval(ge=0, le=ROOM)]

@@ -191,8 +191,7 @@ class Hanging(Task):
         )
 
 
-SIDES = (("left", -1.0), ("right", 1.0))
-"""Of the jaws, and the sign of their z."""
+SIDES = (("left", -1.0), ("right", 1.0))  # of the jaws, and the sign of their z
 
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging)}

@@ -26,10 +26,8 @@ from mosa.twin.twin import Twin
 from mosa.types import Ground
 
 MAX_SUBSTEPS = 5000
-FINEST, COARSEST = 5e-4, 4.0
-"""[m] and shares of the body's longest side: bounds of the distance between particles."""
-APPEARANCE = (0.8, 0.35)
-"""Opacity of a particle in pictures, and its standard deviation in spacings."""
+FINEST, COARSEST = 5e-4, 4.0  # particle spacing: [m], share of the longest side
+APPEARANCE = (0.8, 0.35)  # of a particle: opacity, standard deviation in spacings
 
 
 class TrueMaterial(nn.Module):

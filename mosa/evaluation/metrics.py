@@ -20,8 +20,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio
 from mosa.errors import ConfigError
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
-RIDGE = 1e-3
-"""Of the local fit's slopes, relative to the neighbourhood's own size."""
+RIDGE = 1e-3  # of the local fit's slopes, relative to the neighbourhood's own size
 
 
 class Metric(NamedTuple):
@@ -35,10 +34,8 @@ class Metric(NamedTuple):
     digits: int = 3
 
 
-MOTION_METRICS: dict[str, Metric] = {}
-"""Figure `<part>/<name>` -> metric of the motion, beside those that `mosa.evaluation.evaluate` always has."""
-IMAGE_METRICS: dict[str, Metric] = {}
-"""Figures `<part>/<name>_crop` and `<part>/<name>_full` -> metric of the images, likewise."""
+MOTION_METRICS: dict[str, Metric] = {}  # registered, by the figure's name
+IMAGE_METRICS: dict[str, Metric] = {}  # name -> figures <part>/<name>_crop and _full
 
 
 def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
@@ -52,8 +49,7 @@ def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
         raise ConfigError(f"metric {name!r}: {said}")
 
 
-RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")
-"""What `mosa.evaluation.evaluate` computes itself."""
+RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")  # by `evaluate`
 
 
 # --- motion ---------------------------------------------------------------------------------------------------------

@@ -19,10 +19,8 @@ from mosa.physics.world import World
 from mosa.types import Rollout
 
 FILE = "model_card.md"
-SAME = 1e-6
-"""Relative difference of stiffnesses below which a law has no direction, and a body no field."""
-SHARE = 0.001
-"""Of particles and frames at each end that the range of stretches leaves out."""
+SAME = 1e-6  # relative difference of stiffnesses that counts as none
+SHARE = 0.001  # of particles and frames at each end that the range of stretches leaves out
 
 
 def filmed(sequences: Ordered[Sequence]) -> list[str]:

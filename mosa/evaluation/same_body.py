@@ -18,13 +18,11 @@ from mosa.types import Scene
 MIN_OUTLINE_RATIO = 0.93
 """Overlap of rendered and true mattes, over that in the training film, below which a warning is given. The right body at the right
 start is above 0.98; other bodies reach 0.69 to 0.84 (a chick or a ball for a rabbit, three of them)."""
-TRAINING_OUTLINE = 0.9
-"""Overlap of a coarse body with its own film, where no training film was compared."""
+TRAINING_OUTLINE = 0.9  # overlap assumed where no training film was compared
 MAX_COLOR_OFFSET = 0.15
 """Largest difference of mean colour, of 0 to 1 per channel, without a warning. In one light and exposure the difference is 0.005
 (12 cameras, or four of them) to 0.1 (two), as the object turns in the light."""
-MAX_VIEWS = 4
-"""Cameras compared, evenly spread over a film's: large pictures of many splats take seconds each."""
+MAX_VIEWS = 4  # cameras compared; large pictures of many splats take seconds each
 
 
 class BodyMatch(NamedTuple):

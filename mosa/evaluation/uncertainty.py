@@ -28,16 +28,13 @@ are less independent than the likelihood takes them to be; chosen on the held-ou
 DRAWN = 0.3
 """Factor of the draws' standard deviation in predictions where the law has rivals. What these predict otherwise is most of the
 error; chosen on the same drops under two backbones: 95 % of the errors lie within two standard deviations on average."""
-FORMS = 0.7
-"""Factor of the standard deviation among the forms of a law."""
+FORMS = 0.7  # factor of the standard deviation among the forms of a law
 ELSEWHERE = 3.0
 """By so much more than on the drops that it was learned from a law is wrong on another one, beside what draws and forms say. Both
 were chosen on the held-out drops of these four bodies under two backbones; those of other bodies, and films by other programs, hold
 what docs/lab/2026-11-identification.md#what-is-sure says."""
-LEAST_DRAWS = 4
-"""Of those that could be simulated: fewer say nothing about a spread."""
-QUANTILES = 400
-"""Of a normal distribution, where its image under a bounded map is asked for."""
+LEAST_DRAWS = 4  # of those that could be simulated: fewer say nothing about a spread
+QUANTILES = 400  # of a normal distribution, where its image under a bounded map is asked for
 
 
 @torch.no_grad()

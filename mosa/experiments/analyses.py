@@ -42,8 +42,7 @@ from mosa.system.whole_files import write_table
 
 log = logging.getLogger(__name__)
 
-MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}
-"""File of a run's motions, by the prefix of the model's figures."""
+MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}  # prefix -> file of motions
 
 
 # ------------------------------------------------------------------------------------------------ frame by frame
@@ -154,8 +153,7 @@ def redistribution(body: Body, directions: Tensor) -> Tensor | None:
     return redistribution_response(stress_jacobian(adapter, zero, zero)[0], directions.double())
 
 
-MIN_RANGE = 0.05
-"""Smallest half range of the axis of E over its mean, around 1."""
+MIN_RANGE = 0.05  # smallest half range of the axis of E over its mean, around 1
 
 
 def directions(

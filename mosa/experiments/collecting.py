@@ -57,8 +57,7 @@ class Cell:
         return f"{self.mean:.{decimals}f}{spread}"
 
 
-FAILED = Cell(math.nan, None, 0)
-"""Of a place of which no run is complete, and one has failed."""
+FAILED = Cell(math.nan, None, 0)  # of a place of which no run is complete, and one has failed
 
 
 def footnotes(tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:

@@ -14,8 +14,7 @@ from mosa.system.whole_files import write_whole
 from mosa.training.jobs import held_back
 
 PROGRAM = "mosa.cli.train:main"
-WAIT = 0.2
-"""Seconds between looks at what the running jobs have made."""
+WAIT = 0.2  # seconds between looks at what the running jobs have made
 
 
 def words_of(job: Job) -> list[str]:

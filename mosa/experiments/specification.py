@@ -16,18 +16,12 @@ from mosa.errors import ConfigError, DataError
 from mosa.settings import call
 from mosa.training.sweep_table import seconds
 
-SPECIFICATIONS = Path(__file__).with_name("specifications")
-"""Folder of the files of all experiments."""
-SHARED = "_shared"
-"""File of axes that several experiments name."""
-MINUTES = "minutes.txt"
-"""File of a job's folder with the wall time of its process."""
-COMMIT = "commit.txt"
-"""File of a job's folder with the state of the program that its run was last begun with."""
-FAILED = "failed.txt"
-"""File of a job's folder with the reason why its run failed."""
-PRESSED = "pressed.json"
-"""File of a job's folder with what `specimens` has measured of its laws."""
+SPECIFICATIONS = Path(__file__).with_name("specifications")  # files of all experiments
+SHARED = "_shared"  # file of axes that several experiments name
+MINUTES = "minutes.txt"  # file of a job's folder with the wall time of its process
+COMMIT = "commit.txt"  # commit that a job's run was last begun with
+FAILED = "failed.txt"  # file of a job's folder with the reason why its run failed
+PRESSED = "pressed.json"  # file of a job's folder with what `specimens` has measured of its laws
 
 
 @dataclass(frozen=True)
@@ -291,12 +285,9 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     return list(found.values())
 
 
-USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])
-"""Keys of a scene that say what of its films is used, and change none of them."""
-SHARED_BY = ("scene", "reconstruction", "seed", "simulation")
-"""Parts of the configuration that a reconstruction depends on."""
-ALONE = "alone-"
-"""Before the name of a folder whose run had its device to itself: what others share was run in company."""
+USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])  # keys of use, no film
+SHARED_BY = ("scene", "reconstruction", "seed", "simulation")  # what a reconstruction needs
+ALONE = "alone-"  # before the folder's name of a run that had its device to itself
 QUIET = (
     "hydra.searchpath",
     "logger",

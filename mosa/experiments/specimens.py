@@ -31,14 +31,10 @@ from mosa.twin.twin import Twin
 
 log = logging.getLogger(__name__)
 
-MODELS = {"": "adapted", "prior/": "prior"}
-"""Of a run, by the prefix of their figures."""
-ANGLES = 12
-"""Directions over half a turn of the plane of x and the vertical; along the fibres it is pressed too."""
-STRAIN = 0.04
-"""At which the force is compared."""
-ASKED = 5.0
-"""Per cent that E of the default shall be within."""
+MODELS = {"": "adapted", "prior/": "prior"}  # of a run, by the prefix of their figures
+ANGLES = 12  # directions over half a turn in the plane of x and the vertical
+STRAIN = 0.04  # at which the force is compared
+ASKED = 5.0  # per cent that E of the default shall be within
 
 
 def pressed_modulus(body: Body, variant: str, directions: Tensor) -> list[Pressed]:

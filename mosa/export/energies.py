@@ -51,8 +51,7 @@ def p(name: str) -> Symbol:
 
 mu, lam = p("mu"), p("lam")
 VOLUMETRIC = (lam + Rational(2, 3) * mu) / 2 * ((DET - 1) / 2 - log(DET) / 2)
-J1, J2 = DET ** Rational(-1, 3) * I1, DET ** Rational(-2, 3) * I2
-"""Invariants of the isochoric part of C."""
+J1, J2 = DET ** Rational(-1, 3) * I1, DET ** Rational(-2, 3) * I2  # isochoric invariants of C
 
 
 def neo_hookean() -> Parts:

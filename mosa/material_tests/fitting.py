@@ -20,18 +20,12 @@ from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
 
-ORTHOTROPIC = 7
-"""The first numbers of `anisotropic_basis` keep the planes of x, y and z as mirrors; the others do not."""
-SPREAD = 0.7
-"""Of the starts, in unconstrained numbers."""
-UNKNOWN = 100.0
-"""Standard deviation of an unconstrained number that the tests do not determine."""
-HOPELESS = 1e3
-"""Residual in units of the measured stresses' root mean square, where the law has no equilibrium."""
-UNSURE = 3.0
-"""Standard deviation of an unconstrained number, which may be a logarithm, above which it is not determined."""
-LEAST = 1e-5
-"""Noise, in the unit of the residuals: of a test that a law meets exactly."""
+ORTHOTROPIC = 7  # numbers of `anisotropic_basis` that keep the planes as mirrors
+SPREAD = 0.7  # of the starts, in unconstrained numbers
+UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests do not determine
+HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
+UNSURE = 3.0  # sd of an unconstrained number above which it is not determined
+LEAST = 1e-5  # noise, in the unit of the residuals: of a test that a law meets exactly
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 """Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
 

@@ -31,8 +31,7 @@ UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COLUMNS = ("test", "mode", "angle", "first", "second", "stress_1", "stress_2", "sd_1", "sd_2")
 NEEDED = ("test", "mode", "first", "stress_1")
 AXES = "xyz"
-KINDS = {"uniaxial": 1, "biaxial": 2, "shear": 2}
-"""Axes that a mode names."""
+KINDS = {"uniaxial": 1, "biaxial": 2, "shear": 2}  # axes that a mode names
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,8 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-GOOD, SAME = 0.8, 1.1
-"""R2 below which a fit is warned of; ratio of errors above which exports differ from the fit."""
-SIDE, ACROSS = 0.05, 6
-"""Of the cube that a checkpoint holds [m], and its particles along an edge."""
+GOOD, SAME = 0.8, 1.1  # R2 that is not warned of; ratio of errors that counts as one law
+SIDE, ACROSS = 0.05, 6  # of the cube that a checkpoint holds [m], and its particles along an edge
 
 
 def curves(data: Measurements) -> dict[tuple[int, int], np.ndarray]:

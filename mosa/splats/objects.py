@@ -45,18 +45,12 @@ from mosa.types import Appearance, Splats
 
 log = logging.getLogger(__name__)
 
-ROOM = 4.0
-"""Of the object's size, to each side of what it falls through."""
-PLAUSIBLE = (0.01, 2.0)
-"""[m] of an object's longest side: without `size` others are asked for, with it a warning."""
-WIDE = 0.25
-"""Of the object's longest side: most Gaussians are smaller by far, their standard deviations."""
-ANYWHERE = 1e4
-"""[m] from the origin, how far the command lets the object fly."""
-NEAR = 3.0
-"""Spacings from the nearest particle beyond which a Gaussian does not belong to the body."""
-HALF_CELL = 0.35
-"""Standard deviation of a particle's own Gaussian, in spacings, as in the reconstruction."""
+ROOM = 4.0  # of the object's size, to each side of what it falls through
+PLAUSIBLE = (0.01, 2.0)  # [m] of the longest side; others need `size`, or are warned of
+WIDE = 0.25  # of the longest side: standard deviations of most Gaussians are below
+ANYWHERE = 1e4  # [m] from the origin, how far the command lets the object fly
+NEAR = 3.0  # spacings from the nearest particle beyond which a Gaussian does not belong to the body
+HALF_CELL = 0.35  # sd of a particle's own Gaussian, in spacings (reconstruction)
 
 
 def read_object(

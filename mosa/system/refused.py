@@ -33,8 +33,7 @@ UNLOADABLE = re.compile(
     r"Failed to (load C(PU|UDA) module|find (forward|backward) kernel)|was not found in the cache"
 )
 """What Warp says of a compiled kernel that it cannot use."""
-LAST = Path("checkpoints", "last.ckpt")
-"""Of a run, in its folder."""
+LAST = Path("checkpoints", "last.ckpt")  # of a run, in its folder
 
 
 def disk_message(error: OSError) -> str | None:

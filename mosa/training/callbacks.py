@@ -204,8 +204,7 @@ class ImageStrips(L.Callback):
             )
 
 
-LEGIBLE = 320
-"""Height [px] that a strip of two rows has at least: windows around an object are often 60 px high."""
+LEGIBLE = 320  # [px] least height of a strip of two rows
 
 
 def enlarged(picture: Tensor) -> Tensor:

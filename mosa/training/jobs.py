@@ -37,8 +37,7 @@ from mosa.training.sweep_table import FAILED, text_of, write_table
 
 log = logging.getLogger(__name__)
 
-LONGEST = 120
-"""Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
+LONGEST = 120  # bytes of a job's folder name from its overrides; a file system takes 255
 
 
 def folder_name(overrides: str) -> str:
@@ -130,8 +129,7 @@ def run_command(run: Callable[[], None]) -> None:
             sys.exit(2)
 
 
-begun: list[bool] = []
-"""Whether this process has begun a job or a sweep."""
+begun: list[bool] = []  # whether this process has begun a job or a sweep
 
 
 class Failures(Callback):
@@ -169,8 +167,7 @@ def summarize(folder: str | Path) -> None:
     print(f"\n{text_of(rows)}\n\nall figures: {', '.join(map(str, files))}")
 
 
-signals: list[int] = []
-"""Received. Lightning turns what stops a fit into an exit of its own, which no longer says which one it was."""
+signals: list[int] = []  # received; Lightning's own exit does not say which
 
 
 def terminated(number: int, *_) -> None:

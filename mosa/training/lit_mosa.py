@@ -74,14 +74,11 @@ from mosa.types import Ground, Rollout
 
 log = logging.getLogger(__name__)
 
-PRECISIONS = ("32-true",)
-"""Of a Trainer. The simulation has its own: simulation.precision=64."""
+PRECISIONS = ("32-true",)  # of a Trainer. The simulation has its own: simulation.precision=64.
 
 
-MADE = ("trainer", "callbacks", "logger")
-"""Sections that Hydra makes objects of. A checkpoint does not keep them: what it holds is data."""
-OF_DATA = ("scene", "reconstruction", "rendering", "seed")
-"""Sections of the configuration that the data module decides."""
+MADE = ("trainer", "callbacks", "logger")  # made by Hydra, so not kept in a checkpoint
+OF_DATA = ("scene", "reconstruction", "rendering", "seed")  # the data module's
 
 
 KEPT = (

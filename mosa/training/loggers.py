@@ -24,8 +24,7 @@ OUTCOME = (
 )
 
 
-PICTURED = (TensorBoardLogger, WandbLogger)
-"""Loggers that show pictures."""
+PICTURED = (TensorBoardLogger, WandbLogger)  # loggers that show pictures
 
 
 def add_picture(loggers: Sequence[Logger], name: str, picture: Tensor, step: int) -> None:

@@ -16,12 +16,9 @@ from mosa.system.limits import machine_memory
 from mosa.system.threads import cores
 from mosa.types import Scene
 
-BASE = 1.15e9
-"""Bytes of a process on a CPU with its libraries and kernels, without data."""
-PAIR_BYTES = 61.0
-"""Bytes of a particle over its neighbours squared, while the deformation modes are found; most that a particle takes."""
-MODE_BYTES, FRAME_BYTES = 32.0, 96.0
-"""Of a particle: for each deformation mode; for each frame of a rollout."""
+BASE = 1.15e9  # bytes of a process on a CPU with its libraries and kernels, without data
+PAIR_BYTES = 61.0  # of a particle, over its neighbours squared, while modes are found
+MODE_BYTES, FRAME_BYTES = 32.0, 96.0  # of a particle: per deformation mode, per frame
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,9 @@ from mosa.twin.presets import preset
 from mosa.twin.twin import Twin, viewed_from
 from mosa.types import REST, Scene
 
-PARTICLE_BYTES = 5e3
-"""Of a particle through reconstruction and fit, at least: modes, neighbours, frames, buffers of the rollout."""
+PARTICLE_BYTES = 5e3  # of a particle in reconstruction and fit, at least
 FEWEST = 8
-DEFORMED = 3
-"""Frames after first contact: of three a smoke run on the tiny scene finds E to 15 %, of one to a seventh of it."""
+DEFORMED = 3  # frames after contact that a fit needs (tiny scene: three find E to 15 %)
 
 
 def check_configuration(values: Mapping[str, Any]) -> TrainSettings:

@@ -22,8 +22,7 @@ from mosa.system.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
-VALIDATION = "val/"
-"""Begins the names of figures of what is held out of the training sequence."""
+VALIDATION = "val/"  # begins the names of figures of what is held out of the training sequence
 MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 """Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}

@@ -12,8 +12,7 @@ import yaml
 from mosa.errors import DataError
 from mosa.system.whole_files import written_whole
 
-FAILED = "failed"
-"""Folder in that of a sweep: a file for each job that ended in an error, named after its number."""
+FAILED = "failed"  # folder of a sweep: <number>.txt of each job that failed
 SHOWN = ("test/rms_m", "train/rms_m", "val/loss", "id/E", "id/nu", "posterior/E_relative_sd")
 """Figures of the table on the screen, where a job has them; the file has all."""
 Row = dict[str, object]

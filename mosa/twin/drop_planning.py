@@ -22,8 +22,7 @@ from mosa.system.progress import tqdm
 from mosa.twin.start import rotation_matrix
 from mosa.twin.twin import Twin
 
-INDEPENDENT = 30.0
-"""Data in a frame, as `identification.count`."""
+INDEPENDENT = 30.0  # data in a frame, as `identification.count`
 LEAST_DRAWS = 4
 SQUEEZED, AWAY = 0.2, 1.5
 """Share of the body's height that a press takes; particle spacings of the plate from the body at first."""

@@ -24,8 +24,7 @@ from mosa.physics.engine.law_options import AS_USUAL
 from mosa.settings import is_number
 from mosa.twin.presets import preset
 
-DENSEST = (0.1, 1e5)
-"""[kg/m^3] that a record allows."""
+DENSEST = (0.1, 1e5)  # [kg/m^3] that a record allows
 
 
 class TwinMaterial:

@@ -20,8 +20,7 @@ from mosa.errors import ConfigError
 from mosa.system.whole_files import write_whole
 from mosa.twin.start import as_started
 
-COURANT = 0.2
-"""Time step, over the time of a pressure wave through a cell: flexes are stepped explicitly."""
+COURANT = 0.2  # time step over a pressure wave's time through a cell
 
 
 def tetrahedra(

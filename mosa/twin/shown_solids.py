@@ -14,12 +14,9 @@ from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.twin.rollout_file import poses
 
-WIDTH, OPACITY = 0.45, 0.95
-"""Of a surface's Gaussians: standard deviation in pitches."""
-MOST = 30_000
-"""Gaussians of one solid."""
-SOLID = (150, 160, 175)
-"""8-bit colour of rigid solids."""
+WIDTH, OPACITY = 0.45, 0.95  # of a surface's Gaussians: standard deviation in pitches
+MOST = 30_000  # gaussians of one solid
+SOLID = (150, 160, 175)  # 8-bit colour of rigid solids
 
 
 def lattice(a: float, b: float, pitch: float) -> Tensor:

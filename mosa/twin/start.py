@@ -31,14 +31,10 @@ from mosa.physics.engine.inputs import FASTEST, numbers, vector
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
 
-UNDER = 0.25
-"""Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
-STORED_BYTES = 4 * (3 + 3 + 9 + 9)
-"""Of a particle in a frame of a rollout: x, v, F, F_tot."""
-LARGE = 50.0
-"""Length of a mesh over the body's from which its unit is doubted."""
-CREEP = 5e-3
-"""[m/s] of a held body from which the number of substeps is doubted."""
+UNDER = 0.25  # share of a body that may start below the ground
+STORED_BYTES = 4 * (3 + 3 + 9 + 9)  # of a particle in a frame of a rollout: x, v, F, F_tot
+LARGE = 50.0  # length of a mesh over the body's from which its unit is doubted
+CREEP = 5e-3  # [m/s] of a held body from which the number of substeps is doubted
 
 
 Variant = Annotated[str, Expected(f"one of {', '.join(VARIANTS)}"), such(lambda v: v in VARIANTS)]

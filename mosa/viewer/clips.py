@@ -31,12 +31,9 @@ from mosa.viewer.pages import cell, horizontal
 BODIES = ("observed", "truth", "prior", "learned")
 """What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
 COLORS = ("appearance", "heterogeneity", "deviation", "uncertainty")
-DISTANCE = 1.4
-"""From one body to the next, in widths of what they take up together in the frame where that is most."""
-GRAY = 0.6
-"""Of what has no value, and of a body under another one: white would not be seen on viser's white."""
-FAINT = 0.25
-"""Opacity of a body under another one, relative to its own: where both lie together the upper one's colours are to be seen."""
+DISTANCE = 1.4  # from one body to the next, in their largest common width
+GRAY = 0.6  # of what has no value, and of a body under another one
+FAINT = 0.25  # opacity of a body under another one, relative to its own
 
 
 @dataclass(frozen=True)

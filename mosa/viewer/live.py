@@ -25,10 +25,8 @@ from mosa.viewer.clips import Scale, stiffness_scale
 from mosa.viewer.pages import horizontal
 
 COLORS = ("appearance", "stretch", "heterogeneity")
-FASTEST = 4.0
-"""Of the ball, in sizes of the body per second: a mouse jumps, a solid that jumps passes through what it should push."""
-COURANT = 0.45
-"""Cells per substep that the ball moves at most, below the half that a step allows."""
+FASTEST = 4.0  # of the ball, body sizes per second: a jumping solid passes through the body
+COURANT = 0.45  # cells per substep that the ball moves at most, below the half that a step allows
 STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 """Where the scale of stretches may end [%]: the next one above what was seen since the drop."""
 

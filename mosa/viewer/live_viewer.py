@@ -27,8 +27,7 @@ from mosa.viewer.pages import (
 log = logging.getLogger(__name__)
 
 GEOMETRY = ("splats", "particles")
-BALL = (235, 110, 60)
-"""8-bit colour of the ball that the mouse moves."""
+BALL = (235, 110, 60)  # 8-bit colour of the ball that the mouse moves
 
 
 class LiveViewer:

@@ -18,10 +18,8 @@ from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Shape, Sphere
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.twin.shown_solids import SOLID, surface
 
-PANEL = 0.12
-"""Of the window's height, by which the first view's contents stand left of the middle: viser's panel covers its right."""
-FIELD_OF_VIEW = math.radians(40)
-"""Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
+PANEL = 0.12  # of the window's height: the first view leaves room for viser's panel
+FIELD_OF_VIEW = math.radians(40)  # vertical, of the first view
 
 
 def open_server(host: str, port: int) -> Any:

@@ -13,8 +13,7 @@ from mosa.types import Scene
 AGREEMENT = 0.4
 """Distance between a line of sight and the object's centre, over the object's radius, above which a camera does not fit. Largest
 of all frames with a right calibration: 0.15 (PAC-NeRF bird), 0.10 (rabbit), 0.08 (peanut)."""
-HOLE = 0.01
-"""Enclosed holes up to this share of a matte's area are suspected to be mistakes of matting."""
+HOLE = 0.01  # share of a matte's area up to which an enclosed hole is suspected
 
 
 def lines_of_sight(scene: Scene, frame: int) -> tuple[list[int], Tensor, Tensor, Tensor]:

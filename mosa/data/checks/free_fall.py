@@ -28,8 +28,7 @@ of the built-in scenes and the bird fall with 0.93 to 1.07 of the stated gravity
 ODD, ASIDE = 1.6, 0.25
 """Factor of the acceleration, and its share across gravity, that is said even where the noise assumed could explain it. That noise
 is cautious: in the films above, three frames alone find gravity to 9 %, with 0.1 of it across."""
-WEIGHTLESS = 1.0
-"""[m/s^2] that a film without gravity may show before it touches anything."""
+WEIGHTLESS = 1.0  # [m/s^2] that a film without gravity may show before it touches anything
 SWAPPED = 3.0
 """Factor by which swapping two frames makes a track smoother from which on they are swapped. It is 0.9 to 1.02 for films as they
 are; two swapped frames of the bird give 1.0 (at rest) to 100."""
@@ -39,8 +38,7 @@ COARSE, ABRUPT, MOVED = 160, 10.0, 0.1
 radii that the object then moves at least where data are refused."""
 
 
-SIZES, FASTEST = (1e-4, 1e3), 1e3
-"""[m], [m/s]: what cameras around an object film as it falls and deforms lies far inside."""
+SIZES, FASTEST = (1e-4, 1e3), 1e3  # [m], [m/s] of a falling object, with much room
 
 
 class Track(NamedTuple):

@@ -20,15 +20,12 @@ from mosa.errors import DataError
 from mosa.rendering.cameras import project
 from mosa.types import Cameras, Scene
 
-RESOLUTION = 40
-"""Voxels along the hull's longest side."""
+RESOLUTION = 40  # voxels along the hull's longest side
 OPEN, SUSPECT = 0.2, 0.04
 """Share of a matte that the hull leaves open from which on data are refused, and warned of. With a right calibration it is at most
 0.001 (built-in films of 64 to 400 px, PAC-NeRF's bird)."""
-ISLAND = 4
-"""Pixels of a matte in wholly uncovered pieces, above which a warning is given; single pixels are noise of matting."""
-SUNK = 0.25
-"""Share of the hull below the ground in frame 0, above which scene.ground.height is taken for wrong."""
+ISLAND = 4  # pixels of a matte apart from the hull that are warned of, above noise
+SUNK = 0.25  # share of the hull below ground in frame 0 that means a wrong height
 MAX_GROUND_GAP = 0.35
 """Distance between the ground and the lowest point of the hull at the turning point, in radii, above which a warning is given.
 In correct films it is below 0.15."""

@@ -22,10 +22,8 @@ from mosa.types import Scene
 TRIED, SUSPECT, USUAL = 0.04, 0.08, 4.0
 """Radii by which an outline may miss what most others see: beyond them another place is tried for it, and data are warned of; and
 times the film's median that it may in any case. In films as they are: at most 0.04, and three times the median (docs/data.md)."""
-EXPLAINED = 3.0
-"""Factor by which outlines fit better elsewhere from which on that is where they belong."""
-COPY = 0.1
-"""Difference of colours of 0 to 1 below which a picture is another's copy, written anew."""
+EXPLAINED = 3.0  # outlines belong where they fit better by this factor
+COPY = 0.1  # difference of colours of 0 to 1 below which a picture is another's copy, written anew
 FOCAL = [percent for percent in range(-12, 13) if percent]
 """By which a focal length may be too large [%]: it moves outlines as another moment does where an object falls through the view."""
 NEAR, WIDE = 2.0, 2.0

@@ -22,24 +22,17 @@ from mosa.rendering.cameras import centers
 from mosa.settings import Expected, Positive, Text, Whole, check_values, fits, such
 from mosa.types import FALLING, REST, Cameras, Ground, KnownBody, Markers, Scene, Truth, dense
 
-FULL = 0.99
-"""Share of an image from which on a matte says nothing."""
-CLEAR = 0.9
-"""Coverage that a camera's matte has somewhere in a film."""
-FLASH = 0.2
-"""By which an object's mean colour, of 0 to 1, may leave the line between the frames beside it. Built-in films stay
-below 0.04."""
+FULL = 0.99  # share of an image from which on a matte says nothing
+CLEAR = 0.9  # coverage that a camera's matte has somewhere in a film
+FLASH = 0.2  # jump of the mean colour (0 to 1) in one frame; built-in films stay below 0.04
 DRIFT = 0.15
 """By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
 body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
-OUTSIDE = 1e-3
-"""By which images and mattes may leave [0, 1]: rounding."""
+OUTSIDE = 1e-3  # by which images and mattes may leave [0, 1]: rounding
 COMPOSITED = 0.05
 """Mean distance of colours, of 0 to 1, from the background outside of a matte: compression leaves less, another background more."""
-CORNER = 0.1
-"""Share of an image's size from its corner within which a principal point was measured from the image's centre."""
-FARTHEST = 100.0
-"""[m] of a camera from the origin: float32 rounds positions to 0.008 mm there, a thousandth of a pixel."""
+CORNER = 0.1  # share of an image: a principal point in it was measured from the centre
+FARTHEST = 100.0  # [m] of a camera from the origin: float32 rounds to 0.008 mm there
 MAX_ORIGIN_RATIO = 3.0
 """Distance from the origin, over the cameras' spread, above which the capture is off the origin rather than in another unit."""
 MAX_FOCAL_RATIO, USUAL_FOCAL_RATIO = 2.0, 1.05

@@ -26,8 +26,7 @@ from mosa.errors import DataError
 from mosa.settings import Positive, check
 from mosa.types import REST, Scene
 
-HAND = "hand"
-"""Name of the masks that are not the body's."""
+HAND = "hand"  # name of the masks that are not the body's
 
 
 def load_phystwin(

@@ -22,16 +22,11 @@ from mosa.errors import ConfigError, DataError
 from mosa.settings import Positive, Settings, Text, Three, Whole, check
 from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth
 
-DENSITIES = 0.1, 1e5
-"""[kg/m^3]: aerogel has 1, osmium 22,590."""
-LIGHT = 10.0
-"""[kg/m^3] below which a density is asked about: foams of polystyrene have 15."""
-STEEP = 3.0
-"""[degrees] of an incline that is said."""
-SHAPES = (".ply", ".obj", ".stl")
-"""Endings of files of a body's rest shape."""
-WIDEST = 1e5
-"""[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
+DENSITIES = 0.1, 1e5  # [kg/m^3]: aerogel has 1, osmium 22,590
+LIGHT = 10.0  # [kg/m^3] below which a density is asked about: foams of polystyrene have 15
+STEEP = 3.0  # [degrees] of an incline that is said
+SHAPES = (".ply", ".obj", ".stl")  # endings of files of a body's rest shape
+WIDEST = 1e5  # [m] of scene.box: with gravity and seconds, nothing that cameras film is larger
 
 
 def check_density(key: str, density: float) -> None:

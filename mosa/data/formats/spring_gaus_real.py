@@ -21,12 +21,9 @@ from mosa.data.io.colmap import Camera, read_model
 from mosa.errors import DataError
 from mosa.types import Cameras, Scene
 
-WIDE = 640
-"""Pixels across the reduced masks of photographs."""
-VOXELS = 64
-"""Along the longest side of the rest shape."""
-AROUND = 0.9
-"""Of the distance of the nearest photograph from where they look: half of the box that is searched."""
+WIDE = 640  # pixels across the reduced masks of photographs
+VOXELS = 64  # along the longest side of the rest shape
+AROUND = 0.9  # half of the searched box, over the nearest photograph's distance
 
 
 def load_spring_gaus_real(

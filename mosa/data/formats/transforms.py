@@ -39,15 +39,13 @@ from mosa.data.images.reading import (
 from mosa.errors import DataError
 from mosa.types import Scene
 
-LONGEST = 1000
-"""Characters of a path: a file system takes 4096 bytes, of names of 255 each."""
+LONGEST = 1000  # characters of a path: a file system takes 4096 bytes, of names of 255 each
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 JITTER = 0.01
 """By how much poses of a camera that stands still may differ: radians, and shares of the cameras' distance from their middle. Where
 each image's is solved for itself they differ by about a pixel, 0.002."""
-CUT = 1e-3
-"""Share of a matte that undoing a lens may cut off before it is said."""
+CUT = 1e-3  # share of a matte that undoing a lens may cut off before it is said
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from mosa.data.images.reading import (
 )
 from mosa.errors import DataError
 
-Calibration = Mapping[str, tuple[np.ndarray, np.ndarray]]
-"""Camera name -> K (3, 3) [px], w2c (4, 4) in OpenCV axes."""
+Calibration = Mapping[str, tuple[np.ndarray, np.ndarray]]  # name -> K (3, 3) [px], w2c (4, 4)
 
 
 def read_views(

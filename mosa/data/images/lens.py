@@ -19,14 +19,12 @@ import numpy as np
 from mosa.errors import DataError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-FOREIGN = ("k5", "k6", "s1", "s2", "s3", "s4")
-"""Of the rational and thin prism models, which are not undone."""
+FOREIGN = ("k5", "k6", "s1", "s2", "s3", "s4")  # other lens models, not undone
 MODELS = {
     name: False for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 } | {name: True for name in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")}
 """camera_model as COLMAP names it -> whether it is a fisheye's."""
-ZOOM = 4.0
-"""Largest change of the focal length that still counts as undoing a lens."""
+ZOOM = 4.0  # largest change of the focal length that still counts as undoing a lens
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from mosa.errors import DataError
 
 log = logging.getLogger(__name__)
 
-FINER = 1.5
-"""Times as many pixels as the smallest image above which one is reduced."""
+FINER = 1.5  # times as many pixels as the smallest image above which one is reduced
 
 
 def one_size(

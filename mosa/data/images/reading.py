@@ -15,8 +15,7 @@ from mosa.settings import Whole, check
 from mosa.system.limits import counted
 from mosa.system.ply import named
 
-MOST_PIXELS = 2**26
-"""Of one picture: twice an 8K frame."""
+MOST_PIXELS = 2**26  # of one picture: twice an 8K frame
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -63,10 +62,8 @@ def read_image(path: Path) -> np.ndarray:
 FAINT = 0.5
 """Of a matte that has anything in it at least. Labels are numbers from 1 on, of 255; and a pixel belongs to the object from half
 coverage on, so that one which is fainter everywhere would be an empty one in all that looks at outlines."""
-SLIVER = 50
-"""Pixels of a matte that may all be so faint: the edge of an object that is nearly out of the picture."""
-GREY = 8 / 255
-"""By which the channels of a grey mask differ at most, which JPEG may have written."""
+SLIVER = 50  # pixels that may all be so faint: the edge of an object leaving the picture
+GREY = 8 / 255  # by which the channels of a grey mask differ at most, which JPEG may have written
 
 
 def matte_of(path: Path, pixels: np.ndarray) -> np.ndarray:

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mosa.errors import DataError
 
-HALF = 0.5
-"""Pixel centres lie at half integers here and in COLMAP, at whole numbers in OpenCV."""
+HALF = 0.5  # pixel centres lie at half integers here and in COLMAP, at whole numbers in OpenCV
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
@@ -29,10 +28,8 @@ MODELS = {
 }
 """Model -> number in binary files, names of its parameters. Others (FULL_OPENCV, FOV, THIN_PRISM_FISHEYE) are refused."""
 BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
-POINTS = re.compile(r"[-+.\deE\s]+")
-"""A line of an image's points: numbers by threes."""
-MAX_ENTRIES = 100_000
-"""Cameras or images of a model. The count of a damaged file may be any number."""
+POINTS = re.compile(r"[-+.\deE\s]+")  # A line of an image's points: numbers by threes
+MAX_ENTRIES = 100_000  # cameras or images; the count of a damaged file may be any number
 
 Intrinsics = tuple[np.ndarray, dict[str, float], bool, tuple[int, int]]
 

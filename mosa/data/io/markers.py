@@ -16,26 +16,15 @@ from scipy.spatial.transform import Rotation
 from mosa.errors import ConfigError, DataError
 
 COLUMNS = ("time", "name", "x", "y", "z")
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1e-3}
-"""Of a c3d file, which means millimetres where it says nothing."""
-AT_REST = 0.2
-"""Seconds at the start of a recording in which nothing moves, where the release is sought."""
-SEEN = 0.05
-"""Of the largest displacement: points that have moved by more have been let go; hands that do so
-move them by less."""
-EARLY = 0.4
-"""Of the largest displacement: up to there it grows as the square of the time since the release."""
-SWINGS = 4
-"""Periods of an oscillation that say when it began."""
-MIRRORED = 1 / 3
-"""Of the distance of aligned points: that of points mirrored, below which they are said to be."""
-JUMP = 0.3
-"""Of the points' extent: no body is deformed by so much within a sample."""
-FROZEN, DIGITS = 0.1, 4
-"""Of the largest step, and last digits: a point that moves by more before and after does not stand
-still between."""
-GAP = 2.5
-"""Samples apart between which a recording is interpolated; a longer gap stays one."""
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1e-3}  # of c3d; "": mm
+AT_REST = 0.2  # [s] at the start in which nothing moves
+SEEN = 0.05  # share of the largest displacement beyond which a point has been let go
+EARLY = 0.4  # share of the largest displacement up to which it grows with time squared
+SWINGS = 4  # periods of an oscillation that say when it began
+MIRRORED = 1 / 3  # mirrored points fit so much better than others
+JUMP = 0.3  # of the points' extent: no body is deformed by so much within a sample
+FROZEN, DIGITS = 0.1, 4  # share of the largest step, last digits: motion around a frozen part
+GAP = 2.5  # samples apart between which a recording is interpolated; a longer gap stays one
 
 
 @dataclass(frozen=True)

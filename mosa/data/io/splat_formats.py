@@ -34,12 +34,10 @@ FORMATS = ("ply", "gltf", "sog", "usd", "rrd")
 Formats = Annotated[
     Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: all(name in FORMATS for name in v))
 ]  # fmt: skip
-FRAMES = {"ply": ".ply", "gltf": ".glb", "sog": ".sog"}
-"""Formats of a file for each frame, and how its name ends."""
+FRAMES = {"ply": ".ply", "gltf": ".glb", "sog": ".sog"}  # one file a frame
 PACKAGES = {"usd": ("pxr.UsdVol", "ParticleField3DGaussianSplat", "usd-core, 26.3 or newer", "usd"),
             "rrd": ("rerun", "GaussianSplats3D", "rerun-sdk, 0.41 or newer", "rerun")}  # fmt: skip
-CONVERTER = "splat-transform"
-"""PlayCanvas' program, which writes SOG."""
+CONVERTER = "splat-transform"  # playCanvas' program, which writes SOG
 
 
 def check_formats(formats: Sequence[str]) -> None:

@@ -30,13 +30,11 @@ from mosa.rendering.observer import deformed_covariances, observe
 from mosa.types import Cameras, Rollout, Scene
 
 TITLES = {"prior": "prior", "adapted": "adapted (learned law)"}
-DIFFERENCE = 0.5
-"""Largest image difference that has a colour of its own."""
+DIFFERENCE = 0.5  # largest image difference that has a colour of its own
 NEAR_BACKGROUND = 12
 """8-bit levels: ground lines are drawn where a pixel is as close to the background as that, so that they lie behind the object."""
 
-DARK = 0.45
-"""Of the light that a shadow takes where it is deepest."""
+DARK = 0.45  # of the light that a shadow takes where it is deepest
 
 
 @dataclass(frozen=True)

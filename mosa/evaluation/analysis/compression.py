@@ -22,12 +22,9 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.time_step import required_substeps
 from mosa.types import ParticleState
 
-HEIGHT, RADIUS, CELLS = 0.2, 0.08, 8
-"""Of the specimen [m]; cells of the grid along its height."""
-STROKE, FRAMES = 0.06, 24
-"""Share of the height by which the plates come together, in so many frames."""
-SWINGS = 6.0
-"""Periods of the specimen's longitudinal vibration that the stroke takes: slower does not change the modulus by a percent."""
+HEIGHT, RADIUS, CELLS = 0.2, 0.08, 8  # of the specimen [m]; cells of the grid along its height
+STROKE, FRAMES = 0.06, 24  # share of the height that the plates close, frames of it
+SWINGS = 6.0  # periods of the specimen's vibration in the stroke, slow enough for 1 %
 
 
 @dataclass(frozen=True)

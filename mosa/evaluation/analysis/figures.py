@@ -69,8 +69,7 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
     return np.concatenate([bar(image.shape[1], [text]), image])
 
 
-Images = Mapping[str, Tensor | np.ndarray]
-"""Name -> (T, H, W, 3), float in [0, 1] or uint8."""
+Images = Mapping[str, Tensor | np.ndarray]  # name -> (T, H, W, 3), float in [0, 1] or uint8
 
 
 def side_by_side(

@@ -18,10 +18,8 @@ from mosa.rendering.cameras import look_at, project
 from mosa.system.npz import write_npz
 from mosa.types import Cameras, Rollout
 
-SHOWN = 3
-"""Points of a sequence that are drawn: those that move most."""
-SIZE = (320, 220)
-"""Width and height [px] of the film."""
+SHOWN = 3  # points of a sequence that are drawn: those that move most
+SIZE = (320, 220)  # width and height [px] of the film
 MEASURED, PREDICTED = (200, 30, 30), (20, 60, 200)
 
 

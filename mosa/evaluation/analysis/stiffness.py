@@ -9,8 +9,7 @@ from torch import Tensor
 
 from mosa.evaluation.analysis.anisotropy import directions_on_sphere, dyads
 
-DIRECTIONS = 3000
-"""On a half sphere: 1.5 degrees apart."""
+DIRECTIONS = 3000  # on a half sphere: 1.5 degrees apart
 
 
 def directional_moduli(stiffness: Tensor, directions: Tensor) -> Tensor:

@@ -106,14 +106,11 @@ def with_unit(law: str, name: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-SURE_DEGREES = 30.0
-"""Half angle of a direction's 95 % cone above which it counts as not determined."""
-NOTICEABLE = 1.1
-"""Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
+SURE_DEGREES = 30.0  # half angle of a direction's 95 % cone above which it counts as not determined
+NOTICEABLE = 1.1  # ratio of Young's moduli below which a law counts as isotropic
 
 
-LISTED = 3
-"""So many contacts the sentence lists; more are in a table."""
+LISTED = 3  # so many contacts the sentence lists; more are in a table
 
 
 def ground_table(distances: Mapping[str, float], gains: Mapping[str, float]) -> str:

@@ -19,8 +19,7 @@ from mosa.system.whole_files import written_whole
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
 
 
-WIDTH = 9.0
-"""Of a picture [inch], the width of a page: what has more parts grows downwards, so that its letters stay as large."""
+WIDTH = 9.0  # [inch] of a picture: a page's; more parts grow downwards
 
 STYLES: Mapping[str, Mapping[str, Any]] = {
     "truth": {"color": "black", "linestyle": "--", "linewidth": 1.6, "zorder": 3.5},
@@ -52,12 +51,9 @@ AXES: Mapping[str, str] = {
 """What a stranger is told of an axis, where its name does not say it."""
 
 BETTER = {"most": ", more is better", "least": ", less is better", None: ""}
-MARKS = {"x": "diverged", "+": "failed"}
-"""Of a cell without a finite mean: on the axis, where a bar or a point would be."""
-MANY = 16
-"""Bars from which on a part of the picture has a row for itself."""
-DECADE = 10.0
-"""Errors whose largest is more than so many times their least have a logarithmic axis."""
+MARKS = {"x": "diverged", "+": "failed"}  # of a cell without a finite mean, on the axis
+MANY = 16  # bars from which on a part of the picture has a row for itself
+DECADE = 10.0  # errors whose largest is more than so many times their least have a logarithmic axis
 
 
 def style_of(name: str, names: Sequence[str] = ()) -> dict[str, Any]:

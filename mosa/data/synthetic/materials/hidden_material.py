@@ -65,8 +65,7 @@ def corotated_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tens
 NEEDS = {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}
 register_law("fibre_corotated", fibre_corotated, NEEDS, uses_rotation=True, energy=corotated_energy)
 register_law(LAW, fibre_neo_hookean, NEEDS, needs_positive_J=True, energy=fibre_energy)
-FORMS = {LAW: 1.0, "fibre_corotated": 3.0}
-"""Laws of this material, each with how much stiffer its fibres get than at rest, for the time step."""
+FORMS = {LAW: 1.0, "fibre_corotated": 3.0}  # law -> how much stiffer its fibres get
 
 
 def fibre_stiffness(E: float, nu: float, ratio: float) -> float:
