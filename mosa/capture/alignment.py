@@ -62,8 +62,7 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
 
     Phones are placed one after the other against all that are placed, at each turn the one whose offset is told most sharply: of
     two that face each other, with the object between them, nothing tells it. most [s]: offsets that are looked at. Errors:
-    DataError naming the phone whose lines of sight meet the others' at none of them.
-    """
+    DataError naming the phone whose lines of sight meet the others' at none of them."""
     for phone, track in zip(phones, tracks):
         if len(moving_frames(track)) < 3:
             raise DataError(

@@ -4,8 +4,7 @@ In a fall a clock that is late by a millisecond looks like a shift of the pictur
 outline whose centre wanders: what tells them apart is the change of the speed from its beginning to its end. At the ground the
 speed changes its sign within a hundredth of a second, and a late phone sees the body too high before and too low after it. Where
 the body goes then nobody knows: from the end of the free fall on the parabola gets a free curve on top, one for all phones, which
-begins with the parabola's position, velocity and acceleration.
-"""
+begins with the parabola's position, velocity and acceleration."""
 
 from __future__ import annotations
 
@@ -92,8 +91,7 @@ def through_impact(
     """The fall with clocks and a path that are the impact's too; as it is where some phone does not see what followed.
 
     Scale, down and readouts stay those of the free flight alone: what is read of a collision pulls at the parabola's bend, of the
-    scale of a rigid body by more than a percent, of the readouts by two milliseconds.
-    """
+    scale of a rigid body by more than a percent, of the readouts by two milliseconds."""
     readouts = {phone.name: float(readout) for phone, readout in zip(phones, fall.readouts)}
     problem = Impact(phones, tracks, fall, replace(knowledge, readout=readouts))
     if not problem.seen:

@@ -2,8 +2,7 @@
 
 A phone looks at a body that falls past it first from below, then from above: its outline's centre wanders against the body by a few
 hundredths of its size, which looks like another acceleration. The visual hull of the rigid body in flight, from frames of the
-whole fall, says by how much.
-"""
+whole fall, says by how much."""
 
 from __future__ import annotations
 

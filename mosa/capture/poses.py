@@ -29,8 +29,7 @@ def read_phones(
 ) -> list[Phone]:
     """One phone for each of the videos whose frame sizes [px] are given (name of the file -> width, height).
 
-    Errors: DataError naming the video without a pose, or the poses that do not belong together.
-    """
+    Errors: DataError naming the video without a pose, or the poses that do not belong together."""
     folder = Path(videos)
     cameras = read_poses(poses)
     centres = np.array([camera.centre for camera in cameras.values()])

@@ -1,7 +1,6 @@
 """A run's checkpoint, read as data: its file may come from a stranger, and is checked before anything is built from it.
 
-What is promised, and what is not, is in docs/safety.md.
-"""
+What is promised, and what is not, is in docs/safety.md."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The record of a run: what its checkpoint holds under `mosa`, beside the tensors of its body. Typed, versioned, plain data only.
 
 The settings are those that the user gave, untouched. What was measured from the data and what the run decided are fields of their
-own; nothing is read back from anywhere else.
-"""
+own; nothing is read back from anywhere else."""
 
 from __future__ import annotations
 

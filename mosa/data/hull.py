@@ -53,8 +53,7 @@ def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     """Bilinear matte at the projections of world points, (V, M) from (M, 3) and (V, H, W).
 
     Outside an image it is 0; where the matte itself runs over the image's border the view says nothing there: 1. Behind the
-    camera: 0.
-    """
+    camera: 0."""
     pixel, depth = project(points, cameras)
     size = pixel.new_tensor([cameras.width, cameras.height])
     values = sample_images(mattes[:, None], pixel, beyond="border")[:, 0]
@@ -152,8 +151,7 @@ def shave_ridges(
     A hull of few views sticks out where the cones of two silhouettes meet: by 3 to 10 % of the volume for 8 to 12 cameras,
     of which this takes a third to all (measured). Each pass moves the surface by its mean curvature (Gaussian of `sigma`
     voxels, threshold 0.5), never outwards of the hull, and then gives back the hull's voxels on every ray of a silhouette
-    that nothing covers any more: the silhouettes stay what they are.
-    """
+    that nothing covers any more: the silhouettes stay what they are."""
     hull = (volume.values > 0.5).cpu().numpy()
     index = np.argwhere(hull)
     points = volume.origin.double().cpu() + volume.pitch * torch.from_numpy(index)

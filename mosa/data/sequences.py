@@ -2,8 +2,7 @@
 
 A built-in scene brings its sequences, of which scene.also_train names some. Of other formats each sequence is a folder: scene.path,
 those in scene.also_train, and those in scene.test. An entry of these lists is a folder, or a section with `path` and keys of `OWN`
-that hold for this sequence only, such as {path: drop_2, frames: [3, 20]}.
-"""
+that hold for this sequence only, such as {path: drop_2, frames: [3, 20]}."""
 
 from __future__ import annotations
 
@@ -31,8 +30,7 @@ NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
     """The training sequence and the others of the same object, those of scene.also_train first where they are folders.
 
-    keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file.
-    """
+    keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file."""
     keys = dict(keys)
     also_train, test = keys.pop("also_train", None) or [], keys.pop("test", None) or []
     if keys.get("format") == "builtin":
@@ -110,8 +108,7 @@ def keys_of(keys: Mapping[str, Any], where: str, entry: str | Mapping[str, Any])
     """Keys of `load_scene`, without name and sequence, of an entry: the training sequence's where it has none of its own.
 
     `last_free_frame` and `holdout_frames` are about the training sequence alone. Its particles are not another sequence's: a
-    relative scene.particles counts where such a folder lies beside the images.
-    """
+    relative scene.particles counts where such a folder lies beside the images."""
     own = section(where, entry)
     apart = ("name", "sequence", "last_free_frame", "holdout_frames", "particles")
     inherited = {k: v for k, v in keys.items() if k not in apart}

@@ -4,8 +4,7 @@
     env = TwinVectorEnv("hanging", worlds=32, simulator="learned", checkpoint="outputs/train/.../checkpoints/last.ckpt")
     observations, _ = env.reset(seed=0)
 
-or, after importing this module, gymnasium.make("mosa/Hanging-v0", checkpoint=...).
-"""
+or, after importing this module, gymnasium.make("mosa/Hanging-v0", checkpoint=...)."""
 
 from __future__ import annotations
 
@@ -77,8 +76,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
     Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad], aims [m], speed [m/s]); observations:
     `self.task.observations`, in their units. A hand decides once: an episode has one step, which plays the motion to its end and
     terminates. Reward: minus log(1 + squared misses in tolerances), 0 is the most. `info["success"]`: what the table counts.
-    Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode.
-    """
+    Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode."""
 
     metadata: ClassVar[dict] = {"render_modes": ["rgb_array", "rgb_array_list"], "render_fps": 25}
 

@@ -1,7 +1,6 @@
 """What a task with an elastic body is: the trials that are drawn, what a policy sees and does, how far a trial ends from its aim.
 
-World axes: y up, the ground at y = 0. Plain tensors, no Gymnasium.
-"""
+World axes: y up, the ground at y = 0. Plain tensors, no Gymnasium."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 The paper names both, placing an elastic rabbit onto a white box and hanging on a tower, and their success rates on a robot; it
 gives no sizes, starts, actions or criteria of success. What is chosen here, and on what, is in docs/environments.md.
-The box or tower stands at x = z = 0.
-"""
+The box or tower stands at x = z = 0."""
 
 from __future__ import annotations
 
@@ -40,8 +39,7 @@ class Placement(Task):
 
     It was gripped askew by up to `askew` [rad], which is observed; the hand turns it and lets it fall from rest over the aim.
     Success: its centre is within `near` of the box's middle, its up axis within `lean` of the vertical, and its speed below
-    `still`. A body that fell off is beside the box.
-    """
+    `still`. A body that fell off is beside the box."""
 
     steps: Steps = 60
     low: Height = 0.08
@@ -98,8 +96,7 @@ class Hanging(Task):
     a clock; after `shut` control steps the jaws close within `closing`, to a gap that is narrower than the body by the share
     `squeeze`. What is between them hangs.
     Success: at the end the centre is within `near` of the jaws' middle, along x and in height, no particle is lower than `free`,
-    and the speed is below `still`.
-    """
+    and the speed is below `still`."""
 
     steps: Steps = 32
     tilt: Angle = 0.25

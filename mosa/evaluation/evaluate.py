@@ -119,8 +119,7 @@ def image_metrics(
 ) -> dict[str, float]:
     """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
 
-    images: (V, T, H, W, 3), all frames; where they lie is where they are compared.
-    """
+    images: (V, T, H, W, 3), all frames; where they lie is where they are compared."""
     if not cameras or not frames:
         return {}
     x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
@@ -148,8 +147,7 @@ def motion_metrics(
 ) -> dict[str, float]:
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
-    target: `true_motion`, where it is at hand: it is the same for all models.
-    """
+    target: `true_motion`, where it is at hand: it is the same for all models."""
     truth = sequence.scene.truth
     after = [t for t in frames if t >= sequence.contact]
     if not after:

@@ -1,8 +1,7 @@
 """Energies per rest volume of all laws that have one, as symbols: what every exported text is generated from.
 
 An energy has two parts: one of the entries of C = F^T F, and one of the principal stretches l_1, l_2, l_3. The torch functions of
-the same energies are in `mosa/physics/constitutive/`.
-"""
+the same energies are in `mosa/physics/constitutive/`."""
 
 from __future__ import annotations
 

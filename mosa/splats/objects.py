@@ -1,8 +1,7 @@
 """A 3DGS file of an object becomes a body that falls, without any video.
 
 The Gaussians' inside is filled with particles, a law is chosen (`prior=...`) or taken from a checkpoint (`ckpt_path=...`), and the
-rollout carries the Gaussians, harmonics and all.
-"""
+rollout carries the Gaussians, harmonics and all."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ def read_object(
     box: two corners in the file's units; opacity: the least that is kept; size [m] that the longest side gets, None where the file
     is in metres, which is refused where that is implausible; up: compared with the file's header.
     Strays away from the object are left out before it is sized.
-    Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument.
-    """
+    Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument."""
     splats, harmonics, offset, vertical = read_ply(path, centred=True)
     axis = "xyz".find(vertical[-1:] or "?")
     if up is not None and axis >= 0 and abs(up[axis]) < 0.9 * math.hypot(*up):
@@ -153,8 +151,7 @@ def object_twin(
     """A twin of the object that Gaussians show.
 
     learned: of which material, adapter and contact are taken in place of those of the settings, and no stiffness field, which is of
-    another body's places; most: as `fill_object` takes it. Errors: ConfigError, DataError.
-    """
+    another body's places; most: as `fill_object` takes it. Errors: ConfigError, DataError."""
     if (density := settings.density) is None:
         density = 1000.0 if learned is None else learned.body.density
     check_density("density", density)

@@ -7,8 +7,7 @@
     data.setup("fit")                               # checks, reconstructs (cached) and finds the starts
     batch = next(iter(data.train_dataloader()))     # some views of every frame, with their cues
 
-It stands alone; `LitMosa` asks it for the particles that a body is made of.
-"""
+It stands alone; `LitMosa` asks it for the particles that a body is made of."""
 
 from __future__ import annotations
 

@@ -10,8 +10,7 @@
 
 Any Trainer drives it. A stage runs by Gauss-Newton (`newton_steps.py`: an epoch is one iteration, over all views) or by Adam
 (`adam_steps.py`: an epoch is a pass over the training views). `Stages`, a callback that the module brings along, leads from one
-stage to the next.
-"""
+stage to the next."""
 
 from __future__ import annotations
 
@@ -500,8 +499,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         the scene's data module goes on from there.
 
         The file is read as data (docs/safety.md); Lightning's other arguments (`strict`, `hparams_file`, ...) change nothing.
-        Errors: DataError naming the file.
-        """
+        Errors: DataError naming the file."""
         from mosa.twin.twin import Twin
 
         twin = Twin.load(checkpoint_path, "cpu" if map_location is None else map_location)

@@ -113,8 +113,7 @@ def check_begin(cfg: DictConfig) -> RunRecord | None:
 def check_seen(cfg: DictConfig, scene: Scene) -> None:
     """The object as frame 0 shows it, before its reconstruction: no solid contains it, a grid suits its size, ground and walls.
 
-    Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
-    """
+    Errors: ConfigError naming the key. Silent where fewer than two mattes are whole."""
     world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
     ground = [] if world.ground is None else [ground_plane(world.ground, world.up)]
     turn_along([*ground, *world.planes])

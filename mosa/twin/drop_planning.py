@@ -87,8 +87,7 @@ def plan(
     presses: the body also stands on the ground in each of these poses, and a plate comes down on it. What the force on the plate
     would tell is left out.
 
-    Errors: ConfigError where the run kept no posterior, or no start can be simulated.
-    """
+    Errors: ConfigError where the run kept no posterior, or no start can be simulated."""
     if twin.posterior is None:
         raise ConfigError(
             "plan: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)"

@@ -2,8 +2,7 @@
 
 twin.reset(height=0.2, colliders=[{"type": "box", "name": "paddle", "size": [0.1, 0.1, 0.1], "position": [-0.2, 0.1, 0]}])
 for _ in range(50):
-    state, reactions = twin.step({"paddle": {"velocity": (0.3, 0, 0)}})
-"""
+    state, reactions = twin.step({"paddle": {"velocity": (0.3, 0, 0)}})"""
 
 from __future__ import annotations
 
@@ -47,8 +46,7 @@ class TwinState:
     x, v: (N, 3) [m], [m/s]; C_affine: (N, 3, 3) [1/s]; F, F_tot: (N, 3, 3): particles, in the simulation's type; lift: (3,), the
     contact's offset, by which x is above where the body is seen; position, rotation: (K, 3) [m], (K, 3, 3) of the colliders now;
     driven: (K,) bool, whether an action has moved a collider yet; frames, substeps: () steps and substeps since the start; time: ()
-    [s]; lag: () [s], length of the last substep.
-    """
+    [s]; lag: () [s], length of the last substep."""
 
     __repr__ = in_brief
 

@@ -4,8 +4,7 @@ The mesh has the resolution of the twin's grid: cells of about its spacing that 
 full, each as six tetrahedra around its diagonal (Kuhn 1960). MuJoCo's elasticity is St. Venant and
 Kirchhoff's; its damping is a time [s] by which the strain's rate counts with the strain, so that
 damping / mu makes the shear viscosities equal. A contact gives within the time in which a pressure
-wave crosses a cell: what is faster only shakes the nodes at the surface.
-"""
+wave crosses a cell: what is faster only shakes the nodes at the surface."""
 
 from __future__ import annotations
 

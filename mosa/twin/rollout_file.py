@@ -31,8 +31,7 @@ def save_rollout(
     Where there are K colliders also reactions [T - 1, substeps, K, 6]: force (N) and torque about each one's origin (N m) of
     every substep (one mean where the substeps vary), and collider_position [T, K, 3] (m), collider_rotation [T, K, 3, 3] at the
     frames, in the order of the configuration, and collider_shape [K, 4]: 1 sphere, 2 capsule,
-    3 cylinder (radius, length), 4 box (edges) (m), 0 others, -1 driven particles.
-    """
+    3 cylinder (radius, length), 4 box (edges) (m), 0 others, -1 driven particles."""
     arrays: dict[str, np.ndarray] = {}
     for name, rollout in parts.items():
         tensors = {key: getattr(rollout, key) for key in ("x", "v", "F", "F_tot", "times")}

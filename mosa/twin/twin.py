@@ -3,8 +3,7 @@
 from mosa.twin import Twin
 twin = Twin.load("outputs/train/.../checkpoints/last.ckpt")
 rollout = twin.simulate(rotation=(1, 0, 0, 45), height=0.2, velocity=(0.5, -2, 0), frames=30)
-twin.export(rollout, "falling/")
-"""
+twin.export(rollout, "falling/")"""
 
 from __future__ import annotations
 
@@ -136,8 +135,7 @@ class Twin:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
         start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
-        (a fit by Adam), or where fewer than two of the draws can be simulated.
-        """
+        (a fit by Adam), or where fewer than two of the draws can be simulated."""
         if self.posterior is None:
             raise ConfigError(
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
@@ -186,8 +184,7 @@ class Twin:
         the world stay where they are. substeps: of a frame, as `reset` takes them.
         No gradients: `reset(differentiable=True)` and `step` have
         them, and a tensor that requires them is refused. Errors: ConfigError naming the argument
-        (also a solid that the body starts in), SimulationDiverged (the body leaves the box).
-        """
+        (also a solid that the body starts in), SimulationDiverged (the body leaves the box)."""
         check_frames(frames, len(self.body.rest))
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
@@ -230,8 +227,7 @@ class Twin:
         the `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
         motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
         (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
-        require gradients are refused. Errors: ConfigError.
-        """
+        require gradients are refused. Errors: ConfigError."""
         check_frames(frames, len(self.body.rest))
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
@@ -253,8 +249,7 @@ class Twin:
         `angular_velocity` (3,) [rad/s] in world axes, about the collider's origin, for this step, or the `position` (3,) [m] and
         `rotation` ((3,) vector [rad] or (3, 3)) where it shall be after it; three numbers alone are a velocity. A collider that
         was never in an action follows its own motion; one that was, but is not in this one, stands still.
-        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged.
-        """
+        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged."""
         return self.episode.step(action)
 
     @property

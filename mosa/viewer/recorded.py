@@ -3,8 +3,7 @@
 With --live its twin, to be dropped and pushed (`mosa.viewer.live_viewer`).
 
 The observed motion (the reconstruction's, of the sequences learned from) or, of other sequences, the true one where it is
-known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`.
-"""
+known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`."""
 
 from __future__ import annotations
 

@@ -20,8 +20,7 @@ def lines_of_sight(scene: Scene, frame: int) -> tuple[list[int], Tensor, Tensor,
     """Cameras whose matte is whole, and per camera the line through the matte's centroid and the matte's radius.
 
     Returns indices (C), origins (C, 3) [m], unit directions (C, 3), tangents of the angular radius (C,), float64. A matte
-    that is empty or touches the image's border has no known centroid and is left out.
-    """
+    that is empty or touches the image's border has no known centroid and is left out."""
     chosen, origins, directions, radii = [], [], [], []
     for v in range(len(scene.cameras)):
         mask = scene.mattes[v, frame] > 0.5
@@ -53,8 +52,7 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
     """The lines of sight through the mattes' centroids meet, inside the scene's box.
 
     Errors: DataError naming the one camera without which the others agree, or all that disagree; and where they meet outside
-    of the box (wrong box, unit or axis). Silent where fewer than three mattes are whole.
-    """
+    of the box (wrong box, unit or axis). Silent where fewer than three mattes are whole."""
     chosen, origins, directions, radii = lines_of_sight(scene, frame)
     if len(chosen) < 3:
         return

@@ -1,8 +1,7 @@
 """Does the film move as a thrown object can? Wrong frame rates, units and orders of frames show before anything is learned.
 
 The track is the point where the lines of sight through the mattes' centroids meet, frame by frame. What contradicts mechanics by a
-factor of two or more beyond its own noise is refused, what does by less is a warning.
-"""
+factor of two or more beyond its own noise is refused, what does by less is a warning."""
 
 from __future__ import annotations
 
@@ -84,8 +83,7 @@ def parabola(track: Track, frames: int) -> tuple[Tensor, float]:
     """Acceleration (3,) [m/s^2] of a parabola through the first frames, at least three, and what it may be off by.
 
     That is three standard errors of the assumed noise, or Student's quantile of the same probability of the residuals', whichever
-    is more. Three frames leave no residuals: the noise assumed is then that of a coarse track.
-    """
+    is more. Three frames leave no residuals: the noise assumed is then that of a coarse track."""
     t = torch.arange(frames, dtype=torch.float64)
     design = torch.stack([torch.ones_like(t), t, 0.5 * t * t], 1)
     x = track.points[:frames]

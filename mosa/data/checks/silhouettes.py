@@ -109,8 +109,7 @@ def check_outlines(scene: Scene, label: str) -> None:
     """The mattes of a frame are those of one solid, and it meets the ground where the ground is said to be.
 
     Looks at frame 0 and at the one where the object is lowest. Errors: DataError naming cameras and frame, or scene.ground.height
-    and scene.up. Silent where fewer than three mattes are whole.
-    """
+    and scene.up. Silent where fewer than three mattes are whole."""
     track = track_of(scene)
     turn = 0 if track is None else int((track.points @ scene.up.double()).argmin())
     worst = (0.0, "")

@@ -50,8 +50,7 @@ def load_markers(
     the end; fps: frames per second that it is resampled to, None for the recording's; loads: sets
     with a mass that goes with the body in this recording, as in world.driven; holdout_frames: how
     many last frames are not learned from.
-    Errors: ConfigError naming the key, DataError naming the file.
-    """
+    Errors: ConfigError naming the key, DataError naming the file."""
     check_density("scene.density", density)
     given = {"points": points, "tracked": tracked, "duration": duration, "fps": fps}
     check_values(given | {"holdout_frames": holdout_frames}, KINDS, "scene")

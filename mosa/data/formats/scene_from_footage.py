@@ -99,8 +99,7 @@ def scene_from_footage(
     last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
     per frame; body: {shape: file, scale} of a known rest shape; driven: as of
     `Scene`; fps overrides times.
-    Errors: ConfigError naming the key, DataError for particle files.
-    """
+    Errors: ConfigError naming the key, DataError for particle files."""
     check_types(footage, f"scene {name} ({sequence})")
     up, pull = directions(up, gravity, ground)
     if not isinstance(box, (list, tuple, torch.Tensor)) or len(box) != 2:

@@ -201,8 +201,7 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
     """Camera name -> the shot whose pose is nearest to the mean, and all its shots; by label, or by equal pose.
 
     A warning where the poses of a label differ by a little. Errors: DataError where a camera has several intrinsics or moves, or
-    unlabelled ones all do.
-    """
+    unlabelled ones all do."""
     members: dict[str, list[Shot]] = {}
     for shot in shots:
         same = (

@@ -141,8 +141,7 @@ def deep_png(path: Path) -> np.ndarray | None:
 def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
     """A matte (H, W) whose enclosed holes of at most `largest` pixels are covered; 0 leaves it as it is.
 
-    Errors: ConfigError for a size that is none.
-    """
+    Errors: ConfigError for a size that is none."""
     check("scene.fill_holes", largest, Whole)
     if largest == 0:
         return matte

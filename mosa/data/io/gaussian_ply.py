@@ -1,8 +1,7 @@
 """Gaussians in the PLY layout of 3D Gaussian Splatting (Kerbl et al. 2023), which its trainers write and its viewers open.
 
 Per vertex, float32: x y z, nx ny nz (unused), f_dc_0..2 and f_rest_* (spherical harmonics: the rest channel by channel),
-opacity (logit), scale_0..2 (log of the standard deviations), rot_0..3 (quaternion wxyz).
-"""
+opacity (logit), scale_0..2 (log of the standard deviations), rot_0..3 (quaternion wxyz)."""
 
 from __future__ import annotations
 
@@ -42,8 +41,7 @@ def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = Non
     """Write Gaussians as a binary 3DGS PLY; folders are made.
 
     coefficients: spherical harmonics (N, K, 3), K = 1, 4, 9 or 16; None: the constant colours of `splats`.
-    Errors: DataError where a field holds a number that is not finite; ConfigError for another K.
-    """
+    Errors: DataError where a field holds a number that is not finite; ConfigError for another K."""
     path = Path(path)
     if coefficients is None:
         coefficients = constant_coefficients(splats.colors)

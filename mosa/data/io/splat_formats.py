@@ -2,8 +2,7 @@
 
 Each frame is written in the world's axes and in its own light: covariances are taken apart into scales and rotations, harmonics are
 turned with the body, and a factor of the colours becomes part of the harmonics, which no format keeps apart. glTF alone has a
-vertical of its own, y, to which its frames are turned.
-"""
+vertical of its own, y, to which its frames are turned."""
 
 from __future__ import annotations
 
@@ -194,8 +193,7 @@ def save_frames(
     """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `gltf/000.glb`,
     `sog/000.sog` and so on, and for all of them `splats.usdc` and `splats.rrd`.
 
-    rate [1/s], up (3,): of the motion. Errors: ConfigError as `check_formats`; DataError.
-    """
+    rate [1/s], up (3,): of the motion. Errors: ConfigError as `check_formats`; DataError."""
     check_formats(formats)
     folder, count = Path(folder), len(shown.means)
     up = torch.tensor([0.0, 1, 0]) if up is None else up

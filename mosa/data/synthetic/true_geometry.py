@@ -31,8 +31,7 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
 
     outside_share: farther than 0.7 spacings outside of the true body; missing_share: part of the true body that is farther than one
     spacing from every particle; volume_error: relative; center_error_m: of the centre of mass.
-    Errors: ConfigError where the scene is not a built-in one.
-    """
+    Errors: ConfigError where the scene is not a built-in one."""
     if scene.truth is None or not scene.synthetic:
         raise ConfigError(f"scene {scene.name}: the true shape is known for built-in scenes only")
     shape = SHAPES[object_named(scene.name).shape]

@@ -1,8 +1,7 @@
 """Directions of a learned law: its redistribution w(n) and its directional modulus E(n) (paper, appendix A).
 
 Everything is in the material frame and in Mandel scaling, where the double contraction of symmetric tensors is a dot
-product; in plain 6-vectors even an isotropic law would look anisotropic.
-"""
+product; in plain 6-vectors even an isotropic law would look anisotropic."""
 
 from __future__ import annotations
 

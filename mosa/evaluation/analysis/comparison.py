@@ -67,8 +67,7 @@ def compare(
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
-    limit [m]: the distance that has the last colour (`error_limit` of this sequence).
-    """
+    limit [m]: the distance that has the last colour (`error_limit` of this sequence)."""
     scene = shown.scene
     camera = (scene.training_cameras or [0])[0]
     x0, y0, w, h = crop_boxes(scene.mattes[[camera]], margin=16)

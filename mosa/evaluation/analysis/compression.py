@@ -1,8 +1,7 @@
 """A cylinder of a law pressed between two plates: Young's modulus in any direction of the material, from the plates' force.
 
 The test that would be made on a real specimen: nothing is read from the law but the force. The specimen is always the same, the
-material is turned in it.
-"""
+material is turned in it."""
 
 from __future__ import annotations
 
@@ -58,8 +57,7 @@ def press(
 
     parameters: numbers by the law's own names; modulus [Pa], poisson: about those of the law, for the time scale and the start;
     adapter: switched on, or None; stiffening: of the P wave modulus, which the time step allows for.
-    Errors: SimulationDiverged, ConfigError (time step).
-    """
+    Errors: SimulationDiverged, ConfigError (time step)."""
     dx = HEIGHT / cells
     axis = (torch.arange(2 * cells).double() + 0.5) * dx / 2 - HEIGHT / 2
     side = torch.arange(-2 * cells, 2 * cells).double() * dx / 2 + dx / 4

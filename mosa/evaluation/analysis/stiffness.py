@@ -14,8 +14,7 @@ DIRECTIONS = 3000  # on a half sphere: 1.5 degrees apart
 
 def directional_moduli(stiffness: Tensor, directions: Tensor) -> Tensor:
     """(..., K) Young's modulus along unit vectors (K, 3) of stiffnesses (..., 6, 6) in Mandel scaling, in their unit: 1/(n n :
-    C^-1 : n n).
-    """
+    C^-1 : n n)."""
     N = dyads(directions).to(stiffness)
     return 1 / torch.einsum("ka,...ab,kb->...k", N, torch.linalg.inv(stiffness), N)
 

@@ -1,7 +1,6 @@
 """Bodies that stand in for the nine scenes of PAC-NeRF, whose own shapes are not used: half a metre large, and named alike.
 
-The tube of toothpaste is a tenth of that, as there.
-"""
+The tube of toothpaste is a tenth of that, as there."""
 
 from __future__ import annotations
 

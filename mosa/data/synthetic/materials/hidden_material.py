@@ -72,8 +72,7 @@ def fibre_stiffness(E: float, nu: float, ratio: float) -> float:
     """kf [Pa] with which Young's modulus along the fibre is `ratio` times the one across it, at small strain.
 
     With k = 4 kf the fibre's own modulus: E_along = E + k; across, the fibre holds the lateral contraction back,
-    E_across = E/(1 - nu^2 k/(E + k)); their ratio is 1 + (1 - nu^2) k/E.
-    """
+    E_across = E/(1 - nu^2 k/(E + k)); their ratio is 1 + (1 - nu^2) k/E."""
     return 0.25 * (ratio - 1) * E / (1 - nu**2)
 
 
