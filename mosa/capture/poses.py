@@ -19,8 +19,6 @@ from mosa.errors import DataError
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 FEWEST = 3  # phones from which places and clocks can be told
 MOVED, TURNED = 0.01, 0.5  # most by which one phone's poses may differ: share of extent, degrees
-
-
 FOCUS = 0.02  # of the focal length, by which intrinsics of one phone may differ
 
 
@@ -48,9 +46,7 @@ def read_phones(
         one = plausible(still(mine, extent, video.stem))
         phones.append(Phone(video.stem, resized(one, size, video), video))
     if len(phones) < FEWEST:
-        raise DataError(
-            f"{folder}: expected at least {FEWEST} videos, one of each phone, found {len(phones)}"
-        )
+        raise DataError(f"{folder}: expected at least {FEWEST} videos, found {len(phones)}")
     return phones
 
 
@@ -61,9 +57,8 @@ def read_poses(path: str | Path) -> dict[str, Camera]:
         return read_model(model)
     if place.is_dir():
         if not (place / "transforms.json").is_file():
-            raise DataError(
-                f"{place}: expected a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json, found neither"
-            )
+            wanted = "a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json"
+            raise DataError(f"{place}: expected {wanted}, found neither")
         place = place / "transforms.json"
     return read_transforms_poses(place)
 
@@ -89,9 +84,7 @@ def read_transforms_poses(file: Path) -> dict[str, Camera]:
         shot = shot_of(where, entry, document)
         width, height = (int(shot.intrinsics.get(key, 0)) for key in ("w", "h"))
         if min(width, height) < 1:
-            raise DataError(
-                f"{where}: expected w and h, an image size w, h of at least 1 px, found {width}, {height}"
-            )
+            raise DataError(f"{where}: expected w and h of at least 1 px, found {width}, {height}")
         K = camera_matrix(shot, width, height)
         lens = {name: shot.intrinsics[name] for name in COEFFICIENTS if name in shot.intrinsics}
         found[str(entry["file_path"])] = Camera(K, shot.w2c, (width, height), where, lens, shot.fisheye)  # fmt: skip
@@ -116,8 +109,8 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
         angle = math.degrees(math.acos(np.clip(0.5 * (np.trace(turn) - 1), -1, 1)))
         if away > MOVED * extent or angle > TURNED:
             raise DataError(
-                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
-                f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each"
+                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span {extent:.3g}) and "
+                f"{angle:.2g} degrees: expected phones that stand still"
             )
         other = np.abs(camera.K / camera.size[0] - one.K / one.size[0]).max()
         if other > FOCUS * one.K[0, 0] / one.size[0]:

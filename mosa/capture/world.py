@@ -48,9 +48,7 @@ class World:
 
     def lowered(self, height: float) -> World:
         """The world whose zero is at that height [m] of this one."""
-        return World(
-            self.scale, self.R, self.origin + self.R.T @ np.array([0.0, height / self.scale, 0.0])
-        )
+        return World(self.scale, self.R, self.origin + height / self.scale * self.R[1])
 
     def written(self) -> dict:
         return {"scale": self.scale, "rotation": self.R.tolist(), "origin": self.origin.tolist()}
@@ -76,16 +74,13 @@ def read_world(folder: str | Path) -> World:
     found = document.get("world") if isinstance(document, Mapping) else None
     if not isinstance(found, Mapping) or not {"scale", "rotation", "origin"} <= set(found):
         raise DataError(
-            f"{file}: expected the record of a capture with the keys world.scale, rotation and origin; name the folder that "
-            "mosa-capture wrote"
+            f"{file}: expected a folder of mosa-capture, or its record with world.scale, rotation, origin"
         )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
     scale = number(found["scale"], f"{file}, world.scale")
     R = matrix(found["rotation"], (3, 3), f"{file}, world.rotation")
     if not scale > 0:
-        raise DataError(
-            f"{file}, world.scale: expected metres per unit of the poses, above 0, found {scale:g}"
-        )
+        raise DataError(f"{file}, world.scale: expected a number above 0, found {scale:g}")
     if not (np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0):
         raise DataError(f"{file}, world.rotation: expected a rotation matrix, found {R.tolist()}")
     return World(scale, R, origin)

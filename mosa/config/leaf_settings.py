@@ -196,8 +196,6 @@ class CaptureSettings(Settings):
     """s of free fall that are written"""
     after: Seconds = 0.25
     """s after the end of the free fall that are written"""
-    interpolation: Literal["flow", "shift", "none"] = "flow"
-    """images between frames; shift: the nearest frame, moved; none: the nearest frame"""
     colours: Literal["floor", "none"] = "floor"
     """floor: the phones' colours are matched by the floor that all plates show; none: no
     matching"""

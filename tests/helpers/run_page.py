@@ -30,7 +30,7 @@ from markdown_it import MarkdownIt
 from mosa.cli import configured
 from mosa.config.build import plain
 from mosa.config.extensions import load_extensions
-from mosa.config.leaf_settings import MaterialSettings
+from mosa.config.leaf_settings import CaptureSettings, MaterialSettings
 from mosa.environments.command import setting_of
 from mosa.export import run as exported
 from mosa.training import preflight
@@ -42,7 +42,7 @@ RUN = "outputs/train/<date>/<time>"
 """A folder of this name, letter for letter, is what the pages' commands find."""
 NO_CODE = ("bibtex", "csv", "math", "text")
 CHECKS = {"train": preflight.check_configuration, "eval": preflight.check_evaluation, "splats": preflight.check_splats,
-          "capture": preflight.check_capture, "environments": setting_of, "material": MaterialSettings.read}  # fmt: skip
+          "capture": CaptureSettings.read, "environments": setting_of, "material": MaterialSettings.read}  # fmt: skip
 
 
 class Block(NamedTuple):
