@@ -219,8 +219,8 @@ def fit_fall(
         count = sum(map(len, problem.times))
         if count < 3 * len(phones) or window[1] - window[0] < 3 * interval:
             raise DataError(
-                f"no free fall: {count} centres from {window[0]:.3f} to {window[1]:.3f} s on the clock of {phones[0].name} are left "
-                f"of {3 * len(phones)} needed; let the object fall from higher up, or set flight=[<from>, <to>]"
+                f"no free fall: {count} centres from {window[0]:.3f} to {window[1]:.3f} s on the clock of {phones[0].name} are "
+                f"left of {3 * len(phones)} needed; let the object fall from higher up, or set flight=[<from>, <to>]"
             )
         numbers = problem.solve(problem.begin() if numbers is None else numbers, noise).x
         misses = problem.misses(numbers)

@@ -317,8 +317,8 @@ def warnings_of(
                 f"{name}: its frames are up to {record['jitter']:.2g} frames off an even rate; the file's times are used"
             )
         if record["readout_sd"] > 0.006 and knowledge.readout_of(phone.name) is None:
-            said.append(f"{name}: the fall does not tell how long its sensor takes to be read ({own:.0f} +- "
-                        f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale")  # fmt: skip
+            said.append(f"{name}: the fall does not tell how long a readout takes ({own:.0f} +- "
+                        f"{1e3 * record['readout_sd']:.0f} ms, 15 +- 10 is assumed); each ms changes the scale")  # fmt: skip
         if off > MAX_PHONE_OFFSET * record["radius_px"]:
             said.append(
                 f"{name}: the object appears {off:.1f} px from where the others see it: a pose or a matte that is off?"
@@ -327,8 +327,8 @@ def warnings_of(
         said.append(f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; "
                     "scene.ground is a level plane")  # fmt: skip
     if ground["from"] == "lowest contact" and ground["sd"] > 0.05 * found["radius"]:
-        said.append(f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: name a point of the floor with "
-                    "ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor")  # fmt: skip
+        said.append(f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: name a point of it "
+                    "with ground=[x, y, z], in the poses' world, or film with a phone at the height of the floor")  # fmt: skip
     if not SIZES[0] <= found["radius"] <= SIZES[1]:
         said.append(f"the object would be {2 * found['radius']:.2g} m across: lengths follow from gravity and the clock alone; "
                     "measure one, set scale=, and check fps=")  # fmt: skip

@@ -35,24 +35,21 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
     also_train, test = keys.pop("also_train", None) or [], keys.pop("test", None) or []
     if keys.get("format") == "builtin":
         if test:
-            raise ConfigError(
-                "scene.test: a built-in scene brings its held-out sequences itself; expected no list"
-            )
+            raise ConfigError("scene.test: a built-in scene brings its own; expected no list")
         scene, others = load_scene(**keys), held_out_sequences(**keys)
         known = [s.sequence for s in others]
         if unknown := [name for name in also_train if name not in known]:
             found = f"has {', '.join(known)}" if known else "has none"
+            wanted = "other sequences of the scene"
             raise ConfigError(
-                f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}"
+                f"scene.also_train: expected {wanted}, found {unknown[0]!r}; it {found}"
             )
         return scene, others
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
-    others = [
-        load_scene(**keys_of(keys, where, entry), name=scene.name, sequence=name)
-        for (where, entry), name in zip(entries, names)
-    ]
+    named = zip(names, (keys_of(keys, *entry) for entry in entries))
+    others = [load_scene(**own, name=scene.name, sequence=name) for name, own in named]
     if other := next((o for o in others if o.driven != scene.driven), None):
         raise ConfigError(
             f"scene.also_train, scene.test: expected recordings in one world, found driven sets in {other.sequence} that "
@@ -98,8 +95,9 @@ def section(where: str, entry: str | Mapping[str, Any]) -> dict[str, Any]:
             f"scene.{where}: expected folders, or sections like {{path: <folder>, frames: [0, 9]}}, found {entry!r}"
         )
     if unknown := [key for key in entry if key not in OWN]:
+        wanted = ", ".join(OWN)
         raise ConfigError(
-            f"scene.{where}: {unknown[0]}: not a key of a single sequence; expected {', '.join(OWN)}"
+            f"scene.{where}: {unknown[0]}: not a key of a sequence; expected {wanted}"
         )
     return dict(entry)
 
@@ -124,10 +122,8 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
     sections = [section(*each) for each in entries]
     root, first = keys.get("root"), keys.get("path")
     places = [("scene.path", first, keys.get("frames"))] if isinstance(first, str) else []
-    places += [
-        (f"scene.{where}", s["path"], s.get("frames", keys.get("frames")))
-        for (where, _), s in zip(entries, sections)
-    ]
+    for (where, _), own in zip(entries, sections):
+        places.append((f"scene.{where}", own["path"], own.get("frames", keys.get("frames"))))
     for k, (where, path, frames) in enumerate(places):
         for before, other, others in places[:k]:
             if place(root, path) == place(root, other) and overlap(frames, others):
@@ -140,7 +136,7 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
         name = own.get("name")
         if name is not None and (not isinstance(name, str) or not NAME.fullmatch(name)):
             raise ConfigError(
-                f"scene.{where}: name: expected letters, digits, _, - and ., found {name!r}"
+                f"scene.{where}: name: expected letters, digits, _, -, ., found {name!r}"
             )
         parts.append([name] if name is not None else pieces(place(root, own["path"])))
     depth = [1] * len(parts)
@@ -153,9 +149,8 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
         for k in deeper:
             depth[k] += 1
     if named := [names[k] for k in twice if "name" in sections[k]]:
-        raise ConfigError(
-            f"scene.{entries[0][0]}: name: expected a name once, found {named[0]!r} again"
-        )
+        where = f"scene.{entries[0][0]}"
+        raise ConfigError(f"{where}: name: expected a name once, found {named[0]!r} again")
     for number, k in enumerate(sorted(twice), 1):
         names[k] = f"{names[k]}_{number}"
     return names

@@ -34,13 +34,9 @@ class Simulator:
 
 
 def simulator_named(
-    name: str,
-    checkpoint: str | Path | None = None,
-    *,
-    scene: str | None = None,
-    device: str = "cpu",
+    name: str, checkpoint: str | Path | None = None, *, scene: str | None = None, device: str = "cpu",
     spacing: float | None = None,
-) -> Simulator:
+) -> Simulator:  # fmt: skip
     """learned | isotropic: of a run's checkpoint; truth: of the built-in scene that the run learned from, or of `scene`.
 
     spacing [m]: of the truth's particles, None for the films' own. Errors: ConfigError, DataError naming what is missing.
@@ -69,16 +65,12 @@ def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
     known = learned.record.settings.get("scene")
     where, way = f"checkpoint: {checkpoint}: settings.scene", "name one with truth.scene="
     if not isinstance(known, Mapping) or not isinstance(known.get("format"), str):
-        raise DataError(
-            f"{where}: expected the scene that the twin was learned from, found none; {way}"
-        )
+        raise DataError(f"{where}: expected the scene that the twin is from, found none; {way}")
     if (kind := known["format"]) != "builtin":
         said = f"a run on a scene of format {kind}: the truth is known for built-in scenes only"
         raise ConfigError(f"simulator: expected learned or isotropic for {said}")
     if not isinstance(name := known.get("name"), str):
-        raise DataError(
-            f"{where}.name: expected the name of a built-in scene, found {name!r}; {way}"
-        )
+        raise DataError(f"{where}.name: expected a built-in scene's name, found {name!r}; {way}")
     return known
 
 

@@ -92,9 +92,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
         self.render_mode, self.size = render_mode, size
 
     @typed
-    def reset(
-        self, *, seed: Seed | None = None, options: dict | None = None
-    ) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: Seed | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:  # fmt: skip
         super().reset(seed=seed)
         return self._draw(self.np_random, self.render_mode is not None)[0], {}
 
@@ -144,16 +142,12 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         self.observation_space = batch_space(self.single_observation_space, worlds)
 
     @typed
-    def reset(
-        self, *, seed: Seed | None = None, options: dict | None = None
-    ) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: Seed | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:  # fmt: skip
         if seed is not None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
         return self._draw(self.np_random, False), {}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:  # fmt: skip
         rewards = self._step(actions)
         ended, never = np.ones(self.num_envs, bool), np.zeros(self.num_envs, bool)
         last = np.empty(self.num_envs, dtype=object)

@@ -39,22 +39,17 @@ def mark(target: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     """As `scenery`, of a disc of radius `near` [m] at target (3,) on what lies there."""
     flat = lattice(2 * near, 2 * near, THIN)
     flat = flat[flat.norm(dim=1) <= near]
-    points = target.float() + torch.stack(
-        [flat[:, 0], torch.full((len(flat),), THIN), flat[:, 1]], 1
-    )
+    points = target.float() + torch.stack([flat[:, 0], 0 * flat[:, 0] + THIN, flat[:, 1]], 1)
     return points, torch.full((len(points),), 0.5 * THIN), torch.tensor(MARK).expand(len(points), 3)
 
 
-def scenery(
-    solids: Sequence[Mapping[str, Any]], places: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def scenery(solids: Sequence[Mapping[str, Any]], places: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """(means (K, 3), standard deviations (K,) [m], colours (K, 3)) of ground and solids. places: (solids, 3, 4) poses, None for
     those that they begin at."""
     flat = lattice(2 * GROUND, 2 * GROUND, TILE)
     ground = torch.stack([flat[:, 0], torch.full((len(flat),), -0.5 * TILE), flat[:, 1]], 1)
-    tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor(
-        [0.08, 0.08, 0.08]
-    ) + torch.tensor([0.66, 0.65, 0.62])
+    odd = ((flat / 0.12).floor().sum(1) % 2)[:, None]
+    tiles = odd * torch.tensor([0.08, 0.08, 0.08]) + torch.tensor([0.66, 0.65, 0.62])
     parts = [(ground, torch.full((len(ground),), 0.5 * TILE), tiles)]
     for k, solid in enumerate(colliders_from_config(solids, "solids")):
         points = solid_surface(solid, None if places is None else places[k])
@@ -104,16 +99,13 @@ def film(
     """`frames` pictures, from the first to the last moment, of one recorded world (`Played.states`)."""
     x, F_tot, places = states
     chosen = np.linspace(0, len(x) - 1, min(frames, len(x))).round().astype(int)
-    return [
-        picture(arena, x[t, world], F_tot[t, world], places[t, world], size, world) for t in chosen
-    ]
+    moments = ((x[t, world], F_tot[t, world], places[t, world]) for t in chosen)
+    return [picture(arena, *moment, size, world) for moment in moments]
 
 
-def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
-    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other. The paths written."""
+def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> None:
+    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other."""
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
-    return [
-        write_strip(folder / f"{name}.png", rows, frames=6),
-        write_video(folder / f"{name}.mp4", side_by_side(rows), fps=12),
-    ]
+    write_strip(folder / f"{name}.png", rows, frames=6)
+    write_video(folder / f"{name}.mp4", side_by_side(rows), fps=12)

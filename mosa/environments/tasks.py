@@ -26,7 +26,7 @@ from mosa.environments.task import (
     Task,
     Trials,
     View,
-)
+)  # fmt: skip
 from mosa.physics.contact.motion import exponential
 from mosa.settings import call, check
 
@@ -52,9 +52,7 @@ class Placement(Task):
 
     @property
     def situation(self) -> tuple[Quantity, ...]:
-        return tuple(
-            Quantity(f"askew about {axis}", "rad", -self.askew, self.askew) for axis in "xz"
-        )
+        return tuple(Quantity(f"askew about {a}", "rad", -self.askew, self.askew) for a in "xz")
 
     def release(self, trials: Trials, given: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         return given[:, :2] + trials.observed[:, 1:3], torch.zeros_like(given[:, 2:4])
@@ -181,16 +179,11 @@ class Hanging(Task):
 
     def succeeded(self, trials: Trials, view: View) -> Tensor:
         away = torch.hypot(view.center[:, 0], view.center[:, 1] - self.grip)
-        return (
-            (away < self.near)
-            & (view.lowest > self.free)
-            & (view.velocity.norm(dim=1) < self.still)
-        )
+        still = view.velocity.norm(dim=1) < self.still
+        return (away < self.near) & (view.lowest > self.free) & still
 
 
 SIDES = (("left", -1.0), ("right", 1.0))  # of the jaws, and the sign of their z
-
-
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging)}
 
 

@@ -39,15 +39,9 @@ QUANTILES = 400  # of a normal distribution, where its image under a bounded map
 
 @torch.no_grad()
 def predicted_spread(
-    body: Body,
-    posterior: Posterior,
-    sequences: Ordered[Sequence],
-    world: World,
-    *,
-    draws: int = DRAWS,
-    seed: int = 0,
+    body: Body, posterior: Posterior, sequences: Ordered[Sequence], world: World, *, draws: int = DRAWS, seed: int = 0,
     known: Mapping[str, Tensor] | None = None,
-) -> tuple[dict[str, float], dict[str, Tensor]]:
+) -> tuple[dict[str, float], dict[str, Tensor]]:  # fmt: skip
     """(figures, standard deviation (T, N) [m] of every particle's position by the sequence's prefix).
 
     The variance of a position, summed over its three components, is that of the draws (times `DRAWN`^2), that among the forms of
@@ -68,25 +62,15 @@ def predicted_spread(
         except MosaError:  # `evaluate` has said so
             continue
     sequences = [s for s in sequences if s.prefix in base]
-    if not sequences:  # of no draw would anything be simulated
-        return {
-            "posterior/draws": 0.0,
-            "posterior/rivals": 0.0,
-            "posterior/model_error_m": posterior.model_error,
-        }, {}
-
-    def positions() -> dict[str, Tensor]:
-        return {s.prefix: _positions(body, s, world) for s in sequences}
-
-    drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
-    others = rival_motions(body, posterior, positions)
-    figures: dict[str, float] = {
-        "posterior/draws": float(len(drawn)),
-        "posterior/rivals": float(len(others)),
-        "posterior/model_error_m": posterior.model_error,
-    }
+    drawn, others = [], []
+    if sequences:  # else of no draw would anything be simulated
+        predict = lambda: {s.prefix: _positions(body, s, world) for s in sequences}  # noqa: E731
+        drawn = drawn_motions(body, posterior.draws(draws, generator), predict)
+        others = rival_motions(body, posterior, predict)
+    figures = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others)),
+               "posterior/model_error_m": posterior.model_error}  # fmt: skip
     spreads: dict[str, Tensor] = {}
-    if figures["posterior/draws"] < LEAST_DRAWS:
+    if len(drawn) < LEAST_DRAWS:
         return figures, spreads
     for s in sequences:
         own, *others_here = (each[s.prefix] for each in (base, *others))
@@ -122,10 +106,8 @@ def drawn_motions(
     body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False
 ) -> list[Predicted]:
     """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
-    found = []
-    for _ in tqdm(
-        each_law(body, laws), "draws of the posterior", total=len(laws), leave=False, disable=quiet
-    ):
+    found, every = [], each_law(body, laws)
+    for _ in tqdm(every, "draws of the posterior", total=len(laws), leave=False, disable=quiet):
         try:
             found.append(predict())
         except MosaError:
@@ -185,13 +167,11 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
     if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
         return sd * float(slope.abs())
     low, high = limits_of(name)
-    middle, sd = (raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9))
-    below, within = torch.special.ndtr(
-        (torch.tensor([low, high], dtype=torch.float64) - middle) / sd
-    ).tolist()
-    shares = (
-        below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
-    )
+    middle, sd = raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9)
+    ends = torch.tensor([low, high], dtype=torch.float64)
+    below, within = torch.special.ndtr((ends - middle) / sd).tolist()
+    middles = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    shares = below + (within - below) * middles
     drawn = (middle + sd * torch.special.ndtri(shares)).clamp(low, high)
     return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
 
@@ -206,9 +186,8 @@ def determined(
     determine, and the 95 % cone about the stiffest direction: of draws about every form of the law
     that explains the data, each form as likely as the others."""
     figures: dict[str, float] = {}
-    forms = torch.stack(
-        [posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())]
-    )
+    mean = posterior.mean
+    forms = torch.stack([mean, *(n.to(mean) for n in posterior.rivals.values())])
     blocks: dict[str, list[int]] = {}
     for i, name in enumerate(posterior.names):
         blocks.setdefault(name.split("[")[0], []).append(i)
@@ -219,9 +198,8 @@ def determined(
             variance += FORMS**2 * forms[:, index[0]].var(correction=0)
             sd = physical_sd(name, raw, float(variance.sqrt()))
             if name in RELATIVE:
-                figures[f"posterior/{name}_relative_sd"] = sd / float(
-                    body.material.physical_of(name, raw)
-                )
+                value = float(body.material.physical_of(name, raw))
+                figures[f"posterior/{name}_relative_sd"] = sd / value
             else:
                 figures[f"posterior/{name}_sd"] = sd
         elif name in ("operator", "stiffness"):

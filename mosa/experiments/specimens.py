@@ -70,6 +70,12 @@ def plane(name: str) -> tuple[list[float], Tensor]:
     return [degrees[i] for i in order], torch.stack([vectors[i] for i in order])
 
 
+def parameters_at_origin(hidden: Any) -> dict[str, Tensor]:
+    """Of a hidden material, by name: () each."""
+    found = hidden.parameters(torch.zeros(1, 3)).items()
+    return {key: value[0] if value.ndim else value for key, value in found}
+
+
 Truths = dict[tuple[str, str], list[Pressed]]
 
 
@@ -86,7 +92,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             return found
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"{kept}: not what a specimen has measured ({error}); remove it to measure again"
+                f"{kept}: a damaged file ({error}); remove it to measure again"
             ) from error
     twin = Twin.load(checkpoint(record))
     scene = twin.record.settings["scene"]
@@ -96,10 +102,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
     degrees, n = plane(name)
     if (name, variant) not in truths:
         hidden = OBJECTS[name].material.variant(variant)
-        one = {
-            key: (value[0] if value.ndim else value)
-            for key, value in hidden.parameters(torch.zeros(1, 3)).items()
-        }
+        one = parameters_at_origin(hidden)
         truths[name, variant] = [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.nu,
                                        density=hidden.density, stiffening=1.0) for k in n]  # fmt: skip
     true, models = truths[name, variant], {}
@@ -119,9 +122,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
     return found
 
 
-def compression(
-    experiment: Experiment, records: Sequence[Record], stem: Path
-) -> tuple[str, list[Path]]:
+def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:  # fmt: skip
     """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical; a row
     of the picture for each column of the table: E, and how far it is from the truth's."""
     truths: Truths = {}

@@ -24,31 +24,22 @@ from mosa.twin.start import (
     check_frames,
     check_wants_no_gradients,
     start_in,
-)
+)  # fmt: skip
 
 
 class TwinWorlds:
     """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
 
     def __init__(
-        self,
-        body: Body,
-        world: World,
-        frame_dt: float,
-        training_start: Start,
-        count: int,
-        laws: Tensor | None = None,
-    ) -> None:
+        self, body: Body, world: World, frame_dt: float, training_start: Start, count: int, laws: Tensor | None = None,
+    ) -> None:  # fmt: skip
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
             shape = (count, len(read_numbers(body)))
             said = f"one for each of {count} worlds, a tensor {shape} of finite numbers"
             laws = numbers("laws", laws, said, shape)
-        self.body = body
-        self.world = world
-        self.frame_dt = frame_dt
-        self.training_start = training_start
-        self.count, self.laws = count, laws
+        self.body, self.world, self.frame_dt = body, world, frame_dt
+        self.training_start, self.count, self.laws = training_start, count, laws
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 
@@ -70,9 +61,14 @@ class TwinWorlds:
         """
         check_frames(frames, self.count * len(self.body.rest))
         if not differentiable:
-            check_wants_no_gradients(
-                starts=starts, colliders=colliders, gravity=gravity, box=box, driven=driven
-            )
+            given = {
+                "starts": starts,
+                "colliders": colliders,
+                "gravity": gravity,
+                "box": box,
+                "driven": driven,
+            }
+            check_wants_no_gradients(**given)
         found = self._found(starts, range(self.count), colliders, box, driven)
         if gravity is not None:
             shape = (self.count, 3)
@@ -87,28 +83,20 @@ class TwinWorlds:
 
     @typed
     def restart(
-        self,
-        which: Annotated[Sequence[int], Expected("a list of numbers of worlds")],
+        self, which: Annotated[Sequence[int], Expected("a list of numbers of worlds")],
         starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
-    ) -> TwinState:
+    ) -> TwinState:  # fmt: skip
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
         which, episode = list(which), self._going()
-        if starts is None:
-            given = None
-        else:
-            given = [start for start, _ in self._found(starts, which, (), self._box, ())]
-        return episode.restart(which, given)
+        found = [] if starts is None else self._found(starts, which, (), self._box, ())
+        return episode.restart(which, None if starts is None else [start for start, _ in found])
 
     def _found(
-        self,
-        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None,
-        which: Sequence[int],
-        colliders: Any,
-        box: Any,
-        driven: Any = None,
-    ) -> list[tuple[Start, World]]:
+        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None, which: Sequence[int], colliders: Any,
+        box: Any, driven: Any,
+    ) -> list[tuple[Start, World]]:  # fmt: skip
         """The starts of these worlds, and the world. Errors: ConfigError."""
         each = [starts or {}] * len(which) if isinstance(starts, Mapping | None) else starts
         if not isinstance(each, (list, tuple)) or not all(isinstance(s, Mapping) for s in each):
@@ -117,7 +105,7 @@ class TwinWorlds:
             )
         if len(each) != len(which):
             raise ConfigError(
-                f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"
+                f"starts: expected one, or {len(which)}, one a world, found {len(each)}"
             )
         found: list[tuple[Start, World]] = []
         more = {"colliders": colliders, "box": box, "driven": driven}

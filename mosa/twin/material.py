@@ -114,9 +114,7 @@ class TwinMaterial:
                 )
             adapter.follow(body.material.poisson())
             known, E_ref = adapter.in_double(), float(adapter.E_ref)
-            vech = (
-                C / scale[:, None] / scale * torch.tensor([1.0, 1, 1, 2, 2, 2], dtype=torch.float64)
-            )
+            vech = C / scale[:, None] / scale * torch.tensor([1.0, 1, 1, 2, 2, 2]).double()
 
         def stress(strain: Tensor) -> Tensor:
             prior = vech @ strain / E_ref
@@ -147,9 +145,8 @@ class TwinMaterial:
         if "E" not in known and {"mu", "kappa"} <= set(known) and {"E", "nu"} & set(values):
             E, nu = given.pop("E", self.E), given.pop("nu", self.nu)
             if not is_number(E) or not is_number(nu) or not E > 0 or not -1 < nu < 0.5:
-                raise ConfigError(
-                    f"E, nu: expected a number above 0 and one from -1 to 0.5, found {E!r}, {nu!r}"
-                )
+                wanted = "a number above 0 and one from -1 to 0.5"
+                raise ConfigError(f"E, nu: expected {wanted}, found {E!r}, {nu!r}")
             given |= {"mu": E / (2 * (1 + nu)), "kappa": E / (3 * (1 - 2 * nu))}
         if not any(given.get(name) for name in DAMPING):
             given = {name: value for name, value in given.items() if name not in DAMPING}

@@ -115,12 +115,11 @@ class Twin:
             world, start = world_of(record), Start.read(record.start.plain())
         except (
             Exception
-        ) as error:  # every part has been checked; a file of a stranger may still fit no body
-            reason = (
-                str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
-            )
+        ) as error:  # every part has been checked; a stranger's may still fit no body
+            kind = "" if isinstance(error, MosaError) else f"{type(error).__name__}: "
+            reason = " ".join(f"{kind}{error}".split())[:300]
             raise DataError(
-                f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})"
+                f"ckpt_path: {path}: no body can be built from it ({reason})"
             ) from error
         check_numbers(record, len(read_numbers(body)), path)
         posterior = None if record.posterior is None else Posterior.read(record.posterior.plain())
@@ -146,31 +145,21 @@ class Twin:
         found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(
-                f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
-                f"found {len(found)}"
+                f"predict: expected at least two of {draws} draws of the law that can be simulated, found {len(found)}"
             )
         others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
-        return rollout, total_spread(
-            torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others)
-        )
+        forms = among_forms(rollout.x, others)
+        return rollout, total_spread(torch.stack(found), self.posterior.model_error, forms)
 
     @typed
     def simulate(
-        self,
-        *,
-        rotation: Sequence[float] | Tensor | None = None,
-        height: Number | None = None,
-        position: Sequence[float | None] | Tensor | None = None,
-        velocity: Sequence[float] | None = None,
-        angular_velocity: Sequence[float] | None = None,
-        frames: Count = 30,
-        variant: Variant = "adapted",
-        progress: bool = False,
-        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        box: Sequence[Sequence[float]] | Tensor | None = None,
-        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+        self, *, rotation: Sequence[float] | Tensor | None = None, height: Number | None = None,
+        position: Sequence[float | None] | Tensor | None = None, velocity: Sequence[float] | None = None,
+        angular_velocity: Sequence[float] | None = None, frames: Count = 30, variant: Variant = "adapted",
+        progress: bool = False, colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
         substeps: Substeps | None = None,
-    ) -> Rollout:
+    ) -> Rollout:  # fmt: skip
         """Roll the learned law out from a new start.
 
         rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; position: (3,) [m]
@@ -204,22 +193,13 @@ class Twin:
 
     @typed
     def reset(
-        self,
-        *,
-        rotation: Sequence[float] | Tensor | None = None,
-        height: Number | None = None,
-        position: Sequence[float | None] | Tensor | None = None,
-        velocity: Sequence[float] | Tensor | None = None,
+        self, *, rotation: Sequence[float] | Tensor | None = None, height: Number | None = None,
+        position: Sequence[float | None] | Tensor | None = None, velocity: Sequence[float] | Tensor | None = None,
         angular_velocity: Sequence[float] | Tensor | None = None,
-        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        variant: Variant = "adapted",
-        control_dt: Seconds | None = None,
-        substeps: Substeps | None = None,
-        frames: Count = 30,
-        differentiable: bool = False,
-        box: Sequence[Sequence[float]] | Tensor | None = None,
-        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
-    ) -> TwinState:
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None, variant: Variant = "adapted",
+        control_dt: Seconds | None = None, substeps: Substeps | None = None, frames: Count = 30, differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+    ) -> TwinState:  # fmt: skip
         """Begin a motion that `step` goes on with; returns its state at time 0.
 
         rotation, height, position, velocity, angular_velocity, colliders, variant, box, driven: as
@@ -280,13 +260,9 @@ class Twin:
     @torch.no_grad()
     @typed
     def render(
-        self,
-        rollout: Motion,
-        size: Pixels = 400,
-        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        view: Sequence[float] | None = None,
-        shadow: bool = True,
-    ) -> Tensor:
+        self, rollout: Motion, size: Pixels = 400, colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        view: Sequence[float] | None = None, shadow: bool = True,
+    ) -> Tensor:  # fmt: skip
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
         rollout was simulated with (None: the world's). rollout: or a list of the states of T steps,
         whose solids are drawn where they were then (None: those of `reset`). Half spaces are not
@@ -295,13 +271,8 @@ class Twin:
         return self._pictures(*self._met(rollout, colliders), size, view, shadow)
 
     def _pictures(
-        self,
-        rollout: Rollout,
-        solids: Sequence[Collider],
-        size: int,
-        view: Sequence[float] | None,
-        shadow: bool,
-    ) -> Tensor:
+        self, rollout: Rollout, solids: Sequence[Collider], size: int, view: Sequence[float] | None, shadow: bool,
+    ) -> Tensor:  # fmt: skip
         body, up = self.body, self.world.up.to(self.body.rest)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
         # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
@@ -311,10 +282,8 @@ class Twin:
                 high = torch.maximum(high, at.amax(0).to(high) + far)
         target = 0.5 * (low + high)
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
-        if float((side - (side @ up) * up).norm()) > 1e-3:
-            side = side - (side @ up) * up
-        else:
-            side = torch.roll(up, 1)
+        level = side - (side @ up) * up
+        side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
         focal = 1.6 * size
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
         toward = side / side.norm() + 0.25 * up
@@ -348,10 +317,8 @@ class Twin:
         return shown.images(camera, behind)[0].clamp(0, 1).cpu()
 
     def _met(
-        self,
-        motion: Rollout | Sequence[TwinState],
-        colliders: Sequence[Collider | Mapping[str, Any]] | None,
-    ) -> tuple[Rollout, tuple[Collider, ...]]:
+        self, motion: Rollout | Sequence[TwinState], colliders: Sequence[Collider | Mapping[str, Any]] | None,
+    ) -> tuple[Rollout, tuple[Collider, ...]]:  # fmt: skip
         """(rollout, its solids), both as `render` takes them. Errors: ConfigError where it was not
         simulated with as many."""
         if isinstance(motion, Rollout):
@@ -359,17 +326,14 @@ class Twin:
             met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         else:
             rollout, world, met = rollout_of(motion), self.episode.world, len(motion[0].position)
-        if met and colliders is None:
-            solids = world.solids
-        else:
-            solids = colliders_from_config(colliders or (), "colliders")
+        own = met and colliders is None
+        solids = world.solids if own else colliders_from_config(colliders or (), "colliders")
         # driven sets have reactions, and nothing to draw
         if colliders is not None and met > len(solids):
             solids += world.solids[len(world.colliders) :]
         if met != len(solids):
             raise ConfigError(
-                f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
-                f"{len(solids)}"
+                f"colliders: expected the {met} that the rollout was simulated with, found {len(solids)}"
             )
         return rollout, solids if isinstance(motion, Rollout) else placed_as(motion, solids)
 
@@ -397,20 +361,13 @@ class Twin:
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
         write_frames(folder / "ply", rollout.x.cpu().numpy(), self.body.colors.cpu().numpy())
-        save_frames(
-            seen(self.body, rollout.x, rollout.F_tot),
-            folder / "splats",
-            formats,
-            rate=1 / apart,
-            up=self.world.up,
-        )
+        splats = seen(self.body, rollout.x, rollout.F_tot)
+        save_frames(splats, folder / "splats", formats, rate=1 / apart, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             images = self._pictures(rollout, solids, size, view, shadow)
-            if caption:
-                frames = side_by_side({title: images}, footer=moments)
-            else:
-                frames = [to_uint8(image) for image in images]
+            plain = map(to_uint8, images)
+            frames = side_by_side({title: images}, footer=moments) if caption else list(plain)
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))
         return folder
 

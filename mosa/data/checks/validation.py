@@ -78,18 +78,13 @@ def validate(scene: Scene) -> Scene:
         low, high = map(float, value.aminmax()) if value.numel() else (0.0, 0.0)
         if not math.isfinite(low) or not math.isfinite(high):  # NaN is the least and the largest
             v, t = (~value.isfinite()).flatten(2).any(2).nonzero()[0].tolist()
-            raise DataError(
-                f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
-            )
+            where = f"camera {scene.cameras.names[v]}, frame {t}"
+            raise DataError(f"{label}: {name}: NaN or infinite pixels in {where}")
         if low < -OUTSIDE or high > 1 + OUTSIDE:
-            raise DataError(
-                f"{label}: {name}: expected numbers in [0, 1], found {low:.4g} to {high:.4g}; divide bytes by 255"
-            )
-    check_cameras(scene, label)
-    check_times(scene, label)
-    check_mattes(scene, label)
-    check_background(scene, label)
-    check_borders(scene, label)
+            found = f"found {low:.4g} to {high:.4g}; divide bytes by 255"
+            raise DataError(f"{label}: {name}: expected numbers in [0, 1], {found}")
+    for check in (check_cameras, check_times, check_mattes, check_background, check_borders):
+        check(scene, label)
     learned = scene.training_cameras
     check_film(replace(scene, images=scene.images[learned], mattes=scene.mattes[learned], cameras=scene.cameras.select(learned),
                        holdout_cameras=()) if scene.holdout_cameras else scene, label)  # fmt: skip
@@ -126,10 +121,8 @@ def check_types(film: Scene | Footage, label: str) -> None:
               "cameras.w2c": (V, 4, 4)}  # fmt: skip
     own = vars(film) | {"cameras.K": cameras.K, "cameras.w2c": cameras.w2c}
     for name, shape in shapes.items():
-        if name in own and tuple(own[name].shape) != shape:
-            raise DataError(
-                f"{label}: {name}: expected shape {shape}, found {tuple(own[name].shape)}"
-            )
+        if name in own and (found := tuple(own[name].shape)) != shape:
+            raise DataError(f"{label}: {name}: expected shape {shape}, found {found}")
     if isinstance(film, Footage):
         return
     last = range(T - len(film.holdout_frames), T)
@@ -182,15 +175,17 @@ def check_cameras(scene: Scene, label: str) -> None:
                 f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids"
             )
         if not bool((cameras.K[v].diagonal()[:2] > 0).all()):
+            found = cameras.K[v].diagonal()[:2].tolist()
             raise DataError(
-                f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}"
+                f"{label}: camera {name}: expected positive focal lengths, found {found}"
             )
         check_pixels(cameras.K[v], f"{label}: camera {name}")
         R = cameras.w2c[v, :3, :3].double()
         bent = float((R @ R.T - torch.eye(3).double()).abs().max())
         if bent > 2e-3 or float(torch.linalg.det(R)) < 0:
+            found = R.tolist()
             raise DataError(
-                f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}"
+                f"{label}: camera {name}: expected a rotation in its pose, found {found}"
             )
         cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
         inside = 0 < cx < cameras.width and 0 < cy < cameras.height
@@ -199,11 +194,9 @@ def check_cameras(scene: Scene, label: str) -> None:
             f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
             f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: "
         )
-        said += (
-            "measured from their centre? Expected from the upper left corner: add half of their size"
-            if centred
-            else "intrinsics of another resolution?"
-        )
+        corner = "Expected from the upper left corner: add half of their size"
+        other = "intrinsics of another resolution?"
+        said += f"measured from their centre? {corner}" if centred else other
         if not inside:
             raise DataError(said)
         if centred:
@@ -215,9 +208,8 @@ def check_pixels(K: torch.Tensor, label: str) -> None:
     they differ visibly."""
     fixed = K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])
     if float(fixed.abs().max()) > 1e-6:
-        raise DataError(
-            f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
-        )
+        wanted = "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
+        raise DataError(f"{label}: intrinsics: expected {wanted}, found {K.tolist()}")
     across, down = K[0, 0].item(), K[1, 1].item()
     ratio = max(across / down, down / across)
     said = (
@@ -234,9 +226,8 @@ def check_times(scene: Scene, label: str) -> None:
     """Increasing times at one frame rate."""
     steps = scene.times.double().diff()
     if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
-        raise DataError(
-            f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}"
-        )
+        found = [round(t, 5) for t in scene.times.tolist()]
+        raise DataError(f"{label}: expected increasing frame times, found {found}")
     # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
     allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
     worst = int((steps - steps.median()).abs().argmax())

@@ -43,9 +43,8 @@ def read_spring_gaus(
     present = sorted({int(found[1]) for camera in calibration for file in pictures(folder / camera)
                       if (found := PICTURE.fullmatch(file.name)) is not None})  # fmt: skip
     if not present:
-        raise DataError(
-            f"{folder}: expected pictures {next(iter(calibration))}/000.png and so on, found none"
-        )
+        wanted = f"pictures {next(iter(calibration))}/000.png and so on"
+        raise DataError(f"{folder}: expected {wanted}, found none")
     numbers, listing = frame_range(present, frames, str(folder)), str(folder / "frame.json")
     if numbers[-1] >= len(times):
         raise DataError(
@@ -72,9 +71,8 @@ def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Calibration (folder of the camera -> K, w2c) from a list of {"camera": folder, "K": 3x3 [px], "c2w": 4x4 in OpenGL axes}."""
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
-        raise DataError(
-            f"{path}: expected a list with one object per camera, found {type(entries).__name__}"
-        )
+        found = type(entries).__name__
+        raise DataError(f"{path}: expected a list with one object per camera, found {found}")
     calibration = {}
     for i, entry in enumerate(entries):
         where = f"{path}, entry {i}"
@@ -83,9 +81,8 @@ def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
                 raise DataError(f"{where}: expected the keys camera, K and c2w, found no {key}")
         name = entry["camera"]
         if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
-            raise DataError(
-                f"{where}, camera: expected the name of a folder beside {path.name}, found {str(name)[:80]!r}"
-            )
+            wanted = f"the name of a folder beside {path.name}"
+            raise DataError(f"{where}, camera: expected {wanted}, found {str(name)[:80]!r}")
         if name in calibration:
             raise DataError(f"{where}: camera {name!r} twice")
         calibration[name] = (matrix(entry["K"], (3, 3), f"{where}, K"),
@@ -97,30 +94,21 @@ def read_times(path: Path) -> list[float]:
     """Time [s] of each frame, from a list of objects that have one entry each."""
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
-        raise DataError(
-            f"{path}: expected a list with one object per frame, found {type(entries).__name__}"
-        )
+        found = type(entries).__name__
+        raise DataError(f"{path}: expected a list with one object per frame, found {found}")
     times = []
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict) or len(entry) != 1:
-            raise DataError(
-                f"{path}, entry {i}: expected an object with one entry, a time [s], found {str(entry)[:80]}"
-            )
+            wanted = "an object with one entry, a time [s]"
+            raise DataError(f"{path}, entry {i}: expected {wanted}, found {str(entry)[:80]}")
         times.append(number(next(iter(entry.values())), f"{path}, entry {i}"))
     return times
 
 
 def load_spring_gaus(
-    path: str | Path,
-    *,
-    frames=None,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
-    **world,
+    path: str | Path, *, frames=None, scale=1.0, fill_holes=0, name=None, **world
 ) -> Scene:
     """Scene of a folder in Spring-Gaus' layout. `world`: the keyword arguments of `scene_from_footage`."""
-    footage = read_spring_gaus(
-        path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes
-    )
+    fps = world.get("fps")
+    footage = read_spring_gaus(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
     return scene_from_footage(footage, name=name or Path(path).resolve().name, **world)

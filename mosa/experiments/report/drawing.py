@@ -16,9 +16,9 @@ from mosa.experiments.collecting import Cell
 from mosa.experiments.specification import Experiment, Figure
 from mosa.system.whole_files import written_whole
 
-Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
-
-
+Rows = Mapping[str, Mapping[str, Cell | None]]
+Tables = Mapping[str, Rows]
+Styles = Mapping[str, Mapping]
 WIDTH = 9.0  # [inch] of a picture: a page's; more parts grow downwards
 
 STYLES: Mapping[str, Mapping[str, Any]] = {
@@ -31,9 +31,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
     "NeuMA": {"color": "#23803c"},
     "black box": {"color": "#7a5ab5"},
     "four networks (paper)": {"color": "#f2a12e"},
-    "full": {
-        "color": "#f2a12e"
-    },  # of the ablations: the same four networks with all of their parts
+    "full": {"color": "#f2a12e"},  # of the ablations: the same four networks with all their parts
     "ours": {"color": "#d4111f", "linewidth": 2.6, "zorder": 3},
 }
 """How a method is drawn in every picture, by its name in specifications/_shared.yaml."""
@@ -68,14 +66,10 @@ def say_cut(place) -> None:
     """Adds to the label of the y axis where it begins, unless it shows the 0."""
     low, high = place.get_ylim()
     if not low <= 0 <= high:
-        said = (
-            f"{'logarithmic axis from' if place.get_yscale() == 'log' else 'axis cut at'} {low:.4g}"
-        )
-        known = place.get_ylabel()
-        place.set_ylabel(
-            f"{known} ({said})" if known else said,
-            fontsize=place.yaxis.label.get_size() if known else 8,
-        )
+        what = "logarithmic axis from" if place.get_yscale() == "log" else "axis cut at"
+        known, said = place.get_ylabel(), f"{what} {low:.4g}"
+        size = place.yaxis.label.get_size() if known else 8
+        place.set_ylabel(f"{known} ({said})" if known else said, fontsize=size)
 
 
 def wide(values: Sequence[float]) -> bool:
@@ -122,14 +116,10 @@ def limit(place, figure: Figure, least: float, values: Sequence[float]) -> None:
 def save(canvas: Canvas, stem: Path) -> Path:
     """<stem>.png and .pdf; the path of the first."""
     with matplotlib.rc_context({"pdf.fonttype": 42}):
-        with written_whole(stem.with_suffix(".pdf")) as partial:
-            canvas.savefig(
-                partial, format="pdf", bbox_inches="tight", metadata={"CreationDate": None}
-            )
-        with written_whole(stem.with_suffix(".png")) as partial:
-            canvas.savefig(
-                partial, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None}
-            )
+        for kind, stamp, dpi in (("pdf", "CreationDate", "figure"), ("png", "Software", 150)):
+            with written_whole(stem.with_suffix(f".{kind}")) as partial:
+                look = {"dpi": dpi, "bbox_inches": "tight", "metadata": {stamp: None}}
+                canvas.savefig(partial, format=kind, **look)
     return stem.with_suffix(".png")
 
 
@@ -147,10 +137,7 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
         run = {
             row for rows in tables.values() for row, cells in rows.items() if any(cells.values())
         }
-        tables = {
-            label: {row: cells for row, cells in rows.items() if row in run}
-            for label, rows in tables.items()
-        }
+        tables = {k: {row: rows[row] for row in rows if row in run} for k, rows in tables.items()}
     elif experiment.plot == "lines":
         names = [option.name for option in experiment.axes[experiment.columns]]
     styles = {name: style_of(name, names) for name in names}
@@ -177,26 +164,18 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
 
 
 def legend(
-    canvas: Canvas,
-    names: Sequence[str],
-    rows: Sequence[Mapping[str, Cell | None]] = (),
-    without: str = "not run",
-) -> None:
+    canvas: Canvas, names: Sequence[str], rows: Sequence[Mapping[str, Cell | None]] = (), without: str = "not run",
+) -> None:  # fmt: skip
     """One above all parts, in the order of `names`, with the words for the marks and gaps of the cells of rows. without: what is
     said of those of `names` that no part shows."""
-    known = {
-        text: handle
-        for place in canvas.axes
-        for handle, text in zip(*place.get_legend_handles_labels())
-    }
+    every = (place.get_legend_handles_labels() for place in canvas.axes)
+    known = {text: handle for handles, texts in every for handle, text in zip(handles, texts)}
     ordered = [name for name in names if name in known] + [t for t in known if t not in names]
     found = [cell for row in rows for cell in row.values() if cell is not None]
     marks = {mark_of(cell) for cell in found if not np.isfinite(cell.mean)}
-    handles = [known[name] for name in ordered] + [
-        Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
-        for mark in sorted(marks, reverse=True)
-    ]
-    words = []
+    handles, words = [known[name] for name in ordered], []
+    handles += [Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
+                for mark in sorted(marks, reverse=True)]  # fmt: skip
     if any(cell is None for row in rows for column, cell in row.items() if column != "mean"):
         words.append("gap: not run")
     if any("mean" in row and row["mean"] is None for row in rows):
@@ -207,8 +186,8 @@ def legend(
         canvas.supxlabel("; ".join(words), fontsize=9)
     if len(handles) > 1:
         labels = [*ordered, *(handle.get_label() for handle in handles[len(ordered) :])]
-        look: dict[str, Any] = {"loc": "outside upper center", "fontsize": 9, "frameon": False}
-        canvas.legend(handles, labels, ncols=min(len(handles), 5), **look)
+        canvas.legend(handles, labels, ncols=min(len(handles), 5), loc="outside upper center",
+                      fontsize=9, frameon=False)  # fmt: skip
 
 
 def mark_of(cell: Cell) -> str:
@@ -222,13 +201,7 @@ def marked(place, at: float, cell: Cell, color: str) -> None:
                color=color, linestyle="", zorder=4, clip_on=False)  # fmt: skip
 
 
-Rows = Mapping[str, Mapping[str, Cell | None]]
-Styles = Mapping[str, Mapping]
-
-
-def measured(
-    place, cells: Sequence[tuple[float, Cell | None]], color: str
-) -> list[tuple[float, Cell]]:
+def measured(place, cells: Sequence[tuple[float, Cell | None]], color: str) -> list[tuple[float, Cell]]:  # fmt: skip
     """Those of cells at x that have a finite mean; of the others that were run a mark is drawn."""
     for x, cell in cells:
         if cell is not None and not np.isfinite(cell.mean):
@@ -289,13 +262,11 @@ def heat_map(place, experiment: Experiment, rows: Rows, figure: Figure, styles: 
     cells = [[of.get(name) for name in names] for of in rows.values()]
     finite = [[c is not None and np.isfinite(c.mean) for c in row] for row in cells]
     values = np.array(
-        [[c.mean if f else np.nan for c, f in zip(*pair)] for pair in zip(cells, finite)]
+        [[c.mean if f else np.nan for c, f in zip(*both)] for both in zip(cells, finite)]
     )
     less = figure.best == "least"
     image = place.imshow(values, aspect="auto", cmap="viridis_r" if less else "viridis")
-    middle = (
-        np.nanmean([np.nanmin(values), np.nanmax(values)]) if np.isfinite(values).any() else 0.0
-    )
+    middle = (np.nanmin(values) + np.nanmax(values)) / 2 if np.isfinite(values).any() else 0.0
     for (i, j), value in np.ndenumerate(values):
         if cells[i][j] is None:
             continue
