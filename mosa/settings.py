@@ -36,7 +36,7 @@ from typing import (
     get_origin,
 )
 
-from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Interval, Le, Len, Lt
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -59,7 +59,6 @@ else:
 LARGEST, MOST = 1e20, 10**9  # of numbers and whole numbers without limits of their own
 WIDEST = 4096  # of a network's layer: many times what any run has used
 
-
 Public = TypeVar("Public", bound=Callable[..., Any])
 
 
@@ -80,20 +79,8 @@ Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
 Text = Annotated[str, Expected("a text")]
 Section = Annotated[dict[str, Any], Expected("a section of keys")]
 Entries = Annotated[list[dict[str, Any]], Expected("a list of sections")]
-Three = Annotated[
-    list[float], Expected("three numbers"), MinLen(3), AfterValidator(lambda v: _long(v, 3))
-]
-Four = Annotated[
-    list[float],
-    Expected("four numbers, an axis and degrees"),
-    AfterValidator(lambda v: _long(v, 4)),
-]
-
-
-def _long(values: list[Any], count: int) -> list[Any]:
-    if len(values) != count:
-        raise ValueError(f"{count} of them")
-    return values
+Three = Annotated[list[float], Expected("three numbers"), Len(3, 3)]
+Four = Annotated[list[float], Expected("four numbers, an axis and degrees"), Len(4, 4)]
 
 
 def such(valid: Callable[[Any], bool]) -> AfterValidator:
@@ -148,15 +135,12 @@ class Settings(BaseModel, metaclass=_Checked):
     def _completed(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
-        known = cls.model_fields
-        return {
-            key: {**dict(default), **value}
-            if key in known
-            and isinstance(value, Mapping)
-            and isinstance(default := known[key].get_default(call_default_factory=True), Settings)
-            else value
-            for key, value in values.items()
-        }
+        found = dict(values)
+        for key in cls.model_fields.keys() & found.keys():
+            default = cls.model_fields[key].get_default(call_default_factory=True)
+            if isinstance(found[key], Mapping) and isinstance(default, Settings):
+                found[key] = {**dict(default), **found[key]}
+        return found
 
     @classmethod
     def read(cls, values: Any, where: str | None = None) -> Self:
@@ -203,11 +187,10 @@ def mistake(
     name = ".".join(path)
     if first["type"] in ("extra_forbidden", "invalid_key"):
         section, key = model_in(wanted) if wanted is not None else owner, str(first["loc"][-1])
-        known = [name for name, f in (section or owner).model_fields.items()]
+        known = list((section or owner).model_fields)
         expected = f"one of {', '.join(known)}" if known else "none"
-        return ConfigError(
-            f"{'.'.join([*path, key])}: unknown key; expected {expected}{nearest(key, known, '.'.join(path))}"
-        )
+        expected += nearest(key, known, name)
+        return ConfigError(f"{'.'.join([*path, key])}: unknown key; expected {expected}")
     if first["type"] == "missing":
         return ConfigError(f"{name}: expected this key, found none")
     return ConfigError(f"{name}: expected {described(wanted)}, found {shown(values)}")
@@ -229,13 +212,11 @@ def shown(value: Any) -> str:
 
 def next_in(kind: Any, key: Any) -> Any:
     """The type of what lies at `key` of a model or of a mapping of models; None where that is no key of a user's."""
-    inside = model_in(kind)
-    if inside is not None and get_origin(bare(kind)) is not dict:
+    if (inside := model_in(kind)) is not None:
         f = inside.model_fields.get(key)
         return None if f is None else annotation_of(f)
-    if get_origin(bare(kind)) is dict and model_in(get_args(bare(kind))[1]) is not None:
-        return get_args(bare(kind))[1]
-    return None
+    of = get_args(bare(kind))[1] if get_origin(bare(kind)) is dict else None
+    return of if of is not None and model_in(of) is not None else None
 
 
 def annotation_of(f: FieldInfo) -> Any:
@@ -281,15 +262,14 @@ def described(kind: Any) -> str:
         return ", or ".join(some + ["null"] * (type(None) in inside))
     if kind in (int, float):
         return numbers_described(kind, []) or ""
-    return {bool: "true or false", str: "a text", Path: "a path", type(None): "null"}.get(
-        kind, "a list" if list in (origin, kind) or origin is Sequence else "a section of keys"
-    )
+    other = "a list" if list in (origin, kind) or origin is Sequence else "a section of keys"
+    words = {bool: "true or false", str: "a text", Path: "a path", type(None): "null"}
+    return words.get(kind, other)
 
 
 def word(value: Any) -> str:
-    return (
-        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    )
+    plain = str(value).lower() if isinstance(value, bool) else str(value)
+    return "null" if value is None else plain
 
 
 def flattened(told: Iterable[Any]) -> Iterable[Any]:
@@ -307,10 +287,13 @@ def numbers_described(kind: Any, told: list[Any]) -> str | None:
     """Of a whole number or a number with bounds; None for another type."""
     if kind not in (int, float):
         return None
-    low = max(((b.ge if isinstance(b, Ge) else b.gt), isinstance(b, Gt)) for b in told
-              if isinstance(b, (Ge, Gt))) if any(isinstance(b, (Ge, Gt)) for b in told) else None  # fmt: skip
-    high = min(((b.le if isinstance(b, Le) else b.lt), not isinstance(b, Lt)) for b in told
-               if isinstance(b, (Le, Lt))) if any(isinstance(b, (Le, Lt)) for b in told) else None  # fmt: skip
+    lows = [
+        (b.ge, False) if isinstance(b, Ge) else (b.gt, True) for b in told if isinstance(b, Ge | Gt)
+    ]
+    highs = [
+        (b.le, True) if isinstance(b, Le) else (b.lt, False) for b in told if isinstance(b, Le | Lt)
+    ]
+    low, high = max(lows, default=None), min(highs, default=None)
     number = (lambda v: f"{v:g}") if kind is float else str
     parts = ["a number" if kind is float else "a whole number"]
     if low is not None:
@@ -362,9 +345,8 @@ def imported(where: str, place: str) -> Any:
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            f"{where} is registered as {place}, which cannot be imported ({error})"
-        ) from error
+        found = f"registered as {place}, which cannot be imported ({error})"
+        raise ConfigError(f"{where} is {found}") from error
 
 
 # -------------------------------------------------------------------------------- arguments

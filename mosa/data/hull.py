@@ -75,9 +75,8 @@ def _smallest(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     smallest = torch.ones(len(points), dtype=points.dtype, device=points.device)
     left = torch.arange(len(points), device=points.device)
     for v in range(len(cameras)):
-        smallest[left] = torch.minimum(
-            smallest[left], matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0]
-        )
+        values = matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0]
+        smallest[left] = torch.minimum(smallest[left], values)
         left = left[smallest[left] > 0]
     return smallest
 
@@ -143,9 +142,7 @@ def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: 
     return hull.points()[hull.values > 0.5].mean(0)
 
 
-def shave_ridges(
-    volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: float = 2.0
-) -> Volume:
+def shave_ridges(volume: Volume, cameras: Cameras, *, passes=24, sigma=2.0) -> Volume:
     """The hull with its ridges rounded where no silhouette asks for them; returns 0 or 1 per voxel.
 
     A hull of few views sticks out where the cones of two silhouettes meet: by 3 to 10 % of the volume for 8 to 12 cameras,

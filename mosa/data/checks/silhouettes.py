@@ -29,8 +29,6 @@ SUNK = 0.25  # share of the hull below ground in frame 0 that means a wrong heig
 MAX_GROUND_GAP = 0.35
 """Distance between the ground and the lowest point of the hull at the turning point, in radii, above which a warning is given.
 In correct films it is below 0.15."""
-
-
 STRAY, LOST = 0.3, 0.6
 """Radii from the middle of the true particles to where the cameras see the object, from which on they are warned of, and refused.
 Of the built-in films it is at most 0.1."""
@@ -74,9 +72,7 @@ def uncovered_share(points: Tensor, pitch: float, mattes: Tensor, cameras: Camer
     return uncovered_and_islands(points, pitch, mattes, cameras)[0]
 
 
-def uncovered_and_islands(
-    points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras
-) -> tuple[Tensor, list[int]]:
+def uncovered_and_islands(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras):
     """`uncovered_share`, and the pixels of each matte that are in wholly uncovered pieces."""
     shares, islands = [], []
     size = torch.tensor([cameras.width, cameras.height])
@@ -151,9 +147,7 @@ def check_outlines(scene: Scene, label: str) -> None:
         warnings.warn(worst[1], stacklevel=3)
 
 
-def worst_uncovered(
-    shares: Tensor, names: tuple[str, ...], frame: int, label: str
-) -> tuple[float, str]:
+def worst_uncovered(shares: Tensor, names: tuple[str, ...], frame: int, label: str):
     """Largest uncovered share of a matte, and a message that names cameras and causes."""
     large = [v for v in shares.argsort(descending=True)[:4].tolist()
              if float(shares[v]) > 0.25 * float(shares.max())]  # fmt: skip
