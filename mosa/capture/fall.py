@@ -109,8 +109,9 @@ def longest_parabola(times: np.ndarray, points: np.ndarray, tolerance: float) ->
                 best, found = bend, (i, j - 1)
     if found is None or best < tolerance:
         raise DataError(
-            f"no free fall: expected {FEWEST} frames or more in which two phones see the whole object fall, and its path bend by "
-            f"{tolerance:.2g} units of the poses, found {best:.2g}; let it fall from higher up, or set flight=[<from>, <to>]"
+            f"no free fall: expected {FEWEST} frames in which two phones see the whole object, whose fall "
+            f"bends off a straight line by {tolerance:.2g} units of the poses, found {best:.2g}; let it fall "
+            "from higher up, or set flight=[<from>, <to>]"
         )
     return found
 

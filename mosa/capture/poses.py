@@ -84,7 +84,9 @@ def read_transforms_poses(file: Path) -> dict[str, Camera]:
         shot = shot_of(where, entry, document)
         width, height = (int(shot.intrinsics.get(key, 0)) for key in ("w", "h"))
         if min(width, height) < 1:
-            raise DataError(f"{where}: expected w and h of at least 1 px, found {width}, {height}")
+            raise DataError(
+                f"{where}: expected an image size w, h of at least 1 px, found {width}, {height}"
+            )
         K = camera_matrix(shot, width, height)
         lens = {name: shot.intrinsics[name] for name in COEFFICIENTS if name in shot.intrinsics}
         found[str(entry["file_path"])] = Camera(K, shot.w2c, (width, height), where, lens, shot.fisheye)  # fmt: skip

@@ -74,7 +74,8 @@ def read_world(folder: str | Path) -> World:
     found = document.get("world") if isinstance(document, Mapping) else None
     if not isinstance(found, Mapping) or not {"scale", "rotation", "origin"} <= set(found):
         raise DataError(
-            f"{file}: expected a folder of mosa-capture, or its record with world.scale, rotation, origin"
+            f"{file}: expected the record of a capture with world.scale, rotation, origin: "
+            "name the folder that mosa-capture wrote"
         )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
     scale = number(found["scale"], f"{file}, world.scale")

@@ -65,7 +65,9 @@ def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
     known = learned.record.settings.get("scene")
     where, way = f"checkpoint: {checkpoint}: settings.scene", "name one with truth.scene="
     if not isinstance(known, Mapping) or not isinstance(known.get("format"), str):
-        raise DataError(f"{where}: expected the scene that the twin is from, found none; {way}")
+        raise DataError(
+            f"{where}: expected the scene that the twin was learned from, found none; {way}"
+        )
     if (kind := known["format"]) != "builtin":
         said = f"a run on a scene of format {kind}: the truth is known for built-in scenes only"
         raise ConfigError(f"simulator: expected learned or isotropic for {said}")

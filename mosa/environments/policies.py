@@ -52,7 +52,9 @@ class LinearPolicy(nn.Module):
             policy.load_state_dict({name: torch.tensor(value) for name, value in written.items()})
         except (RuntimeError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
-            raise DataError(f"policy: expected numbers for {task.name}, found {reason}") from error
+            raise DataError(
+                f"policy: expected the numbers of a policy for {task.name}, found {reason}"
+            ) from error
         return policy
 
 

@@ -20,6 +20,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio
 from mosa.errors import ConfigError
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
+NEIGHBOURS = 8  # true points that a motion is interpolated from
 RIDGE = 1e-3  # of the local fit's slopes, relative to the neighbourhood's own size
 
 
@@ -55,9 +56,7 @@ RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")  # by `evalu
 # --- motion ---------------------------------------------------------------------------------------------------------
 
 
-def interpolate_motion(
-    rest: Tensor, positions: Tensor, query: Tensor, neighbours: int = 8
-) -> Tensor:
+def interpolate_motion(rest: Tensor, positions: Tensor, query: Tensor) -> Tensor:
     """True motion at rest positions `query` (N, 3): (T, N, 3) [m], from true rest points (M, 3) and positions (T, M, 3).
 
     A linear fit to the nearest true rest points, weighted by inverse distance. A plain weighted mean lies at the
@@ -67,23 +66,20 @@ def interpolate_motion(
     """
     points, wanted = rest.cpu().double(), query.cpu().double()
     displaced = positions.cpu().double() - points
-    distance, index = cKDTree(points.numpy()).query(
-        wanted.numpy(), k=np.arange(1, min(neighbours, len(points)) + 1)
-    )
+    ranks = np.arange(1, min(NEIGHBOURS, len(points)) + 1)
+    distance, index = cKDTree(points.numpy()).query(wanted.numpy(), k=ranks)
     weight = torch.as_tensor(1 / np.maximum(distance, 1e-12))
     weight, index = weight / weight.sum(1, keepdim=True), torch.as_tensor(index)
     center = points.mean(0)
     basis = torch.nn.functional.pad(points - center, (0, 1), value=1.0)
     # (T, 4, 3), the shortest solution: clouds that are flat or have few points pass
-    affine = torch.linalg.lstsq(
-        basis.expand(len(displaced), -1, -1), displaced, driver="gelsd"
-    ).solution
+    every = basis.expand(len(displaced), -1, -1)
+    affine = torch.linalg.lstsq(every, displaced, driver="gelsd").solution
     residual = displaced - basis @ affine
     # value at the query of the fit = weighted sum of the neighbours' residuals with these coefficients
     reach = torch.as_tensor(distance).amax(1).clamp(min=1e-12)
-    local = torch.nn.functional.pad(
-        (points[index] - wanted[:, None]) / reach[:, None, None], (0, 1), value=1.0
-    )
+    away = (points[index] - wanted[:, None]) / reach[:, None, None]
+    local = torch.nn.functional.pad(away, (0, 1), value=1.0)
     moment = torch.einsum("nk,nki,nkj->nij", weight, local, local)
     moment = moment + torch.diag(torch.tensor([RIDGE, RIDGE, RIDGE, 0.0], dtype=torch.float64))
     unit = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(wanted), 4)
@@ -119,10 +115,8 @@ def chamfer_distances(
     """`cd_sq_m2`, two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m], and `cd_m` [m], the same
     of the distances themselves."""
     ab, ba = _nearest(a, b, samples, seed)
-    return {
-        "cd_sq_m2": float((ab**2).mean() + (ba**2).mean()),
-        "cd_m": float(ab.mean() + ba.mean()),
-    }
+    squares = float((ab**2).mean() + (ba**2).mean())
+    return {"cd_sq_m2": squares, "cd_m": float(ab.mean() + ba.mean())}
 
 
 def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> float:
@@ -149,23 +143,17 @@ def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
 
 
 def sampling_floors(
-    cloud: Tensor,
-    first: int,
-    second: int,
-    *,
-    samples: int = CHAMFER_SAMPLES,
-    assignment: int = ASSIGNMENT_SAMPLES,
-    seed: int = 0,
-) -> dict[str, float]:
+    cloud: Tensor, first: int, second: int, *, samples: int = CHAMFER_SAMPLES,
+    assignment: int = ASSIGNMENT_SAMPLES, seed: int = 0,
+) -> dict[str, float]:  # fmt: skip
     """`cd_sq_m2`, `cd_m`, `emd_m` between two random samplings of one shape, of `first` and `second` points.
 
     cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.
     """
     a = resample_shape(cloud, first, 2 * seed + 101)
     b = resample_shape(cloud, second, 2 * seed + 102)
-    return chamfer_distances(a, b, samples=samples, seed=seed) | {
-        "emd_m": emd(a, b, samples=assignment, seed=seed)
-    }
+    apart = emd(a, b, samples=assignment, seed=seed)
+    return chamfer_distances(a, b, samples=samples, seed=seed) | {"emd_m": apart}
 
 
 # --- images ---------------------------------------------------------------------------------------------------------
@@ -174,9 +162,8 @@ def sampling_floors(
 def psnr(rendered: Tensor, real: Tensor) -> float:
     """Mean over images (T, H, W, 3) in [0, 1] of each one's PSNR [dB]; infinite if one of them is exact."""
     a, b = rendered.movedim(-1, 1), real.movedim(-1, 1)
-    return float(
-        peak_signal_noise_ratio(a, b, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean")
-    )
+    psnrs = peak_signal_noise_ratio(a, b, 1.0, dim=(1, 2, 3), reduction="elementwise_mean")
+    return float(psnrs)
 
 
 def ssim(rendered: Tensor, real: Tensor) -> float:
@@ -184,23 +171,17 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
 
     Over all pixels, with borders reflected (torchmetrics, kornia; others leave 5 px at the border out). At least 6 x 6 px.
     """
-    if rendered.shape != real.shape:
-        raise ValueError(
-            f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}"
-        )
+    shapes = tuple(rendered.shape), tuple(real.shape)
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"ssim: expected images of one shape, found {shapes[0]} and {shapes[1]}")
     if min(rendered.shape[1:3]) < 6:
-        raise ValueError(
-            f"ssim: expected images of at least 6 x 6 px, found {tuple(rendered.shape[1:3])}"
-        )
+        raise ValueError(f"ssim: expected images of at least 6 x 6 px, found {shapes[0][1:3]}")
     if rendered.device.type == "cpu":
         pairs = zip(rendered.detach().numpy(), real.detach().numpy())
         return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))
     # in float64: convolutions on a GPU may round to TF32, and variances are small differences
-    return float(
-        kornia_ssim(
-            rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double(), 11, eps=0.0
-        ).mean()
-    )
+    a, b = (images.movedim(-1, 1).double() for images in (rendered, real))
+    return float(kornia_ssim(a, b, 11, eps=0.0).mean())
 
 
 def _ssim_on_cpu(a: np.ndarray, b: np.ndarray) -> float:

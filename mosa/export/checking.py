@@ -20,6 +20,7 @@ from mosa.evaluation.analysis.law_stress import deformations, kirchhoff, tangent
 from mosa.export.source import Source
 from mosa.physics.launching import launch
 
+Pair = tuple[Tensor, Tensor]
 ABAQUS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -29,7 +30,7 @@ def relative(found: Tensor, expected: Tensor) -> float:
     return float((away / expected.abs().flatten(1).amax(1)).max())
 
 
-def expected(found: Source, F: Tensor) -> tuple[Tensor, Tensor]:
+def expected(found: Source, F: Tensor) -> Pair:
     """Kirchhoff stress (n, 3, 3) and its derivative d tau/dF (n, 3, 3, 3, 3) [Pa], by the kernels."""
     parts = found.material, found.adapter, F
     return kirchhoff(*parts), tangent(*parts)
@@ -48,9 +49,7 @@ def jaumann(derivative: Tensor, F: Tensor) -> Tensor:
     return torch.stack(columns, 2) / J[:, None, None]
 
 
-def check_umat(
-    found: Source, text: str, F: Tensor, truth: tuple[Tensor, Tensor]
-) -> tuple[float, float]:
+def check_umat(found: Source, text: str, F: Tensor, truth: Pair) -> tuple[float, float]:
     """Relative differences of stress and tangent, compiled by gfortran. Errors: DataError where it does not compile."""
     n, tau, derivative = len(F), *truth
     with tempfile.TemporaryDirectory() as folder:
@@ -92,7 +91,7 @@ LIKE_UFL = SimpleNamespace(
 """The functions of UFL that a text calls, on batches."""
 
 
-def check_ufl(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float, float]:
+def check_ufl(text: str, F: Tensor, truth: Pair) -> tuple[float, float]:
     """Relative differences of stress and tangent: first and second derivatives of the text's energy."""
     scope: dict = {"ufl": LIKE_UFL}
     exec(compile(text.replace("\nimport ufl\n", "\n"), "law_ufl.py", "exec"), scope)
@@ -101,17 +100,13 @@ def check_ufl(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float
     psi = scope["energy"](Entries(F))
     (P,) = torch.autograd.grad(psi.sum(), F, create_graph=True)
     found = P @ F.mT
-    rows = [
-        torch.autograd.grad(found[:, i, j].sum(), F, retain_graph=True)[0]
-        for i in range(3)
-        for j in range(3)
-    ]
-    return relative(found.detach(), tau), relative(
-        torch.stack(rows, 1).unflatten(1, (3, 3)), derivative
-    )
+    sums = (found[:, i, j].sum() for i in range(3) for j in range(3))
+    rows = [torch.autograd.grad(each, F, retain_graph=True)[0] for each in sums]
+    slopes = torch.stack(rows, 1).unflatten(1, (3, 3))
+    return relative(found.detach(), tau), relative(slopes, derivative)
 
 
-def check_warp(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> float:
+def check_warp(text: str, F: Tensor, truth: Pair) -> float:
     """Relative difference of the stress, in a kernel."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "law_warp.py"
@@ -139,9 +134,8 @@ def check_all(found: Source, texts: dict[str, str], count: int) -> dict[str, flo
     truth = expected(found, F)
     result: dict[str, float] = {}
     if shutil.which("gfortran"):
-        result["umat stress"], result["umat tangent"] = check_umat(
-            found, texts["umat.f90"], F, truth
-        )
+        both = check_umat(found, texts["umat.f90"], F, truth)
+        result["umat stress"], result["umat tangent"] = both
     result["ufl stress"], result["ufl tangent"] = check_ufl(texts["law_ufl.py"], F, truth)
     result["warp stress"] = check_warp(texts["law_warp.py"], F, truth)
     return result

@@ -62,8 +62,9 @@ def gpu_memory() -> tuple[float, float] | None:
     """Bytes (free, in all) of the GPU that this process computes on; None without one, or where it does not answer any more."""
     torch = sys.modules.get("torch")
     try:
-        used = torch is not None and torch.cuda.is_initialized()
-        return torch.cuda.mem_get_info() if used else None
+        if torch is None or not torch.cuda.is_initialized():
+            return None
+        return torch.cuda.mem_get_info()
     except Exception:  # a GPU that has no memory for the question either
         return None
 

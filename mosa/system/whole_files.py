@@ -8,6 +8,7 @@ import platform
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from mosa.errors import ConfigError
 
@@ -56,7 +57,7 @@ def write_whole(path: str | Path, text: str) -> None:
         partial.write_bytes(text.encode())
 
 
-def write_table(path: str | Path, header: Sequence[object], rows: Iterable) -> None:
+def write_table(path: str | Path, header: Sequence[object], rows: Iterable[Any]) -> None:
     """A csv file."""
     with written_whole(path) as partial, open(partial, "w", newline="") as file:
         csv.writer(file).writerows([header, *rows])

@@ -39,12 +39,10 @@ def save_rollout(
         if rollout.reactions is not None:
             tensors["reactions"] = rollout.reactions
         if colliders:
-            tensors["collider_position"], tensors["collider_rotation"] = poses(
-                colliders, rollout.times
-            )
-            tensors["collider_shape"] = torch.tensor(
-                [_numbers(each.shape) for each in colliders], dtype=torch.float64
-            )
+            position, rotation = poses(colliders, rollout.times)
+            tensors |= {"collider_position": position, "collider_rotation": rotation}
+            shapes = [_numbers(each.shape) for each in colliders]
+            tensors["collider_shape"] = torch.tensor(shapes, dtype=torch.float64)
         arrays |= {f"{name}/{key}": t.detach().cpu().numpy() for key, t in tensors.items()}
     write_npz(path, arrays)
 

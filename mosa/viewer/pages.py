@@ -28,7 +28,8 @@ def open_server(host: str, port: int) -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ConfigError("viewer: expected viser, found none: pip install viser") from error
+        way = "pip install -e '.[viewer]' in a clone, pip install viser elsewhere"
+        raise ConfigError(f"viewer: expected the package viser, found none: {way}") from error
     try:  # viser's own server would try port after port and then wait for ever
         with socket.create_server((host, 0)):
             pass

@@ -107,9 +107,8 @@ class Viewer:
                 scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
             )  # fmt: skip
 
-        self.solids = {
-            (each.name, place): [] for each in clips for place in range(len(each.bodies))
-        }
+        places = [(each.name, place) for each in clips for place in range(len(each.bodies))]
+        self.solids: dict[tuple[str, int], list[Any]] = {each: [] for each in places}
         for (name, place), nodes in self.solids.items():
             for k, shape in enumerate(self.clips[name].solids):
                 nodes.append(add_solid(scene, f"/solids/{name}/{place}/{k}", shape, visible=False))
@@ -259,7 +258,8 @@ def checkpoint_of(run: str, checkpoint: str | None) -> Path:
     path = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
     if not path.is_file():
         raise DataError(
-            f"run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no file {path}"
+            "run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no "
+            f"file {path}; of an exported folder it is given by checkpoint="
         )
     return path
 

@@ -72,7 +72,9 @@ def uncovered_share(points: Tensor, pitch: float, mattes: Tensor, cameras: Camer
     return uncovered_and_islands(points, pitch, mattes, cameras)[0]
 
 
-def uncovered_and_islands(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras):
+def uncovered_and_islands(
+    points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras
+) -> tuple[Tensor, list[int]]:
     """`uncovered_share`, and the pixels of each matte that are in wholly uncovered pieces."""
     shares, islands = [], []
     size = torch.tensor([cameras.width, cameras.height])
@@ -147,7 +149,9 @@ def check_outlines(scene: Scene, label: str) -> None:
         warnings.warn(worst[1], stacklevel=3)
 
 
-def worst_uncovered(shares: Tensor, names: tuple[str, ...], frame: int, label: str):
+def worst_uncovered(
+    shares: Tensor, names: tuple[str, ...], frame: int, label: str
+) -> tuple[float, str]:
     """Largest uncovered share of a matte, and a message that names cameras and causes."""
     large = [v for v in shares.argsort(descending=True)[:4].tolist()
              if float(shares[v]) > 0.25 * float(shares.max())]  # fmt: skip

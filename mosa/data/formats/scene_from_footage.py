@@ -192,7 +192,9 @@ def vector(value, key: str) -> Tensor:
 def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> tuple[int, ...]:
     """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where fewer than `fewest` are left."""
     if names is not None and not isinstance(names, (list, tuple)):
-        raise ConfigError(f"scene.holdout_cameras: expected a list like [3], found {names!r}")
+        raise ConfigError(
+            f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}"
+        )
     indices = set()
     for name in names or ():
         if str(name) not in footage_names:
@@ -234,7 +236,7 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
             "what comes after a gap cannot be learned from"
         )
     if len(frames) < 3:
-        raise ConfigError(f"scene.frames: expected three frames or more, found {len(frames)}")
+        raise ConfigError(f"scene.frames: expected at least three frames, found {len(frames)}")
     if len(frames) - len(indices) < 3:
         found = f"{len(indices)} of {len(frames)} frames held out"
         raise ConfigError(f"scene.holdout_frames: {found}; three must be left to learn from")

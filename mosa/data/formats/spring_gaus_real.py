@@ -27,18 +27,9 @@ AROUND = 0.9  # half of the searched box, over the nearest photograph's distance
 
 
 def load_spring_gaus_real(
-    path: str | Path,
-    *,
-    frames=None,
-    fps: float = 120.0,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
-    body: dict[str, Any] | None = None,
-    last_free_frame: int | None = None,
-    cache: str | Path | None = None,
-    **world,
-) -> Scene:
+    path: str | Path, *, frames=None, fps=120.0, scale=1.0, fill_holes=0, name=None,
+    body: dict[str, Any] | None = None, last_free_frame=None, cache=None, **world,
+) -> Scene:  # fmt: skip
     """Scene of <capture>/dynamic/sequences/<object>/<sequence>.json.
 
     fps: of the film, which no file says; body: {shape, scale} as of `scene_from_footage`: without a
@@ -47,9 +38,8 @@ def load_spring_gaus_real(
     `scene_from_footage`. Errors: DataError naming file and field, ConfigError."""
     file = Path(path)
     if file.suffix != ".json" or file.parent.parent.name != "sequences" or len(file.parents) < 4:
-        raise DataError(
-            f"scene.path: expected <capture>/dynamic/sequences/<object>/<sequence>.json, found {file}"
-        )
+        wanted = "<capture>/dynamic/sequences/<object>/<sequence>.json"
+        raise DataError(f"scene.path: expected {wanted}, found {file}")
     capture, thing = file.parents[3], file.parent.name
     photographs = read_model(capture / "static" / "colmap" / thing)
     footage, hit = read_sequence(file, photographs, frames, fps, scale, fill_holes)

@@ -224,7 +224,7 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
         still = 2 * close > len(shots) >= 2 * len({shot.time for shot in shots})
         cause = "a single moving camera cannot be used"
         if still:
-            cause = "they seem to, with poses solved for each: name each entry's camera (`camera`)"
+            cause = "they seem to, with poses solved for each image: name the camera of each entry"
         raise DataError(
             f"{file}: {len(shots)} entries with {len(members)} different poses: expected cameras that stand still and "
             f"see every frame; {cause}"

@@ -80,9 +80,7 @@ class ForceCurve:
         return mean, sd
 
 
-def forces_from_config(
-    items: Sequence[Mapping[str, Any]] | None,
-) -> tuple[ForceCurve, ...]:
+def forces_from_config(items: Sequence[Mapping[str, Any]] | None) -> tuple[ForceCurve, ...]:
     """Of entries {of: name of a collider or driven set, file: csv, sd [N]}.
 
     Columns of the file: time [s], fx, fy, fz [N].
@@ -104,14 +102,11 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
             raise ValueError(f"the columns {', '.join(names)}")
         found = {name: [float(row[names.index(name)] or "nan") for row in rows] for name in known}
     except (OSError, ValueError, IndexError, csv.Error) as error:
-        raise DataError(
-            f"{path}: expected a csv of {', '.join(COLUMNS)} (SI units), found {error}"
-        ) from error
-    blank = [math.nan] * len(rows)
-    times, *columns = (
-        torch.tensor(found.get(name, blank), dtype=torch.float64) for name in COLUMNS
-    )
-    forces = torch.stack(columns, 1)
+        wanted = ", ".join(COLUMNS)
+        raise DataError(f"{path}: expected a csv of {wanted} (SI units), found {error}") from error
+    columns = [found.get(name, [math.nan] * len(rows)) for name in COLUMNS]
+    times, *parts = torch.tensor(columns, dtype=torch.float64)
+    forces = torch.stack(parts, 1)
     if len(times) < 2 or not bool((times.diff() > 0).all()):
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
     there = forces[~torch.isnan(forces)]

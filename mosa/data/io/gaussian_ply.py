@@ -92,8 +92,9 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         document = PlyData.read(io.BytesIO(plain + end + body))
         vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
     except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
+        found = f"a damaged or other one ({error})"
         raise DataError(
-            f"{path}: expected a PLY file with an element vertex, found a damaged or other one ({error})"
+            f"{path}: expected a PLY file with an element vertex, found {found}"
         ) from error
     if any(name.startswith("scalar_") for name in vertices):  # as CloudCompare writes them
         vertices = {name.removeprefix("scalar_"): column for name, column in vertices.items()}
@@ -145,14 +146,12 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         wide = (scales.square() + read(("filter_3D",)).square()).sqrt()
         opacities, scales = opacities * (scales / wide).prod(1), wide
     if not bool(torch.isfinite(scales).all()):
-        raise DataError(
-            f"{path}: field scale_*: expected logarithms of standard deviations, found some too large for exp"
-        )
+        wanted = "logarithms of standard deviations"
+        raise DataError(f"{path}: field scale_*: expected {wanted}, found some too large for exp")
     length = rotations.norm(dim=1, keepdim=True)
     if float(length.min()) == 0:
-        raise DataError(
-            f"{path}: field rot_*: expected quaternions, found zero at vertex {int(length.argmin())}"
-        )
+        found = f"zero at vertex {int(length.argmin())}"
+        raise DataError(f"{path}: field rot_*: expected quaternions, found {found}")
     higher = read(tuple(f"f_rest_{i}" for i in range(len(rest))))
     higher = higher.view(len(means), 3, per_channel).transpose(1, 2)
     coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)

@@ -48,9 +48,8 @@ def check_formats(formats: Sequence[str]) -> None:
             try:
                 getattr(importlib.import_module(module), known)
             except (ImportError, AttributeError) as error:
-                raise ConfigError(
-                    f"formats: {name} needs the package {package}: pip install 'mosa[{extra}]'"
-                ) from error
+                way = f"pip install 'mosa[{extra}]'"
+                raise ConfigError(f"formats: {name} needs the package {package}: {way}") from error
     if "sog" in formats and shutil.which(CONVERTER) is None:
         raise ConfigError(
             f"formats: sog needs the program {CONVERTER} on the PATH: npm install --global "
@@ -162,15 +161,12 @@ def save_rrd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
             colors = torch.cat([splats.colors, splats.opacities[:, None]], 1).clamp(0, 1)
             padded = torch.nn.functional.pad(higher, (0, 0, 0, 15 - higher.shape[1])).numpy()
             recording.set_time("time", duration=t / rate)
-            shown = rr.GaussianSplats3D(
-                splats.means.numpy(),
-                scales=splats.scales.numpy(),
-                quaternions=splats.rotations[:, [1, 2, 3, 0]].numpy(),
-                colors=(255 * colors + 0.5).byte().numpy(),
-                sh_coefficients=padded if higher.shape[1] else None,
-                spherical_harmonics_degree=degree_of(frame.harmonics),
-            )
-            recording.log("body", shown)
+            harmonics = {"sh_coefficients": padded if higher.shape[1] else None,
+                         "spherical_harmonics_degree": degree_of(frame.harmonics)}  # fmt: skip
+            turns, painted = splats.rotations[:, [1, 2, 3, 0]], (255 * colors + 0.5).byte()
+            look = {"quaternions": turns.numpy(), "colors": painted.numpy()} | harmonics
+            own = splats.means.numpy(), splats.scales.numpy()
+            recording.log("body", rr.GaussianSplats3D(own[0], scales=own[1], **look))
         recording.disconnect()
     return path
 
@@ -183,12 +179,7 @@ def drop_later_frames(folder: Path, suffix: str, count: int) -> None:
 
 
 def save_frames(
-    shown: Seen,
-    folder: str | Path,
-    formats: Sequence[str],
-    *,
-    rate: float = 30.0,
-    up: Tensor | None = None,
+    shown: Seen, folder: str | Path, formats: Sequence[str], *, rate: float = 30.0, up=None
 ) -> Path:
     """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `gltf/000.glb`,
     `sog/000.sog` and so on, and for all of them `splats.usdc` and `splats.rrd`.

@@ -231,9 +231,9 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     numbers = {"operator": "numbers of the anisotropic stiffness", "stiffness": "modes of the stiffness over the body"}  # fmt: skip
     for name, what in numbers.items():
         if (count := figures.get(f"posterior/{name}_numbers")) is not None:
-            sure = figures[f"posterior/{name}_determined"]
+            known = figures[f"posterior/{name}_determined"]
             lines.append(
-                f"- Of {count:.0f} {what} the data determine {sure:.1f}; the others keep their prior values."
+                f"- Of {count:.0f} {what} the data determine {known:.1f}; the others keep their prior values."
             )
     if (sd := figures.get("posterior/test/sd_m")) is not None:
         sure = figures.get("posterior/test/coverage")
