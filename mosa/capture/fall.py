@@ -109,9 +109,9 @@ def longest_parabola(times: np.ndarray, points: np.ndarray, tolerance: float) ->
                 best, found = bend, (i, j - 1)
     if found is None or best < tolerance:
         raise DataError(
-            f"no free fall: expected {FEWEST} frames in which two phones see the whole object, whose fall "
-            f"bends off a straight line by {tolerance:.2g} units of the poses, found {best:.2g}; let it fall "
-            "from higher up, or set flight=[<from>, <to>]"
+            f"no free fall: expected {FEWEST} frames in which two phones see the whole object, "
+            f"whose fall bends off a straight line by {tolerance:.2g} units of the poses, found "
+            f"{best:.2g}; let it fall from higher up, or set flight=[<from>, <to>]"
         )
     return found
 
@@ -220,8 +220,9 @@ def fit_fall(
         count = sum(map(len, problem.times))
         if count < 3 * len(phones) or window[1] - window[0] < 3 * interval:
             raise DataError(
-                f"no free fall: {count} centres from {window[0]:.3f} to {window[1]:.3f} s on the clock of {phones[0].name} are "
-                f"left of {3 * len(phones)} needed; let the object fall from higher up, or set flight=[<from>, <to>]"
+                f"no free fall: {count} centres from {window[0]:.3f} to {window[1]:.3f} s on the "
+                f"clock of {phones[0].name} are left of {3 * len(phones)} needed; let the object "
+                "fall from higher up, or set flight=[<from>, <to>]"
             )
         numbers = problem.solve(problem.begin() if numbers is None else numbers, noise).x
         misses = problem.misses(numbers)

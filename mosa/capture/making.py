@@ -66,7 +66,7 @@ def make(cfg: DictConfig) -> dict[str, Any]:
 
 
 def capture(values: Mapping[str, Any]) -> dict[str, Any]:
-    """From the keys of conf/capture.yaml, which have been checked. Errors: ConfigError, DataError."""
+    """From the checked keys of conf/capture.yaml. Errors: ConfigError, DataError."""
     folder = output_folder(values)
     files = find_videos(values["videos"])
     if unknown := set(values["phones"] or {}) - (stems := {file.stem for file in files}):
@@ -303,35 +303,52 @@ def warnings_of(
     """What a reader has to know before training on it."""
     said, fall, g, ground = [], found.get("fall"), values["gravity"], found["ground"]
     if found["scale_sd"] is not None and (sd := found["scale_sd"] / found["scale"]) > 0.03:
-        said.append(f"the scale is known to {sd:.1%} only, and a modulus of elasticity to twice that: let it fall from higher up, "
-                    "or measure a distance and set scale=<metres per unit of the poses>")  # fmt: skip
+        said.append(
+            f"the scale is known to {sd:.1%} only, and a modulus of elasticity to twice that: let "
+            "it fall from higher up, or measure a distance and set scale=<metres per unit of the "
+            "poses>"
+        )
     if knowledge.scale is not None and abs(fall["acceleration"] / g - 1) > 0.03:
-        said.append(f"with the scale {knowledge.scale:.6g} the object falls with {fall['acceleration']:.3g} m/s^2 in place of "
-                    f"{g:.3g}: check scale, fps and gravity")  # fmt: skip
+        said.append(
+            f"with the scale {knowledge.scale:.6g} the object falls with "
+            f"{fall['acceleration']:.3g} m/s^2 in place of {g:.3g}: check scale, fps and gravity"
+        )
     if knowledge.up is not None and (beside := fall["turned_degrees"]) > 3:
         said.append(f"the object falls {beside:.1f} degrees beside the given up: check up, or like")
     for phone, record in zip(phones, found["phones"]):
         name, own, off = record["name"], 1e3 * record["readout"], np.hypot(*record["shift"])
         if record["jitter"] > 0.5:
             said.append(
-                f"{name}: its frames are up to {record['jitter']:.2g} frames off an even rate; the file's times are used"
+                f"{name}: its frames are up to {record['jitter']:.2g} frames off an even rate; the "
+                "file's times are used"
             )
         if record["readout_sd"] > 0.006 and knowledge.readout_of(phone.name) is None:
-            said.append(f"{name}: the fall does not tell how long a readout takes ({own:.0f} +- "
-                        f"{1e3 * record['readout_sd']:.0f} ms, 15 +- 10 is assumed); each ms changes the scale")  # fmt: skip
+            said.append(
+                f"{name}: the fall does not tell how long a readout takes ({own:.0f} +- "
+                f"{1e3 * record['readout_sd']:.0f} ms, 15 +- 10 is assumed); each ms changes the "
+                "scale"
+            )
         if off > MAX_PHONE_OFFSET * record["radius_px"]:
             said.append(
-                f"{name}: the object appears {off:.1f} px from where the others see it: a pose or a matte that is off?"
+                f"{name}: the object appears {off:.1f} px from where the others see it: a pose or "
+                "a matte that is off?"
             )
     if (tilt := ground["tilt_degrees"]) is not None and tilt > 1.5:
-        said.append(f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; "
-                    "scene.ground is a level plane")  # fmt: skip
+        said.append(
+            f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an "
+            "up that is off; scene.ground is a level plane"
+        )
     if ground["from"] == "lowest contact" and ground["sd"] > 0.05 * found["radius"]:
-        said.append(f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: name a point of it "
-                    "with ground=[x, y, z], in the poses' world, or film with a phone at the height of the floor")  # fmt: skip
+        said.append(
+            f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: "
+            "name a point of it with ground=[x, y, z], in the poses' world, or film with a phone "
+            "at the height of the floor"
+        )
     if not SIZES[0] <= found["radius"] <= SIZES[1]:
-        said.append(f"the object would be {2 * found['radius']:.2g} m across: lengths follow from gravity and the clock alone; "
-                    "measure one, set scale=, and check fps=")  # fmt: skip
+        said.append(
+            f"the object would be {2 * found['radius']:.2g} m across: lengths follow from gravity and the clock alone; "
+            "measure one, set scale=, and check fps="
+        )
     if found["free_frames"] < 3:
         said.append(f"only {found['free_frames']} frames of free fall are written: raise before=")
     return said

@@ -83,8 +83,8 @@ def from_videos(folder: Path, clip: Clip) -> Matting:
     other = open_clip(named[clip.path.stem])
     if len(other.times) != len(clip.times) or other.size != clip.size:
         raise DataError(
-            f"{other.path}: expected {len(clip.times)} frames of {clip.size[0]}x{clip.size[1]} px as {clip.path}, found "
-            f"{len(other.times)} of {other.size[0]}x{other.size[1]}"
+            f"{other.path}: expected {len(clip.times)} frames of {clip.size[0]}x{clip.size[1]} px "
+            f"as {clip.path}, found {len(other.times)} of {other.size[0]}x{other.size[1]}"
         )
     source: Iterator[tuple[int, np.ndarray]] | None = None
     at = -1

@@ -111,8 +111,9 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
         angle = math.degrees(math.acos(np.clip(0.5 * (np.trace(turn) - 1), -1, 1)))
         if away > MOVED * extent or angle > TURNED:
             raise DataError(
-                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span {extent:.3g}) and "
-                f"{angle:.2g} degrees: expected phones that stand still"
+                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} "
+                f"(the cameras span {extent:.3g}) and {angle:.2g} degrees: expected phones that "
+                "stand still"
             )
         other = np.abs(camera.K / camera.size[0] - one.K / one.size[0]).max()
         if other > FOCUS * one.K[0, 0] / one.size[0]:

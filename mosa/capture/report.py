@@ -40,8 +40,9 @@ def page(found: dict[str, Any]) -> str:
     first, up = found["phones"][0]["name"], ", ".join(f"{x:.4f}" for x in found["up"])
     rows = "\n".join(
         f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | "
-        f"{1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | {1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} "
-        f"({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {', '.join(f'{g:.2f}' for g in p['gain'] or ())} |"
+        f"{1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | {1e3 * p['readout']:.1f} +- "
+        f"{1e3 * p['readout_sd']:.1f} ({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | "
+        f"{', '.join(f'{g:.2f}' for g in p['gain'] or ())} |"
         for p in found["phones"]
     )
     return f"""# A capture by {len(found["phones"])} phones
@@ -73,8 +74,8 @@ A modulus of elasticity is known to twice the relative error of the scale, besid
 |---|---|---|---|---|---|---|
 {rows}
 
-Clock: what is added to a phone's own time to have that of {first}. Readout: time from the sensor's first row to its last, and where
-the next row lies in the picture.
+Clock: what is added to a phone's own time to have that of {first}. Readout: time from the sensor's
+first row to its last, and where the next row lies in the picture.
 
 ![frames and outlines of the mattes](contact.png)
 

@@ -69,7 +69,7 @@ def common_path(
         seen = track.seen
         late = fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
         own = track.times[seen] + fall.offsets[v] + late
-        # where a phone sees the object minus where it falls: of its pose, and of its side of the object
+        # seen minus where it falls: of the phone's pose, and of its side of the object
         free = (own >= fall.window[0]) & (own <= fall.window[1])
         off = (track.centres[seen][free] - phone.camera.project(fall.at(own[free]))).mean(0)
         rays = phone.camera.rays(track.centres[seen] - off)
@@ -131,8 +131,9 @@ def common_times(
     begin, end = max(bad[bad <= low], default=-1) + 1, min(bad[bad > low], default=len(grid))
     if end - begin < 5 or low - begin < 1:
         raise DataError(
-            f"{end - begin} common frames ({low - begin} of them in free fall): expected five in which every phone sees the whole "
-            "object, two of them in free fall; film with more room around, longer, or change before=, after="
+            f"{end - begin} common frames ({low - begin} of them in free fall): expected five in "
+            "which every phone sees the whole object, two of them in free fall; film with more "
+            "room around, longer, or change before=, after="
         )
     return grid[begin:end]
 

@@ -119,8 +119,9 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                 return picture.astype(np.float32) / 255
     if seconds is None:
         raise DataError(
-            f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) in {folder or 'the folder plates='}, or "
-            "plate_seconds=[0, 0.5] where the video begins without the object, or another mattes="
+            f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) in "
+            f"{folder or 'the folder plates='}, or plate_seconds=[0, 0.5] where the video begins "
+            "without the object, or another mattes="
         )
     inside = np.flatnonzero((clip.times >= seconds[0]) & (clip.times <= seconds[1]))
     if len(inside) == 0:

@@ -106,7 +106,8 @@ def check_archive(path: Path) -> None:
                 # STACK_GLOBAL names nothing here, and is not written
                 if "GLOBAL" in code.name and named not in NAMED:
                     raise DataError(
-                        f"refers to {named or 'a function or class'}, not only to tensors and plain values"
+                        f"refers to {named or 'a function or class'}, not only to tensors and "
+                        "plain values"
                     )
 
 
@@ -143,7 +144,8 @@ def check_containers(checkpoint: Any) -> None:
             if not whole or value.numel() * value.element_size() > value.untyped_storage().nbytes():
                 found = tuple(value.shape)
                 raise DataError(
-                    f"{where}: expected a dense tensor of as many numbers as are stored, found {found}"
+                    f"{where}: expected a dense tensor of as many numbers as are stored, found "
+                    f"{found}"
                 )
         elif not isinstance(value, (str, int, float, type(None))):
             kind = type(value).__name__
@@ -169,8 +171,8 @@ def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
                 raise
             version = importlib.import_module("mosa").__version__  # beside all layers
             raise DataError(
-                f"{error}: expected the settings of this version of mosa, {version}, found those of another "
-                "one; learn it again, or use the version that wrote it"
+                f"{error}: expected the settings of this version of mosa, {version}, found those "
+                "of another one; learn it again, or use the version that wrote it"
             ) from error
     return record
 

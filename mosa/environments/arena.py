@@ -34,9 +34,13 @@ class Simulator:
 
 
 def simulator_named(
-    name: str, checkpoint: str | Path | None = None, *, scene: str | None = None, device: str = "cpu",
+    name: str,
+    checkpoint: str | Path | None = None,
+    *,
+    scene: str | None = None,
+    device: str = "cpu",
     spacing: float | None = None,
-) -> Simulator:  # fmt: skip
+) -> Simulator:
     """learned | isotropic: of a run's checkpoint; truth: of the built-in scene that the run learned from, or of `scene`.
 
     spacing [m]: of the truth's particles, None for the films' own. Errors: ConfigError, DataError naming what is missing.

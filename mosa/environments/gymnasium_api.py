@@ -43,7 +43,7 @@ class _Worlds:
     def _spaces(
         self, worlds: int, task: str | Task, simulator: str, options: dict | None, **of: Any
     ) -> tuple[spaces.Box, spaces.Box]:
-        """(observations: the ranges of a start, wider by rounding; actions in [-1, 1]). Errors: ConfigError, DataError."""
+        """(observations: ranges of a start, wider by rounding; actions). Errors: ConfigError, DataError."""
         made = simulator_named(simulator, **of)
         if not isinstance(task, Task):
             task = task_named(task, made.twin.body.rest, **(options or {}))
@@ -92,7 +92,9 @@ class TwinEnv(gymnasium.Env, _Worlds):
         self.render_mode, self.size = render_mode, size
 
     @typed
-    def reset(self, *, seed: Seed | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:  # fmt: skip
+    def reset(
+        self, *, seed: Seed | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
         return self._draw(self.np_random, self.render_mode is not None)[0], {}
 
@@ -114,8 +116,10 @@ def held(arena: Arena) -> tuple[Tensor, Tensor, None]:
     """(x (B, N, 3), F_tot (B, N, 3, 3), None) of bodies in the hand, before it has decided: as if it aimed at the middle."""
     nothing = torch.zeros(arena.count, len(arena.task.actions))
     starts = arena.task.starts(arena.trials, nothing, arena.rest, arena.gravity)
-    turns, place, height = (torch.stack([torch.as_tensor(start[key]) for start in starts]).to(arena.rest)
-                            for key in ("rotation", "position", "height"))  # fmt: skip
+    turns, place, height = (
+        torch.stack([torch.as_tensor(start[key]) for start in starts]).to(arena.rest)
+        for key in ("rotation", "position", "height")
+    )
     x = arena.rest @ turns.mT
     place[:, 1] = height - x[..., 1].amin(1)
     return x + place[:, None], turns[:, None].expand(*x.shape, 3), None
@@ -142,12 +146,16 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         self.observation_space = batch_space(self.single_observation_space, worlds)
 
     @typed
-    def reset(self, *, seed: Seed | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:  # fmt: skip
+    def reset(
+        self, *, seed: Seed | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
         if seed is not None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
         return self._draw(self.np_random, False), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:  # fmt: skip
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         rewards = self._step(actions)
         ended, never = np.ones(self.num_envs, bool), np.zeros(self.num_envs, bool)
         last = np.empty(self.num_envs, dtype=object)

@@ -43,7 +43,9 @@ def mark(target: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     return points, torch.full((len(points),), 0.5 * THIN), torch.tensor(MARK).expand(len(points), 3)
 
 
-def scenery(solids: Sequence[Mapping[str, Any]], places: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+def scenery(
+    solids: Sequence[Mapping[str, Any]], places: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
     """(means (K, 3), standard deviations (K,) [m], colours (K, 3)) of ground and solids. places: (solids, 3, 4) poses, None for
     those that they begin at."""
     flat = lattice(2 * GROUND, 2 * GROUND, TILE)
@@ -104,7 +106,7 @@ def film(
 
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> None:
-    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other."""
+    """`<name>.png`, a row of pictures for each film; `<name>.mp4`, the films beside each other."""
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
     write_strip(folder / f"{name}.png", rows, frames=6)

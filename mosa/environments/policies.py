@@ -74,8 +74,13 @@ class PolicyChecks:
     check: the arena that the trials are played in; say: told a line of each look."""
 
     def __init__(
-        self, policy: LinearPolicy, check: Arena, search: Search, seed: int, say: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self,
+        policy: LinearPolicy,
+        check: Arena,
+        search: Search,
+        seed: int,
+        say: Callable[[str], None],
+    ) -> None:
         self.policy, self.check, self.search, self.say = policy, check, search, say
         own = torch.Generator().manual_seed(10**6 + seed)
         self.trials = check.task.draw(search.validation, own)
@@ -108,8 +113,12 @@ class PolicyChecks:
 
 
 def by_gradient(
-    train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None,
-) -> Found:  # fmt: skip
+    train: Arena,
+    check: Arena,
+    search: Search,
+    seed: int,
+    say: Callable[[str], None] = lambda line: None,
+) -> Found:
     """The mean loss descended through the simulator, contact and all. train, check: of the same simulator and task."""
     task, generator = train.task, torch.Generator().manual_seed(seed)
     policy = LinearPolicy(task)
@@ -202,8 +211,12 @@ def _fitted_model(inputs: Tensor, outcomes: Tensor, generator: torch.Generator) 
 
 @torch.no_grad()
 def by_model(
-    train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None,
-) -> Found:  # fmt: skip
+    train: Arena,
+    check: Arena,
+    search: Search,
+    seed: int,
+    say: Callable[[str], None] = lambda line: None,
+) -> Found:
     """A model of how trials end is fitted to all that was tried in the simulator, and the policy is descended on the model; then
     more is tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over many.
     train, check: of the same simulator and task, the former with `search.candidates` times `search.batch` worlds."""
@@ -229,7 +242,9 @@ def by_model(
 
 
 @torch.enable_grad()
-def _descend(policy: LinearPolicy, model: OutcomeModel, task: Task, generator: torch.Generator) -> None:  # fmt: skip
+def _descend(
+    policy: LinearPolicy, model: OutcomeModel, task: Task, generator: torch.Generator
+) -> None:
     """The policy's numbers to the least cost that the model's members agree on: their mean and their standard deviation."""
     trials = task.draw(IMAGINED, generator)
     observed, many = trials.observed, trials.select(torch.arange(IMAGINED).repeat(MEMBERS))

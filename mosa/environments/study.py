@@ -99,7 +99,9 @@ def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) 
     return record
 
 
-def log_successes(bench: Bench, simulator: str, seed: int, result: Mapping[str, Any], where: str) -> None:  # fmt: skip
+def log_successes(
+    bench: Bench, simulator: str, seed: int, result: Mapping[str, Any], where: str
+) -> None:
     """How often a policy succeeded, as a line of the log."""
     s, won = bench.setting, sum(result["success"])
     log.info("%s, trained in %s, seed %d: %d of %d in %s", s.task, simulator, seed, won, s.trials, where)  # fmt: skip
@@ -133,8 +135,10 @@ def table(
     jobs = [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)]
     records, task = make_jobs(bench, jobs, folder), bench.task("truth")
     page = write_table(bench.setting, records, task, folder, about_twin(bench))
-    policies = {f"trained in {name}": LinearPolicy.read(task, records[name, seeds[0]]["policy"])
-                for name in simulators}  # fmt: skip
+    policies = {
+        f"trained in {name}": LinearPolicy.read(task, records[name, seeds[0]]["policy"])
+        for name in simulators
+    }
     films(bench, policies, "truth", folder, filmed)
     return page
 
@@ -197,8 +201,12 @@ def _read(file: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def films(
-    bench: Bench, policies: Mapping[str, Callable[[Tensor], Tensor]], simulator: str, folder: Path, filmed: int,
-) -> None:  # fmt: skip
+    bench: Bench,
+    policies: Mapping[str, Callable[[Tensor], Tensor]],
+    simulator: str,
+    folder: Path,
+    filmed: int,
+) -> None:
     """The first tested trials under each policy, in that simulator: one strip and one video a trial."""
     task = bench.task(simulator)
     count = min(filmed, bench.setting.trials)

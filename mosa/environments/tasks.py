@@ -26,7 +26,7 @@ from mosa.environments.task import (
     Task,
     Trials,
     View,
-)  # fmt: skip
+)
 from mosa.physics.contact.motion import exponential
 from mosa.settings import call, check
 

@@ -85,9 +85,13 @@ def rollouts(
         began, counted = time.perf_counter(), len(sizes)
         try:
             result[v] = body.simulate(
-                sequence.start, world, scene.frames, frame_dt, model=body.model(v),
+                sequence.start,
+                world,
+                scene.frames,
+                frame_dt,
+                model=body.model(v),
                 collect=lambda found: sizes.append(float(found.mean_abs_C)),
-            )  # fmt: skip
+            )
         except (SimulationDiverged, ConfigError) as error:
             del sizes[counted:]
             warn(
@@ -133,9 +137,13 @@ def image_metrics(
 
 
 def motion_metrics(
-    x: Tensor, body: Body, sequence: Sequence, frames: list[int], settings: EvaluationSettings,
+    x: Tensor,
+    body: Body,
+    sequence: Sequence,
+    frames: list[int],
+    settings: EvaluationSettings,
     target: Tensor | None = None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
     target: `true_motion`, where it is at hand: it is the same for all models."""
@@ -241,8 +249,13 @@ def worst(name: str) -> float:
 
 
 def sequence_metrics(
-    body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings, target: Tensor | None,
-) -> dict[str, float]:  # fmt: skip
+    body,
+    sequence: Sequence,
+    rollout: Rollout,
+    model: str,
+    settings: EvaluationSettings,
+    target: Tensor | None,
+) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x, parts = sequence.scene, rollout.x.cpu(), parts_of(sequence)
     training = sequence.prefix.startswith("train")

@@ -87,9 +87,13 @@ rollout = twin.simulate(height=0.2, velocity=(0, 0, 0), angular_velocity=(0, 0, 
 
 
 def model_card(
-    figures: Mapping[str, float], body: Body, sequences: Ordered[Sequence], kept: Kept,
-    world: World, version: str,
-) -> str:  # fmt: skip
+    figures: Mapping[str, float],
+    body: Body,
+    sequences: Ordered[Sequence],
+    kept: Kept,
+    world: World,
+    version: str,
+) -> str:
     """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and
     variant; version: of mosa."""
     law, name = body.material.law, sequences[0].scene.name

@@ -20,7 +20,9 @@ def setting(overrides: Sequence[str], key: str) -> str | None:
     return {name: value for name, _, value in (each.partition("=") for each in overrides)}.get(key)
 
 
-def parameters(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:  # fmt: skip
+def parameters(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """A line for each parameter of each built-in body whose law has the form that is identified, with means over the seeds."""
     asked = {claim.figure: claim.most for claim in experiment.claims if claim.most is not None}
     limits = {f.figure.removeprefix("id/").removesuffix("_relative_error"): asked.get(f.label)

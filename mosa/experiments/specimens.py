@@ -122,7 +122,9 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
     return found
 
 
-def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:  # fmt: skip
+def compression(
+    experiment: Experiment, records: Sequence[Record], stem: Path
+) -> tuple[str, list[Path]]:
     """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical; a row
     of the picture for each column of the table: E, and how far it is from the truth's."""
     truths: Truths = {}

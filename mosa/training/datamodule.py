@@ -65,10 +65,13 @@ class SceneDataModule(L.LightningDataModule):
     """
 
     def __init__(
-        self, scene: str | Mapping[str, Any] | DictConfig = "rabbit", *overrides: str,
-        device: torch.device | str | None = None, held_out: bool = True,
+        self,
+        scene: str | Mapping[str, Any] | DictConfig = "rabbit",
+        *overrides: str,
+        device: torch.device | str | None = None,
+        held_out: bool = True,
         predict: Sequence[Mapping[str, Any]] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         """scene: a name of conf/scene, or a whole configuration (`mosa.compose`); overrides: as on the command line, beside a name.
 
         device: where reconstruction and targets are; None: the trainer's. held_out: whether to load sequences that nothing is
@@ -119,10 +122,19 @@ class SceneDataModule(L.LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """Keyword arguments of `Twin.simulate`, one mapping a start."""
-        return served(self.predict or [
-            {"rotation": s.start.rotation, "position": s.start.center, "velocity": s.start.velocity,
-             "angular_velocity": s.start.angular_velocity, "frames": s.scene.frames} for s in self.sequences
-        ])  # fmt: skip
+        return served(
+            self.predict
+            or [
+                {
+                    "rotation": s.start.rotation,
+                    "position": s.start.center,
+                    "velocity": s.start.velocity,
+                    "angular_velocity": s.start.angular_velocity,
+                    "frames": s.scene.frames,
+                }
+                for s in self.sequences
+            ]
+        )
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
@@ -188,8 +200,9 @@ class SceneDataModule(L.LightningDataModule):
     @property
     def _found_with(self) -> dict[str, Any]:
         """What is the same for the reconstruction of every sequence."""
-        return {"settings": self.settings.reconstruction, "cache_dir": self.cache, "seed": self.settings.seed,
-                "device": self.device or "cpu"}  # fmt: skip
+        settings, device = self.settings, self.device or "cpu"
+        return {"settings": settings.reconstruction, "cache_dir": self.cache, "seed": settings.seed,
+                "device": device}  # fmt: skip
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
@@ -297,8 +310,19 @@ class SceneDataModule(L.LightningDataModule):
         parts = {"cameras": (scene.holdout_cameras, scene.training_frames),
                  "frames": (range(len(scene.cameras)), scene.holdout_frames)}  # fmt: skip
         return [
-            MotionBatch(sequences=(SequenceBatch(
-                name=name, index=0, views=list(views), frames=list(frames), cues=None, extra={},
-                observations=cropped(scene, views, frames, margin)),))
-            for name, (views, frames) in parts.items() if views and frames
-        ]  # fmt: skip
+            MotionBatch(
+                sequences=(
+                    SequenceBatch(
+                        name=name,
+                        index=0,
+                        views=list(views),
+                        frames=list(frames),
+                        cues=None,
+                        extra={},
+                        observations=cropped(scene, views, frames, margin),
+                    ),
+                )
+            )
+            for name, (views, frames) in parts.items()
+            if views and frames
+        ]

@@ -85,9 +85,13 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     arguments_of(begin, "trainer", "precision", *untold(begin)).part(given)
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
     trainer = made(
-        "trainer", cfg.trainer, logger=loggers or False, callbacks=callbacks,
-        default_root_dir=str(folder), plugins=[AtomicCheckpointIO(), LightningEnvironment()],
-    )  # fmt: skip
+        "trainer",
+        cfg.trainer,
+        logger=loggers or False,
+        callbacks=callbacks,
+        default_root_dir=str(folder),
+        plugins=[AtomicCheckpointIO(), LightningEnvironment()],
+    )
     check_trainer(trainer, given.get("precision"))
     check_monitors(cfg, callbacks)
     return trainer

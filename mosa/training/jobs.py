@@ -92,7 +92,8 @@ def check_folders(arguments: Sequence[str]) -> None:
         many = {"-m", "--multirun"} & set(arguments)
         if key == "hydra.sweep.subdir" and many and "$" not in value:
             raise ConfigError(
-                f"{key}: expected a name that is another one for each job, as ${{hydra.job.num}} is, found {value}"
+                f"{key}: expected a name that is another one for each job, as ${{hydra.job.num}} "
+                f"is, found {value}"
             )
 
 
@@ -198,7 +199,8 @@ def held(folder: str | Path, wait: bool = False) -> Iterator[None]:
         except BlockingIOError:
             if not wait:
                 raise ConfigError(
-                    f"hydra.run.dir: another process is at work in {folder}; wait, or give this run another folder"
+                    f"hydra.run.dir: another process is at work in {folder}; wait, or give this "
+                    "run another folder"
                 ) from None
             log.info("another process is at work in %s: waiting (resume=auto)", folder)
             fcntl.flock(number, fcntl.LOCK_EX)

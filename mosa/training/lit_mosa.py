@@ -93,7 +93,8 @@ def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
     """Errors: ConfigError naming an argument that no fit can do with. precision: as it was given, which a Trainer may change."""
     if trainer.world_size != 1:
         raise ConfigError(
-            f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.world_size} (docs/sweeps.md)"
+            "trainer.devices: expected 1, or a list with the index of one GPU, found "
+            f"{trainer.world_size} (docs/sweeps.md)"
         )
     if trainer.precision not in PRECISIONS:
         raise ConfigError(
@@ -263,8 +264,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     def of_another_body(self, found: int | None) -> ConfigError:
         return ConfigError(
-            f"ckpt_path: expected a fit to a body of {len(self.body.rest)} particles, found {found}: the "
-            "checkpoint belongs to another scene, reconstruction or simulation.particles"
+            f"ckpt_path: expected a fit to a body of {len(self.body.rest)} particles, found "
+            f"{found}: the checkpoint belongs to another scene, reconstruction or "
+            "simulation.particles"
         )
 
     def is_plastic(self) -> bool:
@@ -283,15 +285,23 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             cues = [take.cues.positions.cpu() for take in self.takes]
             responses = [take.response and take.response.written() for take in self.takes]
         fit = FitRecord(
-            **{name: getattr(self, name) for name in KEPT}, stage=self.stage_index, losses=list(self.losses),
-            particles=len(self.body.rest), identification=self.identification.state() if self.identification else None,
-            retreat=self.retreat.written(), cues=cues, responses=responses,
-        )  # fmt: skip
+            **{name: getattr(self, name) for name in KEPT},
+            stage=self.stage_index,
+            losses=list(self.losses),
+            particles=len(self.body.rest),
+            identification=self.identification.state() if self.identification else None,
+            retreat=self.retreat.written(),
+            cues=cues,
+            responses=responses,
+        )
         posterior, splats = self.posterior, self.body.splats
         record = RunRecord(
-            **dict(self.record), start=self.start, fit=fit, posterior=posterior and posterior.written(),
+            **dict(self.record),
+            start=self.start,
+            fit=fit,
+            posterior=posterior and posterior.written(),
             splats=None if splats is None else splats.written(),
-        )  # fmt: skip
+        )
         check_plain("", checkpoint)  # with what callbacks and data modules of anyone's added
         checkpoint["mosa"] = record.plain()
 
@@ -314,7 +324,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if self.compared and (candidates := self.body.material.candidates):
             if (law := record.law) not in candidates:
                 raise ConfigError(
-                    f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r}"
+                    f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, "
+                    f"found {law!r}"
                 )
             self.choose(law)
         if self.ground_is_sought and record.ground is not None and not record.ground_is_sought:
@@ -327,8 +338,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
               and any(take.again for take in self.takes)):  # fmt: skip
             raise ConfigError(
-                "ckpt_path: expected the motion that reconstruction.informed finds, found none: set "
-                "reconstruction.informed.iterations=0, as the run had it"
+                "ckpt_path: expected the motion that reconstruction.informed finds, found none: "
+                "set reconstruction.informed.iterations=0, as the run had it"
             )
 
     def choose(self, law: str) -> None:

@@ -58,14 +58,16 @@ def check_memory(cfg: Mapping[str, Any], size: Size) -> None:
     if most < 8 and empty < 0.5 * there:
         settings = cfg["reconstruction"]
         raise ConfigError(
-            f"reconstruction.neighbours: {settings['neighbours']}, with reconstruction.dynamic.modes: "
-            f"{settings['dynamic']['modes']}, take {particle_bytes(cfg, size) / 1e9:.2g} GB for each "
-            f"particle, of this machine's {there / 1e9:.1f} GB"
+            f"reconstruction.neighbours: {settings['neighbours']}, with "
+            f"reconstruction.dynamic.modes: {settings['dynamic']['modes']}, take "
+            f"{particle_bytes(cfg, size) / 1e9:.2g} GB for each particle, of this machine's "
+            f"{there / 1e9:.1f} GB"
         )
     if most < 8:
         raise ConfigError(
-            f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of {size.pixels} px take "
-            f"{empty / 1e9:.1f} GB, of this machine's {there / 1e9:.1f} GB; lower it or scene.frames"
+            f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of "
+            f"{size.pixels} px take {empty / 1e9:.1f} GB, of this machine's {there / 1e9:.1f} GB; "
+            "lower it or scene.frames"
         )
     key, above, dx = "particles", "", cfg["simulation"]["dx"]
     if dx is not None:

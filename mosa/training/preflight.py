@@ -119,7 +119,8 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
         count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
         if count < FEWEST:
             raise ConfigError(
-                f"simulation.dx: expected less than the object's radius of {radius:.3g} m, found {dx} m"
+                f"simulation.dx: expected less than the object's radius of {radius:.3g} m, found "
+                f"{dx} m"
             )
 
 
@@ -172,6 +173,7 @@ def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
         if (path := keys.get("path")) is not None:
             below = keys.get("root")
             print(
-                f"scene: reads {path} below {below}, as the checkpoint says (scene=... reads another)"
+                f"scene: reads {path} below {below}, as the checkpoint says (scene=... reads "
+                "another)"
             )
     return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})

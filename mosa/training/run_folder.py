@@ -65,7 +65,8 @@ def read_figures(path: Path) -> dict[str, float | str]:
             raise ValueError("no figures by name")
     except (ValueError, TypeError, RecursionError, OSError) as error:
         raise DataError(
-            f"{path}: expected the figures of a complete run, found a damaged file ({error}): remove it"
+            f"{path}: expected the figures of a complete run, found a damaged file ({error}): "
+            "remove it"
         ) from error
     return {k: SPECIAL.get(v, v) if isinstance(v, str) else v for k, v in found.items()}
 

@@ -24,15 +24,21 @@ from mosa.twin.start import (
     check_frames,
     check_wants_no_gradients,
     start_in,
-)  # fmt: skip
+)
 
 
 class TwinWorlds:
     """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
 
     def __init__(
-        self, body: Body, world: World, frame_dt: float, training_start: Start, count: int, laws: Tensor | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        body: Body,
+        world: World,
+        frame_dt: float,
+        training_start: Start,
+        count: int,
+        laws: Tensor | None = None,
+    ) -> None:
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
             shape = (count, len(read_numbers(body)))
@@ -48,12 +54,19 @@ class TwinWorlds:
 
     @typed
     def reset(
-        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,
-        colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
-        variant: Variant = "adapted", control_dt: Seconds | None = None,
-        substeps: Substeps | None = None, frames: Count = 30, differentiable: bool = False,
-        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
-    ) -> TwinState:  # fmt: skip
+        self,
+        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
+        *,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        gravity: Tensor | Sequence[Any] | None = None,
+        variant: Variant = "adapted",
+        control_dt: Seconds | None = None,
+        substeps: Substeps | None = None,
+        frames: Count = 30,
+        differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+    ) -> TwinState:
         """Begin a motion in every world; returns the state (count, ...).
 
         starts: rotation, height, position, velocity, angular_velocity as `Twin.simulate` takes them, for all worlds or one mapping
@@ -83,9 +96,10 @@ class TwinWorlds:
 
     @typed
     def restart(
-        self, which: Annotated[Sequence[int], Expected("a list of numbers of worlds")],
+        self,
+        which: Annotated[Sequence[int], Expected("a list of numbers of worlds")],
         starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
-    ) -> TwinState:  # fmt: skip
+    ) -> TwinState:
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
@@ -94,9 +108,13 @@ class TwinWorlds:
         return episode.restart(which, None if starts is None else [start for start, _ in found])
 
     def _found(
-        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None, which: Sequence[int], colliders: Any,
-        box: Any, driven: Any,
-    ) -> list[tuple[Start, World]]:  # fmt: skip
+        self,
+        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None,
+        which: Sequence[int],
+        colliders: Any,
+        box: Any,
+        driven: Any,
+    ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
         each = [starts or {}] * len(which) if isinstance(starts, Mapping | None) else starts
         if not isinstance(each, (list, tuple)) or not all(isinstance(s, Mapping) for s in each):

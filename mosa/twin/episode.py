@@ -140,8 +140,13 @@ class Episode:
             raise ConfigError(
                 f"colliders: expected names of their own, found {', '.join(twice)} twice"
             )
-        options = {"frames": frames, "frame_dt": frame_dt, "model": body.model(variant), "substeps": substeps,
-                   "enough": True}  # fmt: skip
+        options = {
+            "frames": frames,
+            "frame_dt": frame_dt,
+            "model": body.model(variant),
+            "substeps": substeps,
+            "enough": True,
+        }
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)
@@ -328,7 +333,9 @@ class Episode:
             last.append([end.get("position", x + self.frame_dt * v), end.get("rotation", after)])
         axis = 1 + len(self._leading())
         # of one collider without a copy: what is the same at all substeps stays one row
-        poses = Poses(*(torch.stack(p, axis) if len(p) > 1 else p[0].unsqueeze(axis) for p in zip(*columns)))  # fmt: skip
+        poses = Poses(
+            *(torch.stack(p, axis) if len(p) > 1 else p[0].unsqueeze(axis) for p in zip(*columns))
+        )
         return poses, tuple(torch.stack(parts, axis - 1) for parts in zip(*last))
 
     def _twist(
@@ -378,8 +385,8 @@ class Episode:
             if not command or not (set(command) <= set(TWISTS) or set(command) <= set(TARGETS)):
                 found = ", ".join(map(str, command)) or "nothing"
                 raise ConfigError(
-                    f"{where}: expected {' and '.join(TWISTS)}, or {' and '.join(TARGETS)} after the step, or one of them, "
-                    f"found {found}"
+                    f"{where}: expected {' and '.join(TWISTS)}, or {' and '.join(TARGETS)} after "
+                    f"the step, or one of them, found {found}"
                 )
             k, given = self.names.index(name), command.get("rotation")
             commands[k] = {kind: self._vector(f"{where}.{kind}", v) for kind, v in command.items()}
@@ -419,13 +426,18 @@ def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 def _fastest(body: Body, starts: Sequence[Start]) -> Start:
     """The start for which the time step must be smallest."""
-    speed = lambda s: s.velocity.detach().norm() + s.angular_velocity.detach().norm() * body.size  # noqa: E731
-    return max(starts, key=lambda s: float(speed(s)))
+    parts = ((s, s.velocity.detach().norm(), s.angular_velocity.detach().norm()) for s in starts)
+    return max(parts, key=lambda each: float(each[1] + each[2] * body.size))[0]
 
 
 def _worlds(
-    body: Body, world: World, starts: Sequence[Start], laws: Tensor | None, gravity: Tensor | None, options: dict,
-) -> tuple[Ready, Callable[[int, Start], ParticleState]]:  # fmt: skip
+    body: Body,
+    world: World,
+    starts: Sequence[Start],
+    laws: Tensor | None,
+    gravity: Tensor | None,
+    options: dict,
+) -> tuple[Ready, Callable[[int, Start], ParticleState]]:
     """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
         raise ConfigError("simulation.adaptive: expected false with many worlds")

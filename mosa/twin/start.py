@@ -158,16 +158,17 @@ def start_in(
     pressed = check_clear(world.colliders, center + arms, "the body", field, body.spacing)
     if pressed > 0.25 * body.spacing:
         warnings.warn(
-            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} mm deep in a contact, which throws "
-            f"it off at once: contact begins {500 * body.spacing:.3g} mm, half the particles' spacing, outside of a solid",
+            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} "
+            "mm deep in a contact, which throws it off at once: contact begins "
+            f"{500 * body.spacing:.3g} mm, half the particles' spacing, outside of a solid",
             stacklevel=4,
         )
     for i, each in enumerate(world.colliders):
         size = each.shape.extent if isinstance(each.shape, SignedDistanceField) else 0.0
         if size > LARGE * body.size:
             warnings.warn(
-                f"{field}[{i}]: expected a mesh about as large as the body of {body.size:.3g} m, found {size:.3g} m: set scale "
-                "(0.001 for a file in mm), or spacing [m] if it is",
+                f"{field}[{i}]: expected a mesh about as large as the body of {body.size:.3g} m, "
+                f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
                 stacklevel=4,
             )
     if world.ground is not None:
@@ -194,8 +195,9 @@ def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | Non
     speed, enough = pull * frame_dt / substeps, math.ceil(pull * frame_dt / CREEP)
     if speed > CREEP:
         warnings.warn(
-            f"substeps: solids that hold the body by friction let it slide at about {1e3 * speed:.2g} mm/s with {substeps} "
-            f"substeps; substeps={enough} give {1e3 * CREEP:.2g} mm/s",
+            "substeps: solids that hold the body by friction let it slide at about "
+            f"{1e3 * speed:.2g} mm/s with {substeps} substeps; substeps={enough} give "
+            f"{1e3 * CREEP:.2g} mm/s",
             stacklevel=4,
         )
 

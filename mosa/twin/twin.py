@@ -145,7 +145,8 @@ class Twin:
         found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(
-                f"predict: expected at least two of {draws} draws of the law that can be simulated, found {len(found)}"
+                f"predict: expected at least two of {draws} draws of the law that can be "
+                f"simulated, found {len(found)}"
             )
         others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
         forms = among_forms(rollout.x, others)
@@ -153,13 +154,21 @@ class Twin:
 
     @typed
     def simulate(
-        self, *, rotation: Sequence[float] | Tensor | None = None, height: Number | None = None,
-        position: Sequence[float | None] | Tensor | None = None, velocity: Sequence[float] | None = None,
-        angular_velocity: Sequence[float] | None = None, frames: Count = 30, variant: Variant = "adapted",
-        progress: bool = False, colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+        self,
+        *,
+        rotation: Sequence[float] | Tensor | None = None,
+        height: Number | None = None,
+        position: Sequence[float | None] | Tensor | None = None,
+        velocity: Sequence[float] | None = None,
+        angular_velocity: Sequence[float] | None = None,
+        frames: Count = 30,
+        variant: Variant = "adapted",
+        progress: bool = False,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
         substeps: Substeps | None = None,
-    ) -> Rollout:  # fmt: skip
+    ) -> Rollout:
         """Roll the learned law out from a new start.
 
         rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; position: (3,) [m]
@@ -193,13 +202,22 @@ class Twin:
 
     @typed
     def reset(
-        self, *, rotation: Sequence[float] | Tensor | None = None, height: Number | None = None,
-        position: Sequence[float | None] | Tensor | None = None, velocity: Sequence[float] | Tensor | None = None,
+        self,
+        *,
+        rotation: Sequence[float] | Tensor | None = None,
+        height: Number | None = None,
+        position: Sequence[float | None] | Tensor | None = None,
+        velocity: Sequence[float] | Tensor | None = None,
         angular_velocity: Sequence[float] | Tensor | None = None,
-        colliders: Sequence[Collider | Mapping[str, Any]] | None = None, variant: Variant = "adapted",
-        control_dt: Seconds | None = None, substeps: Substeps | None = None, frames: Count = 30, differentiable: bool = False,
-        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
-    ) -> TwinState:  # fmt: skip
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        variant: Variant = "adapted",
+        control_dt: Seconds | None = None,
+        substeps: Substeps | None = None,
+        frames: Count = 30,
+        differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+    ) -> TwinState:
         """Begin a motion that `step` goes on with; returns its state at time 0.
 
         rotation, height, position, velocity, angular_velocity, colliders, variant, box, driven: as
@@ -260,9 +278,13 @@ class Twin:
     @torch.no_grad()
     @typed
     def render(
-        self, rollout: Motion, size: Pixels = 400, colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        view: Sequence[float] | None = None, shadow: bool = True,
-    ) -> Tensor:  # fmt: skip
+        self,
+        rollout: Motion,
+        size: Pixels = 400,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        view: Sequence[float] | None = None,
+        shadow: bool = True,
+    ) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
         rollout was simulated with (None: the world's). rollout: or a list of the states of T steps,
         whose solids are drawn where they were then (None: those of `reset`). Half spaces are not
@@ -271,8 +293,13 @@ class Twin:
         return self._pictures(*self._met(rollout, colliders), size, view, shadow)
 
     def _pictures(
-        self, rollout: Rollout, solids: Sequence[Collider], size: int, view: Sequence[float] | None, shadow: bool,
-    ) -> Tensor:  # fmt: skip
+        self,
+        rollout: Rollout,
+        solids: Sequence[Collider],
+        size: int,
+        view: Sequence[float] | None,
+        shadow: bool,
+    ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
         # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
@@ -317,8 +344,10 @@ class Twin:
         return shown.images(camera, behind)[0].clamp(0, 1).cpu()
 
     def _met(
-        self, motion: Rollout | Sequence[TwinState], colliders: Sequence[Collider | Mapping[str, Any]] | None,
-    ) -> tuple[Rollout, tuple[Collider, ...]]:  # fmt: skip
+        self,
+        motion: Rollout | Sequence[TwinState],
+        colliders: Sequence[Collider | Mapping[str, Any]] | None,
+    ) -> tuple[Rollout, tuple[Collider, ...]]:
         """(rollout, its solids), both as `render` takes them. Errors: ConfigError where it was not
         simulated with as many."""
         if isinstance(motion, Rollout):
@@ -333,7 +362,8 @@ class Twin:
             solids += world.solids[len(world.colliders) :]
         if met != len(solids):
             raise ConfigError(
-                f"colliders: expected the {met} that the rollout was simulated with, found {len(solids)}"
+                f"colliders: expected the {met} that the rollout was simulated with, found "
+                f"{len(solids)}"
             )
         return rollout, solids if isinstance(motion, Rollout) else placed_as(motion, solids)
 

@@ -256,8 +256,8 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
     the folder's own, or else its body.npz. Errors: DataError naming the file that is missing or of another run."""
     folder = Path(folder)
     if not folder.is_dir():
-        wanted = "the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion"
-        raise DataError(f"run: expected {wanted}, found no folder {folder}")
+        wanted = "a finished run (run=outputs/train/<date>/<time>), or of an exported motion"
+        raise DataError(f"run: expected the folder of {wanted}, found no folder {folder}")
     learned = Arrays.of(folder / "rollout.npz")
     if not learned.path.is_file():  # what a run that has not ended lacks
         raise DataError(

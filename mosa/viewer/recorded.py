@@ -13,6 +13,7 @@ import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -258,8 +259,8 @@ def checkpoint_of(run: str, checkpoint: str | None) -> Path:
     path = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
     if not path.is_file():
         raise DataError(
-            "run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no "
-            f"file {path}; of an exported folder it is given by checkpoint="
+            "run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found "
+            f"no file {path}; of an exported folder it is given by checkpoint="
         )
     return path
 

@@ -30,9 +30,20 @@ HAND = "hand"  # name of the masks that are not the body's
 
 
 def load_phystwin(
-    path: str | Path, *, frames=None, fps=30.0, scale=1.0, fill_holes=0, name=None, reach=0.04,
-    body: dict[str, Any] | None = None, start=REST, holdout_frames=None, cache=None, **world,
-) -> Scene:  # fmt: skip
+    path: str | Path,
+    *,
+    frames=None,
+    fps=30.0,
+    scale=1.0,
+    fill_holes=0,
+    name=None,
+    reach=0.04,
+    body: dict[str, Any] | None = None,
+    start=REST,
+    holdout_frames=None,
+    cache=None,
+    **world,
+) -> Scene:
     """Scene of the folder of a case, with the driven set `controller`.
 
     fps: of the film, which no file says; reach [m]: the controller's points that are at most so far

@@ -27,9 +27,18 @@ AROUND = 0.9  # half of the searched box, over the nearest photograph's distance
 
 
 def load_spring_gaus_real(
-    path: str | Path, *, frames=None, fps=120.0, scale=1.0, fill_holes=0, name=None,
-    body: dict[str, Any] | None = None, last_free_frame=None, cache=None, **world,
-) -> Scene:  # fmt: skip
+    path: str | Path,
+    *,
+    frames=None,
+    fps=120.0,
+    scale=1.0,
+    fill_holes=0,
+    name=None,
+    body: dict[str, Any] | None = None,
+    last_free_frame=None,
+    cache=None,
+    **world,
+) -> Scene:
     """Scene of <capture>/dynamic/sequences/<object>/<sequence>.json.
 
     fps: of the film, which no file says; body: {shape, scale} as of `scene_from_footage`: without a

@@ -161,8 +161,10 @@ def save_rrd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
             colors = torch.cat([splats.colors, splats.opacities[:, None]], 1).clamp(0, 1)
             padded = torch.nn.functional.pad(higher, (0, 0, 0, 15 - higher.shape[1])).numpy()
             recording.set_time("time", duration=t / rate)
-            harmonics = {"sh_coefficients": padded if higher.shape[1] else None,
-                         "spherical_harmonics_degree": degree_of(frame.harmonics)}  # fmt: skip
+            harmonics = {
+                "sh_coefficients": padded if higher.shape[1] else None,
+                "spherical_harmonics_degree": degree_of(frame.harmonics),
+            }
             turns, painted = splats.rotations[:, [1, 2, 3, 0]], (255 * colors + 0.5).byte()
             look = {"quaternions": turns.numpy(), "colors": painted.numpy()} | harmonics
             own = splats.means.numpy(), splats.scales.numpy()

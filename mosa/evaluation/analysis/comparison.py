@@ -57,8 +57,13 @@ class Comparison:
 
 @torch.no_grad()
 def compare(
-    body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, width: int = 320, limit: float | None = None,
-) -> Comparison:  # fmt: skip
+    body: Body,
+    shown: Sequence,
+    variants: Mapping[str, Rollout],
+    *,
+    width: int = 320,
+    limit: float | None = None,
+) -> Comparison:
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
@@ -88,8 +93,12 @@ def compare(
         errors = {v: drawn(body, variants[v], cameras, scene, p) for v, p in painted.items()}
     return Comparison(
         {"real": finished(real)} | {TITLES[v]: finished(images) for v, images in seen.items()},
-        {TITLES[v]: finished(images) for v, images in errors.items()}, label, high, colors, scene.times.tolist(),
-    )  # fmt: skip
+        {TITLES[v]: finished(images) for v, images in errors.items()},
+        label,
+        high,
+        colors,
+        scene.times.tolist(),
+    )
 
 
 def distances(body: Body, scene: Scene, variants: Mapping[str, Rollout]) -> dict[str, Tensor]:

@@ -124,8 +124,12 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
 
 
 def write_strip(
-    path: str | Path, columns: Images, frames: int = 6, *, notes: Mapping[str, list[str]] | None = None,
-) -> Path:  # fmt: skip
+    path: str | Path,
+    columns: Images,
+    frames: int = 6,
+    *,
+    notes: Mapping[str, list[str]] | None = None,
+) -> Path:
     """PNG of about `frames` frames from left to right, one captioned row per entry of `columns`, whose sizes may differ. notes: of
     some rows, a text over each frame."""
     path, notes = Path(path), notes or {}

@@ -61,8 +61,10 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
     if "train" not in columns:
         return ""
     parts = [f"`train` is the recording {recording}"]
-    others = {"train/": "`train/...` the others that were learned from",
-              "test/": "`test/...` those held out, `test` their mean"}  # fmt: skip
+    others = {
+        "train/": "`train/...` the others that were learned from",
+        "test/": "`test/...` those held out, `test` their mean",
+    }
     parts += [about for start, about in others.items() if any(c.startswith(start) for c in columns)]
     prefixes = dict(MODELS)
     rows = [f"*{name}*: {about}" for name, about in ROWS.items()
@@ -104,7 +106,11 @@ def ground_table(distances: Mapping[str, float], gains: Mapping[str, float]) -> 
     gains: as in `ground_text`."""
     if len(distances) <= LISTED:
         return ""
-    header = ["a body that ...", "calibrated law: distance [mm]", "learned law: gain in log likelihood"]  # fmt: skip
+    header = [
+        "a body that ...",
+        "calibrated law: distance [mm]",
+        "learned law: gain in log likelihood",
+    ]
     rows = [[_words(name), f"{1e3 * distances[name]:.2f}" if name in distances else "",
              f"{gains[name]:+.1f}" if name in gains else ""]
             for name in sorted({**distances, **gains}, key=lambda name: distances.get(name, math.inf))]  # fmt: skip
@@ -119,8 +125,10 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     # only the isotropic law was asked for its friction
     if touches != "sticky" and (taken == "sticky" or not gains):
         near = ", ".join(f"{friction:.3g}" for friction in alike(distances, contact(touches)[0]))
-        said.append("Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
-                    f"{near}, and is wrong itself.")  # fmt: skip
+        said.append(
+            "Its friction is *not* determined: the isotropic law comes within a tenth of the "
+            f"nearest with {near}, and is wrong itself."
+        )
     nearest = sorted(distances, key=distances.get)
     listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in nearest)
     where = f": {listed}" if len(distances) <= LISTED else " in the table below"
@@ -134,8 +142,10 @@ def _asked(gains: Mapping[str, float]) -> str:
     """What the learned law says of the best of the contacts that it was asked for, and what is left open."""
     best, gain = max(gains.items(), key=lambda each: each[1])
     better = f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f}"
-    said = (f"With the learned law, a body that {_words(best)} explains the motion {better} of the logarithm of the "
-            "likelihood.")  # fmt: skip
+    said = (
+        f"With the learned law, a body that {_words(best)} explains the motion {better} of the "
+        "logarithm of the likelihood."
+    )
     if -EXPLAINED < gain <= EXPLAINED:
         said += f" Which of the two it is, is *not* determined: that takes {EXPLAINED:g}."
     return said
@@ -148,11 +158,15 @@ def form_text(errors: Mapping[str, float]) -> str:
              "operator+stiffness": "anisotropic, of a stiffness that varies over the body"}  # fmt: skip
     listed = "; ".join(f"{words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
     taken = chosen(errors)
-    said = (f"The learned law is {words[taken]}. Error of frames that were held back from the fit, plus the error of the "
-            f"grid: {listed}.")  # fmt: skip
+    said = (
+        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, "
+        f"plus the error of the grid: {listed}."
+    )
     if taken == named(()) and len(errors) > 1:
-        said += (f" A richer law is only learned where this error is below {WORTH:g} of the isotropic one, because errors of "
-                 "contact and cues can look like slight anisotropy.")  # fmt: skip
+        said += (
+            f" A richer law is only learned where this error is below {WORTH:g} of the isotropic "
+            "one, because errors of contact and cues can look like slight anisotropy."
+        )
     return said
 
 
@@ -220,28 +234,40 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
         spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
         if ratio < NOTICEABLE:
-            said = f"No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as its prior."
+            said = f"No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as "
+            said += "its prior."
         elif half > SURE_DEGREES:
-            said = (f"Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* determined: "
-                    f"the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees.")  # fmt: skip
+            said = (
+                f"Some anisotropy (largest over smallest Young's modulus {spread}), but its "
+                f"direction is *not* determined: the 95 % cone about ({axis}) has a half angle of "
+                f"{half:.0f} degrees."
+            )
         else:
-            said = (f"The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest Young's "
-                    f"modulus is {spread}.")  # fmt: skip
+            said = (
+                f"The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the "
+                f"largest over the smallest Young's modulus is {spread}."
+            )
         lines.append(f"- {said}")
-    numbers = {"operator": "numbers of the anisotropic stiffness", "stiffness": "modes of the stiffness over the body"}  # fmt: skip
+    numbers = {
+        "operator": "numbers of the anisotropic stiffness",
+        "stiffness": "modes of the stiffness over the body",
+    }
     for name, what in numbers.items():
         if (count := figures.get(f"posterior/{name}_numbers")) is not None:
             known = figures[f"posterior/{name}_determined"]
             lines.append(
-                f"- Of {count:.0f} {what} the data determine {known:.1f}; the others keep their prior values."
+                f"- Of {count:.0f} {what} the data determine {known:.1f}; the others keep their "
+                "prior values."
             )
     if (sd := figures.get("posterior/test/sd_m")) is not None:
         sure = figures.get("posterior/test/coverage")
         covered = (
             "" if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations"
         )
-        lines.append("- Held-out positions after contact have a predicted standard deviation (not an error) of "
-                     f"{sd * 1e3:.1f} mm (rms){covered}.")  # fmt: skip
+        lines.append(
+            "- Held-out positions after contact have a predicted standard deviation (not an error) of "
+            f"{sd * 1e3:.1f} mm (rms){covered}."
+        )
     return "\n".join(lines)
 
 

@@ -164,8 +164,11 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
 
 
 def legend(
-    canvas: Canvas, names: Sequence[str], rows: Sequence[Mapping[str, Cell | None]] = (), without: str = "not run",
-) -> None:  # fmt: skip
+    canvas: Canvas,
+    names: Sequence[str],
+    rows: Sequence[Mapping[str, Cell | None]] = (),
+    without: str = "not run",
+) -> None:
     """One above all parts, in the order of `names`, with the words for the marks and gaps of the cells of rows. without: what is
     said of those of `names` that no part shows."""
     every = (place.get_legend_handles_labels() for place in canvas.axes)
@@ -174,8 +177,10 @@ def legend(
     found = [cell for row in rows for cell in row.values() if cell is not None]
     marks = {mark_of(cell) for cell in found if not np.isfinite(cell.mean)}
     handles, words = [known[name] for name in ordered], []
-    handles += [Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
-                for mark in sorted(marks, reverse=True)]  # fmt: skip
+    handles += [
+        Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
+        for mark in sorted(marks, reverse=True)
+    ]
     if any(cell is None for row in rows for column, cell in row.items() if column != "mean"):
         words.append("gap: not run")
     if any("mean" in row and row["mean"] is None for row in rows):
@@ -186,8 +191,14 @@ def legend(
         canvas.supxlabel("; ".join(words), fontsize=9)
     if len(handles) > 1:
         labels = [*ordered, *(handle.get_label() for handle in handles[len(ordered) :])]
-        canvas.legend(handles, labels, ncols=min(len(handles), 5), loc="outside upper center",
-                      fontsize=9, frameon=False)  # fmt: skip
+        canvas.legend(
+            handles,
+            labels,
+            ncols=min(len(handles), 5),
+            loc="outside upper center",
+            fontsize=9,
+            frameon=False,
+        )
 
 
 def mark_of(cell: Cell) -> str:
@@ -201,7 +212,9 @@ def marked(place, at: float, cell: Cell, color: str) -> None:
                color=color, linestyle="", zorder=4, clip_on=False)  # fmt: skip
 
 
-def measured(place, cells: Sequence[tuple[float, Cell | None]], color: str) -> list[tuple[float, Cell]]:  # fmt: skip
+def measured(
+    place, cells: Sequence[tuple[float, Cell | None]], color: str
+) -> list[tuple[float, Cell]]:
     """Those of cells at x that have a finite mean; of the others that were run a mark is drawn."""
     for x, cell in cells:
         if cell is not None and not np.isfinite(cell.mean):

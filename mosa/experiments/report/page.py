@@ -184,8 +184,10 @@ def compared(mine: Cells, other: Cells, column: str | None, sign: int) -> Compar
     both = {c: p for c, p in pairs.items() if all(math.isfinite(cell.mean) for cell in p)}
     if not both:
         return None
-    better = sum(math.isfinite(a.mean) and (c not in both or sign * (a.mean - b.mean) > 0)
-                 for c, (a, b) in pairs.items())  # fmt: skip
+    better = sum(
+        math.isfinite(a.mean) and (c not in both or sign * (a.mean - b.mean) > 0)
+        for c, (a, b) in pairs.items()
+    )
     means = mine.get("mean"), other.get("mean")
     if len(both) < len(names) or column is not None or None in means:
         means = tuple(averaged(cells) for cells in zip(*both.values()))
@@ -257,7 +259,8 @@ def ahead_in_each(figure: Figure, claim: Claim, rows: Rows, sign: int) -> str:
         return NOT_RUN
     good = [column for column, said in known.items() if not said]
     some = 0 < len(good) < len(known)
-    text = f"{'holds' if len(good) == len(known) else 'does not hold'}, ahead in {len(good)} of {len(known)}"
+    said = "holds" if len(good) == len(known) else "does not hold"
+    text = f"{said}, ahead in {len(good)} of {len(known)}"
     text += f" ({', '.join(good)})" * some + "".join(f"; {said}" for said in known.values() if said)
     return text + "; one seed" * all(cell is None or cell.sd is None for cell in mine.values())
 
