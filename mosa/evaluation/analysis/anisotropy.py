@@ -180,8 +180,7 @@ def directions_about(axis: Tensor, radius: float, count: int) -> Tensor:
 
 def stiffest_axis(states: States, adapter: Adapter | None) -> tuple[Tensor, float]:
     """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of 200 directions, and as
-    many about the best of them: which way a learned law is stiff, to be compared with a known fibre. 200: to 1.2 degrees, where those of the half sphere
-    alone are up to 8 away."""
+    many about the best of them, which are within 1.2 degrees of it: the half sphere's alone, within 8."""
     directions = directions_on_sphere()
     modulus = directional_modulus(states, adapter, directions)
     beyond_neighbours = math.sqrt(4 * math.pi / len(directions))
