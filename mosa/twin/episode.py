@@ -138,7 +138,7 @@ class Episode:
         self.names = [collider.name or str(i) for i, collider in enumerate(world.solids)]
         if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ConfigError(
-                f"colliders: expected names of their own, found {', '.join(twice)} twice"
+                f"colliders: expected names of their own, found {', '.join(twice)} more than once"
             )
         options = {
             "frames": frames,

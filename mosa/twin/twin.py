@@ -362,8 +362,8 @@ class Twin:
             solids += world.solids[len(world.colliders) :]
         if met != len(solids):
             raise ConfigError(
-                f"colliders: expected the {met} that the rollout was simulated with, found "
-                f"{len(solids)}"
+                f"colliders: expected the {met} that the rollout was simulated with, as simulate takes "
+                f"them, found {len(solids)}"
             )
         return rollout, solids if isinstance(motion, Rollout) else placed_as(motion, solids)
 

@@ -79,8 +79,8 @@ def markdown_page(
     if experiment.printed is not None:
         parts.append(printed_table(experiment.printed))
     left = [job for job in jobs if not job.finished]
-    missing = [f"failed: {job.folder.name} ({' '.join(job.overrides)}): {job.failed}" for job in left
-               if job.failed]  # fmt: skip
+    bad = [job for job in left if job.failed]
+    missing = [f"failed: {j.folder.name} ({' '.join(j.overrides)}): {j.failed}" for j in bad]
     waiting = [job.folder.name for job in left if not job.failed]
     if waiting:
         shown = ", ".join(waiting[:SHOWN]) + (", ..." if len(waiting) > SHOWN else "")
