@@ -285,15 +285,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             cues = [take.cues.positions.cpu() for take in self.takes]
             responses = [take.response and take.response.written() for take in self.takes]
         fit = FitRecord(
-            **{name: getattr(self, name) for name in KEPT},
-            stage=self.stage_index,
-            losses=list(self.losses),
-            particles=len(self.body.rest),
-            identification=self.identification.state() if self.identification else None,
-            retreat=self.retreat.written(),
-            cues=cues,
-            responses=responses,
-        )
+            **{name: getattr(self, name) for name in KEPT}, stage=self.stage_index, losses=list(self.losses),
+            particles=len(self.body.rest), identification=self.identification.state() if self.identification else None,
+            retreat=self.retreat.written(), cues=cues, responses=responses,
+        )  # fmt: skip
         posterior, splats = self.posterior, self.body.splats
         record = RunRecord(
             **dict(self.record),

@@ -54,19 +54,12 @@ class TwinWorlds:
 
     @typed
     def reset(
-        self,
-        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
-        *,
-        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        gravity: Tensor | Sequence[Any] | None = None,
-        variant: Variant = "adapted",
-        control_dt: Seconds | None = None,
-        substeps: Substeps | None = None,
-        frames: Count = 30,
-        differentiable: bool = False,
-        box: Sequence[Sequence[float]] | Tensor | None = None,
-        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
-    ) -> TwinState:
+        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
+        variant: Variant = "adapted", control_dt: Seconds | None = None,
+        substeps: Substeps | None = None, frames: Count = 30, differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None, driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+    ) -> TwinState:  # fmt: skip
         """Begin a motion in every world; returns the state (count, ...).
 
         starts: rotation, height, position, velocity, angular_velocity as `Twin.simulate` takes them, for all worlds or one mapping
