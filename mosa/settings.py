@@ -357,11 +357,10 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
     An argument without an annotation may be anything."""
     call = build.__init__ if inspect.isclass(build) else build
     hints = typing.get_type_hints(call, include_extras=True)
-    wanted = {
-        name: (hints.get(name, Any), ... if p.default is p.empty else p.default)
-        for name, p in inspect.signature(build).parameters.items()
-        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) and name not in given
-    }
+    wanted = {}
+    for name, p in inspect.signature(build).parameters.items():
+        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) and name not in given:
+            wanted[name] = hints.get(name, Any), ... if p.default is p.empty else p.default
     made: type[Settings] = create_model(build.__name__, __base__=Settings, **wanted)  # type: ignore[call-overload]
     made.where = where
     return made

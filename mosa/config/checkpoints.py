@@ -13,6 +13,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -216,10 +217,8 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             check("posterior.names", own["names"], Names)
             # fits to films have other names for numbers of the learned stiffness
-            named = [
-                re.sub(r"stiffness_(\d+)", lambda m: f"operator[{int(m[1]) - 1}]", name)
-                for name in own["names"]
-            ]
+            operator = partial(re.sub, r"stiffness_(\d+)", lambda m: f"operator[{int(m[1]) - 1}]")
+            named = list(map(operator, own["names"]))
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,
                                            "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip

@@ -116,10 +116,11 @@ def held(arena: Arena) -> tuple[Tensor, Tensor, None]:
     """(x (B, N, 3), F_tot (B, N, 3, 3), None) of bodies in the hand, before it has decided: as if it aimed at the middle."""
     nothing = torch.zeros(arena.count, len(arena.task.actions))
     starts = arena.task.starts(arena.trials, nothing, arena.rest, arena.gravity)
-    turns, place, height = (
-        torch.stack([torch.as_tensor(start[key]) for start in starts]).to(arena.rest)
+    parts = (
+        [torch.as_tensor(start[key]) for start in starts]
         for key in ("rotation", "position", "height")
     )
+    turns, place, height = (torch.stack(part).to(arena.rest) for part in parts)
     x = arena.rest @ turns.mT
     place[:, 1] = height - x[..., 1].amin(1)
     return x + place[:, None], turns[:, None].expand(*x.shape, 3), None

@@ -56,10 +56,8 @@ def sequences(
     body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]
 ) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences."""
-    return [
-        Sequence(p, s, start, first_contact(body, start, s))
-        for (p, start), s in zip(found.items(), [training, *others])
-    ]
+    pairs = zip(found.items(), [training, *others])
+    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in pairs]
 
 
 def run_sequences(
@@ -84,14 +82,9 @@ def rollouts(
     for v in VARIANTS:
         began, counted = time.perf_counter(), len(sizes)
         try:
-            result[v] = body.simulate(
-                sequence.start,
-                world,
-                scene.frames,
-                frame_dt,
-                model=body.model(v),
-                collect=lambda found: sizes.append(float(found.mean_abs_C)),
-            )
+            collect = lambda found: sizes.append(float(found.mean_abs_C))  # noqa: E731
+            how = {"model": body.model(v), "collect": collect}
+            result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, **how)
         except (SimulationDiverged, ConfigError) as error:
             del sizes[counted:]
             warn(

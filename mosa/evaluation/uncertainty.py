@@ -73,11 +73,8 @@ def predicted_spread(
         predict = lambda: {s.prefix: _positions(body, s, world) for s in sequences}  # noqa: E731
         drawn = drawn_motions(body, posterior.draws(draws, generator), predict)
         others = rival_motions(body, posterior, predict)
-    figures = {
-        "posterior/draws": float(len(drawn)),
-        "posterior/rivals": float(len(others)),
-        "posterior/model_error_m": posterior.model_error,
-    }
+    figures = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others))}
+    figures["posterior/model_error_m"] = posterior.model_error
     spreads: dict[str, Tensor] = {}
     if len(drawn) < LEAST_DRAWS:
         return figures, spreads

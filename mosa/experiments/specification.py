@@ -262,10 +262,8 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             film = [each for each, key in parts.items() if key[0] in uses and key[1:] not in USES]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
             shared = " ".join(film), " ".join([*film, *rest])
-            minutes = {
-                device: value * math.prod(option.cost_on(device) for option in options)
-                for device, value in experiment.minutes.items()
-            }
+            costs = {d: math.prod(o.cost_on(d) for o in options) for d in experiment.minutes}
+            minutes = {d: value * costs[d] for d, value in experiment.minutes.items()}
             alone = experiment.alone
             found[folder] = Job(folder, overrides, seed, (place,), minutes, *shared, alone)
     return list(found.values())
@@ -274,13 +272,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
 USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])  # keys of use, no film
 SHARED_BY = ("scene", "reconstruction", "seed", "simulation")  # what a reconstruction needs
 ALONE = "alone-"  # before the folder's name of a run that had its device to itself
-QUIET = (
-    "hydra.searchpath",
-    "logger",
-    "evaluation.video",
-    "evaluation.assignment",
-    "evaluation.floor",
-)
+QUIET = "hydra.searchpath logger evaluation.video evaluation.assignment evaluation.floor".split()
 """Overrides that the name of a folder leaves to its digest."""
 
 

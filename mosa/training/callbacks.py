@@ -81,14 +81,9 @@ class FitProgress(L.Callback):
         if module.stage is not None and self.shown != module.stage_index:
             self._close()
             self.shown = module.stage_index
-            self.bar = tqdm(
-                desc=f"fit {module.stage.name}",
-                total=module.stage.iterations,
-                unit="it",
-                initial=len(module.losses),
-                dynamic_ncols=True,
-                mininterval=2.0,
-            )
+            count = {"total": module.stage.iterations, "initial": len(module.losses)}
+            look = {"unit": "it", "dynamic_ncols": True, "mininterval": 2.0}
+            self.bar = tqdm(desc=f"fit {module.stage.name}", **count, **look)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         if self.bar is not None:

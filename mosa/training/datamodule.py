@@ -122,19 +122,11 @@ class SceneDataModule(L.LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """Keyword arguments of `Twin.simulate`, one mapping a start."""
-        return served(
-            self.predict
-            or [
-                {
-                    "rotation": s.start.rotation,
-                    "position": s.start.center,
-                    "velocity": s.start.velocity,
-                    "angular_velocity": s.start.angular_velocity,
-                    "frames": s.scene.frames,
-                }
-                for s in self.sequences
-            ]
-        )
+        names = {"position": "center"} | {
+            k: k for k in ("rotation", "velocity", "angular_velocity")
+        }
+        begins = (({k: getattr(s.start, v) for k, v in names.items()}, s) for s in self.sequences)
+        return served(self.predict or [own | {"frames": s.scene.frames} for own, s in begins])
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
@@ -309,20 +301,11 @@ class SceneDataModule(L.LightningDataModule):
         scene, margin = self.scene, self.settings.rendering.margin
         parts = {"cameras": (scene.holdout_cameras, scene.training_frames),
                  "frames": (range(len(scene.cameras)), scene.holdout_frames)}  # fmt: skip
-        return [
-            MotionBatch(
-                sequences=(
-                    SequenceBatch(
-                        name=name,
-                        index=0,
-                        views=list(views),
-                        frames=list(frames),
-                        cues=None,
-                        extra={},
-                        observations=cropped(scene, views, frames, margin),
-                    ),
-                )
-            )
-            for name, (views, frames) in parts.items()
-            if views and frames
-        ]
+        found = []
+        for name, (views, frames) in parts.items():
+            if views and frames:
+                seen = {"cues": None, "observations": cropped(scene, views, frames, margin)}
+                where = {"index": 0, "views": list(views), "frames": list(frames)}
+                own = SequenceBatch(name=name, extra={}, **where, **seen)
+                found.append(MotionBatch(sequences=(own,)))
+        return found

@@ -84,14 +84,9 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     given, begin = plain(cfg.trainer), L.Trainer.__init__
     arguments_of(begin, "trainer", "precision", *untold(begin)).part(given)
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
-    trainer = made(
-        "trainer",
-        cfg.trainer,
-        logger=loggers or False,
-        callbacks=callbacks,
-        default_root_dir=str(folder),
-        plugins=[AtomicCheckpointIO(), LightningEnvironment()],
-    )
+    own = {"logger": loggers or False, "callbacks": callbacks, "default_root_dir": str(folder)}
+    own["plugins"] = [AtomicCheckpointIO(), LightningEnvironment()]
+    trainer = made("trainer", cfg.trainer, **own)
     check_trainer(trainer, given.get("precision"))
     check_monitors(cfg, callbacks)
     return trainer

@@ -252,12 +252,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         elif len(data.shape.rest) != len(self.body.rest):
             raise self.of_another_body(len(data.shape.rest))
         if fitting and not self.takes:
-            self.takes = [
-                take
-                if take.again is None
-                else replace(take, again=replace(take.again, plastic=self.is_plastic))
-                for take in data.takes
-            ]
+            again = (
+                take.again and replace(take.again, plastic=self.is_plastic) for take in data.takes
+            )
+            self.takes = [replace(take, again=each) for take, each in zip(data.takes, again)]
             self.first_takes = list(self.takes)
             if self.saved_cues is not None:
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True

@@ -172,8 +172,6 @@ def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
         keys = stored | {"cache": None}
         if (path := keys.get("path")) is not None:
             below = keys.get("root")
-            print(
-                f"scene: reads {path} below {below}, as the checkpoint says (scene=... reads "
-                "another)"
-            )
+            way = "as the checkpoint says (scene=... reads another)"
+            print(f"scene: reads {path} below {below}, {way}")
     return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})

@@ -67,14 +67,8 @@ class TwinWorlds:
         """
         check_frames(frames, self.count * len(self.body.rest))
         if not differentiable:
-            given = {
-                "starts": starts,
-                "colliders": colliders,
-                "gravity": gravity,
-                "box": box,
-                "driven": driven,
-            }
-            check_wants_no_gradients(**given)
+            world = {"colliders": colliders, "gravity": gravity, "box": box, "driven": driven}
+            check_wants_no_gradients(starts=starts, **world)
         found = self._found(starts, range(self.count), colliders, box, driven)
         if gravity is not None:
             shape = (self.count, 3)

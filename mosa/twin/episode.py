@@ -140,13 +140,8 @@ class Episode:
             raise ConfigError(
                 f"colliders: expected names of their own, found {', '.join(twice)} more than once"
             )
-        options = {
-            "frames": frames,
-            "frame_dt": frame_dt,
-            "model": body.model(variant),
-            "substeps": substeps,
-            "enough": True,
-        }
+        options = {"frames": frames, "frame_dt": frame_dt, "substeps": substeps, "enough": True}
+        options["model"] = body.model(variant)
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)

@@ -78,11 +78,8 @@ def side_by_side(
     """Frames with the columns beside each other. below: a second row, of as many; footer: a text under each frame."""
     frames = []
     for t in range(min(len(c) for c in columns.values())):
-        named = (
-            [label(to_uint8(images[t]), name) for name, images in row.items()]
-            for row in (columns, below)
-            if row
-        )
+        shown = (row.items() for row in (columns, below) if row)
+        named = ([label(to_uint8(images[t]), name) for name, images in row] for row in shown)
         rows = [np.concatenate(row, 1) for row in named]
         if footer is not None:
             rows.append(bar(rows[0].shape[1], [footer[t]]))

@@ -107,9 +107,6 @@ def vibration_growth(
         return max(
             later / before for before, later in zip(itertools.accumulate(maxima, max), maxima[1:])
         )
-    ratios = [
-        later / earlier
-        for earlier, later in itertools.pairwise(maxima)
-        if earlier > NEGLIGIBLE * maxima[0]
-    ]
+    pairs = (pair for pair in itertools.pairwise(maxima) if pair[0] > NEGLIGIBLE * maxima[0])
+    ratios = [later / earlier for earlier, later in pairs]
     return max(ratios, default=0.0)

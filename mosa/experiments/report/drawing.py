@@ -191,14 +191,8 @@ def legend(
         canvas.supxlabel("; ".join(words), fontsize=9)
     if len(handles) > 1:
         labels = [*ordered, *(handle.get_label() for handle in handles[len(ordered) :])]
-        canvas.legend(
-            handles,
-            labels,
-            ncols=min(len(handles), 5),
-            loc="outside upper center",
-            fontsize=9,
-            frameon=False,
-        )
+        look: dict[str, Any] = {"loc": "outside upper center", "fontsize": 9, "frameon": False}
+        canvas.legend(handles, labels, ncols=min(len(handles), 5), **look)
 
 
 def mark_of(cell: Cell) -> str:

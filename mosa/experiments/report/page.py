@@ -92,10 +92,8 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         run = f"[Tables, seeds, machine and command]({results.name}/{name}.md)"
         command = f"Not run. Command: `mosa-experiment {name}`"
         parts += filter(None, [not provenance and command, "\n".join(claims), provenance and run])
-    beside = [
-        f"[{read_title(page)}]({results.name}/{page.name})"
-        for page in sorted(results.glob("*_from_motion.md"))
-    ]
+    pages = sorted(results.glob("*_from_motion.md"))
+    beside = [f"[{read_title(page)}]({results.name}/{page.name})" for page in pages]
     if beside:
         parts.append(
             f"## Without images\n\nLaws learned from the true motion of a body: {', '.join(beside)}."
@@ -236,11 +234,8 @@ def ahead_in_each(figure: Figure, claim: Claim, rows: Rows, sign: int) -> str:
     """Whether a row is better than all others in every column, with those in which it is not."""
     mine, known = rows.get(claim.row, {}), dict[str, str]()
     for column, own in mine.items():
-        others = {
-            row: cell
-            for row in claim.against
-            if (cell := rows.get(row, {}).get(column)) is not None
-        }
+        others = {row: rows.get(row, {}).get(column) for row in claim.against}
+        others = {row: cell for row, cell in others.items() if cell is not None}
         if column == "mean" or own is None or not others:
             continue
         if not math.isfinite(own.mean):
@@ -248,11 +243,8 @@ def ahead_in_each(figure: Figure, claim: Claim, rows: Rows, sign: int) -> str:
             continue
         # None: the other one diverged
         found = {row: compared(mine, rows[row], column, sign) for row in others}
-        bad = [
-            row
-            for row, each in found.items()
-            if each is not None and outcome(each, sign, claim.spread) != "ahead"
-        ]
+        both = {row: each for row, each in found.items() if each is not None}
+        bad = [row for row in both if outcome(both[row], sign, claim.spread) != "ahead"]
         worse = ", ".join(f"{others[row].text(figure.decimals)} ({row})" for row in bad)
         known[column] = f"{column}: {own.text(figure.decimals)} against {worse}" if bad else ""
     if not known:

@@ -63,13 +63,9 @@ def markdown_page(
         best = {column: best_of(rows, column, figure.best) for column in header[1:]}
         body = []
         for row, cells in rows.items():
-            shown = [(c, cells[c].text(figure.decimals) if cells.get(c) else "") for c in best]
-            body.append(
-                [
-                    row,
-                    *(bold.format(text) if text and best[c] == row else text for c, text in shown),
-                ]
-            )
+            texts = [(c, cells[c].text(figure.decimals) if cells.get(c) else "") for c in best]
+            ahead = {c for c, text in texts if text and best[c] == row}
+            body.append([row, *(bold.format(text) if c in ahead else text for c, text in texts)])
         title = f"{figure.label}{BETTER[figure.best]} (`{figure.figure}`)"
         parts.append(f"{title}\n\n{markdown(header, body)}")
     parts += [said] if (said := footnotes(tables)) else []
