@@ -136,9 +136,11 @@ class Settings(BaseModel, metaclass=_Checked):
         if not isinstance(values, Mapping):
             return values
         found = dict(values)
-        for key in cls.model_fields.keys() & found.keys():
+        for key in (
+            k for k, v in values.items() if isinstance(v, Mapping) and k in cls.model_fields
+        ):
             default = cls.model_fields[key].get_default(call_default_factory=True)
-            if isinstance(found[key], Mapping) and isinstance(default, Settings):
+            if isinstance(default, Settings):
                 found[key] = {**dict(default), **found[key]}
         return found
 

@@ -217,7 +217,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             check("posterior.names", own["names"], Names)
             # fits to films have other names for numbers of the learned stiffness
-            operator = partial(re.sub, r"stiffness_(\d+)", lambda m: f"operator[{int(m[1]) - 1}]")
+            operator = partial(re.sub, r"^stiffness_(\d+)", lambda m: f"operator[{int(m[1]) - 1}]")
             named = list(map(operator, own["names"]))
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,

@@ -96,10 +96,10 @@ def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
     """Errors: ConfigError where a callback or a sweep's objective is of validation and nothing is held out."""
     if cfg.scene.get("holdout_cameras") or cfg.scene.get("holdout_frames"):
         return
-    monitors = {
-        f"callbacks: {type(c).__name__}.monitor": getattr(c, "monitor", "") for c in callbacks
-    }
-    for where, figure in (monitors | {"optimized_metric": cfg.optimized_metric}).items():
+    monitors = [
+        (f"callbacks: {type(c).__name__}.monitor", getattr(c, "monitor", None)) for c in callbacks
+    ]
+    for where, figure in [*monitors, ("optimized_metric", cfg.optimized_metric)]:
         if str(figure).startswith(VALIDATION):
             raise ConfigError(
                 f"{where} is {figure}: expected something that is held out of the training sequence, found nothing; "
