@@ -97,7 +97,7 @@ def section(where: str, entry: str | Mapping[str, Any]) -> dict[str, Any]:
     if unknown := [key for key in entry if key not in OWN]:
         wanted = ", ".join(OWN)
         raise ConfigError(
-            f"scene.{where}: {unknown[0]}: not a key of a sequence; expected {wanted}"
+            f"scene.{where}: {unknown[0]}: not a key of a single sequence; expected {wanted}"
         )
     return dict(entry)
 
