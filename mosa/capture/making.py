@@ -158,7 +158,10 @@ def output_folder(values: Mapping[str, Any]) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise DataError(f"output: {folder} cannot be written ({error.strerror})") from error
+        found = f"found none ({error.strerror})"
+        raise DataError(
+            f"output: {folder}: expected a folder that can be written, {found}"
+        ) from error
     return folder
 
 
