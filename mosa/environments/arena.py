@@ -76,7 +76,8 @@ def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
         said = f"a run on a scene of format {kind}: the truth is known for built-in scenes only"
         raise ConfigError(f"simulator: expected learned or isotropic for {said}")
     if not isinstance(name := known.get("name"), str):
-        raise DataError(f"{where}.name: expected a built-in scene's name, found {name!r}; {way}")
+        wanted = "the name of a built-in scene"
+        raise DataError(f"{where}.name: expected {wanted}, found {name!r}; {way}")
     return known
 
 
