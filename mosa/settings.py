@@ -289,12 +289,8 @@ def numbers_described(kind: Any, told: list[Any]) -> str | None:
     """Of a whole number or a number with bounds; None for another type."""
     if kind not in (int, float):
         return None
-    lows = [
-        (b.ge, False) if isinstance(b, Ge) else (b.gt, True) for b in told if isinstance(b, Ge | Gt)
-    ]
-    highs = [
-        (b.le, True) if isinstance(b, Le) else (b.lt, False) for b in told if isinstance(b, Le | Lt)
-    ]
+    lows = [(b.ge if isinstance(b, Ge) else b.gt, isinstance(b, Gt)) for b in told if isinstance(b, (Ge, Gt))]  # fmt: skip
+    highs = [(b.le if isinstance(b, Le) else b.lt, isinstance(b, Le)) for b in told if isinstance(b, (Le, Lt))]  # fmt: skip
     low, high = max(lows, default=None), min(highs, default=None)
     number = (lambda v: f"{v:g}") if kind is float else str
     parts = ["a number" if kind is float else "a whole number"]
@@ -371,7 +367,7 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
 def call(where: str, build: Callable[..., Any], keys: Mapping[str, Any], **given: Any) -> Any:
     """build(**given, **keys), the keys checked by its annotations. Errors: ConfigError for a key that it does not take, that is
     missing, or whose value is of another type."""
-    checked = arguments_of(build, where, *given).read(keys, where)
+    checked = arguments_of(build, "", *given).read(keys, where)  # once for all places
     return build(**given, **{key: getattr(checked, key) for key in keys})
 
 

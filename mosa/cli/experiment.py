@@ -43,7 +43,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 def arguments(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
-    first = "experiments, or all; the jobs of what is named first begin first; none: list them"
+    first = "experiments, in the order to run them, or all; none: list them"
     parser.add_argument("names", nargs="*", metavar="NAME", help=first)
     parser.set_defaults(only=[], overrides=[])
     for name, how in OPTIONS.items():

@@ -26,11 +26,18 @@ def main(words: list[str] | None = None) -> None:
         default=1000,
         help="deformations at which every text is compared; 0: none",
     )
+    parser.add_argument(
+        "--extensions",
+        metavar="MODULE,MODULE",
+        help="modules that register the law and its energy (docs/law_export.md)",
+    )
     given = parser.parse_args(words)
+    from mosa.config.extensions import load_extensions
     from mosa.export.run import LARGEST, export
 
     warnings.formatwarning = lambda *about: f"{one_line(*about)}\n"
     with one_message():
+        load_extensions(given.extensions.split(",") if given.extensions else None)
         differences = export(given.source, given.folder, given.check)
     for name, value in differences.items():
         print(f"{name:14s} {value:.1e} relative difference at {given.check} deformations")

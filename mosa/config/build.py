@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ import mosa.config.composition  # noqa: F401  registers what conf/ refers to
 from mosa.config.command_settings import TrainSettings
 from mosa.config.record import BodyRecord
 from mosa.data.io.forces import columns_of, forces_from_config
+from mosa.data.sequences import further_names
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.law_stress import check_own
 from mosa.modules.adapters.registry import adapter_class
@@ -197,7 +198,7 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
     for collider in colliders_from_config(settings.world.colliders or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
-    check_forces(settings.world.plain())
+    check_forces(settings.world.plain(), further_names(settings.scene.plain()))
     if settings.world.forces and not all(stage.newton for stage in stages):
         raise ConfigError(
             "world.forces: expected stages that run Gauss-Newton, which compares forces, found Adam "
@@ -206,12 +207,19 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
     return stages
 
 
-def check_forces(world: Mapping[str, Any]) -> None:
-    """Driven sets and measured forces, before anything takes long. Errors: ConfigError naming the
-    key, DataError the file."""
+def check_forces(world: Mapping[str, Any], recordings: Sequence[str] = ()) -> None:
+    """Driven sets and measured forces, before anything takes long. recordings: names of those beside
+    the first. Errors: ConfigError naming the key, DataError the file."""
     solids = colliders_from_config(world.get("colliders") or ())
     sets = driven_from_config(world.get("driven") or ())
-    columns_of(forces_from_config(world.get("forces")), solids_of(solids, sets))
+    curves = forces_from_config(world.get("forces"))
+    columns_of(curves, solids_of(solids, sets))
+    if unknown := [c.recording for c in curves if c.recording not in (None, *recordings)]:
+        raise ConfigError(
+            "world.forces: recording: expected the name of one of scene.also_train or scene.test "
+            f"({', '.join(recordings) or 'there are none'}), no key for that of scene.path, found "
+            f"{unknown[0]!r}"
+        )
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:

@@ -66,9 +66,15 @@ def keys_of(values: Any, where: str = "") -> Iterator[str]:
 def said_of(error: BaseException) -> str:
     """What Hydra says of an override that it cannot take, and the options or the nearest key, where it does not name those."""
     said = "\n".join(dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error)))
-    if found := re.search(r"Could not load '(\w+)/(.+)'", said):
+    if found := re.search(r"Could not (?:load|find) '([\w/]+)/([^/']+)'", said):
         options = sorted(f.stem for f in Path(configuration(), found[1]).glob("*.yaml"))
-        said += f"\nAvailable options in '{found[1]}': {', '.join(options)}{nearest(found[2], options, '')}"
+        if listed := re.search(r"Available options in '.*':((?:\s+\w+$)+)", said, re.MULTILINE):
+            options = listed[1].split()
+        said = (
+            f"{found[1]}: expected one of {', '.join(options)}, found {found[2]}"
+            f"{nearest(found[2], options, '')}; files of your own: hydra.searchpath=[file://<folder>], "
+            f"which holds {found[1]}/{found[2]}.yaml"
+        )
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
         known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
         said = said.replace(found[0], f"{nearest(found[1], known, '')}.")

@@ -69,9 +69,7 @@ Finite = Annotated[Any, Expected("finite numbers"), such(finite)]
 ByLaw = Annotated[
     dict[str, Any], Expected(f"numbers of laws among {', '.join(RIVALS)}"), such(lambda v: set(v) <= set(RIVALS))
 ]  # fmt: skip
-Tensors = Annotated[
-    Any, Expected("null, or a list of finite tensors"), such(lambda v: v is None or (isinstance(v, list) and all(map(finite, v))))
-]  # fmt: skip
+Tensors = Annotated[list[Finite] | None, Expected("null, or a list of finite tensors")]
 Rotation = Annotated[list[list[float]], Expected("a 3x3 rotation matrix"), such(is_rotation)]
 Box = Annotated[
     list[Three], Expected("two corners, min below max"), such(lambda v: len(v) == 2 and all(a < b for a, b in zip(*v)))
@@ -81,14 +79,13 @@ Distances = Annotated[
     dict[str, Annotated[float, AllowInfNan(True)]], Expected("numbers by name"), such(lambda v: not any(x != x for x in v.values()))
 ]  # fmt: skip
 FieldsOfRollouts = Annotated[
-    Any, Expected("null, or for each rollout three tensors of finite numbers"),
-    such(lambda v: v is None or (isinstance(v, list) and all(
-        isinstance(each, (list, tuple)) and len(each) == 3 and all(map(finite, each)) for each in v))),
-]  # fmt: skip
+    list[Annotated[list[Finite] | tuple[Finite, ...], such(lambda v: len(v) == 3)]] | None,
+    Expected("null, or for each rollout three tensors of finite numbers"),
+]
 Positions = Annotated[
-    Any, Expected("null, or for each sequence finite positions of shape (T, N, 3)"),
-    such(lambda v: v is None or (isinstance(v, list) and all(finite(t, (None, None, 3)) for t in v))),
-]  # fmt: skip
+    list[Annotated[Any, such(lambda t: finite(t, (None, None, 3)))]] | None,
+    Expected("null, or for each sequence finite positions of shape (T, N, 3)"),
+]
 Responses = Annotated[
     Any, Expected("null, or for each sequence null or finite tensors `about` (T, N, 3) and `share` (T, 3 K, 3 K)"),
     such(lambda v: v is None or (isinstance(v, list) and all(each is None or (

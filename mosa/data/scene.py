@@ -12,8 +12,9 @@ from typing import Literal
 from mosa.data.checks.validation import validate
 from mosa.data.formats.scene_from_footage import scene_from_footage
 from mosa.errors import ConfigError, DataError
+from mosa.physics.contact.planes import check_rubbing
 from mosa.settings import Number, Positive, Settings, Weight, check, imported
-from mosa.types import RUBBING, Ground, Scene
+from mosa.types import Ground, Scene
 
 FORMATS = {
     "pacnerf": "mosa.data.formats.pacnerf:load_pacnerf",
@@ -179,8 +180,5 @@ def ground_from(keys) -> Ground | None:
         return keys
     given = keys.items() if isinstance(keys, Mapping) else ()
     found = GroundSettings.read({k: v for k, v in given if v is not None} if given else keys)
-    if found.friction > 0 and found.mode not in RUBBING:
-        raise ConfigError(
-            f"scene.ground.friction: acts with modes {' and '.join(RUBBING)} only, found {found.friction} with mode {found.mode!r}"
-        )
+    check_rubbing("scene.ground.", found.mode, found.friction)
     return Ground(**dict(found))

@@ -78,12 +78,16 @@ def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:
 
 def taught_names(keys: Mapping[str, Any]) -> list[str]:
     """`Scene.sequence` of the sequences in scene.also_train. Errors: ConfigError."""
+    return further_names(keys)[: len(keys.get("also_train") or [])]
+
+
+def further_names(keys: Mapping[str, Any]) -> list[str]:
+    """The same of those in scene.test too, which follow."""
     also_train = keys.get("also_train") or []
     if keys.get("format") == "builtin":
         return list(also_train)
     entries = [("also_train", each) for each in also_train]
-    entries += [("test", each) for each in keys.get("test") or []]
-    return sequence_names(keys, entries)[: len(also_train)]
+    return sequence_names(keys, entries + [("test", each) for each in keys.get("test") or []])
 
 
 def section(where: str, entry: str | Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.data.io.forces import force_figures
+from mosa.data.io.forces import curves_of, force_figures
 from mosa.data.sequences import load_sequences
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
@@ -197,10 +197,12 @@ def evaluate(
             model = PREFIX[variant]
             if variant in simulated:
                 kept[sequence.prefix][variant] = simulated[variant]
-                if world.forces and sequence.prefix == "train" and variant == "adapted":
-                    dt = float(sequence.scene.times[1] - sequence.scene.times[0])
-                    figures |= force_figures(simulated[variant], world.forces, world, dt)
-                found = sequence_metrics(
+                if world.forces and variant == "adapted":
+                    scene, first = sequence.scene, sequence.prefix == "train"
+                    curves = curves_of(world.forces, scene.sequence, first)
+                    dt = float(scene.times[1] - scene.times[0])
+                    figures |= force_figures(simulated[variant], curves, world, dt)
+                figures |= sequence_metrics(
                     body, sequence, simulated[variant], model, settings, target
                 )
                 figures |= found

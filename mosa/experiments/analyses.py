@@ -98,7 +98,7 @@ def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> 
     else:
         places[0].set_ylim(bottom=0)
     say_cut(places[0])
-    legend(canvas, names, without="no motion kept")
+    legend(canvas, names, without="not drawn, as their runs saved no motion")
     frames = stem.with_name(stem.name + "_frames")
     header = [experiment.columns, experiment.rows, "time_s", "rms_mm", "sd_mm"]
     write_table(frames.with_suffix(".csv"), header, rows)

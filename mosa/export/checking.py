@@ -49,9 +49,10 @@ def jaumann(derivative: Tensor, F: Tensor) -> Tensor:
     return torch.stack(columns, 2) / J[:, None, None]
 
 
-def check_umat(found: Source, text: str, F: Tensor, truth: Pair) -> tuple[float, float]:
-    """Relative differences of stress and tangent, compiled by gfortran. Errors: DataError where it does not compile."""
-    n, tau, derivative = len(F), *truth
+def umat_of(found: Source, text: str, F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(SSE (n,) [J/m^3], stress (n, 6) [Pa], tangent (n, 6, 6)) of the text, compiled by gfortran.
+    Errors: DataError where it does not compile."""
+    n = len(F)
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder) / "umat.f90", Path(folder) / "umat.so"
         source.write_text(text)
@@ -63,15 +64,25 @@ def check_umat(found: Source, text: str, F: Tensor, truth: Pair) -> tuple[float,
             raise DataError(f"export: gfortran does not compile umat.f90: {run.stderr[-500:]}")
         call = ctypes.CDLL(str(library)).mosa_check
         props = np.array([found.values[name] for name in found.energy.names])
-        stresses, tangents = np.empty((n, 6)), np.empty((n, 6, 6))
+        results = np.empty(n), np.empty((n, 6)), np.empty((n, 6, 6))
         gradients = np.ascontiguousarray(F.mT.numpy())  # Fortran's columns
         double = ctypes.POINTER(ctypes.c_double)
-        arrays = [a.ctypes.data_as(double) for a in (gradients, props, stresses, tangents)]
+        arrays = [a.ctypes.data_as(double) for a in (gradients, props, *results)]
         call(n, arrays[0], len(props), *arrays[1:])
-    sigma = tau / torch.linalg.det(F)[:, None, None]
+    stored, stress, tangent = map(torch.from_numpy, results)
+    return stored, stress, tangent.mT
+
+
+def check_umat(
+    found: Source, text: str, F: Tensor, truth: tuple[Tensor, Tensor], psi: Tensor
+) -> tuple[float, float, float]:
+    """Relative differences of stress, tangent and SSE. psi: (n,) [J/m^3] per rest volume."""
+    (stored, stress, tangent), (tau, derivative) = umat_of(found, text, F), truth
+    J = torch.linalg.det(F)
+    sigma = tau / J[:, None, None]
     asked = torch.stack([sigma[:, i, j] for i, j in ABAQUS], 1)
-    stiff = torch.from_numpy(tangents).mT
-    return relative(torch.from_numpy(stresses), asked), relative(stiff, jaumann(derivative, F))
+    energy = float((stored - psi / J).abs().max() / psi.abs().max())
+    return relative(stress, asked), relative(tangent, jaumann(derivative, F)), energy
 
 
 class Entries:
@@ -91,13 +102,18 @@ LIKE_UFL = SimpleNamespace(
 """The functions of UFL that a text calls, on batches."""
 
 
-def check_ufl(text: str, F: Tensor, truth: Pair) -> tuple[float, float]:
-    """Relative differences of stress and tangent: first and second derivatives of the text's energy."""
+def energy_of(text: str, F: Tensor) -> Tensor:
+    """(n,) [J/m^3] per rest volume, by the text for FEniCSx."""
     scope: dict = {"ufl": LIKE_UFL}
     exec(compile(text.replace("\nimport ufl\n", "\n"), "law_ufl.py", "exec"), scope)
+    return scope["energy"](Entries(F))
+
+
+def check_ufl(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float, float]:
+    """Relative differences of stress and tangent: first and second derivatives of the text's energy."""
     tau, derivative = truth
     F = F.clone().requires_grad_()
-    psi = scope["energy"](Entries(F))
+    psi = energy_of(text, F)
     (P,) = torch.autograd.grad(psi.sum(), F, create_graph=True)
     found = P @ F.mT
     sums = (found[:, i, j].sum() for i in range(3) for j in range(3))
@@ -134,8 +150,9 @@ def check_all(found: Source, texts: dict[str, str], count: int) -> dict[str, flo
     truth = expected(found, F)
     result: dict[str, float] = {}
     if shutil.which("gfortran"):
-        both = check_umat(found, texts["umat.f90"], F, truth)
-        result["umat stress"], result["umat tangent"] = both
+        names, psi = ("stress", "tangent", "energy"), energy_of(texts["law_ufl.py"], F)
+        differences = check_umat(found, texts["umat.f90"], F, truth, psi)
+        result |= {f"umat {name}": value for name, value in zip(names, differences)}
     result["ufl stress"], result["ufl tangent"] = check_ufl(texts["law_ufl.py"], F, truth)
     result["warp stress"] = check_warp(texts["law_warp.py"], F, truth)
     return result

@@ -9,7 +9,8 @@ from mosa.export.source import as_json, read_source
 from mosa.export.texts import ufl_text, umat, warp_text
 from mosa.settings import Whole, typed
 
-LARGEST = {"stress": 1e-10, "tangent": 1e-6}  # relative difference that a text may have
+LARGEST = {"stress": 1e-10, "energy": 1e-10, "tangent": 1e-6}
+"""Relative difference that a text may have."""
 
 
 @typed

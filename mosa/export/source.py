@@ -71,8 +71,9 @@ def source(material: Material, adapter: object) -> Source:
     """Errors: ConfigError naming the law or the adapter that has no energy as text."""
     if material.law not in ENERGIES:
         raise ConfigError(
-            f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow, are "
-            "damped (fit without damping) or have no energy"
+            f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow or "
+            "are damped (fit without damping); a law of your own needs its energy in "
+            "mosa.export.energies.ENERGIES, by a module of --extensions"
         )
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
         found = "found another adapter: its law has no energy"

@@ -112,8 +112,17 @@ def umat(found: Source) -> str:
     """Fortran 95, free form: an Abaqus UMAT with its consistent tangent, and a check's entry that C can call."""
     printer = Fortran()
     stress, stiff, along, slopes = derivatives(found.energy)
-
-    def assigned(targets: list[str], expressions: list[sp.Expr]) -> list[str]:
+    names = [
+        "psi",
+        *(f"S({k + 1})" for k in range(6)),
+        *(f"CC({i + 1},{j + 1})" for i in range(6) for j in range(i, 6)),
+    ]
+    for into, targets, expressions in (
+        (entries, names, [found.energy.entries, *stress, *stiff]),
+        (principal, ["psi", *(f"s({k + 1})" for k in range(3)),
+                     *(f"ds({i + 1},{j + 1})" for i in range(3) for j in range(3))],
+         [found.energy.stretches, *along, *slopes]),
+    ):  # fmt: skip
         steps, rest = reduced(expressions)
         lines = [(str(name), value) for name, value in steps] + list(zip(targets, rest))
         texts = (wrap(f"{name} = {printer.doprint(value)}") for name, value in lines)

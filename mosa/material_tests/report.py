@@ -25,8 +25,11 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-GOOD, SAME = 0.8, 1.1  # R2 that is not warned of; ratio of errors that counts as one law
-SIDE, ACROSS = 0.05, 6  # of the cube that a checkpoint holds [m], and its particles along an edge
+GOOD, SAME, SOFTEST = 0.95, 1.1, 10.0
+"""R2 below which a fit is warned of; ratio of errors above which exports differ from the fit; E [Pa]
+below which the unit is doubted: gels that keep their shape have more."""
+SIDE, ACROSS = 0.05, 6
+"""Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
 
 def curves(data: Measurements) -> dict[tuple[int, int], np.ndarray]:
@@ -100,13 +103,15 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
 
 def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
     """What a user should look at: poor curves, an export that is another law."""
-    R2, poor = float(figures(data, fit, {})["R2"]), ""
+    R2, poor, soft = float(figures(data, fit, {})["R2"]), "", ""
     if R2 < GOOD:
         poor = (
             f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), or the "
             "file holds true stress (expected: force over the undeformed area) or strain (expected: stretch, 1 at rest)"
         )
-    return [each for each in (poor, note(law, data, fit, unit)) if each]
+    if (E := float(law.material.physical()["E"].detach())) < SOFTEST:
+        soft = f"unit: E is {E:.3g} Pa, softer than gels: is the file in {unit}, not in kPa or MPa?"
+    return [each for each in (poor, soft, note(law, data, fit, unit)) if each]
 
 
 def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:

@@ -11,6 +11,7 @@ from mosa.config.build import build_adapter, build_prior, plain
 from mosa.config.checkpoints import known_numbers
 from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import MaterialSettings
+from mosa.data.formats.scene_from_footage import check_density
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.law_stress import check_own
 from mosa.material_tests.fitting import Fitting, Law
@@ -56,6 +57,7 @@ def fit_tests(cfg: DictConfig) -> float:
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
     MaterialSettings.read(values)
+    check_density("density", values["density"])
     data = read_tests(values["tests"], values["unit"])
     law, known = build_law(values), None
     if values["known"] is not None:

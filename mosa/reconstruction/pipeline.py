@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.data.checks.silhouettes import uncovered_share, whole_views
+from mosa.data.checks.silhouettes import uncovered_and_islands, whole_views
 from mosa.data.hull import Volume, hull_bounds, occupancy, visual_hull
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
@@ -236,7 +236,7 @@ def check_place(path: str, splats: Splats, scene: Scene) -> None:
     inside = occupancy(splats.means, mattes, cameras) > 0.25
     within = float((splats.opacities * inside).sum() / splats.opacities.sum())
     reach = 2 * float(splats.scales.mean())
-    filled = 1 - float(uncovered_share(splats.means, reach, mattes, cameras).median())
+    filled = 1 - float(uncovered_and_islands(splats.means, reach, mattes, cameras)[0].median())
     said = (
         f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "
         f"and {filled:.0%} of the mattes filled: check the file's unit, axes and place in the scene's world"
@@ -390,7 +390,7 @@ def follow(
     _first_frame(scene)
     pose = (rotation, center, rest_center)
     cache = _open_cache(
-        cache_dir, scene, _motion_settings(settings), seed, light="of its first frame",
+        cache_dir, scene, _motion_settings(settings), seed, light="of its first frame, all along",
         body=[first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
         pose=[[round(v, 6) for v in part.flatten().tolist()] for part in pose],
     )  # fmt: skip
@@ -399,21 +399,24 @@ def follow(
     def in_pose(rest: Splats) -> Splats:
         return posed(rest.to("cpu"), *(p.cpu() for p in pose))
 
-    def turned(rest: Splats) -> Splats:
-        """In the pose, in the light that falls on it there: the one that frame 0 shows."""
+    def turned(rest: Splats) -> tuple[Splats, tuple[Tensor, ...]]:
+        """In the pose, in the light that falls on it there, which frame 0 shows; (its normals, the light)."""
         normals = surface_normals(rest.means, reconstruction.splats.means)
         still = [c for c in views if bool((scene.mattes[c, 0] > 0.5).any())]
         light = light_of(
             rest.to(device), normals.to(device), (rotation, center), scene.images[still, 0], scene.mattes[still, 0],
             scene.cameras.select(still), background=scene.background, rest_center=rest_center,
         ).cpu()  # fmt: skip
-        moved = in_pose(rest)
-        shades = shading(light, normals.cpu(), rotation.cpu().to(normals))
-        return replace(moved, colors=moved.colors * shades[:, None])
+        moved, turn = in_pose(rest), rotation.cpu().to(normals)
+        shades = shading(light, normals.cpu(), turn)
+        return replace(moved, colors=moved.colors * shades[:, None]), (
+            normals @ turn.T.to(normals),
+            light,
+        )
 
     rest = reconstruction.splats
-    splats = (in_pose if settings.dynamic.carriers == "static" else turned)(rest)
-    static = turned(rest if reconstruction.static is None else reconstruction.static)
+    splats = in_pose(rest) if settings.dynamic.carriers == "static" else turned(rest)[0]
+    static, lit = turned(rest if reconstruction.static is None else reconstruction.static)
 
     def bar(name: str, total: int) -> tqdm:
         title = f"reconstruction of {scene.sequence}: {name}"
@@ -421,7 +424,8 @@ def follow(
 
     known = reconstruction.moving.place if reconstruction.moving is not None else None
     place = None if known is None else known.turned(*(p.cpu() for p in pose))
-    parts = MovingParts(scene, splats.to(device), static.to(device), settings, place)
+    lit = tuple(part.to(device) for part in lit)
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings, place, lit)
 
     def motion_stage() -> dict[str, Tensor]:
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)

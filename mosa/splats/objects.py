@@ -88,7 +88,7 @@ def read_object(
     if (wide := float(splats.scales.amax(1).median())) > WIDE * longest:
         raise DataError(
             f"{path}: field scale_*: expected logarithms of standard deviations, found half of the Gaussians wider "
-            f"than {wide / longest:.0%} of the object: another encoding of the scales?"
+            f"than {wide:.3g} in an object of {longest:.3g}: another encoding of the scales?"
         )
     usual = PLAUSIBLE[0] <= (longest if size is None else size) <= PLAUSIBLE[1]
     if size is None and not usual:

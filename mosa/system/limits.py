@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from mosa.errors import ConfigError, MosaError
-from mosa.system.refused import lacks_memory
+from mosa.system.refused import short_of_memory
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
@@ -49,7 +49,7 @@ def named_device(name: str | torch.device) -> str:
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
-        if lacks_memory(error):
+        if short_of_memory(error):
             raise
         raise ConfigError(f"{wanted} {str(name)!r} ({str(error).splitlines()[0]})") from error
     return str(name)

@@ -69,13 +69,9 @@ def gpu_memory() -> tuple[float, float] | None:
         return None
 
 
-def lacks_memory(error: BaseException) -> bool:
-    """Whether the error says that the machine, or a GPU, has no memory left; also by what its libraries make of that."""
-    return short_of_memory(error) is not None
-
-
 def short_of_memory(error: BaseException) -> BaseException | None:
-    """The error, or that of its causes, which says so."""
+    """The error, or that of its causes, which says that the machine, or a GPU, has no memory left; also by what its libraries make
+    of that."""
     for one in causes(error):
         if isinstance(one, MemoryError) or NO_MEMORY.search(str(one)):
             return one

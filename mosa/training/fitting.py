@@ -22,7 +22,7 @@ from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.settings import arguments_of, nearest, untold
-from mosa.system.refused import lacks_memory
+from mosa.system.refused import short_of_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa, check_trainer
@@ -123,14 +123,14 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
     except torch.linalg.LinAlgError as error:
-        if lacks_memory(error):
+        if short_of_memory(error):
             raise
         raise SimulationDiverged(
             f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
             "check the checkpoint that it goes on from, or lower simulation.courant"
         ) from error
     except Exception as error:
-        if begun or ckpt_path is None or isinstance(error, MosaError) or lacks_memory(error):
+        if begun or ckpt_path is None or isinstance(error, MosaError) or short_of_memory(error):
             raise
         # Lightning takes its own entries as they are
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]

@@ -115,8 +115,8 @@ def run_command(run: Callable[[], None]) -> None:
                 if begun and not isinstance(error, HydraException):
                     raise
                 message = (
-                    f"ConfigError: {said_of(error)}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds parameters of laws "
-                    "and options of adapters alone; all keys: python -m mosa.config.reference <command> [KEY]"
+                    f"ConfigError: {said_of(error)}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds keys that no file of "
+                    "conf/ has, as a law's parameters; all keys: python -m mosa.config.reference <command> [KEY]"
                 )
             print(f"\n{message}", file=sys.stderr)
             sys.exit(2)

@@ -26,6 +26,9 @@ from mosa.twin.start import (
     start_in,
 )
 
+FARTHEST = 100.0
+"""Of a law's numbers, which are logarithms or shares: the largest single precision is e^89."""
+
 
 class TwinWorlds:
     """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
@@ -42,10 +45,13 @@ class TwinWorlds:
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
             shape = (count, len(read_numbers(body)))
-            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers"
-            laws = numbers("laws", laws, said, shape)
-        self.body, self.world, self.frame_dt = body, world, frame_dt
-        self.training_start, self.count, self.laws = training_start, count, laws
+            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers within {FARTHEST:g}"
+            laws = numbers("laws", laws, said, shape, most=FARTHEST)
+        self.body = body
+        self.world = world
+        self.frame_dt = frame_dt
+        self.training_start = training_start
+        self.count, self.laws = count, laws
         self.episode: Episode | None = None
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 

@@ -34,7 +34,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.numerics import State, flat
 from mosa.physics.time.clock import Moment
 from mosa.settings import shown
-from mosa.twin.start import check_wants_no_gradients
+from mosa.twin.start import Crossings, check_wants_no_gradients
 from mosa.types import ParticleState, Rollout, dense, in_brief
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -79,8 +79,8 @@ class TwinState:
     def read(cls, tensors: Mapping[str, Tensor]) -> TwinState:
         """Errors: DataError naming what is missing or unknown."""
         names = {f.name for f in fields(cls)}
-        if set(tensors) != names:
-            found = ", ".join(sorted(tensors))
+        if not isinstance(tensors, Mapping) or set(tensors) != names:
+            found = ", ".join(map(str, tensors)) if isinstance(tensors, Mapping) else shown(tensors)
             raise DataError(f"state: expected {', '.join(sorted(names))}, found {found}")
         return cls(**tensors)
 
@@ -159,6 +159,8 @@ class Episode:
             self._driven = torch.zeros(len(self.colliders), dtype=torch.bool)
             self._moment, self._poses = moment, self._placed(moment, 0)
             self._starts, self._first = starts, self._poses
+            self._crossings = None if self.worlds is not None else Crossings(self.colliders)
+            self._look()
             self._said: dict[int, Tensor] = {}  # rotation vectors of the last actions
 
     @property
@@ -207,13 +209,21 @@ class Episode:
                 raise ConfigError(
                     f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}"
                 )
+        frames, time = int(state.frames), float(state.time)
+        if not math.isclose(time, frames * self.frame_dt, abs_tol=1e-9 * self.frame_dt):
+            raise ConfigError(
+                f"state.time: expected {frames} steps of {self.frame_dt:g} s, found {time:g} s: reset with the control_dt "
+                "that the state was made with"
+            )
         particles = ParticleState(
             *(getattr(state, name).to(now.x.device) for name in State._fields)
         )
         particles = entered(
             particles, self._stepper.axes, particles.v.dtype, self._stepper.prepared.numerics.dx
         )
-        self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
+        # own motions go by time, and the other reset may have had other substeps
+        done = int(state.substeps) if self.substeps is None else frames * self.substeps
+        self._moment = Moment(particles, done, frames, float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
@@ -237,18 +247,18 @@ class Episode:
             moment, reactions, _ = self._stepper.step(self._moment, wanted, speed)
             self._moment, self._driven = moment, driven
             self._poses = after[0] if after else self._poses
+            self._look()
             return Stepped(self.state, reactions)
 
     def restart(self, which: Sequence[int], starts: Sequence[Start] | None = None) -> TwinState:
         """Put some worlds back to a start, each to its own of `starts`, None for those it had; the others stay as they are. Time
         is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
         """
-        if self.worlds is None or not all(type(b) is int and 0 <= b < self.worlds for b in which):
+        assert self.worlds is not None
+        if not all(0 <= b < self.worlds for b in which):
             raise ConfigError(
-                f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}"
+                f"restart: expected numbers of worlds below {self.worlds}, found {list(which)}"
             )
-        if starts is not None and len(starts) != len(which):
-            raise ConfigError(f"restart: expected {len(which)} starts, found {len(starts)}")
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
         starts = [self._starts[b] for b in which] if starts is None else starts
@@ -273,6 +283,11 @@ class Episode:
             state = ParticleState(*(_where(chosen, *pair) for pair in pairs))
             self._poses, self._moment = poses, moment._replace(state=state)
             return self.state
+
+    def _look(self) -> None:
+        """Of one world alone."""
+        if self._crossings is not None:
+            self._crossings.look(*self._poses)
 
     def _gradients(self):
         return torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled())
@@ -435,15 +450,15 @@ def _worlds(
 ) -> tuple[Ready, Callable[[int, Start], ParticleState]]:
     """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
-        raise ConfigError("simulation.adaptive: expected false with many worlds")
-    if laws is not None and (len(laws) != len(starts) or options["model"] != body.model()):
         raise ConfigError(
-            f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
-            f"{'' if options['model'] == body.model() else ' of another variant'}"
+            "simulation.adaptive: expected false with many worlds, which take the same substeps"
         )
-    pulls = list(
-        (world.gravity if gravity is None else gravity).to(body.rest).expand(len(starts), 3)
-    )
+    if laws is not None and options["model"] != body.model():
+        raise ConfigError("laws: expected those of variant adapted, found another variant")
+    if gravity is None:
+        pulls = [world.gravity.to(body.rest)] * len(starts)
+    else:
+        pulls = list(gravity.to(body.rest))
     # the time step is one for all
     quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
     pulled = (replace(world, gravity=pull) for pull in pulls)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
 from torch import Tensor, nn
 
+from mosa.data.formats.scene_from_footage import check_density
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.anisotropy import mandel_matrix, mandel_scale
 from mosa.evaluation.analysis.law_stress import in_double, tangent, values_of
@@ -21,10 +23,8 @@ from mosa.modules.body.material import RELATIVE, Material, unit_of
 from mosa.physics.constitutive.damping import DAMPED, DAMPING
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import AS_USUAL
-from mosa.settings import is_number
+from mosa.settings import Positive, check, typed
 from mosa.twin.presets import preset
-
-DENSEST = (0.1, 1e5)  # [kg/m^3] that a record allows
 
 
 class TwinMaterial:
@@ -40,8 +40,8 @@ class TwinMaterial:
     def __init__(self, twin: Any) -> None:
         object.__setattr__(self, "_twin", twin)
 
-    def __setattr__(self, name: str, value: float) -> None:
-        self.set(None, **{name: value})
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.set(**{name: value})
 
     @property
     def _body(self) -> Body:
@@ -124,6 +124,7 @@ class TwinMaterial:
         return mandel_matrix(J).detach()
 
     # ---------------------------------------------------------------- setting
+    @typed
     def set(self, law: str | None = None, **values: float) -> None:
         """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa
         s], and all of `parameters`.
@@ -134,19 +135,14 @@ class TwinMaterial:
         ConfigError naming the value."""
         density = values.pop("density", None)
         if density is not None:
-            low, high = DENSEST
-            if not is_number(density) or not low <= density <= high:
-                raise ConfigError(
-                    f"density: expected {low:g} to {high:g} kg/m^3, found {density!r}"
-                )
+            check_density("density", density)
         same = law in (None, self.law)
         known = values_of(self._body.material) if same else {}
         given = {**known, **values}
         if "E" not in known and {"mu", "kappa"} <= set(known) and {"E", "nu"} & set(values):
             E, nu = given.pop("E", self.E), given.pop("nu", self.nu)
-            if not is_number(E) or not is_number(nu) or not E > 0 or not -1 < nu < 0.5:
-                wanted = "a number above 0 and one from -1 to 0.5"
-                raise ConfigError(f"E, nu: expected {wanted}, found {E!r}, {nu!r}")
+            check("E", E, Positive)
+            check("nu", nu, Annotated[float, Interval(gt=-1, lt=0.5)])
             given |= {"mu": E / (2 * (1 + nu)), "kappa": E / (3 * (1 - 2 * nu))}
         if not any(given.get(name) for name in DAMPING):
             given = {name: value for name, value in given.items() if name not in DAMPING}

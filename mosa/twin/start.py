@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,19 +18,36 @@ from torch import Tensor
 from mosa.config.record import is_rotation
 from mosa.errors import ConfigError
 from mosa.modules.body.body import VARIANTS, Body, Start, World
-from mosa.physics.contact.colliders import HOLD, HalfSpace, axis_degrees, colliders_from_config
+from mosa.physics.contact.colliders import (
+    HOLD,
+    Collider,
+    HalfSpace,
+    Particles,
+    axis_degrees,
+    colliders_from_config,
+    half_width,
+    reach,
+)
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.mesh import SignedDistanceField
+from mosa.physics.contact.motion import pose_at
 from mosa.physics.contact.overlap import check_clear
+from mosa.physics.contact.reference import signed_distance
 from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.inputs import FASTEST, numbers, vector
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
+from mosa.twin.shown_solids import surface
 
-UNDER = 0.25  # share of a body that may start below the ground
-STORED_BYTES = 4 * (3 + 3 + 9 + 9)  # of a particle in a frame of a rollout: x, v, F, F_tot
-LARGE = 50.0  # length of a mesh over the body's from which its unit is doubted
-CREEP = 5e-3  # [m/s] of a held body from which the number of substeps is doubted
+UNDER = 0.25
+"""Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
+STORED_BYTES = 4 * (3 + 3 + 9 + 9)
+"""Of a particle in a frame of a rollout: x, v, F, F_tot."""
+LARGE = 50.0
+"""A mesh's length, and a solid's distance, over the body's size, from which their unit is doubted."""
+CREEP = 5e-3
+"""[m/s] of a held body from which the number of substeps is doubted."""
+
 
 Variant = Annotated[str, Expected(f"one of {', '.join(VARIANTS)}"), such(lambda v: v in VARIANTS)]
 Seconds = Annotated[float, Gt(0), Le(100)]
@@ -99,8 +117,6 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
                 "what was learned"
             )
         return value
-    if value.shape != (4,) or not value[:3].any():
-        raise ConfigError(f"rotation: expected {expected}, found {value.tolist()}")
     turn = axis_degrees(value.cpu()).numpy()
     return torch.tensor(Rotation.from_rotvec(turn).as_matrix(), dtype=torch.float32)
 
@@ -108,8 +124,8 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
 def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
     """(2, 3) [m] the corners of a box. Errors: ConfigError."""
     expected = f"[low, high] corners, (2, 3) finite numbers within {FASTEST:g} [m] with low below high on every axis"
-    result = numbers("box", value, expected, (2, 3)).detach()
-    if float(result.abs().max()) > FASTEST or not bool((result[0] < result[1]).all()):
+    result = numbers("box", value, expected, (2, 3), most=FASTEST).detach()
+    if not bool((result[0] < result[1]).all()):
         raise ConfigError(f"box: expected {expected}, found {str(value)[:120]}")
     return result
 
@@ -164,11 +180,20 @@ def start_in(
             stacklevel=4,
         )
     for i, each in enumerate(world.colliders):
-        size = each.shape.extent if isinstance(each.shape, SignedDistanceField) else 0.0
-        if size > LARGE * body.size:
+        if isinstance(each.shape, (HalfSpace, Particles)):
+            continue
+        expected, far = f"{field}[{i}]: expected a", LARGE * body.size
+        away = float((pose_at(each.motion)[0] - center.detach().cpu()).norm()) - reach(each.shape)
+        if isinstance(each.shape, SignedDistanceField) and (size := each.shape.extent) > far:
             warnings.warn(
-                f"{field}[{i}]: expected a mesh about as large as the body of {body.size:.3g} m, "
+                f"{expected} mesh about as large as the body of {body.size:.3g} m, "
                 f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
+                stacklevel=4,
+            )
+        elif away > far:
+            warnings.warn(
+                f"{expected} solid within reach of the body of {body.size:.3g} m, found it "
+                f"{away:.3g} m away: lengths are in metres",
                 stacklevel=4,
             )
     if world.ground is not None:
@@ -200,6 +225,47 @@ def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | Non
             f"{1e3 * CREEP:.2g} mm/s",
             stacklevel=4,
         )
+
+
+class Crossings:
+    """Warns of each pair of solids that comes to overlap, once: what is between them is pressed
+    through them."""
+
+    def __init__(self, solids: Sequence[Collider]) -> None:
+        endless = HalfSpace, Particles
+        self.solids = {k: s for k, s in enumerate(solids) if not isinstance(s.shape, endless)}
+        self.points: dict[int, Tensor] = {}
+        self.known: set[tuple[int, int]] | None = None
+
+    @torch.no_grad()
+    def look(self, position: Tensor, rotation: Tensor) -> None:
+        """position: (K, 3) [m], rotation: (K, 3, 3) float64, first at the start."""
+        found: dict[tuple[int, int], float] = {}
+        for i, j in itertools.combinations(self.solids, 2):
+            shapes = [self.solids[k].shape for k in (i, j)]
+            if float((position[i] - position[j]).norm()) > sum(map(reach, shapes)):
+                continue
+            inside = [self._inside(k, l, position, rotation) for k, l in ((i, j), (j, i))]
+            if max(inside) > 0.1 * min(map(half_width, shapes)):
+                found[i, j] = max(inside)
+        for i, j in found.keys() - self.known if self.known is not None else ():
+            names = " and ".join(self.solids[k].name or str(k) for k in (i, j))
+            warnings.warn(
+                f"colliders: expected solids that stay apart, found {names} "
+                f"{1e3 * found[i, j]:.3g} mm inside each other: they press what is between them "
+                "with any force",
+                stacklevel=4,
+            )
+        self.known = (self.known or set()) | set(found)
+
+    def _inside(self, k: int, l: int, position: Tensor, rotation: Tensor) -> float:
+        """How deep [m] solid k reaches into solid l."""
+        shape = self.solids[k].shape
+        if k not in self.points:
+            pitch = max(0.1 * reach(shape), 0.7 * half_width(shape))
+            self.points[k] = surface(shape, pitch).double()
+        at = (self.points[k] @ rotation[k].mT + position[k] - position[l]) @ rotation[l]
+        return -float(signed_distance(self.solids[l].shape, at).min())
 
 
 @torch.no_grad()

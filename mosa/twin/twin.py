@@ -49,7 +49,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
-from mosa.settings import Count, Expected, Number, Seed, such, typed
+from mosa.settings import Count, Expected, Number, Positive, Seed, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
@@ -63,6 +63,7 @@ from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
 from mosa.twin.shown_solids import with_solids
 from mosa.twin.start import (
+    Crossings,
     Seconds,
     Variant,
     check_frames,
@@ -198,6 +199,11 @@ class Twin:
             )  # fmt: skip
             fixed = ready.simulator.substeps if ready.timing is None else None
             warn_of_creep(self.body, world, self.frame_dt, fixed)
+            if len(world.colliders) > 1:
+                crossings = Crossings(world.colliders)
+                times = self.frame_dt * torch.arange(frames)
+                for moment in zip(*poses(world.colliders, times)):
+                    crossings.look(*moment)
             return ready.simulate(frames, world.solids, progress=lambda _: bar.update())
 
     @typed
@@ -355,8 +361,14 @@ class Twin:
             met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         else:
             rollout, world, met = rollout_of(motion), self.episode.world, len(motion[0].position)
-        own = met and colliders is None
-        solids = world.solids if own else colliders_from_config(colliders or (), "colliders")
+        if rollout.x.shape[1:] != self.body.rest.shape:
+            raise ConfigError(
+                f"rollout: expected one of this body's {len(self.body.rest)} particles, found {rollout!r}"
+            )
+        if met and colliders is None:
+            solids = world.solids
+        else:
+            solids = colliders_from_config(colliders or (), "colliders")
         # driven sets have reactions, and nothing to draw
         if colliders is not None and met > len(solids):
             solids += world.solids[len(world.colliders) :]
@@ -371,7 +383,7 @@ class Twin:
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        size: Pixels = 400, fps: float | None = None, view: Sequence[float] | None = None,
+        size: Pixels = 400, fps: Positive | None = None, view: Sequence[float] | None = None,
         shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;

@@ -30,7 +30,7 @@ def composed(*overrides: str, name: str = "train") -> dict:
 @pytest.mark.parametrize("overrides", [
     [], ["ablation=no_stress"], ["ablation=paper"], ["debug=default"], ["fit=paper", "reconstruction=paper", "simulation=paper"],
     ["+prior.options.norm_eps=0"], ["reconstruction.static.relocate_every=50"], ["fit.joint.converged=0.001"], ["adapter=direct"],
-    ["trainer=gpu"], ["~losses.image"], ["adapter=none", "logger=none"], ["~fit.views"], ["~world"],
+    ["trainer=gpu"], ["~losses.image"], ["adapter=none", "logger=none"], ["~fit.views"], ["~world"], ["~rendering"],
 ])  # fmt: skip
 def test_what_is_known_passes(overrides):
     TrainSettings.read(composed(*overrides))

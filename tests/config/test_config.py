@@ -56,8 +56,9 @@ def test_a_mistyped_option_is_refused(override):
 
 
 @pytest.mark.parametrize("override, message", [
-    ("prior=neo_hokean", "Could not find 'prior/neo_hokean'.*neo_hookean"),
-    ("callbacks=[default,early_stoping]", "options in 'callbacks': default, early_stopping.*nearest is early_stopping"),
+    ("prior=neo_hokean", r"prior: expected .*, found neo_hokean; .*neo_hookean; .* hydra\.searchpath"),
+    ("callbacks=[default,early_stoping]", "callbacks: expected one of default, early_st.*nearest is early_stopping"),
+    ("hydra/launcher=rai", "hydra/launcher: expected one of .*basic"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):
@@ -125,6 +126,13 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
         s.optimizer
         for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))
     } == {"adam"}
+
+
+@pytest.mark.parametrize("overrides, law", [("", "auto"), ("fit=adam", "corotated"), ("fit=paper", "corotated"),
+    ("debug=default", "corotated"), ("fit=adam prior=stvk", "stvk"), ("debug=default prior=auto", "auto")])  # fmt: skip
+def test_laws_are_compared_where_none_is_named(overrides, law):
+    # by Gauss-Newton: Adam, and a smoke run, take one
+    assert composed(*overrides.split())["prior"]["law"] == law
 
 
 @pytest.mark.parametrize("override, adapter, expected", [(None, None, 3), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
@@ -201,6 +209,10 @@ def test_forces_need_a_fit_that_compares_them(tmp_path):
         f"world.forces=[{{of:grip,file:{tmp_path}/cell.csv}}]",
     ]
     rehearse(composed(*world))
+    of_another = [world[0], world[1].replace(".csv", ".csv,recording:test_60")]
+    rehearse(composed(*of_another, "scene.also_train=[test_60]"))
+    with pytest.raises(ConfigError, match=r"recording: .* \(there are none\).* found 'test_60'"):
+        rehearse(composed(*of_another))
     with pytest.raises(ConfigError, match=r"world\.forces: expected stages that run Gauss-Newton"):
         rehearse(composed(*world, "fit=adam"))
     with pytest.raises(

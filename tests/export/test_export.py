@@ -3,13 +3,22 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 import sympy as sp
 import torch
 
 from mosa.cli.export_law import main
 from mosa.errors import ConfigError, DataError
-from mosa.export.checking import check_ufl, check_umat, check_warp, deformations, expected
+from mosa.export.checking import (
+    check_ufl,
+    check_umat,
+    check_warp,
+    deformations,
+    energy_of,
+    expected,
+    umat_of,
+)
 from mosa.export.energies import ENERGIES, ENTRIES, STRETCHES, energy
 from mosa.export.source import as_json, read_material, source
 from mosa.export.texts import ufl_text, umat, warp_text
@@ -80,9 +89,26 @@ def test_umat_agrees_with_the_kernels(law, learned):
     truth[0][0] = 0  # exactly
     text = umat(found)
     assert max(map(len, text.splitlines())) <= 132
-    stress, tangent = check_umat(found, text, F[1:], tuple(t[1:] for t in truth))
-    assert stress < 1e-10 and tangent < 1e-6
-    assert check_umat(found, text, F[:1], (torch.ones_like(truth[0][:1]), truth[1][:1]))[1] < 1e-6
+    psi = energy_of(ufl_text(found), F)
+    stress, tangent, energy = check_umat(found, text, F[1:], tuple(t[1:] for t in truth), psi[1:])
+    assert stress < 1e-10 and tangent < 1e-6 and energy < 1e-10
+    rest = check_umat(found, text, F[:1], (torch.ones(1, 3, 3).double(), truth[1][:1]), 1 + psi[:1])
+    assert rest[1] < 1e-6
+
+
+def test_sse_is_the_work_of_the_stress():
+    """SSE times J against the kernels' stress along a straight path from rest, by Gauss's rule."""
+    if shutil.which("gfortran") is None:
+        pytest.skip("no gfortran here")
+    found, (_, stretches, V) = exported("ogden", True), torch.linalg.svd(deformations(20))
+    one, F = torch.eye(3).double(), V.mT @ torch.diag_embed(stretches) @ V
+    work = torch.zeros(20).double()
+    for place, weight in zip(*np.polynomial.legendre.leggauss(24)):
+        at = one + 0.5 * (1 + place) * (F - one)
+        P = expected(found, at)[0] @ torch.linalg.inv(at).mT
+        work += 0.5 * weight * (P * (F - one)).sum((1, 2))
+    stored, _, _ = umat_of(found, umat(found), F)
+    assert (stored * torch.linalg.det(F) - work).abs().max() < 1e-9 * work.max()
 
 
 def test_the_text_is_ufl():
@@ -120,6 +146,28 @@ def test_the_command_writes_reads_and_checks(tmp_path, capsys):
         "umat.f90",
     ]
     assert json.loads((tmp_path / "law" / "law.json").read_text())["values"]["kept"] < 1
+
+
+def test_an_energy_of_another_package_is_exported(tmp_path, monkeypatch, capsys):
+    form = "from mosa.export.energies import ENERGIES, neo_hookean\nENERGIES['stvk_paper'] = neo_hookean"
+    (tmp_path / "own_energy.py").write_text(form)
+    monkeypatch.syspath_prepend(tmp_path)
+    law = {"law": "stvk_paper", "parameters": {"E": 1e5, "nu": 0.3}, "stiffness": None}
+    (tmp_path / "material.json").write_text(json.dumps(law))
+
+    def code(*words) -> int:
+        with pytest.raises(SystemExit) as ended:
+            main([str(tmp_path / "material.json"), str(tmp_path / "law"), "--check", "0", *words])
+        return ended.value.code
+
+    try:
+        assert code() == 2 and "by a module of --extensions" in capsys.readouterr().err
+        assert code("--extensions", "own_enrgy") == 2
+        assert "extensions: expected a module" in capsys.readouterr().err
+        assert code("--extensions", "own_energy") == 0
+        assert 'Law "stvk_paper"' in (tmp_path / "law" / "umat.f90").read_text()
+    finally:
+        ENERGIES.pop("stvk_paper", None)
 
 
 def test_a_law_without_an_energy_is_refused(tmp_path):

@@ -104,4 +104,5 @@ def take_of(body: Body, begins: Start, frames: int, world: World = WORLD):
         frame_dt=FRAME_DT,
         first_contact=first,
         response=None,
+        name="train",
     )

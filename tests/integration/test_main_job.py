@@ -322,7 +322,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["prior=jelly"], "Could not find 'prior/jelly'"),
+        (["prior=jelly"], "prior: expected one of .*, found jelly"),
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
         (["losses.colour=1"], "colour"),
         (["trainer.devices=[1000]", "trainer.accelerator=gpu"], "trainer=cpu runs without one"),

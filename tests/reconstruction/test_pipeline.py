@@ -149,15 +149,14 @@ def test_the_second_look_compares_what_was_fitted_to_all_frames(squashed, found)
                      for name in ("fitted", "first"))  # fmt: skip
     carried = fitted._carried
     assert torch.equal(carried.splats.means, found.appearance.splats.means)
-    assert carried.shades.shape == (len(found.cues.positions), len(carried.splats.means))
-    torch.testing.assert_close(
-        carried.shades[0], torch.ones_like(carried.shades[0]), atol=1e-4, rtol=0
-    )
+    assert torch.equal(carried.light, found.appearance.light)
+    still = torch.eye(3).expand(1, len(carried.splats.means), 3, 3)
+    torch.testing.assert_close(carried.colors(still)[0], carried.splats.colors)
     assert first._carried is found.moving.carried
     assert (
         moved.SecondLook(
             squashed, replace(found, appearance=None), fitted.settings, progress=False
-        )._carried.shades
+        )._carried.light
         is None
     )
 
@@ -169,7 +168,7 @@ def test_a_body_that_flows_is_not_compared_as_the_first_motion_carried_it(squash
         for _ in range(2)
     )
     assert one.settings.informed.carriers == "auto"
-    assert one._carried.shades is not None
+    assert one._carried.light is not None
     law.append("liquid")
     assert other._carried is found.moving.carried
 

@@ -182,3 +182,14 @@ def test_the_size_is_asked_for_where_metres_are_implausible(tmp_path, factor):
     large = written(tmp_path / "a.ply", times(factor))
     with pytest.raises(ConfigError, match=r"^size: .*a\.ply has no unit, .* m long; .*size=0\.2"):
         read_object(large)
+
+
+def test_opacities_in_per_cent_and_an_object_of_no_extent_are_refused(tmp_path):
+    g = np.random.default_rng(0)
+    change = lambda d: d | {"opacity": g.uniform(40, 100, len(d["x"]))}  # noqa: E731
+    with pytest.raises(
+        DataError, match=r"field opacity: expected logits, found 4.* per cent or bytes"
+    ):
+        load_ply(written(tmp_path / "a.ply", change))
+    with pytest.raises(DataError, match=r"field scale_.*: expected logarithms .* an object of 0"):
+        read_object(written(tmp_path / "a.ply", lambda d: d | {k: 0 * d[k] for k in "xyz"}))

@@ -269,7 +269,7 @@ def refused_command(monkeypatch, capsys):
     (["criterion=5"], r"override must be a string or a list. Got int\n\(in: criterion=5\)"),
     (["seed=" + "9" * 5000], r"Exceeds the limit .* for integer string conversion"),
     (["banana"], "Error parsing override 'banana'"), (["banana=3"], r"override 'banana'\.\nKey 'banana' is not in"),
-    (["scene=banana"], "Could not find 'scene/banana'"), (["-m", "prior=foo,stvk"], "Could not find 'prior/foo'"),
+    (["scene=banana"], "scene: expected one of .*, found banana"), (["-m", "prior=foo,stvk"], "prior: expected .*, found foo"),
     (["hydra.run.dir="], r"hydra\.run\.dir: expected a folder, found nothing"),
     (["hydra.run.dir=file/below"], r"file/below: cannot be written or read \(Not a directory\)"),
     (["-m", "seed=0,1", "hydra.sweep.dir=file/below"], r"file/below: cannot be written or read \(Not a directory\)"),

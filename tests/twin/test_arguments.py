@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
+from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 from tests.modules.body.test_world import twin
@@ -75,7 +76,7 @@ GRID = {"dx": 0.05, "substeps": 40, "frame_dt": 1 / 30}
     ("gravity", ("abc", (0, 1), (0, math.nan, 0), 5, None, (0, 1e9, 0))),
     ("up", ("abc", (0, 1), (0, math.nan, 0), 5, [[0, 1, 0]])), ("ground", (5, "sticky", {}, True, [0.0])),
     (r"ground\.height", (Ground("a"), Ground(math.nan), Ground(True), Ground(10**400), Ground(None))),
-    ("plane 0: friction", (Ground(0.0, "separate", "a"), Ground(0.0, "touch", -1), Ground(0.0, "touch", math.nan))),
+    (r"ground\.friction", (Ground(0.0, "separate", "a"), Ground(0.0, "touch", -1), Ground(0.0, "touch", math.nan))),
     ("planes", (5, [5], "ab", {}, [None])), ("colliders", (5, [5], "ab", [{"type": "sphere"}], [None])),
     ("box", (5, "ab", [[0, 0, 0]], [[1, 1, 1], [0, 2, 2]], torch.full((2, 3), math.nan))),
     ("options", (5, None, {}, "a", True)), ("device", ("foo", "cuda:99", 5, None, "")),
@@ -118,3 +119,51 @@ def rolled(count=4, volume=1e-6, density=1000.0, mu=1e4, ground=0.0, **keys):
 def test_a_wrong_argument_of_a_rollout_is_named(keys, message):
     with pytest.raises(ConfigError, match=f"^{message}"):
         rolled(**keys)
+
+
+@pytest.mark.parametrize("answer, found", [
+    (lambda w: None, "found None"), (lambda w: "Gh", "found 'Gh'"), (lambda w: {"G": 0, "h": 0}, "found {'G'"),
+    (lambda w: (1, 2, 3, 4, 5), "found \\(1, 2"), (lambda w: torch.zeros(2), "found Tensor"),
+])  # fmt: skip
+@pytest.mark.parametrize("stride", [1, None])
+def test_an_adapter_that_answers_with_something_else_is_named(answer, found, stride):
+    with pytest.raises(ConfigError, match=f"^adapter: expected it to answer .G, h. .*{found}"):
+        rolled(adapter=lambda state: answer(state.w), stride=stride)
+
+
+@pytest.mark.parametrize("part", [lambda t: 0.0, lambda t: t.to("meta"), lambda t: t.to_sparse()])
+def test_a_part_of_an_adapter_s_answer_is_a_dense_tensor(part):
+    with pytest.raises(ConfigError, match=r"^adapter output G: expected shape"):
+        rolled(adapter=lambda s: (part(torch.zeros(len(s.w), 6, 6)), torch.zeros(len(s.w), 6)))
+
+
+def test_a_simulator_s_parameters_and_dtype_are_named():
+    made = Simulator("corotated", **GRID)
+    for wrong, named in (([1, 2], "parameters"), ("mu", "parameters")):
+        with pytest.raises(ConfigError, match=f"^{named}: expected"):
+            made.pack(wrong, 4)
+    for count in (-1, "a", 2.5, True):
+        with pytest.raises(ConfigError, match=r"^particles: expected a whole number"):
+            made.pack({"mu": 1.0, "lam": 1.0}, count)
+    for dtype in ([1], "float64", torch.float16, float):
+        with pytest.raises(ConfigError, match=r"^dtype: expected torch.float32 or torch.float64"):
+            Simulator("corotated", **GRID, dtype=dtype)
+
+
+def test_another_body_s_motion_and_what_no_video_or_law_has_are_named(tmp_path):
+    other = replace(MOTION(), x=MOTION().x[:, :27])
+    for call in (lambda: TWIN().render(other), lambda: TWIN().export(other, tmp_path)):
+        with pytest.raises(
+            ConfigError, match=r"^rollout: expected one of this body's \d+ particles, found Rollout"
+        ):
+            call()
+    for fps in (0, -5, math.nan):
+        with pytest.raises(ConfigError, match=r"^fps: expected a number above 0"):
+            TWIN().export(MOTION(), tmp_path, fps=fps)
+    with pytest.raises(ConfigError, match=r"^law: expected a text, or null, found 5"):
+        twin().material.set(law=5)
+    with pytest.raises(ConfigError, match=r"^density: expected a number of at least 0.1"):
+        twin().material.density = "7800"
+    numbers = len(read_numbers(TWIN().body))
+    with pytest.raises(ConfigError, match=r"^laws: expected .* finite numbers within 100"):
+        TWIN().worlds(2, torch.full((2, numbers), 1e5))

@@ -487,7 +487,9 @@ def test_errors_of_starts_and_states():
         match=r"laws: expected one for each of 2 worlds, a tensor .*found shape \(3, 5\)",
     ):
         made.worlds(2, torch.zeros(3, 5))
-    for laws in (torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool()):
+    for laws in (
+        torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool(), torch.zeros(2, 22).cfloat(),
+    ):  # fmt: skip
         with pytest.raises(
             ConfigError,
             match=r"laws: expected one for each of 2 worlds, a tensor \(2, 22\) of finite numbers",
@@ -511,6 +513,8 @@ def test_errors_of_starts_and_states():
         match=r"state\.substeps: expected a whole number of at least 0 and at most 2\^53, found 4611",
     ):
         made.state = replace(made.state, substeps=torch.tensor(2**62))
+    with pytest.raises(ConfigError, match=r"state\.substeps: .* of at least 0 .*, found -1"):
+        made.state = replace(made.state, substeps=torch.tensor(-1))
     with pytest.raises(
         ConfigError,
         match=r"state\.x: expected a dense tensor torch.float64 \(120, 3\), found Tensor \(torch.float64 .* \(7, 3\)",
@@ -719,3 +723,26 @@ def test_a_solid_that_no_body_would_feel_is_refused(solid, action):
         made.reset(colliders=solids, substeps=8)
         for _ in range(3):
             made.step(None if action is None else {"fast": action})
+
+
+def test_a_state_of_another_clock_is_refused_and_of_other_substeps_goes_on():
+    """Own motions of solids go by the time that has passed, whatever the substeps of the reset were."""
+    made, solid = twin(), PUSHER | {"motion": {"velocity": [0.2, 0, 0]}}
+    made.reset(colliders=[solid], substeps=20)
+    for _ in range(3):
+        kept = made.step().state
+    made.reset(colliders=[solid], substeps=40)
+    made.state = kept
+    after = made.step().state
+    moved = (after.position - kept.position).norm()
+    assert float(moved) == pytest.approx(0.2 * FRAME_DT) and float(after.time) == pytest.approx(
+        4 * FRAME_DT
+    )
+    made.reset(colliders=[solid], control_dt=FRAME_DT / 2)
+    with pytest.raises(
+        ConfigError, match=r"^state\.time: expected 3 steps of 0\.00833333 s, found"
+    ):
+        made.state = kept
+    for wrong in ([1], None, {"x": kept.x}):
+        with pytest.raises(DataError, match=r"^state: expected C_affine, F, .*, found"):
+            TwinState.read(wrong)

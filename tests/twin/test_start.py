@@ -85,6 +85,29 @@ def test_a_plane_that_faces_another_way_and_a_mesh_in_millimetres_are_named(tmp_
         )
 
 
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        ({"rotation": (0, 1, 0, 1.57)}, r"found 1.57, which is 90 degrees in radians"),
+        ({"colliders": [{**FLOOR, "rotation": (1, 0, 0, -3.1416)}]}, r"180 degrees in radians"),
+        (
+            {"colliders": [{"type": "sphere", "radius": 0.1, "position": [-325, 100, 0]}]},
+            r"^colliders\[0\]: expected a solid within reach .* found it 340 m away: .* metres",
+        ),
+    ],
+)
+def test_radians_and_millimetres_are_asked_about(given, said):
+    with pytest.warns(UserWarning, match=said):
+        twin().reset(**STILL, **given)
+
+
+def test_a_solid_in_millimetres_that_holds_the_body_is_named():
+    with pytest.raises(
+        ConfigError, match=r"it reaches 86.6 m from its origin \(lengths are in metre"
+    ):
+        twin().reset(colliders=[{"type": "box", "size": [100, 100, 100], "position": [0, 0.1, 0]}])
+
+
 @pytest.mark.parametrize("mode, speed", [("separate", 20), ("sticky", 35)])
 def test_a_grip_slides_about_as_fast_as_it_is_warned_of(mode, speed):
     """g dt H/(3 s) of friction, g dt H/(1.75 s) of sticky, with dt = 1/800 s."""
@@ -110,6 +133,33 @@ def test_a_grip_slides_about_as_fast_as_it_is_warned_of(mode, speed):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert slides(33) < 6
+
+
+def test_jaws_that_close_through_each_other_are_named_once():
+    plates = [{"type": "box", "name": name, "size": [0.04, 0.1, 0.1], "position": [x, 0.6, 0]}
+              for name, x in (("left", -0.05), ("right", 0.05))]  # fmt: skip
+    also = {"type": "box", "name": "wrist", "size": [0.02, 0.3, 0.1], "position": [-0.06, 0.6, 0]}
+
+    def told(run) -> list[str]:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            run()
+        return [str(each.message) for each in said if "inside each other" in str(each.message)]
+
+    def stepped(to):
+        made = twin()
+        made.reset(**STILL, colliders=[*plates, also], control_dt=0.01, substeps=100)
+        for k in range(4):
+            x = 0.05 - (0.05 - to) * (k + 1) / 4
+            made.step({"left": {"position": (-x, 0.6, 0)}, "right": {"position": (x, 0.6, 0)}})
+
+    assert told(lambda: stepped(0.021)) == []
+    (found,) = told(lambda: stepped(0.012))
+    assert "found left and right 16 mm inside each other" in found
+    moving = [
+        {**each, "motion": {"velocity": [-10 * each["position"][0], 0, 0]}} for each in plates
+    ]
+    assert len(told(lambda: twin().simulate(frames=6, **STILL, colliders=moving))) == 1
 
 
 def test_a_turn_in_degrees_is_asked_about():

@@ -67,15 +67,11 @@ def hull_points(mattes: Tensor, cameras: Cameras, box: Tensor) -> tuple[Tensor, 
     return hull.points()[hull.values > 0.5], pitch
 
 
-def uncovered_share(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> Tensor:
-    """Share (V,) of each matte (V, H, W) that is farther than a voxel from the projections of points (M, 3)."""
-    return uncovered_and_islands(points, pitch, mattes, cameras)[0]
-
-
 def uncovered_and_islands(
     points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras
 ) -> tuple[Tensor, list[int]]:
-    """`uncovered_share`, and the pixels of each matte that are in wholly uncovered pieces."""
+    """Share (V,) of each matte (V, H, W) that is farther than a voxel from the projections of points (M, 3), and the pixels of each
+    matte that are in wholly uncovered pieces."""
     shares, islands = [], []
     size = torch.tensor([cameras.width, cameras.height])
     for matte, K, pixels, depth in zip(mattes, cameras.K, *project(points, cameras)):

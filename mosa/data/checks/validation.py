@@ -14,8 +14,8 @@ from pydantic import InstanceOf
 from mosa.data.checks.cameras import check_agreement, holes_report
 from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
-from mosa.data.checks.tangents import check_pictures
-from mosa.data.formats.footage import TIME_JITTER, Footage
+from mosa.data.checks.tangents import check_copies, check_pictures
+from mosa.data.formats.footage import Footage, even_times
 from mosa.data.hull import at_border
 from mosa.errors import ConfigError, DataError
 from mosa.rendering.cameras import centers
@@ -81,10 +81,15 @@ def validate(scene: Scene) -> Scene:
             where = f"camera {scene.cameras.names[v]}, frame {t}"
             raise DataError(f"{label}: {name}: NaN or infinite pixels in {where}")
         if low < -OUTSIDE or high > 1 + OUTSIDE:
-            found = f"found {low:.4g} to {high:.4g}; divide bytes by 255"
-            raise DataError(f"{label}: {name}: expected numbers in [0, 1], {found}")
-    for check in (check_cameras, check_times, check_mattes, check_background, check_borders):
-        check(scene, label)
+            raise DataError(
+                f"{label}: {name}: expected numbers in [0, 1], found {low:.4g} to {high:.4g}; divide bytes by 255"
+            )
+    check_cameras(scene, label)
+    times = scene.times.double()
+    even_times(times.tolist(), list(range(scene.frames)), label, 2e-7 * float(times.abs().max()))
+    check_mattes(scene, label)
+    check_background(scene, label)
+    check_borders(scene, label)
     learned = scene.training_cameras
     check_film(replace(scene, images=scene.images[learned], mattes=scene.mattes[learned], cameras=scene.cameras.select(learned),
                        holdout_cameras=()) if scene.holdout_cameras else scene, label)  # fmt: skip
@@ -156,6 +161,7 @@ def check_film(scene: Scene, label: str) -> None:
         check_agreement(scene, label, frame)
     check_fall(scene, label)
     if not scene.synthetic:
+        check_copies(scene, label)
         check_outlines(scene, label)
         check_particles(scene, label)
 
@@ -220,22 +226,6 @@ def check_pixels(K: torch.Tensor, label: str) -> None:
         raise DataError(said)
     if ratio > USUAL_FOCAL_RATIO:
         warnings.warn(said, stacklevel=4)
-
-
-def check_times(scene: Scene, label: str) -> None:
-    """Increasing times at one frame rate."""
-    steps = scene.times.double().diff()
-    if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
-        found = [round(t, 5) for t in scene.times.tolist()]
-        raise DataError(f"{label}: expected increasing frame times, found {found}")
-    # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
-    allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
-    worst = int((steps - steps.median()).abs().argmax())
-    if abs(float(steps[worst] - steps.median())) > allowed:
-        raise DataError(
-            f"{label}: expected one frame rate, found {float(steps[worst]):.6f} s between frames {worst} and {worst + 1} and "
-            f"{float(steps.median()):.6f} s elsewhere; restrict scene.frames, or set scene.fps if the times are wrong"
-        )
 
 
 def check_mattes(scene: Scene, label: str) -> None:

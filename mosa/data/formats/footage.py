@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mosa.data.images.one_size import one_size
 from mosa.errors import ConfigError, DataError
-from mosa.settings import Expected, check, such
+from mosa.settings import Expected, check, fits, such
 from mosa.types import Cameras
 
 WHITE = np.ones(3, np.float32)
@@ -82,19 +82,28 @@ def read_json(path: Path):
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
 
+def read_entries(path: Path, of: str, *keys: str) -> list[tuple[str, dict]]:
+    """(where it is written, entry) of a JSON list with one object per `of` that has these keys. Errors: DataError."""
+    entries = read_json(path)
+    if not isinstance(entries, list) or not entries:
+        raise DataError(
+            f"{path}: expected a list with one object per {of}, found {type(entries).__name__}"
+        )
+    found = [(f"{path}, entry {i}", entry) for i, entry in enumerate(entries)]
+    for where, entry in found:
+        if not isinstance(entry, dict) or (missing := [key for key in keys if key not in entry]):
+            lacks = missing[0] if isinstance(entry, dict) else "object"
+            raise DataError(f"{where}: expected the keys {', '.join(keys)}, found no {lacks}")
+    return found
+
+
 def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
     """A finite matrix of that shape from nested lists. Errors: DataError beginning with `where`."""
-    try:
-        array = np.array(value, dtype=np.float64)
-        whole = array.ndim == 2 and all(
-            isinstance(x, (int, float)) and not isinstance(x, bool) for row in value for x in row
-        )
-    except (TypeError, ValueError, OverflowError) as error:
+    if not fits(list[list[float]], value) or len({len(row) for row in value}) != 1:
         raise DataError(
-            f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}"
-        ) from error
-    if array.ndim == 2 and not whole:
-        raise DataError(f"{where}: expected numbers, found texts or flags: {str(value)[:80]}")
+            f"{where}: expected a {shape[0]}x{shape[1]} matrix of finite numbers, found {str(value)[:80]}"
+        )
+    array = np.array(value, dtype=np.float64)
     if array.shape == (4, 4) and shape == (3, 4):
         if not np.abs(array[3] - (0, 0, 0, 1)).max() <= 1e-6:
             raise DataError(
@@ -105,8 +114,6 @@ def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
         raise DataError(
             f"{where}: expected a {shape[0]}x{shape[1]} matrix, found shape {array.shape}"
         )
-    if not np.isfinite(array).all():
-        raise DataError(f"{where}: expected finite numbers, found {array[~np.isfinite(array)][0]}")
     return array
 
 
@@ -184,8 +191,9 @@ def check_rate(times: list[float], frames: list[int], fps: float | None, where: 
         warn_of_other_rate(times, fps, where)
 
 
-def even_times(times: list[float], frames: list[int], where: str) -> None:
-    """The times [s] of the chosen frames increase at one rate. Errors: DataError with the times, beginning with `where`."""
+def even_times(times: list[float], frames: list[int], where: str, rounding: float = 0.0) -> None:
+    """The times [s] of the chosen frames increase at one rate, to their `rounding` [s]. Errors: DataError with the times, beginning
+    with `where`."""
     remedy = "correct them, restrict scene.frames, or set scene.fps"
     steps = np.diff(np.asarray(times, dtype=np.float64))
     listed = ", ".join(f"{t:.6g}" for t in times[:8]) + (" ..." if len(times) > 8 else "")
@@ -193,7 +201,7 @@ def even_times(times: list[float], frames: list[int], where: str) -> None:
         raise DataError(f"{where}: expected increasing frame times, found {listed} s; {remedy}")
     middle = float(np.median(steps))
     worst = int(np.abs(steps - middle).argmax())
-    if abs(steps[worst] - middle) > TIME_JITTER * middle:
+    if abs(steps[worst] - middle) > TIME_JITTER * middle + rounding:
         raise DataError(
             f"{where}: expected one frame rate, found the times {listed} s: {steps[worst]:.6f} s between frames "
             f"{frames[worst]} and {frames[worst + 1]}, {middle:.6f} s elsewhere; {remedy}"

@@ -17,7 +17,7 @@ from mosa.data.formats.footage import (
     matrix,
     merge_time,
     number,
-    read_json,
+    read_entries,
     same_camera,
     world_to_camera,
 )  # fmt: skip
@@ -85,17 +85,8 @@ def read_listing(
     path: Path, fps: float | None = None
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[int, tuple[float, str]]]:
     """Calibration (camera name -> K, w2c) in order of camera number, and frame -> (time, where it was read)."""
-    entries = read_json(path)
-    if not isinstance(entries, list) or not entries:
-        found = type(entries).__name__
-        raise DataError(f"{path}: expected a list with one object per image, found {found}")
     calibration, times = {}, {}
-    for i, entry in enumerate(entries):
-        where = f"{path}, entry {i}"
-        for key in ("file_path", "time", "c2w", "intrinsic"):
-            if not isinstance(entry, dict) or key not in entry:
-                wanted = "the keys file_path, time, c2w and intrinsic"
-                raise DataError(f"{where}: expected {wanted}, found no {key}")
+    for where, entry in read_entries(path, "image", "file_path", "time", "c2w", "intrinsic"):
         found = NAME.search(str(entry["file_path"]))
         if found is None:
             wanted = "a file_path like ./data/r_<camera>_<frame>.png"

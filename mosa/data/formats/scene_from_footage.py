@@ -106,10 +106,10 @@ def scene_from_footage(
     if not isinstance(box, (list, tuple, Tensor)) or len(box) != 2:
         raise ConfigError(f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}")
     box = torch.stack([vector(corner, "box") for corner in box])
-    if not bool((box[1] > box[0]).all()):
-        raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
-    if float(box.abs().max()) > WIDEST:
-        raise ConfigError(f"scene.box: expected metres within {WIDEST:g}, found {box.tolist()}")
+    if not bool((box[1] > box[0]).all()) or float(box.abs().max()) > WIDEST:
+        raise ConfigError(
+            f"scene.box: expected min < max on every axis, within {WIDEST:g} m, found {box.tolist()}"
+        )
     check_density("scene.density", density)
     times = footage.times
     if fps is not None:
@@ -201,14 +201,10 @@ def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> 
             known = ", ".join(footage_names)
             raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {known}")
         indices.add(footage_names.index(str(name)))
-    if len(footage_names) < fewest:
-        raise ConfigError(
-            f"scene: expected at least two cameras, found {len(footage_names)}; of one, say the rest shape (scene.body.shape)"
-        )
     if len(footage_names) - len(indices) < fewest:
         raise ConfigError(
-            f"scene.holdout_cameras: {len(indices)} of {len(footage_names)} held out; two must be left to learn from, or one "
-            "of a body whose rest shape is given (scene.body.shape)"
+            f"scene.holdout_cameras: expected at least two cameras to learn from, or one of a body whose rest shape is "
+            f"given (scene.body.shape), found {len(footage_names)}, {len(indices)} of them held out"
         )
     return tuple(sorted(indices))
 
@@ -235,9 +231,9 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
             f"scene.holdout_frames: expected the last frames of {frames[0]} to {frames[-1]}, found {sorted(numbers)}; "
             "what comes after a gap cannot be learned from"
         )
-    if len(frames) < 3:
-        raise ConfigError(f"scene.frames: expected at least three frames, found {len(frames)}")
     if len(frames) - len(indices) < 3:
-        found = f"{len(indices)} of {len(frames)} frames held out"
-        raise ConfigError(f"scene.holdout_frames: {found}; three must be left to learn from")
+        raise ConfigError(
+            f"scene.frames, scene.holdout_frames: expected at least three frames to learn from, found {len(frames)}, "
+            f"{len(indices)} of them held out"
+        )
     return tuple(sorted(indices))

@@ -14,7 +14,7 @@ from mosa.data.formats.footage import (
     frame_range,
     matrix,
     number,
-    read_json,
+    read_entries,
     world_to_camera,
 )
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -69,16 +69,8 @@ def pictures(folder: Path) -> list[Path]:
 
 def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Calibration (folder of the camera -> K, w2c) from a list of {"camera": folder, "K": 3x3 [px], "c2w": 4x4 in OpenGL axes}."""
-    entries = read_json(path)
-    if not isinstance(entries, list) or not entries:
-        found = type(entries).__name__
-        raise DataError(f"{path}: expected a list with one object per camera, found {found}")
     calibration = {}
-    for i, entry in enumerate(entries):
-        where = f"{path}, entry {i}"
-        for key in ("camera", "K", "c2w"):
-            if not isinstance(entry, dict) or key not in entry:
-                raise DataError(f"{where}: expected the keys camera, K and c2w, found no {key}")
+    for where, entry in read_entries(path, "camera", "camera", "K", "c2w"):
         name = entry["camera"]
         if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
             wanted = f"the name of a folder beside {path.name}"
@@ -92,16 +84,11 @@ def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def read_times(path: Path) -> list[float]:
     """Time [s] of each frame, from a list of objects that have one entry each."""
-    entries = read_json(path)
-    if not isinstance(entries, list) or not entries:
-        found = type(entries).__name__
-        raise DataError(f"{path}: expected a list with one object per frame, found {found}")
     times = []
-    for i, entry in enumerate(entries):
-        if not isinstance(entry, dict) or len(entry) != 1:
-            wanted = "an object with one entry, a time [s]"
-            raise DataError(f"{path}, entry {i}: expected {wanted}, found {str(entry)[:80]}")
-        times.append(number(next(iter(entry.values())), f"{path}, entry {i}"))
+    for where, entry in read_entries(path, "frame"):
+        if len(entry) != 1:
+            raise DataError(f"{where}: expected one key, a time [s], found {str(entry)[:80]}")
+        times.append(number(next(iter(entry.values())), where))
     return times
 
 

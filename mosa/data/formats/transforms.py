@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from mosa.data.formats.footage import (
-    WHITE,
     Footage,
     even_times,
     footage_of,
@@ -20,22 +19,12 @@ from mosa.data.formats.footage import (
     number,
     read_json,
     same_camera,
-    scaled,
     warn_of_other_rate,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.formats.scene_from_footage import scene_from_footage
-from mosa.data.formats.views import split_alpha, split_mask
-from mosa.data.images.lens import COEFFICIENTS, FOREIGN, is_fisheye, lens_of
-from mosa.data.images.reading import (
-    check_amount,
-    composite,
-    expect_size,
-    fill_holes,
-    read_image,
-    resize,
-    scaled_size,
-)
+from mosa.data.formats.views import read_views, split_alpha, split_mask
+from mosa.data.images.lens import COEFFICIENTS, FOREIGN, Lens, is_fisheye, lens_of
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -45,7 +34,6 @@ EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 JITTER = 0.01
 """By how much poses of a camera that stands still may differ: radians, and shares of the cameras' distance from their middle. Where
 each image's is solved for itself they differ by about a pixel, 0.002."""
-CUT = 1e-3  # share of a matte that undoing a lens may cut off before it is said
 
 
 @dataclass(frozen=True)
@@ -91,37 +79,19 @@ def read_transforms(
         warn_of_other_rate([times[f] for f in wanted], fps, str(file))
         times = [i / fps for i in range(len(times))]
     even_times([times[f] for f in wanted], wanted, str(file))
-    images, mattes, calibration = [], [], {}
-    for (name, shot), row in zip(cameras.items(), table):
-        pictures, lens, cut, full = [], None, 0.0, None
-        for frame in wanted:
-            one, pixels = row[frame], read_image(row[frame].image)
-            if one.mask is None:
-                color, matte = split_alpha(one.image, pixels, f" or a mask_path in {one.where}")
-            else:
-                color, matte = split_mask(one.image, pixels, one.mask)
-            matte = fill_holes(matte, fill)
-            if full is None:
-                full, first = color.shape[1::-1], row[frame].image.name
-                size = scaled_size(*full, scale)
-                check_amount(len(cameras) * len(wanted), *size)
-                K = camera_matrix(shot, *full)
-                lens = lens_of(K, shot.intrinsics, *full, fisheye=shot.fisheye, where=shot.where)
-                calibration[name] = scaled(K if lens is None else lens.K, full, size), shot.w2c
-            expect_size(row[frame].image, color, *full, reason=f"as {first} of the same camera")
-            picture = composite(color, matte, WHITE)
-            if lens is not None:
-                cut = max(cut, lens.lost(matte))
-                picture, matte = lens.straighten(picture, matte, WHITE)
-            pictures.append((resize(picture, *size), resize(matte, *size)))
-        if cut > CUT:
-            warnings.warn(
-                f"{file}: camera {name}: undoing its lens distortion cuts off up to {cut:.1%} of the object, too close "
-                "to the border of the image",
-                stacklevel=2,
-            )
-        images.append(np.stack([p[0] for p in pictures]))
-        mattes.append(np.stack([p[1] for p in pictures]))
+    rows = {name: {frame: row[frame] for frame in wanted} for name, row in zip(cameras, table)}
+    shots_of = {shot.image: shot for row in rows.values() for shot in row.values()}
+
+    def bent(camera: str, width: int, height: int) -> tuple[np.ndarray, Lens | None]:
+        shot = cameras[camera]
+        K = camera_matrix(shot, width, height)
+        lens = lens_of(K, shot.intrinsics, width, height, fisheye=shot.fisheye, where=shot.where)
+        return (K if lens is None else lens.K), lens
+
+    calibration, images, mattes = read_views(
+        {name: (np.eye(3), shot.w2c) for name, shot in cameras.items()}, wanted,
+        lambda camera, frame: rows[camera][frame].image,
+        lambda _, file, pixels: split_shot(shots_of[file], pixels), str(file), scale=scale, fill=fill, bent=bent)  # fmt: skip
     return footage_of(calibration, images, mattes, wanted, [times[f] for f in wanted], str(file))
 
 
@@ -299,6 +269,13 @@ def clocks(by_camera: dict[str, list[Shot]], fps: float | None) -> str:
             "one frame, and evenly spaced times"
         )
     return f"their clocks are up to {1e3 * apart:.3g} ms apart, of a frame of {1e3 / rate:.3g} ms: shift the times of late cameras"
+
+
+def split_shot(shot: Shot, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W) of its pixels. Errors: DataError where there is no matte."""
+    if shot.mask is not None:
+        return split_mask(shot.image, pixels, shot.mask)
+    return split_alpha(shot.image, pixels, f" or a mask_path in {shot.where}")
 
 
 def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:

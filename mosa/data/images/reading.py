@@ -25,7 +25,7 @@ def read_image(path: Path) -> np.ndarray:
     PNGs keep their 16 bits. Errors: DataError where the file is missing, truncated, no image, or holds values that are not finite.
     """
     if not path.is_file():
-        raise DataError(f"{path}: image not found")
+        raise DataError(f"{path}: image not found; restore it, or restrict scene.frames")
     try:
         check_pixels(path)
         pixels = deep_png(path)

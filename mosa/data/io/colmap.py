@@ -106,6 +106,8 @@ def assembled(cameras: dict[int, Intrinsics], images: Images, file: Path) -> dic
     found = {}
     for name, number, quaternion, shift in images:
         where = f"{file}, image {name}"
+        if name in found:
+            raise DataError(f"{where}: expected every image once, found it twice")
         if number not in cameras:
             known = sorted(cameras)
             raise DataError(
@@ -164,7 +166,7 @@ def whole(words: list[str], where: str) -> list[int]:
 def lines_of(file: Path) -> list[tuple[int, str]]:
     """Numbered lines that are no comments, empty ones included. Errors: DataError."""
     try:
-        lines = file.read_text().splitlines()
+        lines = file.read_text("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         found = f"found a damaged file ({error}); export it again"
         raise DataError(f"{file}: expected the text of a COLMAP model, {found}") from error
@@ -181,6 +183,8 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
             wanted = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
             raise DataError(f"{where}: expected {wanted}, found {line[:80]!r}")
         number, width, height = whole([words[0], *words[2:4]], where)
+        if number in found:
+            raise DataError(f"{where}: expected every CAMERA_ID once, found {number} twice")
         found[number] = intrinsics(words[1], width, height, numbers(words[4:], where), where)
     return found
 

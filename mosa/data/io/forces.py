@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from warnings import warn
@@ -31,18 +31,26 @@ class Measured(Settings):
     of: Text
     file: Text
     sd: Positive | None = None
+    recording: Text | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ForceCurve:
     """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on,
     ascending; forces: (n, 3) [N], NaN for a component that was not measured; sd [N]: noise of one
-    sample, None: found from the samples' roughness."""
+    sample, None: found from the samples' roughness; recording: in which it was measured, None:
+    the first."""
 
     of: str
     times: Tensor
     forces: Tensor
     sd: float | None = None
+    recording: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its figures."""
+        return self.of if self.recording is None else f"{self.recording}/{self.of}"
 
     def noise(self) -> float:
         """Standard deviation of one sample [N]: of white noise the second differences have six
@@ -52,6 +60,11 @@ class ForceCurve:
         rough = self.forces.diff(n=2, dim=0)
         rough = rough[torch.isfinite(rough)]
         return float((rough.square().mean() / 6).sqrt()) if len(rough) else 0.0
+
+    @property
+    def largest(self) -> float:
+        """[N] of all components."""
+        return float(self.forces.nan_to_num().abs().max())
 
     def means(self, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
         """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its
@@ -75,20 +88,31 @@ class ForceCurve:
         mean[blanks[at][1:] > blanks[at - 1][:-1]] = torch.nan
         inside = (self.times[:, None] > ends[:-1]) & (self.times[:, None] <= ends[1:])
         count = inside.sum(0).clamp_min(1)[:, None]
-        largest = float(self.forces[torch.isfinite(self.forces)].abs().max())
-        sd = (self.noise() ** 2 / count + (MODEL_ERROR * largest) ** 2).sqrt().expand_as(mean)
+        sd = (self.noise() ** 2 / count + (MODEL_ERROR * self.largest) ** 2).sqrt().expand_as(mean)
         return mean, sd
 
 
-def forces_from_config(items: Sequence[Mapping[str, Any]] | None) -> tuple[ForceCurve, ...]:
-    """Of entries {of: name of a collider or driven set, file: csv, sd [N]}.
+def forces_from_config(
+    items: Sequence[Mapping[str, Any]] | None,
+) -> tuple[ForceCurve, ...]:
+    """Of entries {of: name of a collider or driven set, file: csv, sd [N], recording: name}.
 
     Columns of the file: time [s], fx, fy, fz [N].
     A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
     entry, DataError the file."""
     check("world.forces", items, Entries | None)
     read = [Measured.read(item, f"world.forces[{i}]") for i, item in enumerate(items or ())]
-    return tuple(read_forces(Path(each.file), each.of, each.sd) for each in read)
+    return tuple(
+        replace(read_forces(Path(each.file), each.of, each.sd), recording=each.recording)
+        for each in read
+    )
+
+
+def curves_of(curves: Sequence[ForceCurve], recording: str, first: bool) -> list[ForceCurve]:
+    """Those that were measured in a recording; first: whether a run begins with it."""
+    return [
+        each for each in curves if each.recording in ((recording, None) if first else (recording,))
+    ]
 
 
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
@@ -102,15 +126,18 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
             raise ValueError(f"the columns {', '.join(names)}")
         found = {name: [float(row[names.index(name)] or "nan") for row in rows] for name in known}
     except (OSError, ValueError, IndexError, csv.Error) as error:
-        wanted = ", ".join(COLUMNS)
-        raise DataError(f"{path}: expected a csv of {wanted} (SI units), found {error}") from error
-    columns = [found.get(name, [math.nan] * len(rows)) for name in COLUMNS]
-    times, *parts = torch.tensor(columns, dtype=torch.float64)
-    forces = torch.stack(parts, 1)
-    if len(times) < 2 or not bool((times.diff() > 0).all()):
+        raise DataError(
+            f"{path}: expected a csv of {', '.join(COLUMNS)} (SI units), found {error}"
+        ) from error
+    blank = [math.nan] * len(rows)
+    times, *columns = (
+        torch.tensor(found.get(name, blank), dtype=torch.float64) for name in COLUMNS
+    )
+    forces = torch.stack(columns, 1)
+    if len(times) < 2 or not bool((times.diff() > 0).all() & times.isfinite().all()):
         raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
     there = forces[~torch.isnan(forces)]
-    if not len(there) or not 0 < float(there.abs().max()) <= LARGEST:
+    if not len(there) or not 1 / LARGEST < float(there.abs().max()) <= LARGEST:
         raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")
     return ForceCurve(of, times, forces, sd)
 
@@ -146,13 +173,16 @@ def force_figures(
     found: dict[str, float] = {}
     for curve, (felt, mean, sd) in zip(curves, compared_forces(rollout, curves, world, frame_dt)):
         at = mean.abs().argmax()
-        off, allowed = (float((v / mean[at]).square().mean().sqrt()) for v in (felt - mean, sd))
+        most = float(mean[at].abs()) or curve.largest  # 0 in all frames: the body was not met yet
+        off, allowed = (
+            float((v.detach() / most).square().mean().sqrt()) for v in (felt - mean, sd)
+        )
         names = ("rms_share", "allowed_share", "measured_N", "predicted_N")
         values = (off, allowed, float(mean[at]), float(felt[at]))
-        found |= {f"forces/{curve.of}/{name}": value for name, value in zip(names, values)}
+        found |= {f"forces/{curve.name}/{name}": value for name, value in zip(names, values)}
         if off > FAR * allowed:
             warn(
-                f"world.forces: {curve.of}: the predicted force is off by {off:.0%} of the largest measured, allowed are "
+                f"world.forces: {curve.name}: the predicted force is off by {off:.0%} of the largest measured, allowed are "
                 f"{allowed:.1%}. Expected: the force that the body exerts (check the sign), world axes, N, times from frame 0",
                 stacklevel=2,
             )

@@ -31,10 +31,16 @@ AXES = ("x", "y", "z")
 SCALES = tuple(f"scale_{i}" for i in range(3))
 ROTATIONS = tuple(f"rot_{i}" for i in range(4))
 CONSTANT = tuple(f"f_dc_{i}" for i in range(3))
-SPREAD = 0.3  # least spread of plain opacities; logits within 0 to 1 are 0.5 to 0.73
-FAR = 100.0  # extents from the origin beyond which an object is read about its middle
-OPACITY_MARGIN = 1e-6  # opacities are kept this far from 0 and 1, where the logit has no number
-SMALLEST = 1e-9  # [m] smallest standard deviation written: log 0 has no number
+SPREAD = 0.3
+"""Of plain opacities, at least: logits that lie within 0 to 1 are of opacities from 0.5 to 0.73."""
+OPAQUE = 30.0
+"""Of a logit: 1 - 1e-13. Of a trained object some are below 0."""
+FAR = 100.0
+"""Extents from the origin, from which on an object is read about its own middle: float32 would round its shape."""
+OPACITY_MARGIN = 1e-6
+"""Opacities are kept this far from 0 and 1, where the logit has no number."""
+SMALLEST = 1e-9
+"""Standard deviations [m] below are written as this: the logarithm of 0 has no number either."""
 
 
 def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = None) -> Path:
@@ -142,6 +148,10 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         odd, opacities = [*odd, "opacities as they are, not their logits"], opacity
     if odd:
         warnings.warn(f"{path}: read with {' and '.join(odd)}, as its numbers are", stacklevel=3)
+    if least >= 0 and float(opacity.median()) > OPAQUE:
+        raise DataError(
+            f"{path}: field opacity: expected logits, found {least:.3g} to {most:.3g}: per cent or bytes?"
+        )
     if "filter_3D" in vertices:
         wide = (scales.square() + read(("filter_3D",)).square()).sqrt()
         opacities, scales = opacities * (scales / wide).prod(1), wide

@@ -16,15 +16,29 @@ from scipy.spatial.transform import Rotation
 from mosa.errors import ConfigError, DataError
 
 COLUMNS = ("time", "name", "x", "y", "z")
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1e-3}  # of c3d; "": mm
-AT_REST = 0.2  # [s] at the start in which nothing moves
-SEEN = 0.05  # share of the largest displacement beyond which a point has been let go
-EARLY = 0.4  # share of the largest displacement up to which it grows with time squared
-SWINGS = 4  # periods of an oscillation that say when it began
-MIRRORED = 1 / 3  # mirrored points fit so much better than others
-JUMP = 0.3  # of the points' extent: no body is deformed by so much within a sample
-FROZEN, DIGITS = 0.1, 4  # share of the largest step, last digits: motion around a frozen part
-GAP = 2.5  # samples apart between which a recording is interpolated; a longer gap stays one
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1e-3}
+"""Of a c3d file, which means millimetres where it says nothing."""
+AT_REST = 0.2
+"""Seconds at the start of a recording in which nothing moves, where the release is sought."""
+SEEN = 0.05
+"""Of the largest displacement: points that have moved by more have been let go; hands that do so
+move them by less."""
+EARLY = 0.4
+"""Of the largest displacement: up to there it grows as the square of the time since the release."""
+SWINGS = 4
+"""Periods of an oscillation that say when it began."""
+MIRRORED = 1 / 3
+"""Of the distance of aligned points: that of points mirrored, below which they are said to be."""
+JUMP = 0.3
+"""Of the points' extent: no body is deformed by so much within a sample."""
+FROZEN, DIGITS = 0.1, 4
+"""Of the largest step, and last digits: a point that moves by more before and after does not stand
+still between."""
+TORN, STILL = 3.0, 0.01
+"""Of the steps beside: a step of all points that is so many times longer is no motion. Where these
+are below that share of it, the points were at rest, and were moved."""
+GAP = 2.5
+"""Samples apart between which a recording is interpolated; a longer gap stays one."""
 
 
 @dataclass(frozen=True)
@@ -105,12 +119,25 @@ def check_moves_on(found: Recording, where: str) -> None:
         warnings.simplefilter("ignore")  # of frames in which nothing is seen
         place = np.nanmedian(found.positions, 0)
         size = np.nanmax(np.nanmax(place, 0) - np.nanmin(place, 0))
-        alone = np.linalg.norm(moves - np.nanmedian(moves, 1, keepdims=True), axis=-1)
+        together = np.nanmedian(moves, 1)
+        alone = np.linalg.norm(moves - together[:, None], axis=-1)
+        middle = np.nanmedian(found.positions, 1)
+        wide = np.nanmax(np.nanmax(middle, 0) - np.nanmin(middle, 0))
     for t, m in np.argwhere(alone > JUMP * size)[:1]:
         raise DataError(
             f"{where}: expected points that move with the others, found {found.names[m]!r} "
             f"{alone[t, m]:.2g} m away from them within one sample at {found.times[t + 1]:g} s: "
             "exchanged names? Leave these rows out"
+        )
+    step = np.nan_to_num(np.linalg.norm(together, axis=-1), nan=np.inf)
+    beside = np.stack([np.roll(step, k)[2:-2] for k in (-2, -1, 1, 2)]).max(0)
+    jumps = (TORN * beside < step[2:-2]) & (step[2:-2] < beside / STILL)
+    for t in 2 + np.flatnonzero(jumps & (step[2:-2] > FROZEN * wide))[:1]:
+        warnings.warn(
+            f"{where}: expected points that move on, found all of them {step[t]:.2g} m away within one "
+            f"sample at {found.times[t + 1]:g} s, in a motion of {beside[t - 2]:.2g} m a sample: "
+            "was a stretch cut out? Leave out what is before it or after it",
+            stacklevel=3,
         )
 
 

@@ -79,7 +79,7 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 
 
 def parameter_table(figures: Mapping[str, float], law: str) -> str:
-    """Markdown table of identified parameters: after calibration, after the joint stage, each with its relative error where the
+    """Markdown table of identified parameters: of the prior and of the learned law, each with its relative error where the
     truth is known. law: of the prior, which says what they are measured in."""
     found = (k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and k.count("/") == 1)
     names = [name for name in found if not name.endswith(("_relative_error", "_ratio"))]
@@ -87,7 +87,7 @@ def parameter_table(figures: Mapping[str, float], law: str) -> str:
     rows = [[with_unit(law, n), *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
             for n in names]  # fmt: skip
-    return markdown(["parameter", "prior", "joint", "error of prior", "error of joint"], rows)
+    return markdown(["parameter", "prior", "adapted", "error of prior", "error of adapted"], rows)
 
 
 def with_unit(law: str, name: str) -> str:
@@ -224,12 +224,19 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             lines.append(
                 f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, {says} {sd:.1%}."
             )
-    if (sd := figures.get("posterior/friction_angle_sd")) is not None:
-        angle = figures["id/friction_angle"]
-        lines.append(f"- friction angle = {angle:.3g} degrees, {says} {sd:.2g}.")
-    if (sd := figures.get("posterior/nu_sd")) is not None:
-        lines.append(f"- nu = {figures['id/nu']:.3f} {says} {sd:.3f}.")
-    if "posterior/stiffest_cone_deg" in figures:
+    if "posterior/friction_angle_sd" in figures:
+        lines.append(
+            f"- friction angle = {figures['id/friction_angle']:.3g} degrees, with a standard deviation of "
+            f"{figures['posterior/friction_angle_sd']:.2g}."
+        )
+    if "posterior/nu_sd" in figures:
+        lines.append(
+            f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}."
+        )
+    # a part that the choice of the law left out was not measured
+    taken = chosen(held_back) if held_back else "operator+stiffness"
+    left_out = {"operator", "stiffness"} - set(taken.split("+"))
+    if "posterior/stiffest_cone_deg" in figures and "operator" not in left_out:
         ratio, half = figures["id/stiffness_ratio"], figures["posterior/stiffest_cone_deg"]
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
         spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
@@ -247,14 +254,11 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
                 f"The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the "
                 f"largest over the smallest Young's modulus is {spread}."
             )
-        lines.append(f"- {said}")
-    numbers = {
-        "operator": "numbers of the anisotropic stiffness",
-        "stiffness": "modes of the stiffness over the body",
-    }
-    for name, what in numbers.items():
-        if (count := figures.get(f"posterior/{name}_numbers")) is not None:
-            known = figures[f"posterior/{name}_determined"]
+    for name, what in (
+        ("operator", "numbers of the anisotropic stiffness"),
+        ("stiffness", "modes of the stiffness over the body"),
+    ):
+        if f"posterior/{name}_numbers" in figures and name not in left_out:
             lines.append(
                 f"- Of {count:.0f} {what} the data determine {known:.1f}; the others keep their "
                 "prior values."

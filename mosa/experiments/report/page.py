@@ -28,8 +28,8 @@ INTRODUCTION = """# Results
 This page lists every table and figure of the paper that this program reproduces, and says which
 claims hold. Each section links to a page with its tables, the difference between its data and the
 paper's, the paper's printed figures, commit, seeds and machine. The table below names the
-commit of the figures and, in brackets, how many later commits changed the program. The paper's
-data were not released: the bodies here are simulated, so their true motion is known.
+version and commit of the figures and, in brackets, how many later commits changed the program.
+The paper's data were not released: the bodies here are simulated, so their true motion is known.
 `mosa-experiment --page` makes this page from `docs/results/` ([how to reproduce the
 tables](reproduce.md)).
 
@@ -86,23 +86,49 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             for label, rows in tables.items()
         }
         lines.append([experiment.title, *state_of(provenance), *claims_of(experiment, tables)])
-        claims = [
-            listed(claim.text, verdict(experiment, claim, tables)) for claim in experiment.claims
-        ]
-        run = f"[Tables, seeds, machine and command]({results.name}/{name}.md)"
-        command = f"Not run. Command: `mosa-experiment {name}`"
-        parts += filter(None, [not provenance and command, "\n".join(claims), provenance and run])
-    pages = sorted(results.glob("*_from_motion.md"))
-    beside = [f"[{read_title(page)}]({results.name}/{page.name})" for page in pages]
+        if not provenance:
+            parts.append(f"Not run. Command: `mosa-experiment {name}`")
+        if experiment.claims:
+            parts.append(
+                "\n".join(
+                    listed(claim.text, verdict(experiment, claim, tables))
+                    for claim in experiment.claims
+                )
+            )
+        if experiment.plot == "map":
+            parts += [said] if (said := ranges(experiment, tables)) else []
+        if provenance:
+            parts.append(f"[Tables, seeds, machine and command]({results.name}/{name}.md)")
+    beside = [
+        f"[{read_title(page)}]({results.name}/{page.name})"
+        for page in sorted(results.glob("*_from_motion.md"))
+    ]
     if beside:
         parts.append(
             f"## Without images\n\nLaws learned from the true motion of a body: {', '.join(beside)}."
         )
     page = results.parent / "results.md"
-    header = ["", "jobs complete", "commit (changes of the program since)", "the paper's claims", "claims about ours"]  # fmt: skip
+    age = "version, commit (changes of the program since)"
+    header = ["", "jobs complete", age, "the paper's claims", "claims about ours"]
     whole = [INTRODUCTION, markdown(header, lines), *parts]
     write_whole(page, "\n\n".join(whole) + "\n")
     return page
+
+
+def ranges(experiment: Experiment, tables: Tables) -> str:
+    """A line for each figure of a map: its smallest and largest cell, and where they are."""
+    lines = []
+    for figure in experiment.figures:
+        cells = [
+            (cell.mean, f"{cell.text(figure.decimals)} ({row}, {column})")
+            for row, columns in tables.get(figure.label, {}).items()
+            for column, cell in columns.items()
+            if cell is not None and math.isfinite(cell.mean)
+        ]
+        if cells:
+            axes = f"{experiment.rows}, {experiment.columns}"
+            lines.append(f"- {figure.label} ({axes}): {min(cells)[1]} to {max(cells)[1]}")
+    return "\n".join(lines)
 
 
 def read_title(page: Path) -> str:
@@ -115,8 +141,10 @@ def state_of(lines: Sequence[str]) -> tuple[str, str]:
     if jobs is None:
         return NOT_RUN, ""
     since, said = commits_since(lines), "; ".join(lines)
+    age = sorted(set(re.findall(r"\bversion (\d[\d.]*\d)", said)))
     changed = ", with changes" if re.search(r"\bcommit [0-9a-f]+, with changes", said) else ""
-    return jobs[1], "" if since is None else f"{since[0]}{changed} ({since[1]})"
+    age += [] if since is None else [f"{since[0]}{changed} ({since[1]})"]
+    return jobs[1], ", ".join(age)
 
 
 OUTCOMES = {"holds against": ("holds against what was run", "hold against what was run"), "holds": ("holds", "hold"),

@@ -6,10 +6,10 @@ module mosa_law
   integer, parameter :: first(6) = (/1, 2, 3, 2, 1, 1/), second(6) = (/1, 2, 3, 3, 3, 2/)  ! 11 22 33 23 13 12
 contains
 
-! Second Piola-Kirchhoff stress and 2 dS/dC of the part of the energy that is written in the entries of C
-subroutine of_entries(C11, C22, C33, C23, C13, C12, props, S, CC)
+! Energy, second Piola-Kirchhoff stress and 2 dS/dC of the part that is written in the entries of C
+subroutine of_entries(C11, C22, C33, C23, C13, C12, props, psi, S, CC)
   double precision, intent(in) :: C11, C22, C33, C23, C13, C12, props(*)
-  double precision, intent(out) :: S(6), CC(6, 6)
+  double precision, intent(out) :: psi, S(6), CC(6, 6)
   integer :: i, j
   @ENTRIES@
   do i = 1, 6
@@ -19,10 +19,10 @@ subroutine of_entries(C11, C22, C33, C23, C13, C12, props, S, CC)
   end do
 end subroutine
 
-! Of the part in the principal stretches: s_i = (1/l_i) dpsi/dl_i, ds_ij = (1/l_j) ds_i/dl_j
-subroutine of_stretches(l1, l2, l3, props, s, ds)
+! Of the part in the principal stretches: psi, s_i = (1/l_i) dpsi/dl_i, ds_ij = (1/l_j) ds_i/dl_j
+subroutine of_stretches(l1, l2, l3, props, psi, s, ds)
   double precision, intent(in) :: l1, l2, l3, props(*)
-  double precision, intent(out) :: s(3), ds(3, 3)
+  double precision, intent(out) :: psi, s(3), ds(3, 3)
   @PRINCIPAL@
 end subroutine
 
@@ -63,13 +63,14 @@ subroutine eigen(matrix, w, V)
   w = (/A(1, 1), A(2, 2), A(3, 3)/)
 end subroutine
 
-subroutine add_stretches(C, props, S, CC)
+subroutine add_stretches(C, props, psi, S, CC)
   double precision, intent(in) :: C(3, 3), props(*)
-  double precision, intent(inout) :: S(6), CC(6, 6)
-  double precision :: w(3), V(3, 3), pr(3), ds(3, 3), q, a(6), b(6)
+  double precision, intent(inout) :: psi, S(6), CC(6, 6)
+  double precision :: w(3), V(3, 3), more, pr(3), ds(3, 3), q, a(6), b(6)
   integer :: i, j, k
   call eigen(C, w, V)
-  call of_stretches(sqrt(w(1)), sqrt(w(2)), sqrt(w(3)), props, pr, ds)
+  call of_stretches(sqrt(w(1)), sqrt(w(2)), sqrt(w(3)), props, more, pr, ds)
+  psi = psi + more
   do i = 1, 3
     do k = 1, 6
       a(k) = V(first(k), i)*V(second(k), i)
@@ -95,17 +96,19 @@ subroutine add_stretches(C, props, S, CC)
   end do
 end subroutine
 
-! Cauchy stress and the tangent of its Jaumann rate (of the Kirchhoff stress over J), in the order 11 22 33 23 13 12
-subroutine stress_and_tangent(F, props, sigma, tangent)
+! Energy per volume now, Cauchy stress and the tangent of its Jaumann rate (of the Kirchhoff stress over J), in the order
+! 11 22 33 23 13 12
+subroutine stress_and_tangent(F, props, stored, sigma, tangent)
   double precision, intent(in) :: F(3, 3), props(*)
-  double precision, intent(out) :: sigma(6), tangent(6, 6)
-  double precision :: C(3, 3), S(6), CC(6, 6), T(6, 6), J, g(3, 3), d(3, 3)
+  double precision, intent(out) :: stored, sigma(6), tangent(6, 6)
+  double precision :: C(3, 3), psi, S(6), CC(6, 6), T(6, 6), J, g(3, 3), d(3, 3)
   integer :: a, b, i, k, m, n
   C = matmul(transpose(F), F)
-  call of_entries(C(1, 1), C(2, 2), C(3, 3), C(2, 3), C(1, 3), C(1, 2), props, S, CC)
-  if (@SPECTRAL@) call add_stretches(C, props, S, CC)
+  call of_entries(C(1, 1), C(2, 2), C(3, 3), C(2, 3), C(1, 3), C(1, 2), props, psi, S, CC)
+  if (@SPECTRAL@) call add_stretches(C, props, psi, S, CC)
   J = F(1, 1)*(F(2, 2)*F(3, 3) - F(2, 3)*F(3, 2)) - F(1, 2)*(F(2, 1)*F(3, 3) - F(2, 3)*F(3, 1)) &
     + F(1, 3)*(F(2, 1)*F(3, 2) - F(2, 2)*F(3, 1))
+  stored = psi/J
   do a = 1, 6
     do b = 1, 6
       T(a, b) = F(first(a), first(b))*F(second(a), second(b))
@@ -147,7 +150,7 @@ subroutine umat(stress, statev, ddsdde, sse, spd, scd, rpl, ddsddt, drplde, drpl
   double precision :: sigma(6), tangent(6, 6)
   integer :: a, b, n
   integer, parameter :: order(6) = (/1, 2, 3, 6, 5, 4/)  ! Abaqus: 11 22 33 12 13 23
-  call stress_and_tangent(dfgrd1, props, sigma, tangent)
+  call stress_and_tangent(dfgrd1, props, sse, sigma, tangent)
   n = min(ntens, 6)
   do a = 1, n
     stress(a) = sigma(order(a))
@@ -158,11 +161,11 @@ subroutine umat(stress, statev, ddsdde, sse, spd, scd, rpl, ddsddt, drplde, drpl
 end subroutine
 
 ! n deformations at once, for a check from another language
-subroutine mosa_check(n, gradients, nprops, props, stresses, tangents) bind(C)
+subroutine mosa_check(n, gradients, nprops, props, stored, stresses, tangents) bind(C)
   use, intrinsic :: iso_c_binding
   implicit none
   integer(c_int), value :: n, nprops
-  real(c_double) :: gradients(3, 3, n), props(nprops), stresses(6, n), tangents(6, 6, n)
+  real(c_double) :: gradients(3, 3, n), props(nprops), stored(n), stresses(6, n), tangents(6, 6, n)
   double precision :: none, many(6), times(2), point(3), turn(3, 3)
   character*80 cmname
   integer :: i
@@ -173,7 +176,7 @@ subroutine mosa_check(n, gradients, nprops, props, stresses, tangents) bind(C)
   point = 0.0d0
   turn = 0.0d0
   do i = 1, n
-    call umat(stresses(:, i), many, tangents(:, :, i), none, none, none, none, many, many, none, many, many, times, none, &
+    call umat(stresses(:, i), many, tangents(:, :, i), stored(i), none, none, none, many, many, none, many, many, times, none, &
       none, none, times, times, cmname, 3, 3, 6, 1, props, nprops, point, turn, none, none, turn, gradients(:, :, i), &
       1, 1, 1, 1, 1, 1)
   end do

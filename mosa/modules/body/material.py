@@ -260,8 +260,12 @@ class Material(nn.Module):
             self.begins[name] = form.inverse(value)
             self.raw[name] = nn.Parameter(torch.tensor(self.begins[name]), requires_grad=learned)
         else:
+            soft = "; nu = 0.5 in stress-strain tests: incompressible=true" * (
+                name == "nu" and value > 0
+            )
             raise ConfigError(
-                f"prior.parameters.{name}: expected a number between {form.low:g} and {min(form.high, LARGEST):g}, found {value:g}"
+                f"prior.parameters.{name}: expected a number between {form.low:g} and "
+                f"{min(form.high, LARGEST):g}, found {value:g}{soft}"
             )
 
     def _add_direction(self, name: str, value: Sequence[float], learned: bool) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.adapters.interface import AdapterOperator
+from mosa.physics.adapters.interface import answer
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import stack_held
 from mosa.physics.engine.simulator import Simulator
@@ -84,9 +84,7 @@ class Ready:
                 f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}"
             )
         state, parameters = self.state, self.arguments["parameters"]
-        held = AdapterOperator(
-            *adapter(self.simulator.material_state(state.F, state.C_affine, parameters))
-        )
+        held = answer(adapter, self.simulator.material_state(state.F, state.C_affine, parameters))
         return replace(self, arguments={**self.arguments, "adapter": lambda _: held})
 
     @classmethod

@@ -18,7 +18,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mosa.data.io.forces import columns_of, force_residuals
+from mosa.data.io.forces import columns_of, curves_of, force_residuals
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules.body.body import Body, Ready, World
 from mosa.modules.body.material import RIVALS
@@ -233,9 +233,9 @@ class Identification:
         return found
 
     def _differences(self, rollout: Rollout, index: int) -> residuals.Fields:
-        """Of a rollout from what was seen of take `index`; forces are those of the first."""
-        take, curves = self.takes[index], self.world.forces if index == 0 else ()
-        turn = take.start.rotation
+        """Of a rollout from what was seen of take `index`, and from the forces measured there."""
+        take = self.takes[index]
+        curves, turn = curves_of(self.world.forces, take.name, index == 0), take.start.rotation
         found = residuals.fields(rollout, take.cues, turn, self.chosen, take.response)
         if not curves:
             return found
@@ -498,18 +498,19 @@ class Identification:
         stretches: list[list[int]] = [[] for _ in range(FOLDS * len(self.takes))]
         kind = 0 if self.kinds[0] else self.kinds.index(True)
         width, first = 3 * len(self.chosen), 0
-        fields = 3 * width * sum(len(scales[0]) for scales in self.noise)
-        felt = (len(table) - fields) // sum(i == 0 for i, _ in self.pairs)
+        felt = [each.force for each in self._fields(self.body)]
         forces: list[Tensor] = []
         for k, ((i, _), scales) in enumerate(zip(self.pairs, self.noise)):
             frames = len(scales[0])
             wrong = self._between_grids(k, kind)
             own = table[first : first + 3 * frames * width].double().view(3, frames, width, -1)
             first += 3 * frames * width
-            if felt and i == 0:  # its forces' rows follow those of its fields, as in `whitened`
-                rows = table[first : first + felt].double()
+            if (
+                force := felt[k]
+            ) is not None:  # its rows follow those of the fields, as in `whitened`
+                rows = table[first : first + len(force)].double()
                 forces.append((rows.mT @ rows).cpu())
-                first += felt
+                first += len(force)
             for frame in range(frames):
                 grams = [(part[frame].mT @ part[frame]).cpu() for part in own]
                 after = frame - (self.takes[i].first_contact - 1)

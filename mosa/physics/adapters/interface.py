@@ -9,6 +9,8 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import Law
 from mosa.physics.engine.material_operations import material_state
+from mosa.settings import shown
+from mosa.types import dense
 
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 
@@ -53,13 +55,20 @@ class Several:
     def __call__(self, state: MaterialState) -> AdapterOperator:
         count = len(self.adapters)
         parts = zip(*((None,) * count if t is None else t.chunk(count) for t in state))
-        answers = [
-            AdapterOperator(*adapter(MaterialState(*part)))
-            for adapter, part in zip(self.adapters, parts)
-        ]
+        answers = [answer(adapter, part) for adapter, part in zip(self.adapters, parts)]
         return AdapterOperator(
             *(None if own[0] is None else torch.cat(own) for own in zip(*answers))
         )
+
+
+def answer(adapter: Callable, state: Sequence[Tensor | None]) -> AdapterOperator:
+    """Errors: ConfigError where it is no G and h."""
+    found = adapter(MaterialState(*state))
+    if not isinstance(found, (tuple, list)) or not 2 <= len(found) <= len(ANSWER):
+        raise ConfigError(
+            f"adapter: expected it to answer (G, h) or an AdapterOperator, found {shown(found)}"
+        )
+    return AdapterOperator(*found)
 
 
 def ask(
@@ -68,17 +77,16 @@ def ask(
 ) -> dict[str, Tensor | None]:  # fmt: skip
     """The adapter's answer by name, checked. into: as `material_state`."""
     n = len(F)
-    answer = AdapterOperator(*adapter(MaterialState(*material_state(law, F, C, packed, into))))
-    plastic = (answer.plastic_G, answer.plastic_h) if law.plastic else (None, None)
-    result = dict(zip(ANSWER, (answer.G, answer.h, *plastic)))
+    found = answer(adapter, material_state(law, F, C, packed, into))
+    plastic = (found.plastic_G, found.plastic_h) if law.plastic else (None, None)
+    result = dict(zip(ANSWER, (found.G, found.h, *plastic)))
     for name, value in result.items():
         if name.startswith("plastic") and all(part is None for part in plastic):
             continue
         shape = (n, 6, 6) if name.endswith("G") else (n, 6)
-        if value is None or tuple(value.shape) != shape or value.dtype != dtype:
-            found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
+        if not dense(value) or tuple(value.shape) != shape or value.dtype != dtype:
             raise ConfigError(
-                f"adapter output {name}: expected shape {shape} of {dtype}, found {found}"
+                f"adapter output {name}: expected shape {shape} of {dtype}, found {shown(value)}"
             )
     if collect is not None:
         collect(adapter.statistics())

@@ -6,6 +6,7 @@ B-spline grid lets material on both sides of a thinner one touch.
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -97,6 +98,9 @@ class Collider:
     motion: Motion | Trajectory | Points = field(default_factory=Motion)
     name: str = ""
 
+    def __post_init__(self) -> None:
+        check_contact(f"collider {self.name}: " if self.name else "", self.mode, self.friction)
+
 
 class PackedColliders(NamedTuple):
     """K colliders for the kernels, without their motion. shapes: (K, 11): size 3, friction, lattice origin 3 and spacing,
@@ -123,7 +127,6 @@ def pack_colliders(
             raise ConfigError(
                 f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}"
             )
-        check_contact(f"{where}: ", collider.mode, collider.friction)
         if isinstance(shape, Particles):
             shapes[i, packing.SIZE] = NOWHERE
         for j, value in enumerate(_sizes(shape)):
@@ -244,8 +247,6 @@ def collider_of(item: Mapping, where: str) -> Collider:
         raise ConfigError(f"{where}: a {kind} needs {', '.join(missing)}")
     check_keys(item, where)
     item = {key: value for key, value in item.items() if value is not None}
-    mode, friction = item.get("mode", "sticky"), float(item.get("friction", 0.0))
-    check_contact(f"{where}.", mode, friction)
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
@@ -254,10 +255,10 @@ def collider_of(item: Mapping, where: str) -> Collider:
             shape = make(
                 *(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed)
             )
-        motion = _motion(item)
+        contact = {key: item[key] for key in ("mode", "friction", "name") if key in item}
+        return Collider(shape, motion=_motion(item), **contact)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
-    return Collider(shape, mode, friction, motion, str(item.get("name", "")))
 
 
 def _motion(item: dict) -> Motion:
@@ -275,8 +276,6 @@ def _motion(item: dict) -> Motion:
             raise ConfigError(
                 "motion: waypoints stand alone, without position, velocity or angular_velocity"
             )
-        if len(points) < 2:
-            raise ConfigError(f"motion.waypoints: expected at least two poses, found {len(points)}")
         turns = [
             axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation
             for p in points
@@ -284,11 +283,11 @@ def _motion(item: dict) -> Motion:
         return Motion.waypoints(
             [p["time"] for p in points], [p["position"] for p in points], torch.stack(turns)
         )
-    if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:
-        raise ConfigError(
-            f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints"
-        )
     return Motion(item.get("position", (0.0, 0.0, 0.0)), rotation, **motion)
+
+
+TURNS = (30, 45, 60, 90, 120, 135, 180, 270, 360)
+"""[degrees] whose radians are asked about."""
 
 
 def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
@@ -305,6 +304,13 @@ def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
         raise ConfigError(
             f"rotation: expected (ax, ay, az, degrees), found {value.tolist()}, a quaternion by "
             "its norm of 1"
+        )
+    found = [abs(float(value[3])) / math.radians(each) for each in TURNS]
+    if near := [each for each, ratio in zip(TURNS, found) if abs(ratio - 1) < 1e-3]:
+        warnings.warn(
+            f"rotation: expected degrees, found {float(value[3]):g}, which is {near[0]} degrees in "
+            "radians",
+            stacklevel=5,
         )
     return value[:3] / value[:3].norm() * torch.deg2rad(value[3])
 

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider, Particles, Shape, collider_of
-from mosa.physics.contact.keys import fits, rows, three, told
+from mosa.physics.contact.keys import rows, three, told
 from mosa.physics.contact.motion import Motion, Points, Trajectory, ends, pose_at
 from mosa.physics.contact.reference import signed_distance
-from mosa.settings import Expected, Section, Text, Weight, Whole
+from mosa.settings import Expected, Section, Text, Weight, Whole, check_values
 from mosa.system.npz import read_npz
 
 FARTHEST = 0.5
@@ -190,7 +190,7 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
     if not isinstance(item, Mapping):
         raise ConfigError(f"{where}: expected type, indices or points and a motion, found {item!r}")
     item = {key: value for key, value in item.items() if value is not None}
-    fits(item, KEYS, where)
+    check_values(item, KEYS, where)
     name = item.pop("name", f"driven{number}")
     more = {key: item.pop(key) for key in ("mass", "held") if key in item}
     own = {key: item.pop(key) for key in ("indices", "points") if key in item}

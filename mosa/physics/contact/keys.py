@@ -7,10 +7,18 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
-from mosa.errors import ConfigError
 from mosa.physics.contact.planes import MODES
-from mosa.settings import Expected, Section, Text, Weight, described, is_number, such
-from mosa.settings import fits as is_one
+from mosa.settings import (  # fmt: skip
+    Expected,
+    Number,
+    Section,
+    Settings,
+    Text,
+    Weight,
+    check_values,
+    is_number,
+    such,
+)
 
 FARTHEST = 1e6
 """Lengths and places [m] of a solid, and its speeds [m/s]: beyond, single precision has no centimetres left."""
@@ -44,15 +52,15 @@ def rows(valid: Callable[[Any], bool], least: int = 1) -> Callable[[Any], bool]:
 
 three = numbers(3)
 Length = Annotated[float, Interval(gt=0, le=FARTHEST)]
-Three = told(f"three finite numbers within {FARTHEST:g}", three)
-Turn = told(
-    "(ax, ay, az, degrees), four finite numbers with a non-zero axis",
-    numbers(4, lambda v: any(v[:3])),
-)
-Velocity = told(
-    f"three finite numbers within {FARTHEST:g}, or such a triple for each piece",
-    lambda v: three(v) or rows(three)(v),
-)
+Three = Annotated[Any, Expected(f"three finite numbers within {FARTHEST:g}"), such(three)]
+Turn = Annotated[Any, Expected("(ax, ay, az, degrees), four finite numbers with a non-zero axis"),
+                 such(numbers(4, lambda v: any(v[:3])))]  # fmt: skip
+Velocity = Annotated[Any, Expected(f"three finite numbers within {FARTHEST:g}, or such a triple for each piece"),
+                     such(lambda v: three(v) or rows(three)(v))]  # fmt: skip
+Times = Annotated[Any, Expected("ascending finite numbers"),
+                  such(lambda v: rows(is_number)(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:])))]  # fmt: skip
+Poses = Annotated[Any, Expected("two poses {time, position, rotation} or more"),
+                  such(rows(lambda v: isinstance(v, Mapping), 2))]  # fmt: skip
 KEYS = {
     "radius": Length, "length": Length, "size": told("three lengths above 0 [m]", numbers(3, lambda v: min(v) > 0)),
     "path": Text, "spacing": Length, "scale": Length,
@@ -60,37 +68,28 @@ KEYS = {
     "mode": Literal[tuple(MODES)], "friction": Weight, "name": Text, "position": Three, "rotation": Turn,
     "motion": Section, "normal": told("a non-zero vector of three finite numbers", numbers(3, any)),
 }  # fmt: skip
-MOTION = {
-    "velocity": Velocity, "angular_velocity": Velocity,
-    "times": told("ascending finite numbers",
-                  lambda v: rows(is_number)(v) and all(a < b for a, b in zip(listed(v), listed(v)[1:]))),
-    "waypoints": told("a list of poses {time, position, rotation}", rows(lambda v: isinstance(v, Mapping), 0)),
-}  # fmt: skip
-WAYPOINT = {"time": told("a finite number", is_number), "position": Three, "rotation": Turn}
+
+
+class Waypoint(Settings):
+    """A pose of a motion's waypoints."""
+
+    time: Number
+    position: Three
+    rotation: Turn | None = None
+
+
+class MotionKeys(Settings):
+    """An entry's motion; values without one count as absent."""
+
+    velocity: Velocity | None = None
+    angular_velocity: Velocity | None = None
+    times: Times | None = None
+    waypoints: Poses | None = None
 
 
 def check_keys(item: Mapping, where: str) -> None:
     """Errors: ConfigError naming the first key whose value is not of its kind; keys without a value count as absent."""
-    fits(item, KEYS, where)
-    motion = item.get("motion") or {}
-    fits(motion, MOTION, f"{where}.motion")
-    for i, point in enumerate(motion.get("waypoints") or ()):
-        at = f"{where}.motion.waypoints[{i}]"
-        if missing := [key for key in ("time", "position") if point.get(key) is None]:
-            raise ConfigError(
-                f"{at}: expected time and position in each, found one without {missing[0]!r}"
-            )
-        if unknown := [key for key in point if key not in WAYPOINT]:
-            raise ConfigError(
-                f"{at}.{unknown[0]}: unknown key; expected one of {', '.join(WAYPOINT)}"
-            )
-        fits(point, WAYPOINT, at)
-
-
-def fits(values: Mapping, kinds: Mapping[str, Any], where: str) -> None:
-    """Errors: ConfigError naming the first value that is not of its kind."""
-    for key, kind in kinds.items():
-        if values.get(key) is not None and not is_one(kind, values[key]):
-            raise ConfigError(
-                f"{where}.{key}: expected {described(kind)}, found {str(values[key])[:120]!r}"
-            )
+    check_values({key: value for key, value in item.items() if value is not None}, KEYS, where)
+    motion = MotionKeys.read(item.get("motion") or {}, f"{where}.motion")
+    for i, point in enumerate(motion.waypoints or ()):
+        Waypoint.read(point, f"{where}.motion.waypoints[{i}]")

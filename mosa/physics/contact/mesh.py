@@ -81,20 +81,13 @@ def field_of_triangles(
     Errors: ConfigError: shapes, indices, no area, not closed, lattice too large.
     """
     points, index = np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
-    if (
-        points.ndim != 2
-        or points.shape[1] != 3
-        or index.ndim != 2
-        or index.shape[1] != 3
-        or not len(index)
-    ):
+    if points.shape[1:] != (3,) or index.shape[1:] != (3,) or not len(index):
         raise ConfigError(
             f"mesh: expected vertices (P, 3) and triangles (T, 3), found {points.shape} and {index.shape}"
         )
     if not np.isfinite(points).all() or index.min() < 0 or index.max() >= len(points):
         raise ConfigError(f"mesh: expected finite vertices and indices from 0 to {len(points) - 1}")
-    if float(np.abs(points).max()) > FARTHEST:
-        far = float(np.abs(points).max())
+    if (far := float(np.abs(points).max())) > FARTHEST:
         raise ConfigError(
             f"mesh: expected vertices within {FARTHEST:g} m, found one at {far:.3g} m: check scale"
         )
@@ -107,12 +100,8 @@ def field_of_triangles(
             f"among {len(index)} triangles: fill its holes"
         )
     corners = points[index]
-    if (
-        np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
-        <= 0
-    ).any():
+    edges = corners[:, 1:] - corners[:, :1]
+    if not np.cross(edges[:, 0], edges[:, 1]).any(1).all():
         raise ConfigError("mesh: expected triangles with an area, found a degenerate one")
     if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:
         raise ConfigError(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.rotations import axial, skew
+from mosa.settings import shown
 from mosa.system.limits import counted
 
 
@@ -308,9 +309,10 @@ class Points:
     def __post_init__(self) -> None:
         times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
         points = torch.as_tensor(self.points, dtype=torch.float64).cpu()
-        if times.ndim != 1 or len(times) < 2 or not bool((times.diff() > 0).all()):
+        ascending = times.ndim == 1 and bool((times.diff() > 0).all())
+        if not ascending or len(times) < 2 or not bool(times.isfinite().all()):
             raise ConfigError(
-                f"motion: times: expected at least two ascending numbers, found shape {tuple(times.shape)}"
+                f"motion: times: expected at least two ascending finite numbers, found {shown(times)}"
             )
         shaped = points.ndim == 3 and points.shape[1] and points.shape[-1] == 3
         if not shaped or len(points) != len(times):

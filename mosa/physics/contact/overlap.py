@@ -6,14 +6,17 @@ import math
 from collections.abc import Sequence
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import Collider, HalfSpace, Particles, half_width
+from mosa.physics.contact.colliders import Collider, HalfSpace, Particles, half_width, reach
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import pose_at
 from mosa.physics.contact.reference import signed_distance
 
+HUGE = 20.0
+"""[m] that a solid reaches from its origin from which its unit is doubted."""
 MOST = 0.01
 """Share of a body's particles that may be deeper than a quarter of their spacing, or of a thin solid: where both touch, they
 are half a spacing outside."""
@@ -39,6 +42,12 @@ def check_clear(
         distance = signed_distance(collider.shape, at)
         pressed = max(pressed, 0.5 * spacing - float(distance.min()))
         deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
+        if half_width(collider.shape) < 0.5 * spacing:  # it may stand between particles
+            pairs = torch.from_numpy(
+                cKDTree(at.numpy()).query_pairs(1.2 * spacing, output_type="ndarray")
+            )
+            between = signed_distance(collider.shape, at[pairs].mean(1)) < 0
+            deep[-1][pairs[between]] = True
         places.append(str([round(p, 4) for p in position.tolist()]))
     share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:
@@ -61,4 +70,6 @@ def _hint(collider: Collider) -> str:
         return "a plane fills all below its xy plane (normal: towards the free side)"
     if isinstance(collider.shape, SignedDistanceField):
         return f"its mesh is {collider.shape.extent:.3g} m long (scale: 0.001 for a file in mm)"
+    if (far := reach(collider.shape)) > HUGE:
+        return f"it reaches {far:.3g} m from its origin (lengths are in metres)"
     return ""

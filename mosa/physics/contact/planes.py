@@ -15,6 +15,7 @@ amount that depends on dx. The price is that slow rolling is damped as well.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import warp as wp
@@ -22,9 +23,10 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.touch import TOUCH
-from mosa.settings import is_number
+from mosa.settings import Expected, Weight, arguments_of, check, is_number
 from mosa.types import RUBBING, Ground
 
+Triple = Annotated[tuple[float, float, float], Expected("a tuple of three finite numbers")]
 NODE_MODES = {"sticky": 0, "slip": 1, "separate": 2}
 """How nodes of a grid meet a plane."""
 MODES = NODE_MODES | {"touch": TOUCH}
@@ -48,19 +50,26 @@ class Plane:
     distance above the plane the contact with what is slow fades in; None: `THICKNESS` cells where there is friction, else 0.
     """
 
-    point: tuple[float, float, float]
-    normal: tuple[float, float, float]
+    point: Triple
+    normal: Triple
     mode: str = "sticky"
     friction: float = 0.0
-    thickness: float | None = None
+    thickness: Weight | None = None
+
+    def __post_init__(self) -> None:
+        """Errors: ConfigError naming the field."""
+        arguments_of(Plane, "plane").read(vars(self))
+        check_contact("plane.", self.mode, self.friction)
+        if not any(self.normal):
+            raise ConfigError(f"plane.normal: expected a non-zero vector, found {self.normal}")
 
 
 def ground_plane(ground: Ground, up: Tensor) -> Plane:
     """The plane of a ground; up: (3,) unit vector."""
     up = torch.as_tensor(up, dtype=torch.float64).cpu()
     up = up / up.norm()
-    if not is_number(ground.height):
-        raise ConfigError(f"ground.height: expected a finite number [m], found {ground.height!r}")
+    check("ground.height", ground.height, float)
+    check_contact("ground.", ground.mode, ground.friction)
     return Plane(
         tuple((ground.height * up).tolist()), tuple(up.tolist()), ground.mode, ground.friction
     )
@@ -72,6 +81,11 @@ def check_contact(where: str, mode: str, friction: float) -> None:
         raise ConfigError(f"{where}mode: expected one of {', '.join(MODES)}, found {mode!r}")
     if not (is_number(friction) and friction >= 0):
         raise ConfigError(f"{where}friction: expected a finite number >= 0, found {friction}")
+    check_rubbing(where, mode, friction)
+
+
+def check_rubbing(where: str, mode: str, friction: float) -> None:
+    """Errors: ConfigError for friction in a mode without."""
     if friction > 0 and mode not in RUBBING:
         raise ConfigError(
             f"{where}friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}"
@@ -81,34 +95,18 @@ def check_contact(where: str, mode: str, friction: float) -> None:
 def pack_planes(
     planes: list[Plane], dtype: torch.dtype, device: torch.device, dx: float
 ) -> tuple[Tensor, Tensor]:
-    """(values (P, 6): normal, offset normal.point, friction, thickness; modes (P,) int32) for the kernels. dx [m]: of the grid.
-
-    Errors: ConfigError naming the plane and the field.
-    """
+    """(values (P, 6): normal, offset normal.point, friction, thickness; modes (P,) int32) for the kernels. dx [m]: of the grid."""
     values = torch.zeros(max(len(planes), 1), 6, dtype=torch.float64)
     modes = torch.zeros(max(len(planes), 1)).int()
     for i, plane in enumerate(planes):
-        check_contact(f"plane {i}: ", plane.mode, plane.friction)
         thickness = plane.thickness
         if thickness is None:
             thickness = THICKNESS * dx if plane.friction > 0 and plane.mode != "touch" else 0.0
-        if not (is_number(thickness) and thickness >= 0):
-            raise ConfigError(
-                f"plane {i}: thickness: expected a finite number >= 0 [m], found {thickness}"
-            )
         normal = torch.tensor(plane.normal, dtype=torch.float64)
-        if not normal.norm() > 0:
-            raise ConfigError(
-                f"plane {i}: normal: expected a non-zero vector, found {plane.normal}"
-            )
         normal = normal / normal.norm()
         values[i, :3] = normal
         values[i, 3] = normal @ torch.tensor(plane.point, dtype=torch.float64)
         values[i, 4], values[i, 5] = plane.friction, thickness
-        if not bool(torch.isfinite(values[i]).all()):
-            raise ConfigError(
-                f"plane {i}: expected a finite point and normal, found {plane.point} and {plane.normal}"
-            )
         modes[i] = MODES[plane.mode]
     return values.to(dtype=dtype, device=device), modes.to(device)
 

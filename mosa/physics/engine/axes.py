@@ -81,7 +81,7 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
     met = {
         i: torch.tensor(p.normal, dtype=torch.float64)
         for i, p in enumerate(planes)
-        if p.mode in NODE_MODES and any(p.normal)
+        if p.mode in NODE_MODES
     }
     met = {i: n / n.norm() for i, n in met.items()}
     for n in met.values():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,14 +29,15 @@ MODULI = {"mu": "mu >= 0", "lam": "lam + 2 mu/3 >= 0", "kappa": "kappa >= 0"}
 
 
 def numbers(
-    name: str, value: Any, expected: str, *shapes: tuple[int, ...], dtype: torch.dtype | None = None
-) -> Tensor:
-    """Tensor of finite numbers, of one of the shapes, if any; of a type, by default float64 where they are given so, else float32.
-    Errors: ConfigError naming the argument."""
+    name: str, value: Any, expected: str, *shapes: tuple[int, ...], dtype: torch.dtype | None = None,
+    most: float = sys.float_info.max,
+) -> Tensor:  # fmt: skip
+    """Tensor of finite numbers within `most`, of one of the shapes, if any; of a type, by default float64 where they are given so,
+    else float32. Errors: ConfigError naming the argument."""
     try:
         found = torch.as_tensor(value)
         odd = found.dtype == torch.bool or found.is_complex()
-        if odd or not bool(found.detach().double().isfinite().all()):
+        if odd or not bool((found.detach().double().abs() <= most).all()):
             raise ValueError
         dtype = dtype or (torch.float64 if found.dtype == torch.float64 else torch.float32)
         result = torch.as_tensor(value, dtype=dtype)
@@ -48,11 +50,7 @@ def numbers(
 
 def vector(name: str, value: Sequence[float] | Tensor) -> Tensor:
     """(3,) tensor. Errors: ConfigError naming the argument."""
-    expected = f"three finite numbers within {FASTEST:g}"
-    result = numbers(name, value, expected, (3,))
-    if float(result.detach().abs().max()) > FASTEST:
-        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
-    return result
+    return numbers(name, value, f"three finite numbers within {FASTEST:g}", (3,), most=FASTEST)
 
 
 def pack_parameters(

@@ -65,6 +65,8 @@ Array = Annotated[Tensor, InstanceOf, such(dense), Expected("a dense tensor")]
 Asked = Annotated[Callable[[MaterialState], AdapterOperator] | Sequence[Callable[..., Any]],
                   Expected("a function of a MaterialState, or one for each world")]  # fmt: skip
 Timing = Annotated[InstanceOf[Adaptive] | InstanceOf[Replay], Expected("an Adaptive or a Replay")]
+Scalar = Annotated[torch.dtype, InstanceOf, such(lambda t: t in SCALARS),
+                   Expected("torch.float32 or torch.float64")]  # fmt: skip
 Handed = Annotated[Held, InstanceOf, Expected("a Held")]
 NEAR = 8
 """Cells from the origin within which driven particles of float32 may move before the origin follows
@@ -115,7 +117,7 @@ class Simulator:
         planes: Planes = (),
         colliders: Colliders = (),
         box: Tensor | None = None,
-        dtype: torch.dtype = torch.float32,
+        dtype: Scalar = torch.float32,
         device: torch.device | str = "cpu",
         energetic: bool = False,
         options: Annotated[LawOptions, InstanceOf, Expected("LawOptions")] = AS_USUAL,
@@ -127,8 +129,6 @@ class Simulator:
             raise ConfigError(
                 f"energetic: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
             )
-        if dtype not in SCALARS:
-            raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
         self.substeps, self.frame_dt = int(substeps), float(frame_dt)
         self.dt = self.frame_dt / self.substeps
         self.dtype, self.device = dtype, torch.device(named_device(device))
@@ -168,12 +168,13 @@ class Simulator:
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
         self._ask = partial(ask, self.law, dtype)
 
+    @typed
     def pack(
         self,
-        parameters: dict[str, Tensor],
-        particles: int,
+        parameters: Values,
+        particles: Count,
         rotation: Tensor | None = None,
-        worlds: int | None = None,
+        worlds: Count | None = None,
     ) -> Tensor:
         """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
 

@@ -21,6 +21,7 @@ from mosa.reconstruction.motion.modes import Modes
 from mosa.reconstruction.motion.motion import ModalMotion, MotionBasisNetwork, MotionSample
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import DynamicSettings
+from mosa.rendering.appearance.lighting import moved_shading
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats
 
@@ -34,18 +35,25 @@ NETWORK = {"bases", "hidden", "basis_layers", "coefficient_layers", "space_frequ
 
 @dataclass(frozen=True)
 class Scaffold:
-    """Gaussians at rest with the modes at their positions and, where they are the particles, their neighbourhoods; shades: (T, M)
-    factors of their colours in every frame, None where the light is not known."""
+    """Gaussians in frame 0 with the modes at their positions and, where they are the particles, their
+    neighbourhoods; normals: (M, 3) of the surface at them, and light: (8,) that stays while they move
+    (`lighting.py`), None where it is not known."""
 
     splats: Splats
     modes: Modes
     around: Neighbourhood | None = None
-    shades: Tensor | None = None
+    normals: Tensor | None = None
+    light: Tensor | None = None
 
-    def colors(self, frames: Tensor) -> Tensor:
-        """(S, M, 3) in frames (S,), (1, M, 3) where they are the same in all."""
+    def colors(self, deformation: Tensor | None) -> Tensor:
+        """(S, M, 3) under deformation gradients (S, M, 3, 3); (1, M, 3) where they are the same under all.
+
+        The light's part of them follows the motion that is being found: else a bright side would go
+        along with a body that turns, and hold back a motion by which it turns."""
         colors = self.splats.colors[None]
-        return colors if self.shades is None else colors * self.shades[frames][..., None]
+        if self.light is None or self.normals is None or deformation is None:
+            return colors
+        return colors * moved_shading(self.light, self.normals, deformation)[..., None]
 
 
 def elastic_energy(deformation: Tensor, poisson: float) -> Tensor:
@@ -122,8 +130,9 @@ class Objective:
     def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
         """frames: (S,) long; state: (B,) which of them each window shows."""
         carried, settings = self.target.carried, self.settings
-        splats, colors = carried.splats, carried.colors(frames)
+        splats = carried.splats
         sample = self.motion(frames, splats, carried.modes, carried.around)
+        colors = carried.colors(sample.deformation)
         shown = colors if len(colors) == 1 else colors[state]
         image, alpha = rasterize(
             sample.positions, sample.covariances, splats.opacities, shown, batch.cameras, state, self.target.background,

@@ -29,8 +29,6 @@ from mosa.reconstruction.motion.response import (
 from mosa.reconstruction.pose.known import known_centres
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.rendering.appearance.carrying import bind
-from mosa.rendering.appearance.lighting import turned_basis
 from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
 from mosa.system.progress import tqdm
@@ -43,8 +41,9 @@ log = logging.getLogger(__name__)
 class MovingParts:
     """What a motion of particles is fitted with. Found when it is first asked for, and kept: the second look takes the first one's.
 
-    splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both fits; place: of a body of
-    known shape in frame 0.
+    splats: the particles at frame 0; static: Gaussians that carry their images; on the device of both
+    fits; place: of a body of known shape in frame 0; lit: the static ones' normals in frame 0 and the
+    light, where it is known.
     """
 
     def __init__(
@@ -54,9 +53,10 @@ class MovingParts:
         static: Splats,
         settings: ReconstructionSettings,
         place: Similarities | None = None,
+        lit: tuple[Tensor, ...] = (),
     ) -> None:
         self.scene, self.splats, self.static, self.settings = scene, splats, static, settings
-        self.place = place
+        self.place, self.lit = place, lit
 
     @cached_property
     def centres(self) -> Tensor:
@@ -83,7 +83,11 @@ class MovingParts:
         """What is compared with the images."""
         if self.settings.dynamic.carriers != "static":
             return self.scaffold
-        return Scaffold(self.static, self.scaffold.modes.at(self.static.means, self.splats.means))
+        return self.carriers(self.static, *self.lit)
+
+    def carriers(self, seen: Splats, *lit: Tensor) -> Scaffold:
+        """Gaussians of frame 0 that the particles carry; lit: normals and light, as of `Scaffold`."""
+        return Scaffold(seen, self.scaffold.modes.at(seen.means, self.splats.means), None, *lit)
 
     @property
     def reach(self) -> float:
@@ -210,11 +214,8 @@ class SecondLook:
         first = carriers == "first" or (carriers == "auto" and self.plastic())
         if first or appearance is None or appearance.light is None:
             return parts.carried
-        appearance = appearance.to(self.device)
-        splats, rest = appearance.splats, parts.splats.means
-        rotations = bind(splats.means, rest).carry(self._seen(None)).rotations
-        shades = (turned_basis(appearance.normals, rotations) @ appearance.light).exp()
-        return Scaffold(splats, parts.scaffold.modes.at(splats.means, rest), shades=shades)
+        seen = appearance.to(self.device)
+        return parts.carriers(seen.splats, seen.normals, seen.light)
 
     def _seen(self, seen: Tensor | None) -> Tensor:
         found = self.reconstruction.cues.positions if seen is None else seen

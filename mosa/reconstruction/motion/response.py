@@ -103,7 +103,7 @@ def image_matrices(
         shift, deformation = motion.displaced(c, frame, carried.modes)
         shapes = carried_covariance(deformation, splats.scales, splats.rotations)
         cameras, states = window.cameras.select([0] * len(c)), torch.arange(len(c), device=device)
-        colors, back = carried.colors(frame), target.background
+        colors, back = carried.colors(deformation), target.background
         return some_of(
             *rasterize(
                 splats.means + shift, shapes, splats.opacities, colors, cameras, states, back

@@ -91,10 +91,6 @@ class RigidBody:
             arm, covariance_from(scales, rotations), opacities, colors, radius, normals
         )
 
-    def shaded(self, rotation: Tensor, light: Tensor) -> RigidBody:
-        """In the colours that it has turned by `rotation` (3, 3) under a light that stays (`lighting.py`)."""
-        return replace(self, colors=self.colors * shading(light, self.normals, rotation)[:, None])
-
     def thinned(self, count: int, seed: int) -> RigidBody:
         """About `count` of the splats, swollen so that they still cover the body."""
         total = len(self.arm)
@@ -109,9 +105,12 @@ class RigidBody:
         return RigidBody(arm, swollen, opacities, colors, self.radius, normals)
 
     @torch.no_grad()
-    def render(self, poses: Poses, cameras: Cameras, background: Tensor) -> Tensor:
-        """Colour and alpha of every pose in every view, (K, V, H, W, 4)."""
-        views = len(cameras)
+    def render(
+        self, poses: Poses, cameras: Cameras, background: Tensor, light: Tensor | None = None
+    ) -> Tensor:
+        """Colour and alpha of every pose in every view, (K, V, H, W, 4). light: (8,) that stays while
+        the body turns (`lighting.py`), None where the colours go along."""
+        views, colors = len(cameras), self.colors[None]
         chunk = max(1, PIXELS_AT_ONCE // (views * cameras.width * cameras.height))
         parts = []
         for k in range(0, len(poses.center), chunk):
@@ -120,8 +119,11 @@ class RigidBody:
             covariances = R[:, None] @ self.covariances @ R[:, None].transpose(-1, -2)
             batch = cameras.select(list(range(views)) * len(R))
             index = torch.arange(len(R), device=c.device).repeat_interleave(views)
+            if light is not None:
+                shades = shading(light, self.normals, R[:, None])
+                colors = (self.colors * shades[..., None]).repeat_interleave(views, 0)
             image, alpha = rasterize(
-                means, covariances, self.opacities, self.colors[None], batch, index, background
+                means, covariances, self.opacities, colors, batch, index, background
             )
             parts.append(torch.cat((image, alpha[..., None]), -1).unflatten(0, (len(R), views)))
         return torch.cat(parts)
@@ -178,9 +180,10 @@ def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pose_columns(
-    body: RigidBody, level: Level, poses: Poses, *, central: bool
+    body: RigidBody, level: Level, poses: Poses, *, central: bool, light: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle times the body's radius [m].
+    """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle
+    times the body's radius [m]; light: as of `RigidBody.render`.
 
     One-sided differences (`central` false) cost half and move the optimum a little: good enough on the way, not at the end."""
     count, h = len(poses.center), STEP_PX * level.pixel
@@ -188,7 +191,8 @@ def pose_columns(
     steps = h * torch.cat(sides).to(poses.center)
     shift, angle = steps[:, :3].repeat(count, 1), steps[:, 3:].repeat(count, 1) / body.radius
     around = poses.take(torch.arange(count).repeat_interleave(len(steps)).to(shift.device))
-    seen = level.weighed(body.render(around.moved(shift, angle), level.cameras, level.background))
+    moved = around.moved(shift, angle)
+    seen = level.weighed(body.render(moved, level.cameras, level.background, light))
     here, *sides = seen.view(count, len(steps), -1).split((1, *(6,) * (len(steps) // 6)), 1)
     columns = (sides[0] - sides[1]) / (2 * h) if central else (sides[0] - here) / h
     return here[:, 0], columns
@@ -247,12 +251,15 @@ LIGHT_STEP = 0.02
 """Differences for the Jacobian change a number of the light by this."""
 LIGHT_RIDGE = 1e-3
 """Of the mean of the light's own diagonal: what pulls it to the light that was known before. One pose hardly tells some of its
-numbers, and what they are then does not show."""
+numbers."""
+TOLD = 30
+"""Independent data that a frame's misfit counts as, beside a light whose numbers are known to within
+1 before: a body that hardly turned does not tell its light, which shows once it turns further."""
 
 
 def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor) -> Tensor:
     """(8, P) derivative of the level's first frame in the numbers of the light, at one pose."""
-    frames = [body.shaded(pose.rotation[0], each).render(pose, level.cameras, level.background).flatten()
+    frames = [body.render(pose, level.cameras, level.background, each).flatten()
               for each in (light, *(light + LIGHT_STEP * torch.eye(LIGHT).to(light)))]  # fmt: skip
     return (torch.stack(frames[1:]) - frames[0]) / LIGHT_STEP
 
@@ -262,13 +269,12 @@ def lit_equations(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
     pose's numbers as of `pose_columns`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
-    # the colours turn with the light's own columns alone: a pose's columns know its geometry
-    lit = body.shaded(pose.rotation[0], light)
-    seen, moved = pose_columns(lit, level, pose, central=True)
+    # a bright side does not go along with a turn, also where its size is asked for
+    seen, moved = pose_columns(body, level, pose, central=True, light=light)
     every = torch.cat((moved, columns[None]), 1)
     found = equations(seen - level.target[:1].flatten(1), every)
     cost, gradient, matrix = (part[0] for part in found)
-    ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
+    ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean() + 2 * cost / TOLD
     matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
     gradient[6:] += ridge * (light - before)
     return cost + 0.5 * ridge * (light - before).square().sum(), gradient, matrix

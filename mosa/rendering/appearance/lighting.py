@@ -43,3 +43,13 @@ def turned_basis(normals: Tensor, rotations: Tensor) -> Tensor:
 def shading(light: Tensor, normals: Tensor, rotations: Tensor) -> Tensor:
     """Factors (..., M) of the colours of splats with normals (M, 3) at rest, turned by (..., M, 3, 3). light: (LIGHT,)."""
     return (turned_basis(normals, rotations) @ light).exp()
+
+
+def moved_shading(light: Tensor, normals: Tensor, deformation: Tensor) -> Tensor:
+    """The same (..., M) under deformation gradients (..., M, 3, 3), whose cofactors turn normals; with
+    their gradient."""
+    a, b, c = deformation.unbind(-1)
+    x, y, z = normals[:, 0, None], normals[:, 1, None], normals[:, 2, None]
+    cross = torch.linalg.cross
+    turned = cross(b, c) * x + cross(c, a) * y + cross(a, b) * z
+    return ((basis(turned, 2) - basis(normals, 2))[..., 1:] @ light).exp()

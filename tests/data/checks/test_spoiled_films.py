@@ -14,7 +14,7 @@ from PIL import Image
 from written_scenes import export_transforms
 
 from mosa.data.checks.free_fall import check_still, track_of
-from mosa.data.checks.tangents import check_pictures
+from mosa.data.checks.tangents import check_copies, check_pictures
 from mosa.data.checks.validation import validate
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
@@ -266,3 +266,28 @@ def test_a_body_at_rest_may_look_the_same_to_the_bit(scene):
         )
     with pytest.raises(DataError, match="found the same in frames 3 to 4"):
         check_still(frozen, track, "scene")
+
+
+@pytest.mark.parametrize("camera, frame", [(0, 0), (3, 2)])
+def test_one_mirrored_frame_of_a_body_that_looks_round_is_told_by_its_colours(camera, frame):
+    scene = replace(load_scene(format="builtin", name="tiny", scale=0.5), synthetic=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_copies(scene, "film")
+    scene.images[camera, frame], scene.mattes[camera, frame] = (
+        scene.images[camera, frame].flip(1), scene.mattes[camera, frame].flip(1),
+    )  # fmt: skip
+    said = rf"camera {camera}: expected pictures of frames .* nearer to each other with one"
+    if frame:
+        with pytest.warns(UserWarning, match=said):
+            check_copies(scene, "film")
+    else:
+        with pytest.raises(DataError, match=said):
+            check_copies(scene, "film")
+
+
+def test_another_camera_s_picture_of_the_same_moment_is_said():
+    scene = load_scene(format="builtin", name="tiny", scale=0.5)
+    scene.images[0, 2], scene.mattes[0, 2] = scene.images[3, 2], scene.mattes[3, 2]
+    with pytest.warns(UserWarning, match="cameras 0 and 3 have the same picture in frame 2"):
+        check_copies(scene, "film")

@@ -37,5 +37,5 @@ def test_other_keys_are_refused(keys, error, said):
 def test_one_camera_is_enough_for_a_known_body_alone():
     names = ("0", "1", "2")
     assert held_out_cameras([1, 2], names, 1) == (1, 2)
-    with pytest.raises(ConfigError, match=r"two must be left .*scene\.body\.shape"):
+    with pytest.raises(ConfigError, match=r"at least two cameras .*scene\.body\.shape"):
         held_out_cameras([1, 2], names)

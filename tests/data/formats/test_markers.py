@@ -278,3 +278,18 @@ def test_a_measured_beam():
                        density=1070.0, duration=3.0)  # fmt: skip
     moved = (scene.markers.positions - scene.markers.rest)[-50:].mean(0) * 1e3
     assert float(moved[0, 0]) == pytest.approx(-6.64, abs=0.05)  # the sag of the first marker
+
+
+def test_a_stretch_that_was_cut_out_is_said(tmp_path, recwarn):
+    """All points are elsewhere within a sample, in the middle of a motion; what is moved step by step is not."""
+    times, positions = let_go()
+    cut = np.delete(positions, slice(45, 60), 0)
+    path = write(tmp_path / "cut.csv", times[: len(cut)], "abcd", cut)
+    with pytest.warns(UserWarning, match=r"within one sample at 0\.45 s, .* was a stretch cut out"):
+        read_markers(path)
+    recwarn.clear()
+    stepped = np.repeat(positions[:1], len(times), 0)
+    stepped[40:, :, 1] += 0.01
+    for k, still in enumerate((positions, stepped)):
+        read_markers(write(tmp_path / f"{k}.csv", times, "abcd", still))
+    assert not recwarn.list

@@ -125,7 +125,7 @@ POINTS, POSES = "final_data.pkl", "calibrate.pkl"
     (lambda c: (c / POSES).unlink(), "calibrate.pkl: file not found"),
     (lambda c: (c / "mask/mask_info_1.json").write_text('{"0": "hand"}'), "mask_info_1.json: expected one number of a mask"),
     (lambda c: (c / "mask/1/1/2.png").unlink(), "mask/1/1/2.png: image not found"),
-    (lambda c: (c / "color/1/2.png").unlink(), "color/1/2.png: image not found, though metadata.json lists camera 1"),
+    (lambda c: (c / "color/1/2.png").unlink(), "color/1/2.png: image not found; restore it, or restrict scene.frames"),
     (lambda c: (c / "split.json").write_text("[]"), "split.json, test: expected [first, end]"),
     (lambda c: shutil.rmtree(c / "color" / "0"), "expected pictures 0.png, 1.png and so on"),
     (lambda c: shutil.rmtree(c), "file not found; set scene.path to a folder of a case of PhysTwin"),

@@ -91,7 +91,7 @@ def changed(name, change):
 
 
 @pytest.mark.parametrize(("act", "told"), [
-    (changed("camera.json", lambda d: d[1].pop("K")), "camera.json, entry 1: expected the keys camera, K and c2w, found no K"),
+    (changed("camera.json", lambda d: d[1].pop("K")), "camera.json, entry 1: expected the keys camera, K, c2w, found no K"),
     (changed("camera.json", lambda d: d[1].update(camera="../torus/camera_0")), "entry 1, camera: expected the name of a folder"),
     (changed("camera.json", lambda d: d[1].update(camera="..")), "entry 1, camera: expected the name of a folder"),
     (changed("camera.json", lambda d: d[1].update(camera=["camera_0"])), "entry 1, camera: expected the name of a folder"),
@@ -101,7 +101,7 @@ def changed(name, change):
     (changed("camera.json", lambda d: d[1].update(c2w=np.diag([2.0, 2, 2, 1]).tolist())), "entry 1, c2w: expected a rotation"),
     (changed("camera.json", lambda d: d.clear()), "camera.json: expected a list with one object per camera"),
     (changed("frame.json", lambda d: d.pop()), "frame.json: expected a time for each frame up to 4, found 4"),
-    (changed("frame.json", lambda d: d[2].update(more=1.0)), "frame.json, entry 2: expected an object with one entry"),
+    (changed("frame.json", lambda d: d[2].update(more=1.0)), "frame.json, entry 2: expected one key, a time"),
     (changed("frame.json", lambda d: d[2].update({"002": "late"})), "frame.json, entry 2: expected a finite number"),
     (changed("frame.json", lambda d: d[2].update({"002": 0.07})), "frame.json: expected one frame rate"),
     (lambda folder: (folder / "frame.json").unlink(), "frame.json: file not found"),

@@ -294,3 +294,21 @@ def test_intrinsics_of_one_phone_are_compared(tmp_path, index, factor, refused):
         DataError, match=r"phone 2 has other intrinsics than in .*single_camera_per"
     ):
         read_phones(tmp_path, tmp_path, sizes)
+
+
+@pytest.mark.parametrize("file, change, said", [
+    ("images", lambda t: t.replace("phone 1", "phone 0"), "image shots/phone 0.jpg: expected every image once"),
+    ("cameras", lambda t: t + t, "expected every CAMERA_ID once, found 10 twice"),
+    ("images", lambda t: "\ufeff" + t, None), ("cameras", lambda t: "\ufeff" + t, None),
+])  # fmt: skip
+def test_what_is_there_twice_is_named_and_a_byte_order_mark_is_passed_over(
+    tmp_path, file, change, said
+):
+    model(tmp_path, binary=False)
+    path = tmp_path / f"{file}.txt"
+    path.write_text(change(path.read_text()), encoding="utf-8")
+    if said is None:
+        assert len(read_model(tmp_path)) == 3
+    else:
+        with pytest.raises(DataError, match=said):
+            read_model(tmp_path)

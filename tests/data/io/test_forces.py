@@ -2,6 +2,7 @@
 from a press alone."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -119,25 +120,33 @@ def test_a_fit_says_how_far_its_force_is_from_the_measured_one(recwarn):
     )
 
 
-@pytest.mark.parametrize("kinds, told", [((True, False, False), True), ((False,) * 3, False)])
-def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told):
-    """A force that says nothing changes no error, though its rows stand between those of two gains."""
+@pytest.mark.parametrize(
+    ("kinds", "told", "recording"),
+    [((True, False, False), True, "second"), ((False,) * 3, False, None)],
+)
+def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told, recording):
+    """A force that says nothing changes no error, though its rows stand between those of two gains,
+    or after those of another recording."""
     times = torch.linspace(0, 1, 5, dtype=torch.float64)
     numbers = 0.1 * torch.randn(19, generator=torch.Generator().manual_seed(0)).double()
     begins = pressed()[1]
-    take = take_of(small_body(numbers=numbers), begins, FRAMES, PRESS)
+    take = take_of(small_body(numbers=numbers), begins, 5, PRESS)
+    takes = [take, SimpleNamespace(**vars(take) | {"name": "second"})][
+        : 1 + (recording is not None)
+    ]
+    curve = ForceCurve("high", times, torch.zeros(5, 3).double(), 1e9, recording)
     found = {}
-    for name, curves in {
-        "with": (ForceCurve("high", times, torch.zeros(5, 3).double(), 1e9),), "without": (),
-    }.items():  # fmt: skip
+    for name, curves in {"with": (curve,), "without": ()}.items():  # fmt: skip
         if not (told or curves):
             continue
         joint = Identification(
-            small_body(E=1.2 * E), [take], replace(PRESS, forces=curves),
+            small_body(E=1.2 * E), takes, replace(PRESS, forces=curves),
             Stage(name="joint", iterations=1, lr=0.1), Criterion(name="both"),
             IdentificationSettings(grid_error=0.0, threads=1), kinds,
         )  # fmt: skip
         joint.iterate()
+        felt = [each.force is not None for each in joint._fields(joint.body)]
+        assert felt == [bool(curves) and take is takes[-1] for take in takes for _ in range(2)]
         found[name] = joint.held_back()
     if told:
         assert found["with"] == pytest.approx(found["without"], rel=1e-6)
@@ -180,3 +189,21 @@ def test_a_force_of_nothing_is_refused(tmp_path):
     (tmp_path / "bad.csv").write_text("t,force\n0,1\n1,2\n")
     with pytest.raises(DataError, match=r"bad.csv: .*found the columns t, force"):
         forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
+
+
+def test_a_body_that_is_met_later_has_finite_shares(tmp_path):
+    """Frames in which the measured force is 0 throughout; and a clock that never ends."""
+    _, _, rollout = pressed()
+    times = torch.tensor([0.0, 1.0, 2.0]).double()
+    curve = ForceCurve(
+        "high", times, torch.tensor([[0.0] * 3, [0.0] * 3, [0.0, 5.0, 0.0]]).double()
+    )
+    with pytest.warns(UserWarning, match="world.forces: high"):
+        found = force_figures(rollout, [curve], PRESS, FRAME_DT)
+    felt = rollout.reactions.mean(1)[:, 1, :3].double()
+    assert found["forces/high/rms_share"] == pytest.approx(float(felt.square().mean().sqrt()) / 5)
+    for rows in ("0,1.0\ninf,1.0", "-inf,1.0\n0,1.0"):
+        path = tmp_path / "a.csv"
+        path.write_text(f"time,fy\n{rows}\n")
+        with pytest.raises(DataError, match="time: expected at least two ascending"):
+            read_forces(path, "high")

@@ -24,7 +24,7 @@ def test_both_stages_have_their_error_where_the_truth_is_known():
     figures = {"id_prior/E": 1.1e5, "id/E": 0.95e5, "id_prior/E_relative_error": 0.1, "id/E_relative_error": 0.05,
                "id_prior/E_ratio": 1.1, "id_prior/contact_offset_m": 0.01}  # fmt: skip
     rows = cells_of(parameter_table(figures, "neo_hookean"))
-    assert rows[0] == ["parameter", "prior", "joint", "error of prior", "error of joint"]
+    assert rows[0] == ["parameter", "prior", "adapted", "error of prior", "error of adapted"]
     assert rows[2:] == [
         ["E [Pa]", "1.1e+05", "95000", "10.0%", "5.0%"],
         ["contact_offset_m", "0.01", "nan", "", ""],
@@ -75,6 +75,18 @@ def test_a_parameter_of_another_package_has_the_unit_that_it_was_registered_with
 ])  # fmt: skip
 def test_what_is_determined_has_its_unit(law, figures, said):
     assert said in determined_text(figures | {"posterior/draws": 12}, law).splitlines()
+
+
+@pytest.mark.parametrize("taken, lines", [("isotropic", 0), ("operator", 2), ("stiffness", 1)])
+def test_what_the_choice_of_a_law_left_out_is_not_given_as_measured(taken, lines):
+    errors = {"isotropic": 5e-3, "operator": 6e-3, "stiffness": 6e-3} | {taken: 3e-3}
+    found = {f"held_back/{name}_m": error for name, error in errors.items()}
+    found |= {f"posterior/{name}": 0.0 for name in ("operator_determined", "stiffness_determined")}
+    found |= {"posterior/draws": 12, "posterior/operator_numbers": 19, "posterior/stiffness_numbers": 50,
+              "posterior/stiffest_cone_deg": 90, "id/stiffness_ratio": 1.0, "posterior/stiffness_ratio_sd": 0.0,
+              **{f"id/stiffest_{n}": 0.0 for n in "xyz"}}  # fmt: skip
+    text = determined_text(found, "corotated")
+    assert sum(("+-" in line) + line.startswith("- Of") for line in text.splitlines()) == lines
 
 
 def test_the_recording_that_no_column_names_is_said():

@@ -11,7 +11,7 @@ from mosa.cli.experiment import arguments, run
 from mosa.errors import ConfigError, DataError
 from mosa.experiments import commits
 from mosa.experiments.collecting import Cell
-from mosa.experiments.report.page import listed, state_of, verdict
+from mosa.experiments.report.page import listed, ranges, state_of, verdict
 from mosa.experiments.report.writing import made_by, write_results
 from mosa.experiments.specification import (
     Claim,
@@ -200,10 +200,14 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
 
 @pytest.mark.parametrize(
     ("count", "said"),
-    [("3", "0123456789ab, with changes (3)"), ("0", "0123456789ab, with changes (0)"), (None, "")],
+    [
+        ("3", "0.1.0, 0123456789ab, with changes (3)"),
+        ("0", "0.1.0, 0123456789ab, with changes (0)"),
+        (None, "0.1.0"),
+    ],
 )
 def test_the_page_counts_the_changes_of_the_program_since_its_figures(monkeypatch, count, said):
-    """Of a commit that this checkout does not know, it says nothing."""
+    """Of a commit that this checkout does not know, it says the version alone."""
     asked = []
     monkeypatch.setattr(commits, "git", lambda *words: asked.append(words) or count)
     found = state_of(
@@ -215,8 +219,16 @@ def test_the_page_counts_the_changes_of_the_program_since_its_figures(monkeypatc
     )
     assert asked == [("rev-list", "--count", "0123456789ab..HEAD", "--", "mosa", "conf")]
     assert found == ("2 of 2", said)
-    assert state_of(["2 of 2 jobs complete", "version 0.1.0, commit unknown"]) == ("2 of 2", "")
+    assert state_of(["2 of 2 jobs complete", "version 0.1.0, commit unknown"])[1] == "0.1.0"
     assert len(asked) == 1
+
+
+def test_a_map_says_its_smallest_and_largest_cell():
+    made = replace(experiment(), figures=(Figure("mm", "rms", decimals=1), Figure("dB", "psnr")))
+    rows = of_columns(slow=(3.0, 1.25, None), fast=(math.inf, 2.0, 9.0))
+    assert ranges(made, {"mm": rows}) == (
+        f"- mm ({made.rows}, {made.columns}): 1.2 (slow, b) to 9.0 (fast, c)"
+    )
 
 
 def test_each_comparison_of_a_claim_is_an_item_of_its_own():

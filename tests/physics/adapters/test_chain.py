@@ -496,7 +496,7 @@ def test_half_an_answer_is_refused(missing, make_block):
     state = make_block(n=3)
     for chained in (False, True):
         sim = simulator(chained, "von_mises", substeps=4, frame_dt=1.6e-3)
-        with pytest.raises(ConfigError, match=f"adapter output {missing}: .*found none"):
+        with pytest.raises(ConfigError, match=f"adapter output {missing}: .*found None"):
             sim.rollout(state, {"mu": 8e3, "lam": 1e4, "yield_stress": 300.0}, torch.full((27,), 8e-6, dtype=torch.float64),
                         1000.0, 2, adapter=Half())  # fmt: skip
 

@@ -170,15 +170,19 @@ def test_ground_is_below_its_height_along_up():
 
 
 @pytest.mark.parametrize(
-    "plane, match",
+    "given, match",
     [
-        (Plane((0, 0, 0), UP, "bouncy"), "plane 0: mode.*'bouncy'"),
-        (Plane((0, 0, 0), UP, "separate", -1.0), "friction"),
-        (Plane((0, 0, 0), UP, "slip", 0.5), "separate and touch only"),
-        (Plane((0, 0, 0), (0, 0, 0)), "normal"),
-        (Plane((0, 0, 0), UP, "separate", 0.1, -1.0), "thickness"),
+        (((0, 0, 0), UP, "bouncy"), r"plane\.mode.*'bouncy'"),
+        (((0, 0, 0), UP, ["slip"]), r"plane\.mode: expected a text"),
+        (((0, 0, 0), UP, "separate", -1.0), r"plane\.friction"),
+        (((0, 0, 0), UP, "slip", 0.5), "separate and touch only"),
+        (((0, 0, 0), (0, 0, 0)), r"plane\.normal: expected a non-zero vector"),
+        (((0, 0, 0, 0), UP), r"plane\.point: expected a tuple of three finite numbers"),
+        (((0, 0, 0), "up"), r"plane\.normal: expected a tuple of three finite numbers"),
+        (((0, 0, 0), (0, float("inf"), 0)), r"plane\.normal: expected a tuple"),
+        (((0, 0, 0), UP, "separate", 0.1, -1.0), r"plane\.thickness"),
     ],
 )
-def test_errors(plane, match):
+def test_errors(given, match):
     with pytest.raises(ConfigError, match=match):
-        pack_planes([plane], torch.float64, torch.device("cpu"), 0.1)
+        Plane(*given)

@@ -9,6 +9,7 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import (
+    Box,
     Collider,
     HalfSpace,
     Sphere,
@@ -17,7 +18,8 @@ from mosa.physics.contact.colliders import (
     reach,
 )
 from mosa.physics.contact.keys import KEYS
-from mosa.physics.contact.motion import Motion
+from mosa.physics.contact.motion import Motion, exponential
+from mosa.physics.contact.overlap import check_clear
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.engine.simulator import Simulator
 
@@ -88,6 +90,9 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
     assert turned.shape == HalfSpace()
 
 
+AT = {"time": 0, "position": [0, 0, 0]}
+
+
 @pytest.mark.parametrize(
     "item, match",
     [
@@ -99,8 +104,8 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
         ({"type": "plane", "normal": [0, 0, 0]}, "normal: expected a non-zero"),
         ({"type": "plane", "normal": [0, 0, 1], "rotation": [0, 0, 1, 3]}, "one of them"),
         ({"type": "sphere", "radius": 1, "rotation": [0, 0, 0, 90]}, "rotation: expected"),
-        ({"type": "sphere", "radius": 1, "motion": {"speed": 1}}, "unknown: speed"),
-        ({"type": "sphere", "radius": 1, "motion": {"waypoints": [], "velocity": [0, 0, 0]}}, "stand alone"),
+        ({"type": "sphere", "radius": 1, "motion": {"speed": 1}}, r"motion\.speed: unknown key; expected one of velocity"),
+        ({"type": "sphere", "radius": 1, "motion": {"waypoints": [AT, AT], "velocity": [0, 0, 0]}}, "stand alone"),
         ({"type": "mesh", "path": "absent.obj"}, r"colliders\[0\]: mesh: no file"),
         ({"type": ["sphere"]}, r"\[0\]\.type"),
         ({"type": "sphere", "radius": True}, r"\[0\]\.radius"),
@@ -111,7 +116,7 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
         ({"type": "box", "size": "111"}, r"\[0\]\.size"),
         ({"type": "sphere", "radius": 1, "thickness": 0.02}, r"\[0\]: unknown: thickness; a sphere takes radius, name, mode"),
         ({"type": "sphere", "radius": 1, "friction": math.inf, "mode": "separate"}, r"\[0\]\.friction"),
-        ({"type": "sphere", "radius": 1, "friction": 0.5}, r"\[0\]\.friction: acts on modes separate and touch"),
+        ({"type": "sphere", "radius": 1, "friction": 0.5}, r"\[0\]: friction: acts on modes separate and touch"),
         ({"type": "sphere", "radius": 1, "mode": ["slip"]}, r"\[0\]\.mode"),
         ({"type": "sphere", "radius": 1, "position": [0, math.nan, 0]}, r"\[0\]\.position"),
         ({"type": "sphere", "radius": 1, "position": [0, True, 0]}, r"\[0\]\.position"),
@@ -119,7 +124,7 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
         ({"type": "sphere", "radius": 1, "motion": {"velocity": "abc"}}, r"\[0\]\.motion\.velocity"),
         ({"type": "sphere", "radius": 1, "motion": {"velocity": [1, 2]}}, r"\[0\]\.motion\.velocity"),
         ({"type": "sphere", "radius": 1, "motion": {"velocity": [1, 0, 0], "times": [1, 0]}}, r"motion\.times"),
-        ({"type": "sphere", "radius": 1, "motion": {"waypoints": []}}, "at least two poses, found 0"),
+        ({"type": "sphere", "radius": 1, "motion": {"waypoints": []}}, r"motion\.waypoints: expected two poses"),
         ({"type": "sphere", "radius": 1, "motion": {"waypoints": [5, 6]}}, r"motion\.waypoints"),
         ({"type": "sphere", "radius": 1, "motion": {"waypoints": [{"time": "a", "position": [0, 0, 0]}] * 2}}, r"\[0\]\.time"),
     ],
@@ -132,18 +137,18 @@ def test_errors_of_a_configuration(item, match):
 @pytest.mark.parametrize(
     "collider, match",
     [
-        (Collider(Sphere(0.0)), "collider 0: Sphere: expected positive"),
-        (Collider(Sphere(1.0), "bouncy", name="ball"), "collider ball: mode.*'bouncy'"),
-        (Collider(Sphere(1.0), "slip", 0.2), "separate and touch only"),
-        (Collider(Sphere(1.0), "touch", -1.0), "friction"),
-        (Collider(Sphere(1.0), "touch", math.inf), "friction"),
-        (Collider(Sphere(math.inf)), "positive lengths"),
-        (Collider("sphere"), "shape: expected one of HalfSpace"),
+        (lambda: Collider(Sphere(0.0)), "collider 0: Sphere: expected positive"),
+        (lambda: Collider(Sphere(1.0), "bouncy", name="ball"), "collider ball: mode.*'bouncy'"),
+        (lambda: Collider(Sphere(1.0), "slip", 0.2), "separate and touch only"),
+        (lambda: Collider(Sphere(1.0), "touch", -1.0), "friction"),
+        (lambda: Collider(Sphere(1.0), "touch", math.inf), "friction"),
+        (lambda: Collider(Sphere(math.inf)), "positive lengths"),
+        (lambda: Collider("sphere"), "shape: expected one of HalfSpace"),
     ],
 )
 def test_packing_errors(collider, match):
     with pytest.raises(ConfigError, match=match):
-        pack_colliders([collider], torch.float64, torch.device("cpu"))
+        pack_colliders([collider()], torch.float64, torch.device("cpu"))
 
 
 def test_motions_of_another_number(make_block):
@@ -164,3 +169,16 @@ def test_motions_of_another_number(make_block):
             2,
             motions=[Motion()] * 2,
         )
+
+
+@pytest.mark.parametrize("turn, place", [(0.0, 0.0), (0.4, 0.0), (0.0, 0.0255), (0.0, 0.3)])
+def test_a_plate_between_the_particles_is_inside_of_the_body(turn, place):
+    """1 mm thick among particles 10 mm apart, none of which it contains; one beside the body is not."""
+    axis, turned = 0.01 * (torch.arange(4).double() - 1.5), torch.tensor([0.0, 0.0, turn]).double()
+    plate = Collider(Box((0.001, 0.5, 0.5)), motion=Motion((place, 0.0, 0.0), turned))
+    x = torch.cartesian_prod(axis, axis, axis) @ exponential(turned).T
+    if place:
+        check_clear([plate], x, "the body", spacing=0.01)
+        return
+    with pytest.raises(ConfigError, match=r"world\.colliders\[0\]: .* outside of, found 50% of"):
+        check_clear([plate], x, "the body", spacing=0.01)

@@ -136,7 +136,7 @@ def rendered_windows(scaffold, truth, frames):
             sample.positions + torch.tensor([0.04, 0.25, 0.0]),
             sample.covariances,
             scaffold.splats.opacities,
-            scaffold.colors(torch.arange(frames)),
+            scaffold.colors(sample.deformation),
             view,
             torch.arange(frames),
             torch.ones(3),

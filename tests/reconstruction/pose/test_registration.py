@@ -14,8 +14,15 @@ from mosa.reconstruction.pose.registration import (
     register_pose,
     spread_rotations,
 )
-from mosa.reconstruction.pose.rigid import Poses, RigidBody, rotation_exp
+from mosa.reconstruction.pose.rigid import (
+    Poses,
+    RigidBody,
+    make_level,
+    pose_columns,
+    rotation_exp,
+)
 from mosa.rendering.appearance.lighting import shading
+from mosa.rendering.appearance.spherical_harmonics import basis
 from mosa.rendering.cameras import look_at
 from mosa.types import Cameras, Splats
 
@@ -143,6 +150,32 @@ def test_a_bright_side_finds_no_other_turn():
     options = dict(background=WHITE, rest_center=REST_CENTER, rotations=300, starts=12)
     Q, *_ = register_pose(lit, images, mattes, cameras, normals=outward(ball), **options)
     assert degrees(Q, truth.rotation[0]) < 1  # 177 where brightness counts as hue does
+
+
+def test_a_bright_side_does_not_go_along_with_a_turn():
+    """A ball of one colour under a light looks the same after a turn that leaves its lattice as it is, and so do all poses near
+    by: what tells a turn from its bright side is wrong."""
+    axis, cameras, light = 0.02 * (torch.arange(10) - 4.5), ring(3, 48), torch.zeros(8)
+    points = torch.cartesian_prod(axis, axis, axis)
+    means = points[points.norm(dim=1) < 0.1]
+    normals, (n, _) = means / means.norm(dim=1, keepdim=True), means.shape
+    light[0], light[3] = 0.8, 0.4
+    bright = 0.4 * (basis(normals, 2)[:, 1:] @ light).exp()[:, None].expand(-1, 3)
+    body = RigidBody(
+        means, 1e-4 * torch.eye(3).expand(n, 3, 3), torch.full((n,), 0.9), bright, 0.08, normals
+    )
+    pose = Poses(torch.eye(3)[None], torch.zeros(1, 3))
+    quarter = Poses(rotation_exp(torch.tensor([[0.0, 0, torch.pi / 2]])), pose.center)
+    seen = body.render(pose, cameras, WHITE).transpose(0, 1)
+    level = make_level(seen[..., :3], seen[..., 3], cameras, WHITE, pose.center[0])
+    for own, same in ((light, True), (None, False)):
+        (here, columns), (there, turned_columns) = (
+            pose_columns(body, level, at, central=True, light=own) for at in (pose, quarter)
+        )
+        assert torch.allclose(here, there, atol=1e-4) == same
+        assert (
+            torch.allclose(columns, turned_columns, atol=0.02 * float(columns.abs().max())) == same
+        )
 
 
 @pytest.mark.parametrize("frames", [2, 5])
