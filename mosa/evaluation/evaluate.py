@@ -202,7 +202,7 @@ def evaluate(
                     curves = curves_of(world.forces, scene.sequence, first)
                     dt = float(scene.times[1] - scene.times[0])
                     figures |= force_figures(simulated[variant], curves, world, dt)
-                figures |= sequence_metrics(
+                found = sequence_metrics(
                     body, sequence, simulated[variant], model, settings, target
                 )
                 figures |= found

@@ -14,7 +14,9 @@ from mosa.export.source import Source
 Assignments = list[tuple[sp.Symbol, sp.Expr]]
 
 
-def derivatives(energy: Energy) -> tuple[list[sp.Expr], ...]:
+def derivatives(
+    energy: Energy,
+) -> tuple[list[sp.Expr], list[sp.Expr], list[sp.Expr], list[sp.Expr]]:
     """S = 2 dpsi/dC (6) and 2 dS/dC (21, upper triangle row by row) of the part of C's entries, in vech order; of the stretches'
     part s_i = (1/l_i) dpsi/dl_i (3) and (1/l_j) ds_i/dl_j (9)."""
     weights = [2, 2, 2, 1, 1, 1]  # an entry off the diagonal is two of C's
@@ -111,6 +113,8 @@ def filled(name: str, found: Source, **parts: str) -> str:
 def umat(found: Source) -> str:
     """Fortran 95, free form: an Abaqus UMAT with its consistent tangent, and a check's entry that C can call."""
     printer = Fortran()
+    entries: list[str] = []
+    principal: list[str] = []
     stress, stiff, along, slopes = derivatives(found.energy)
     names = [
         "psi",
@@ -124,18 +128,11 @@ def umat(found: Source) -> str:
          [found.energy.stretches, *along, *slopes]),
     ):  # fmt: skip
         steps, rest = reduced(expressions)
+        into += [f"double precision :: {name}" for name, _ in steps]
         lines = [(str(name), value) for name, value in steps] + list(zip(targets, rest))
-        texts = (wrap(f"{name} = {printer.doprint(value)}") for name, value in lines)
-        return [f"double precision :: {name}" for name, _ in steps] + [
-            t for each in texts for t in each
+        into += [
+            line for name, value in lines for line in wrap(f"{name} = {printer.doprint(value)}")
         ]
-
-    names = [f"S({k})" for k in range(1, 7)]
-    names += [f"CC({i},{j})" for i in range(1, 7) for j in range(i, 7)]
-    entries = assigned(names, [*stress, *stiff])
-    names = [f"s({k})" for k in range(1, 4)]
-    names += [f"ds({i},{j})" for i in range(1, 4) for j in range(1, 4)]
-    principal = assigned(names, [*along, *slopes])
     props = [f"{name} = props({k + 1})" for k, name in enumerate(found.energy.names)]
     declared = [f"double precision :: {name}" for name in found.energy.names]
 
@@ -144,11 +141,19 @@ def umat(found: Source) -> str:
         later = [line for line in lines if not line.startswith("double precision")]
         return "\n  ".join([*declared, *first, *props, *later])
 
-    numbered = enumerate(found.energy.names, 1)
-    listed = "\n".join(f"!   {k:2d}  {name} = {found.values[name]!r}" for k, name in numbered)
+    listed = "\n".join(
+        f"!   {k + 1:2d}  {name} = {found.values[name]!r}"
+        for k, name in enumerate(found.energy.names)
+    )
     spectral = ".true." if found.energy.stretches != 0 else ".false."
-    blocks = {"entries": block(entries), "principal": block(principal)}
-    return filled("umat.f90", found, props=listed, spectral=spectral, **blocks)
+    return filled(
+        "umat.f90",
+        found,
+        props=listed,
+        entries=block(entries),
+        principal=block(principal),
+        spectral=spectral,
+    )
 
 
 def wrap(line: str) -> list[str]:
@@ -177,9 +182,10 @@ def warp_text(found: Source) -> str:
     steps, rest = reduced([*stress, *along])
     names = ["S11", "S22", "S33", "S23", "S13", "S12", "s1", "s2", "s3"]
     lines = [f"{name} = {printer.doprint(part)}" for name, part in [*steps, *zip(names, rest)]]
-    values = [f"{n} = wp.constant(wp.float64({found.values[n]!r}))" for n in found.energy.names]
-    parts = {"constants": "\n".join(values), "lines": "\n    ".join(lines)}
-    return filled("law_warp.txt", found, **parts)
+    constants = "\n".join(
+        f"{n} = wp.constant(wp.float64({found.values[n]!r}))" for n in found.energy.names
+    )
+    return filled("law_warp.txt", found, constants=constants, lines="\n    ".join(lines))
 
 
 def named(found: Source) -> str:

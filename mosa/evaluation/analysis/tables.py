@@ -254,11 +254,14 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
                 f"The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the "
                 f"largest over the smallest Young's modulus is {spread}."
             )
-    for name, what in (
-        ("operator", "numbers of the anisotropic stiffness"),
-        ("stiffness", "modes of the stiffness over the body"),
-    ):
-        if f"posterior/{name}_numbers" in figures and name not in left_out:
+        lines.append(f"- {said}")
+    numbers = {
+        "operator": "numbers of the anisotropic stiffness",
+        "stiffness": "modes of the stiffness over the body",
+    }
+    for name, what in numbers.items():
+        if (count := figures.get(f"posterior/{name}_numbers")) is not None and name not in left_out:
+            known = figures[f"posterior/{name}_determined"]
             lines.append(
                 f"- Of {count:.0f} {what} the data determine {known:.1f}; the others keep their "
                 "prior values."
