@@ -5,7 +5,7 @@
     python benchmarks/capture.py footage --folder outputs/capture              # perfect footage and held-out drops, train commands
 
 `compare` prints errors of clocks, readouts, scale, up and ground, and how well the frames at common times are those of perfect
-cameras there, interpolated in three ways. `footage` writes what the fits need that `docs/capture.md` compares. Synthetic scenes.
+cameras there. `footage` writes what the fits need that `docs/capture.md` compares. Synthetic scenes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import numpy as np
 from capture_film import Faults, film, perfect
 
 from mosa.capture.making import capture
-from mosa.capture.resampling import KINDS
 from mosa.capture.world import World
 from mosa.config.leaf_settings import CaptureSettings
 from mosa.settings import node_of
@@ -109,23 +108,14 @@ def pictures_errors(seen: Path, right: Path) -> dict[str, float]:
     }
 
 
-def compare(folder: Path, kinds: list[str], rate: float | None = None) -> dict:
-    """mosa-capture with each interpolation; the last of `kinds` is what stays in scene/."""
-    truth, said = json.loads((folder / "truth.json").read_text()), {}
-    for kind in kinds:
-        found = capture(settings(folder, truth, interpolation=kind, rate=rate))
-        times = true_times(truth, found)
-        if kind == kinds[0]:
-            said |= errors(truth, found)
-            perfect(
-                folder / "perfect",
-                truth,
-                sequence="train",
-                times=times,
-                world=gauge(truth, found_world(found)),
-                particles=True,
-            )
-        said[kind] = pictures_errors(folder / "scene", folder / "perfect")
+def compare(folder: Path, rate: float | None = None) -> dict:
+    """mosa-capture on what was filmed, its errors, and its frames beside those of perfect cameras."""
+    truth = json.loads((folder / "truth.json").read_text())
+    found = capture(settings(folder, truth, rate=rate))
+    said, world = errors(truth, found), gauge(truth, found_world(found))
+    times = true_times(truth, found)
+    perfect(folder / "perfect", truth, sequence="train", times=times, world=world, particles=True)
+    said["flow"] = p = pictures_errors(folder / "scene", folder / "perfect")
     print("\n| | error | said |\n|---|---|---|")
     for name, unit in (
         ("clock_rms", "ms"),
@@ -141,12 +131,10 @@ def compare(folder: Path, kinds: list[str], rate: float | None = None) -> dict:
         "\n| frames at common times | overlap of mattes | worst | centres apart [px] | worst | PSNR inside [dB] |\n"
         "|---|---|---|---|---|---|"
     )
-    for kind in kinds:
-        p = said[kind]
-        print(
-            f"| {kind} | {p['overlap']:.4f} | {p['overlap_worst']:.4f} | {p['apart_px']:.2f} | {p['apart_worst_px']:.2f} | "
-            f"{p['psnr']:.1f} |"
-        )
+    print(
+        f"| flow | {p['overlap']:.4f} | {p['overlap_worst']:.4f} | {p['apart_px']:.2f} | {p['apart_worst_px']:.2f} | "
+        f"{p['psnr']:.1f} |"
+    )
     (folder / "compare.json").write_text(json.dumps(said, indent=1))
     return said
 
@@ -194,7 +182,6 @@ def main() -> None:
     parser.add_argument(
         "--jobs", type=int, default=1, help="phones filmed at a time, each in a process"
     )
-    parser.add_argument("--kinds", default=",".join(reversed(KINDS)))
     parser.add_argument("--held", default="test_60,test_40")
     options = parser.parse_args()
     if options.what == "film":
@@ -210,7 +197,7 @@ def main() -> None:
             jobs=options.jobs,
         )
     elif options.what == "compare":
-        compare(options.folder, options.kinds.split(","), options.rate)
+        compare(options.folder, options.rate)
     else:
         footage(options.folder, options.held.split(","))
 

@@ -6,8 +6,7 @@ Public names, each imported when it is first asked for:
     SceneDataModule   the data of a scene under Lightning: films, reconstruction, batches of frames with their motion cues
     LitMosa           the LightningModule: a body in its world, fitted in stages
     Twin              a learned body, to simulate from new starts
-    check_law         whether a law of one's own is objective, symmetric and has an energy
-"""
+    check_law         whether a law of one's own is objective, symmetric and has an energy"""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-LONGEST = 2000
-"""Characters of a message; what was found may be a file's worth of text."""
+LONGEST = 2000  # characters of a message; what was found may be a file's worth of text
 
 
 class MosaError(Exception):

@@ -36,7 +36,7 @@ from typing import (
     get_origin,
 )
 
-from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Interval, Le, Len, Lt
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -56,11 +56,8 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
-LARGEST, MOST = 1e20, 10**9
-"""Of numbers and of whole numbers without limits of their own: single precision and an array's length hold them."""
-WIDEST = 4096
-"""Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
-
+LARGEST, MOST = 1e20, 10**9  # of numbers and whole numbers without limits of their own
+WIDEST = 4096  # of a network's layer: many times what any run has used
 
 Public = TypeVar("Public", bound=Callable[..., Any])
 
@@ -82,20 +79,8 @@ Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
 Text = Annotated[str, Expected("a text")]
 Section = Annotated[dict[str, Any], Expected("a section of keys")]
 Entries = Annotated[list[dict[str, Any]], Expected("a list of sections")]
-Three = Annotated[
-    list[float], Expected("three numbers"), MinLen(3), AfterValidator(lambda v: _long(v, 3))
-]
-Four = Annotated[
-    list[float],
-    Expected("four numbers, an axis and degrees"),
-    AfterValidator(lambda v: _long(v, 4)),
-]
-
-
-def _long(values: list[Any], count: int) -> list[Any]:
-    if len(values) != count:
-        raise ValueError(f"{count} of them")
-    return values
+Three = Annotated[list[float], Expected("three numbers"), Len(3, 3)]
+Four = Annotated[list[float], Expected("four numbers, an axis and degrees"), Len(4, 4)]
 
 
 def such(valid: Callable[[Any], bool]) -> AfterValidator:
@@ -150,15 +135,14 @@ class Settings(BaseModel, metaclass=_Checked):
     def _completed(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
-        known = cls.model_fields
-        return {
-            key: {**dict(default), **value}
-            if key in known
-            and isinstance(value, Mapping)
-            and isinstance(default := known[key].get_default(call_default_factory=True), Settings)
-            else value
-            for key, value in values.items()
-        }
+        found = dict(values)
+        for key in (
+            k for k, v in values.items() if isinstance(v, Mapping) and k in cls.model_fields
+        ):
+            default = cls.model_fields[key].get_default(call_default_factory=True)
+            if isinstance(default, Settings):
+                found[key] = {**dict(default), **found[key]}
+        return found
 
     @classmethod
     def read(cls, values: Any, where: str | None = None) -> Self:
@@ -205,11 +189,10 @@ def mistake(
     name = ".".join(path)
     if first["type"] in ("extra_forbidden", "invalid_key"):
         section, key = model_in(wanted) if wanted is not None else owner, str(first["loc"][-1])
-        known = [name for name, f in (section or owner).model_fields.items()]
+        known = list((section or owner).model_fields)
         expected = f"one of {', '.join(known)}" if known else "none"
-        return ConfigError(
-            f"{'.'.join([*path, key])}: unknown key; expected {expected}{nearest(key, known, '.'.join(path))}"
-        )
+        expected += nearest(key, known, name)
+        return ConfigError(f"{'.'.join([*path, key])}: unknown key; expected {expected}")
     if first["type"] == "missing":
         return ConfigError(f"{name}: expected this key, found none")
     return ConfigError(f"{name}: expected {described(wanted)}, found {shown(values)}")
@@ -231,13 +214,11 @@ def shown(value: Any) -> str:
 
 def next_in(kind: Any, key: Any) -> Any:
     """The type of what lies at `key` of a model or of a mapping of models; None where that is no key of a user's."""
-    inside = model_in(kind)
-    if inside is not None and get_origin(bare(kind)) is not dict:
+    if (inside := model_in(kind)) is not None:
         f = inside.model_fields.get(key)
         return None if f is None else annotation_of(f)
-    if get_origin(bare(kind)) is dict and model_in(get_args(bare(kind))[1]) is not None:
-        return get_args(bare(kind))[1]
-    return None
+    of = get_args(bare(kind))[1] if get_origin(bare(kind)) is dict else None
+    return of if of is not None and model_in(of) is not None else None
 
 
 def annotation_of(f: FieldInfo) -> Any:
@@ -283,15 +264,14 @@ def described(kind: Any) -> str:
         return ", or ".join(some + ["null"] * (type(None) in inside))
     if kind in (int, float):
         return numbers_described(kind, []) or ""
-    return {bool: "true or false", str: "a text", Path: "a path", type(None): "null"}.get(
-        kind, "a list" if list in (origin, kind) or origin is Sequence else "a section of keys"
-    )
+    other = "a list" if list in (origin, kind) or origin is Sequence else "a section of keys"
+    words = {bool: "true or false", str: "a text", Path: "a path", type(None): "null"}
+    return words.get(kind, other)
 
 
 def word(value: Any) -> str:
-    return (
-        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    )
+    plain = str(value).lower() if isinstance(value, bool) else str(value)
+    return "null" if value is None else plain
 
 
 def flattened(told: Iterable[Any]) -> Iterable[Any]:
@@ -363,9 +343,8 @@ def imported(where: str, place: str) -> Any:
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            f"{where} is registered as {place}, which cannot be imported ({error})"
-        ) from error
+        found = f"registered as {place}, which cannot be imported ({error})"
+        raise ConfigError(f"{where} is {found}") from error
 
 
 # -------------------------------------------------------------------------------- arguments
@@ -376,11 +355,10 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
     An argument without an annotation may be anything."""
     call = build.__init__ if inspect.isclass(build) else build
     hints = typing.get_type_hints(call, include_extras=True)
-    wanted = {
-        name: (hints.get(name, Any), ... if p.default is p.empty else p.default)
-        for name, p in inspect.signature(build).parameters.items()
-        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) and name not in given
-    }
+    wanted = {}
+    for name, p in inspect.signature(build).parameters.items():
+        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) and name not in given:
+            wanted[name] = hints.get(name, Any), ... if p.default is p.empty else p.default
     made: type[Settings] = create_model(build.__name__, __base__=Settings, **wanted)  # type: ignore[call-overload]
     made.where = where
     return made

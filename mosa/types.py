@@ -56,8 +56,7 @@ def moved(held: Held, device: torch.device | str) -> Held:
 class Cameras:
     """V pinhole cameras of one image size. `w2c` maps world metres to OpenCV camera axes (x right, y down, z forward).
 
-    K: (V, 3, 3) [px], pixel centres at half integers; w2c: (V, 4, 4); names: V strings.
-    """
+    K: (V, 3, 3) [px], pixel centres at half integers; w2c: (V, 4, 4); names: V strings."""
 
     __repr__ = in_brief
 
@@ -83,8 +82,7 @@ class Cameras:
         return moved(self, device)
 
 
-AUTO = "auto"
-"""Mode of a ground of which only the height is known: how it is touched is found with the law."""
+AUTO = "auto"  # mode of a ground: how it is touched is found with the law
 GROUND_MODES = ("sticky", "slip", "separate", "touch")
 RUBBING = ("separate", "touch")
 """Of these modes, those with friction: the body leaves the ground freely, and is met at nodes or at its own particles."""
@@ -103,8 +101,7 @@ class Ground:
     accuracy: float | None = None
 
 
-FALLING, REST = "falling", "rest"
-"""How a film starts."""
+FALLING, REST = "falling", "rest"  # how a film starts
 
 
 @dataclass(frozen=True)
@@ -159,8 +156,7 @@ class Scene:
     start: `FALLING`, or `REST`: at frame 0 nothing moves, and the body may be in contact already.
     `markers`: tracked points in place of images, of which there are then none (V = 0).
     `body`: the rest shape, where it is known from elsewhere.
-    `driven`: sets of the body's particles whose motion was measured, entries as in world.driven.
-    """
+    `driven`: sets of the body's particles whose motion was measured, entries as in world.driven."""
 
     __repr__ = in_brief
 
@@ -244,8 +240,7 @@ class MotionCues:
 
     positions: (T, N, 3) [m]; rotation: (T, N, 3, 3), stretch: (T, N, 3) descending singular values, both relative to frame 0;
     weight: (T, N) in [0, 1], 0 where rotation and stretch are not determined; covariances: (T, N, 3, 3) [m^2] of the dynamic
-    Gaussians, from which cue flow maps are rendered.
-    """
+    Gaussians, from which cue flow maps are rendered."""
 
     __repr__ = in_brief
 
@@ -321,8 +316,7 @@ class Reconstruction:
 class ParticleState:
     """State between substeps. x, v: (N, 3) [m], [m/s]; C_affine: (N, 3, 3) [1/s]; F, F_tot: (N, 3, 3).
 
-    For laws without return mapping F_tot is the same tensor as F. Of B worlds: (B, N, ...) each.
-    """
+    For laws without return mapping F_tot is the same tensor as F. Of B worlds: (B, N, ...) each."""
 
     __repr__ = in_brief
 

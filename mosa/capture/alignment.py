@@ -11,16 +11,11 @@ from mosa.errors import DataError
 MISS = 0.15
 """Radii of the object by which lines of sight of one moment may pass each other (`mosa.data.checks.cameras.AGREEMENT`: right
 calibrations have up to 0.15)."""
-MOVING = 0.15
-"""Share of a track's fastest motion from which on a frame counts: of an object at rest every offset fits."""
-FINE = 0.25
-"""Step of the search, in frames."""
-FINEST = 0.004
-"""[s] of it: no phone's films need a finer one to begin with."""
-LOST = 0.5
-"""Share of a track that may find no partner."""
-COST_TOLERANCE = 0.1
-"""Difference of cost (a share) below which two time offsets count as equal."""
+MOVING = 0.15  # share of a track's fastest motion from which on a frame counts
+FINE = 0.25  # step of the search, in frames
+FINEST = 0.004  # [s] of it: no phone's films need a finer one to begin with
+LOST = 0.5  # share of a track that may find no partner
+COST_TOLERANCE = 0.1  # difference of cost (a share) below which two time offsets count as equal
 
 
 def moving_frames(track: Track) -> np.ndarray:
@@ -67,8 +62,7 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
 
     Phones are placed one after the other against all that are placed, at each turn the one whose offset is told most sharply: of
     two that face each other, with the object between them, nothing tells it. most [s]: offsets that are looked at. Errors:
-    DataError naming the phone whose lines of sight meet the others' at none of them.
-    """
+    DataError naming the phone whose lines of sight meet the others' at none of them."""
     for phone, track in zip(phones, tracks):
         if len(moving_frames(track)) < 3:
             raise DataError(

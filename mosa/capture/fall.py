@@ -21,19 +21,13 @@ from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 from mosa.errors import DataError
 
-READOUT, READOUT_SD = 0.015, 0.010
-"""[s] Sensors of phones are read in 8 to 30 ms: what is assumed beside what the fall says."""
-SHIFT = 0.04
-"""Standard deviation of a silhouette's centre from the projected centre of mass, in radii of the object."""
-POSE = 1.5e-3
-"""[rad] of a phone's direction."""
-ROUGH = 0.05
-"""Radii of the object within which the triangulated centres of a fall lie on a parabola, clocks known to a quarter of a frame."""
-OUTLIER = 3.5
-"""Standard deviations from which on a frame at an end of the window is no free fall."""
+READOUT, READOUT_SD = 0.015, 0.010  # [s] prior: sensors of phones are read in 8 to 30 ms
+SHIFT = 0.04  # sd of a silhouette's centre from the projected centre of mass, in object radii
+POSE = 1.5e-3  # [rad] of a phone's direction
+ROUGH = 0.05  # radii of the object within which triangulated centres of a fall lie on a parabola
+OUTLIER = 3.5  # standard deviations from which on a frame at an end of the window is no free fall
 FEWEST = 5
-NOISE = 0.05
-"""[px] Least noise that is assumed of a centre."""
+NOISE = 0.05  # [px] Least noise that is assumed of a centre
 OUTLINE = 0.003
 """The same in radii of the object: what a hull leaves of the difference between an outline's centre and the body's. With it the
 errors of the two synthetic films of docs/capture.md are as large as is said."""
@@ -115,9 +109,9 @@ def longest_parabola(times: np.ndarray, points: np.ndarray, tolerance: float) ->
                 best, found = bend, (i, j - 1)
     if found is None or best < tolerance:
         raise DataError(
-            "no free fall: expected a part of the film in which the object, seen whole by two phones or more, falls "
-            f"freely through at least {FEWEST} frames and bends off a straight line by {tolerance:.2g} units of the poses, "
-            f"found {best:.2g} at most; let it fall from higher up, or name the part with flight=[<from>, <to>]"
+            f"no free fall: expected {FEWEST} frames in which two phones see the whole object, "
+            f"whose fall bends off a straight line by {tolerance:.2g} units of the poses, found "
+            f"{best:.2g}; let it fall from higher up, or set flight=[<from>, <to>]"
         )
     return found
 
@@ -136,13 +130,11 @@ def rough_window(
 
 class Problem:
     """Residuals of a window. Numbers: position, velocity, acceleration in units of depth, then per phone offset (but the first's),
-    readout, shift. until [s]: end of the frames that are read, of the window's where None."""
+    readout, shift. until [s]: end of the frames that are read, the window's where 0."""
 
-    def __init__(
-        self, phones, tracks, offsets, window, knowledge: Knowledge, until: float | None = None
-    ):
+    def __init__(self, phones, tracks, offsets, window, knowledge: Knowledge, until: float = 0.0):
         self.phones, self.knowledge, self.window = phones, knowledge, window
-        end = window[1] if until is None else until
+        end = until or window[1]
         self.origin = 0.5 * (window[0] + window[1])
         self.start = offsets
         self.times, self.pixels, self.shares, self.sigma = [], [], [], []
@@ -193,9 +185,7 @@ class Problem:
             found.append(self.pixels[v] - expected - shifts[v])
         return found
 
-    def residuals(
-        self, numbers: np.ndarray, noise: float, without: int | None = None
-    ) -> np.ndarray:
+    def residuals(self, numbers: np.ndarray, noise: float, without: int | None) -> np.ndarray:
         motion, offsets, readouts, shifts = self.parts(numbers)
         size, scale, up = np.linalg.norm(motion[2]), self.knowledge.scale, self.knowledge.up
         misses = enumerate(self.misses(numbers))
@@ -230,23 +220,17 @@ def fit_fall(
         count = sum(map(len, problem.times))
         if count < 3 * len(phones) or window[1] - window[0] < 3 * interval:
             raise DataError(
-                f"no free fall: {count} centres of {len(phones)} phones from {window[0]:.3f} to {window[1]:.3f} s on the "
-                f"clock of {phones[0].name} are left, at least {3 * len(phones)} are needed; let the object fall from "
-                "higher up, or name the part with flight=[<from>, <to>]"
+                f"no free fall: {count} centres from {window[0]:.3f} to {window[1]:.3f} s on the "
+                f"clock of {phones[0].name} are left of {3 * len(phones)} needed; let the object "
+                "fall from higher up, or set flight=[<from>, <to>]"
             )
-        solution = problem.solve(problem.begin() if numbers is None else numbers, noise)
-        numbers = solution.x
+        numbers = problem.solve(problem.begin() if numbers is None else numbers, noise).x
         misses = problem.misses(numbers)
         every = np.concatenate([m.ravel() for m in misses])
         noise = max(NOISE, OUTLINE * problem.radius, 1.4826 * float(np.median(np.abs(every))))
         offsets = problem.parts(numbers)[1]
-        clocks = slice(9, 8 + len(phones))
-        numbers[clocks] = 0
-        if flight is not None:
-            if attempt >= 2:
-                break
-            continue
-        narrower = trimmed(problem, misses, offsets, noise, window, interval)
+        numbers[9 : 8 + len(phones)] = 0  # the clocks' changes
+        narrower = flight or trimmed(problem, misses, offsets, noise, window, interval)
         if attempt >= 2 and narrower == window:
             break
         window, numbers = narrower, None if narrower != window else numbers
@@ -303,7 +287,7 @@ def described(problem: Problem, solution, noise: float, count: int) -> Fall:
     sd = np.sqrt(np.diag(covariance))
     if (
         V > 3
-    ):  # a phone's mistakes are in all of its frames: what the fit is without it says more than its residuals
+    ):  # a phone's mistakes are in all of its frames: leaving it out says more than residuals
         others = [problem.parts(problem.solve(solution.x, noise, v).x)[0][2] for v in range(V)]
         sizes = np.linalg.norm(others, axis=1)
         sines = np.linalg.norm(np.cross(others, direction), axis=1) / sizes

@@ -4,8 +4,7 @@ In a fall a clock that is late by a millisecond looks like a shift of the pictur
 outline whose centre wanders: what tells them apart is the change of the speed from its beginning to its end. At the ground the
 speed changes its sign within a hundredth of a second, and a late phone sees the body too high before and too low after it. Where
 the body goes then nobody knows: from the end of the free fall on the parabola gets a free curve on top, one for all phones, which
-begins with the parabola's position, velocity and acceleration.
-"""
+begins with the parabola's position, velocity and acceleration."""
 
 from __future__ import annotations
 
@@ -19,16 +18,11 @@ from mosa.capture.fall import Fall, Knowledge, Problem
 from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 
-AFTER = 0.2
-"""[s] from the end of the free fall on that are read."""
-STEP = 0.006
-"""[s] between the knots of the curve: a body of some centimetres that strikes the ground is turned around within two or more."""
-OUTLINE = 0.016
-"""Radii by which the outline of a body that deforms is off from the common path, in the picture of one phone."""
-BEND = 0.3
-"""Radii of change in the curve's third differences from knot to knot, one standard deviation: collisions at 20 m/s are within."""
-LEAST = 4
-"""Frames of each phone after the free fall, below which there is no impact to be seen."""
+AFTER = 0.2  # [s] from the end of the free fall on that are read
+STEP = 0.006  # [s] between knots; a body of some centimetres turns around within two or more
+OUTLINE = 0.016  # radii by which a deforming body's outline leaves the common path
+BEND = 0.3  # sd of the curve's third differences from knot to knot [radii]: holds to 20 m/s
+LEAST = 4  # frames of each phone after the free fall, below which there is no impact to be seen
 
 
 class Impact(Problem):
@@ -97,8 +91,7 @@ def through_impact(
     """The fall with clocks and a path that are the impact's too; as it is where some phone does not see what followed.
 
     Scale, down and readouts stay those of the free flight alone: what is read of a collision pulls at the parabola's bend, of the
-    scale of a rigid body by more than a percent, of the readouts by two milliseconds.
-    """
+    scale of a rigid body by more than a percent, of the readouts by two milliseconds."""
     readouts = {phone.name: float(readout) for phone, readout in zip(phones, fall.readouts)}
     problem = Impact(phones, tracks, fall, replace(knowledge, readout=readouts))
     if not problem.seen:

@@ -37,24 +37,21 @@ from mosa.capture.world import (
     write_transforms,
 )  # fmt: skip
 from mosa.config.build import plain
+from mosa.config.leaf_settings import CaptureSettings
 from mosa.errors import ConfigError, DataError
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import write_whole
-from mosa.training.preflight import check_capture
 
 log = logging.getLogger(__name__)
 
 READOUT_DIRECTIONS = {0: "down", 90: "left", 180: "up", 270: "right"}
 """Rotation of a video for display [degrees] -> direction of the sensor's readout in the displayed picture."""
-MAX_PHONE_OFFSET = 0.12
-"""Disagreement with the other phones, in object radii, above which a phone is reported."""
+MAX_PHONE_OFFSET = 0.12  # disagreement [object radii] above which a phone is reported
 CORRECTIONS = 4
 """Times that the fall is fitted again, with the outlines that its hull has. Each time the poses' errors become smaller, and with
 them those of the hull: of the rabbit's film 1.3 px at first, then 0.6, 0.5, 0.4 and 0.4."""
-FAR_OFF = 1.5
-"""Factor between a scale that is given and that of the fall from which on one of them is a mistake."""
-COARSE = 320
-"""Pixels of images in which the ground is looked for."""
+FAR_OFF = 1.5  # factor between a given scale and that of the fall that is a mistake
+COARSE = 320  # pixels of images in which the ground is looked for
 
 
 def make(cfg: DictConfig) -> dict[str, Any]:
@@ -64,16 +61,19 @@ def make(cfg: DictConfig) -> dict[str, Any]:
             way = f"python -m mosa.capture {key}=<folder> ..."
             raise ConfigError(f"{key}: expected a folder, found none; {way}")
     values = plain(cfg)
-    check_capture(values)
+    CaptureSettings.read(values)
     return capture(values)
 
 
 def capture(values: Mapping[str, Any]) -> dict[str, Any]:
-    """From the keys of conf/capture.yaml, which `check_capture` has looked at. Errors: ConfigError, DataError."""
+    """From the checked keys of conf/capture.yaml. Errors: ConfigError, DataError."""
     folder = output_folder(values)
     files = find_videos(values["videos"])
+    if unknown := set(values["phones"] or {}) - (stems := {file.stem for file in files}):
+        raise ConfigError(
+            f"phones.{min(unknown)}: no video of that name; there are {', '.join(sorted(stems))}"
+        )
     clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in files]
-    check_phone_names(values, [clip.path.stem for clip in clips])
     sizes = {clip.path.name: clip.size for clip in clips}
     given, plates = read_phones(values["videos"], values["poses"], sizes), plates_folder(values)
     places = plates, values["plate_seconds"], values["masks"]
@@ -97,12 +97,14 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     world = world_of(fall, phones, ground) if like is None else like
     gains = gains_of(values, phones, clips, plates, world, tracks, fall)
     for v, phone in enumerate(tqdm(phones, desc="frames at common times", unit="phone")):
-        pictures = resampled(exposures[v], tracks[v], mattings[v], times, values["interpolation"])
+        pictures = resampled(exposures[v], tracks[v], mattings[v], times)
         if gains is not None:
             pictures[..., :3] = np.round(np.clip(pictures[..., :3] * gains[v], 0, 255))
         write_images(folder, phone, pictures)
     write_transforms(folder, phones, times, world)
-    centres = world.points(centres_of(exposures, phones, times))
+    paths = [Track(None, times, each.path(times), np.ones(len(times))) for each in exposures]
+    # where the lines of sight meet
+    centres = world.points(centres_at(phones, paths, np.zeros(len(phones)), times))
     radius = radius_of(phones, tracks, fall) * world.scale
     floor = {"from": "ground" if like is None else "like", "sd": None, "tilt_degrees": None}
     if like is None and ground is None:
@@ -148,8 +150,9 @@ def output_folder(values: Mapping[str, Any]) -> Path:
     folder = Path(values["output"])
     for key in ("videos", "poses", "plates", "masks", "like"):
         if values[key] is not None and folder.resolve() == Path(values[key]).resolve():
-            found = f"found that of {key}={values[key]}"
-            raise ConfigError(f"output: expected a folder of its own, {found}")
+            raise ConfigError(
+                f"output: expected a folder of its own, found that of {key}={values[key]}"
+            )
     try:
         (folder / "images").mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -205,7 +208,7 @@ def found_fall(
         better = corrected(phones, tracks, fall, knowledge)
         if better is None:
             log.warning(
-                "warning: the mattes have no common hull in the free fall: poses, or mattes, are off"
+                "warning: the mattes have no common hull in the free fall: check poses, mattes"
             )
             break
         window = fall.window if flight is None else flight
@@ -220,12 +223,6 @@ def found_fall(
 def of_phone(values: Mapping[str, Any], name: str, key: str):
     """A key that phones may have of their own."""
     return ((values["phones"] or {}).get(name) or {}).get(key, values[key])
-
-
-def check_phone_names(values: Mapping[str, Any], names: list[str]) -> None:
-    for name in values["phones"] or {}:
-        if name not in names:
-            raise ConfigError(f"phones.{name}: no video of that name; there are {', '.join(names)}")
 
 
 def plates_folder(values: Mapping[str, Any]) -> Path | None:
@@ -246,12 +243,11 @@ def followed(clips: list[Clip], mattings: list[Matting]) -> list[Track]:
 
 def known(values: Mapping[str, Any], clips: list[Clip], world: World | None) -> Knowledge:
     """What the keys say beforehand; an earlier capture knows scale and up."""
-    names = [clip.path.stem for clip in clips]
-    scans = {}
-    for clip, name in zip(clips, names):
-        scan = of_phone(values, name, "scan")
-        scans[name] = READOUT_DIRECTIONS.get(clip.turned, "down") if scan == "auto" else scan
-    readouts = {name: of_phone(values, name, "readout") for name in names}
+    turned = {clip.path.stem: READOUT_DIRECTIONS.get(clip.turned, "down") for clip in clips}
+    scans = {
+        name: of_phone(values, name, "scan").replace("auto", own) for name, own in turned.items()
+    }
+    readouts = {name: of_phone(values, name, "readout") for name in turned}
     up = None if values["up"] is None else np.array(values["up"], float)
     knowledge = Knowledge(values["gravity"], values["scale"], up, readouts, scans)
     return knowledge if world is None else replace(knowledge, scale=world.scale, up=world.R[1])
@@ -263,12 +259,6 @@ def gains_of(values, phones, clips, plates, world, tracks, fall) -> np.ndarray |
         return None
     pictures = [plate_of(plates, clip, values["plate_seconds"]) for clip in clips]
     return floor_gains(phones, pictures, world, radius_of(phones, tracks, fall) * world.scale)
-
-
-def centres_of(exposures, phones: list[Phone], times: np.ndarray) -> np.ndarray:
-    """(T, 3) in units of the poses, where the lines of sight meet at common times."""
-    tracks = [Track(None, times, e.path(times), np.ones(len(times))) for e in exposures]
-    return centres_at(phones, tracks, np.zeros(len(phones)), times)
 
 
 def phone_figures(
@@ -302,60 +292,60 @@ def figures(
         "scale": world.scale, "scale_sd": None if knowledge.scale is not None else fall.scale_sd,
         "up": fall.up.tolist(), "up_sd_degrees": None if knowledge.up is not None else fall.up_sd, "ground": floor,
         "radius": radius, "frames": len(times), "free_frames": int((times <= fall.window[1]).sum()),
-        "rate": float(1 / np.diff(times).mean()), "box": box, "start": float(times[0]), "interpolation": values["interpolation"],
+        "rate": float(1 / np.diff(times).mean()), "box": box, "start": float(times[0]),
         "world": world.written(), "command": command,
     }  # fmt: skip
 
 
-SIZES = 0.005, 0.75
-"""[m] of an object's radius that somebody lets fall: lengths go with the square of the clock."""
+SIZES = 0.005, 0.75  # [m] of an object's radius; lengths go with the square of the clock
 
 
 def warnings_of(
     found: dict[str, Any], values: Mapping[str, Any], knowledge: Knowledge, phones: list[Phone]
 ) -> list[str]:
     """What a reader has to know before training on it."""
-    said = []
-    g = values["gravity"]
-    if found["scale_sd"] is not None and found["scale_sd"] > 0.03 * found["scale"]:
+    said, fall, g, ground = [], found.get("fall"), values["gravity"], found["ground"]
+    if found["scale_sd"] is not None and (sd := found["scale_sd"] / found["scale"]) > 0.03:
         said.append(
-            f"the scale is known to {found['scale_sd'] / found['scale']:.1%} only, and a modulus of elasticity to twice that: let "
-            "it fall from higher up, or measure a distance and set scale=<metres per unit of the poses>"
+            f"the scale is known to {sd:.1%} only, and a modulus of elasticity to twice that: let "
+            "it fall from higher up, or measure a distance and set scale=<metres per unit of the "
+            "poses>"
         )
-    if knowledge.scale is not None and abs(found["fall"]["acceleration"] / g - 1) > 0.03:
+    if knowledge.scale is not None and abs(fall["acceleration"] / g - 1) > 0.03:
         said.append(
-            f"with the scale {knowledge.scale:.6g} the object falls with {found['fall']['acceleration']:.3g} m/s^2 in place of "
-            f"{g:.3g}: check scale, fps and gravity"
+            f"with the scale {knowledge.scale:.6g} the object falls with "
+            f"{fall['acceleration']:.3g} m/s^2 in place of {g:.3g}: check scale, fps and gravity"
         )
-    if knowledge.up is not None and found["fall"]["turned_degrees"] > 3:
-        said.append(
-            f"the object falls {found['fall']['turned_degrees']:.1f} degrees beside the given up: check up, or like"
-        )
+    if knowledge.up is not None and (beside := fall["turned_degrees"]) > 3:
+        said.append(f"the object falls {beside:.1f} degrees beside the given up: check up, or like")
     for phone, record in zip(phones, found["phones"]):
+        name, own, off = record["name"], 1e3 * record["readout"], np.hypot(*record["shift"])
         if record["jitter"] > 0.5:
             said.append(
-                f"{record['name']}: its frames are up to {record['jitter']:.2g} frames off an even rate; the file's times are used"
+                f"{name}: its frames are up to {record['jitter']:.2g} frames off an even rate; the "
+                "file's times are used"
             )
         if record["readout_sd"] > 0.006 and knowledge.readout_of(phone.name) is None:
             said.append(
-                f"{record['name']}: the fall does not tell how long its sensor takes to be read ({1e3 * record['readout']:.0f} +- "
-                f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale"
+                f"{name}: the fall does not tell how long a readout takes ({own:.0f} +- "
+                f"{1e3 * record['readout_sd']:.0f} ms, 15 +- 10 is assumed); each ms changes the "
+                "scale"
             )
-        if np.hypot(*record["shift"]) > MAX_PHONE_OFFSET * record["radius_px"]:
+        if off > MAX_PHONE_OFFSET * record["radius_px"]:
             said.append(
-                f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or "
+                f"{name}: the object appears {off:.1f} px from where the others see it: a pose or "
                 "a matte that is off?"
             )
-    if (tilt := found["ground"]["tilt_degrees"]) is not None and tilt > 1.5:
+    if (tilt := ground["tilt_degrees"]) is not None and tilt > 1.5:
         said.append(
-            f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; scene.ground "
-            "is a level plane"
+            f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an "
+            "up that is off; scene.ground is a level plane"
         )
-    ground = found["ground"]
     if ground["from"] == "lowest contact" and ground["sd"] > 0.05 * found["radius"]:
         said.append(
-            f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: name a point of the "
-            "floor with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
+            f"the ground is known to {1e3 * ground['sd']:.0f} mm only, from the body's outlines: "
+            "name a point of it with ground=[x, y, z], in the poses' world, or film with a phone "
+            "at the height of the floor"
         )
     if not SIZES[0] <= found["radius"] <= SIZES[1]:
         said.append(

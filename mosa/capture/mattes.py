@@ -15,10 +15,8 @@ from mosa.data.images.matting import SPECK, matte_from_plate
 from mosa.data.images.reading import fill_holes
 from mosa.errors import ConfigError, DataError
 
-DARK = 0.1
-"""Plate values below say nothing about the exposure."""
-SMALLEST = 30
-"""Pixels of an object below which its centre is not a number to fit a fall to."""
+DARK = 0.1  # plate values below say nothing about the exposure
+SMALLEST = 30  # pixels of an object below which its centre is not a number to fit a fall to
 
 Matting = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(number of the frame, its picture (H, W, 3) in [0, 1]) -> straight colour (H, W, 3), matte (H, W)."""
@@ -59,7 +57,7 @@ def matting_of(
         return lambda i, picture: matte_from_plate(same_exposure(picture, plate), plate)
     if masks is None:
         raise ConfigError(
-            "masks: expected the folder of mask videos (white: the object), found none; or choose mattes=plates"
+            "masks: expected the folder of mask videos, found none; or choose mattes=plates"
         )
     return from_videos(Path(masks), clip)
 
@@ -68,9 +66,8 @@ def same_exposure(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """A picture with the plate's exposure and white balance, which phones change as something comes into sight: each channel by
     the median of what it is over the plate's. That is the background's as long as it fills more than half of the picture."""
     gains = []
-    for small, behind in zip(
-        picture[::4, ::4].transpose(2, 0, 1), plate[::4, ::4].transpose(2, 0, 1)
-    ):
+    for channel in range(3):
+        small, behind = picture[::4, ::4, channel], plate[::4, ::4, channel]
         bright = behind > DARK
         gains.append(float(np.median(small[bright] / behind[bright])) if bright.any() else 1.0)
     return np.clip(picture / np.maximum(gains, 0.1), 0, 1).astype(np.float32)
@@ -78,16 +75,16 @@ def same_exposure(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
 
 def from_videos(folder: Path, clip: Clip) -> Matting:
     """Masks of another program, one video per phone of as many frames, white where the object is. Errors: DataError."""
-    named = [file for file in find_videos(folder) if file.stem == clip.path.stem]
-    if not named:
+    named = {file.stem: file for file in find_videos(folder)}
+    if clip.path.stem not in named:
         raise DataError(
-            f"{folder}: expected a mask video named {clip.path.stem}, found {[f.name for f in find_videos(folder)]}"
+            f"{folder}: expected a mask video named {clip.path.stem}, found {list(named)}"
         )
-    other = open_clip(named[0])
+    other = open_clip(named[clip.path.stem])
     if len(other.times) != len(clip.times) or other.size != clip.size:
         raise DataError(
-            f"{named[0]}: expected {len(clip.times)} frames of {clip.size[0]}x{clip.size[1]} px as {clip.path}, found "
-            f"{len(other.times)} of {other.size[0]}x{other.size[1]}"
+            f"{other.path}: expected {len(clip.times)} frames of {clip.size[0]}x{clip.size[1]} px "
+            f"as {clip.path}, found {len(other.times)} of {other.size[0]}x{other.size[1]}"
         )
     source: Iterator[tuple[int, np.ndarray]] | None = None
     at = -1

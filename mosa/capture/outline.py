@@ -2,8 +2,7 @@
 
 A phone looks at a body that falls past it first from below, then from above: its outline's centre wanders against the body by a few
 hundredths of its size, which looks like another acceleration. The visual hull of the rigid body in flight, from frames of the
-whole fall, says by how much.
-"""
+whole fall, says by how much."""
 
 from __future__ import annotations
 
@@ -16,15 +15,11 @@ from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 from mosa.system.limits import counted
 
-PITCH = 1 / 18
-"""Of the hull's grid, in radii of the object."""
+PITCH = 1 / 18  # of the hull's grid, in radii of the object
 REACH = 2.2
-VIEWS = 3
-"""Frames of each phone that carve it."""
-SAMPLES = 9
-"""Times of the fall at which the outline is looked at; a parabola in time goes through them."""
-MAX_CENTRE_OFFSET = 0.3
-"""Distance of an outline's centre from the body's, in radii, above which the hull is rejected."""
+VIEWS = 3  # frames of each phone that carve it
+SAMPLES = 9  # times of the fall at which the outline is seen; a parabola fits them
+MAX_CENTRE_OFFSET = 0.3  # outline's centre to body's [radii] above which the hull is rejected
 
 
 def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:

@@ -13,8 +13,7 @@ from mosa.errors import DataError
 
 FOCAL, BESIDE = (0.05, 1000.0), 1.0
 """Focal length over the image's longer side, and image sizes by which the principal point may lie beside the image."""
-FARTHEST = 1e9
-"""Of a camera from the origin of the poses' world, in whatever unit that has."""
+FARTHEST = 1e9  # of a camera from the origin of the poses' world, in whatever unit that has
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,9 @@ from mosa.data.io.colmap import is_model, read_model, read_points
 from mosa.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-FEWEST = 3
-"""Phones from which places and clocks can be told."""
-MOVED, TURNED = 0.01, 0.5
-"""Share of the distance between cameras, and degrees, by which poses of one phone may differ: it stands still."""
-
-
-FOCUS = 0.02
-"""Of the focal length, by which intrinsics of one phone may differ."""
+FEWEST = 3  # phones from which places and clocks can be told
+MOVED, TURNED = 0.01, 0.5  # most by which one phone's poses may differ: share of extent, degrees
+FOCUS = 0.02  # of the focal length, by which intrinsics of one phone may differ
 
 
 def read_phones(
@@ -32,8 +27,7 @@ def read_phones(
 ) -> list[Phone]:
     """One phone for each of the videos whose frame sizes [px] are given (name of the file -> width, height).
 
-    Errors: DataError naming the video without a pose, or the poses that do not belong together.
-    """
+    Errors: DataError naming the video without a pose, or the poses that do not belong together."""
     folder = Path(videos)
     cameras = read_poses(poses)
     centres = np.array([camera.centre for camera in cameras.values()])
@@ -52,9 +46,7 @@ def read_phones(
         one = plausible(still(mine, extent, video.stem))
         phones.append(Phone(video.stem, resized(one, size, video), video))
     if len(phones) < FEWEST:
-        raise DataError(
-            f"{folder}: expected at least {FEWEST} videos, one of each phone, found {len(phones)}"
-        )
+        raise DataError(f"{folder}: expected at least {FEWEST} videos, found {len(phones)}")
     return phones
 
 
@@ -65,9 +57,8 @@ def read_poses(path: str | Path) -> dict[str, Camera]:
         return read_model(model)
     if place.is_dir():
         if not (place / "transforms.json").is_file():
-            raise DataError(
-                f"{place}: expected a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json, found neither"
-            )
+            wanted = "a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json"
+            raise DataError(f"{place}: expected {wanted}, found neither")
         place = place / "transforms.json"
     return read_transforms_poses(place)
 
@@ -94,7 +85,7 @@ def read_transforms_poses(file: Path) -> dict[str, Camera]:
         width, height = (int(shot.intrinsics.get(key, 0)) for key in ("w", "h"))
         if min(width, height) < 1:
             raise DataError(
-                f"{where}: expected w and h, an image size w, h of at least 1 px, found {width}, {height}"
+                f"{where}: expected an image size w, h of at least 1 px, found {width}, {height}"
             )
         K = camera_matrix(shot, width, height)
         lens = {name: shot.intrinsics[name] for name in COEFFICIENTS if name in shot.intrinsics}
@@ -120,8 +111,9 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
         angle = math.degrees(math.acos(np.clip(0.5 * (np.trace(turn) - 1), -1, 1)))
         if away > MOVED * extent or angle > TURNED:
             raise DataError(
-                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
-                f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each"
+                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} "
+                f"(the cameras span {extent:.3g}) and {angle:.2g} degrees: expected phones that "
+                "stand still"
             )
         other = np.abs(camera.K / camera.size[0] - one.K / one.size[0]).max()
         if other > FOCUS * one.K[0, 0] / one.size[0]:

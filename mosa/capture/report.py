@@ -17,8 +17,7 @@ from mosa.capture.resampling import Exposure
 from mosa.capture.world import World
 from mosa.system.whole_files import write_whole
 
-TILE, COLUMNS, SPARE = 1.8, 8, 10
-"""Inches of a picture on the contact sheet, pictures in a row, and pixels around the object."""
+TILE, COLUMNS, SPARE = 1.8, 8, 10  # inches of a picture, pictures in a row, pixels around it
 
 
 def write_report(
@@ -33,63 +32,55 @@ def write_report(
 
 def page(found: dict[str, Any]) -> str:
     """What was found, in Markdown."""
-    fall, said = found["fall"], found["warnings"]
+    fall, said, ground = found["fall"], found["warnings"], found["ground"]
     sure = lambda value: "given" if value is None else f"{value:.2g}"  # noqa: E731
-    lines = [
-        f"# A capture by {len(found['phones'])} phones",
-        "",
-        *(
-            ["**To be looked at first:**", "", *(f"- {line}" for line in said), ""]
-            if said
-            else ["Nothing unusual was found.", ""]
-        ),
-        "Learn from it:",
-        "",
-        f"    {found['command']}",
-        "",
-        "## What the fall says",
-        "",
-        "| | found | one standard deviation |",
-        "|---|---|---|",
-        f"| metres per unit of the poses | {found['scale']:.6g} | {sure(found['scale_sd'])} |",
-        f"| up in the poses' world | {', '.join(f'{x:.4f}' for x in found['up'])} | {sure(found['up_sd_degrees'])} degrees |",
-        f"| ground [m], from {found['ground']['from']} | 0, by definition | {sure(found['ground']['sd'])} |",
-        *(
-            [f"| tilt of the floor's points [degrees] | {found['ground']['tilt_degrees']:.2f} | |"]
-            if found["ground"]["tilt_degrees"] is not None
-            else []
-        ),
-        f"| radius of the object [m] | {found['radius']:.3g} | |",
-        f"| free fall [s, clock of {found['phones'][0]['name']}] | {fall['window'][0]:.3f} to {fall['window'][1]:.3f} | |",
-        f"| acceleration in it [m/s^2] | {fall['acceleration']:.4g} | |",
-        f"| centres used, and their noise [px] | {fall['centres']} | {fall['noise_px']:.2f} |",
-        f"| frames written, of them free | {found['frames']}, {found['free_frames']} | at {found['rate']:.5g} per second |",
-        "",
-        "A modulus of elasticity is known to twice the relative error of the scale, beside all else.",
-        "",
-        "## Phones",
-        "",
-        "| phone | frames/s | whole object in | clock [ms] | readout [ms] | appears off by [px] | colour factors |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for p in found["phones"]:
-        gain = "" if p["gain"] is None else ", ".join(f"{g:.2f}" for g in p["gain"])
-        lines.append(
-            f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | "
-            f"{1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | {1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} "
-            f"({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {gain} |"
-        )
-    lines += [
-        "",
-        f"Clock: what is added to a phone's own time to have that of {found['phones'][0]['name']}. Readout: time from the sensor's "
-        "first row to its last, and where the next row lies in the picture.",
-        "",
-        "![frames and outlines of the mattes](contact.png)",
-        "",
-        "![height of the object's centre, and what is left](fall.png)",
-        "",
-    ]
-    return "\n".join(lines)
+    unusual = "\n".join(["**To be looked at first:**", "", *(f"- {line}" for line in said)])
+    tilt = ground["tilt_degrees"]
+    tilted = "" if tilt is None else f"| tilt of the floor's points [degrees] | {tilt:.2f} | |\n"
+    first, up = found["phones"][0]["name"], ", ".join(f"{x:.4f}" for x in found["up"])
+    rows = "\n".join(
+        f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | "
+        f"{1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | {1e3 * p['readout']:.1f} +- "
+        f"{1e3 * p['readout_sd']:.1f} ({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | "
+        f"{', '.join(f'{g:.2f}' for g in p['gain'] or ())} |"
+        for p in found["phones"]
+    )
+    return f"""# A capture by {len(found["phones"])} phones
+
+{unusual if said else "Nothing unusual was found."}
+
+Learn from it:
+
+    {found["command"]}
+
+## What the fall says
+
+| | found | one standard deviation |
+|---|---|---|
+| metres per unit of the poses | {found["scale"]:.6g} | {sure(found["scale_sd"])} |
+| up in the poses' world | {up} | {sure(found["up_sd_degrees"])} degrees |
+| ground [m], from {ground["from"]} | 0, by definition | {sure(ground["sd"])} |
+{tilted}| radius of the object [m] | {found["radius"]:.3g} | |
+| free fall [s, clock of {first}] | {fall["window"][0]:.3f} to {fall["window"][1]:.3f} | |
+| acceleration in it [m/s^2] | {fall["acceleration"]:.4g} | |
+| centres used, and their noise [px] | {fall["centres"]} | {fall["noise_px"]:.2f} |
+| frames written, of them free | {found["frames"]}, {found["free_frames"]} | at {found["rate"]:.5g} per second |
+
+A modulus of elasticity is known to twice the relative error of the scale, beside all else.
+
+## Phones
+
+| phone | frames/s | whole object in | clock [ms] | readout [ms] | appears off by [px] | colour factors |
+|---|---|---|---|---|---|---|
+{rows}
+
+Clock: what is added to a phone's own time to have that of {first}. Readout: time from the sensor's
+first row to its last, and where the next row lies in the picture.
+
+![frames and outlines of the mattes](contact.png)
+
+![height of the object's centre, and what is left](fall.png)
+"""
 
 
 def draw_contact_sheet(folder: Path, names: list[str], frames: int) -> None:

@@ -22,14 +22,10 @@ from mosa.data.images.reading import fill_holes
 from mosa.errors import DataError
 from mosa.system.limits import counted
 
-NEAR = 0.02
-"""Share of a frame within which a wanted time is that of a frame."""
-KNOTS = 2
-"""Of the common path in the shortest time between frames."""
-SMOOTH = 1e-3
-"""Weight of the change of its acceleration from knot to knot, where a line of sight's distance has 1."""
-AROUND = 0.6
-"""Radii of the object beside it in which flow is looked for."""
+NEAR = 0.02  # share of a frame within which a wanted time is that of a frame
+KNOTS = 2  # of the common path in the shortest time between frames
+SMOOTH = 1e-3  # weight of the change of acceleration between knots; a line of sight has 1
+AROUND = 0.6  # radii of the object beside it in which flow is looked for
 
 
 @dataclass(frozen=True)
@@ -73,7 +69,9 @@ def common_path(
         seen = track.seen
         late = fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
         own = track.times[seen] + fall.offsets[v] + late
-        off = centre_shift(phone, own, track.centres[seen], fall)
+        # seen minus where it falls: of the phone's pose, and of its side of the object
+        free = (own >= fall.window[0]) & (own <= fall.window[1])
+        off = (track.centres[seen][free] - phone.camera.project(fall.at(own[free]))).mean(0)
         rays = phone.camera.rays(track.centres[seen] - off)
         across = np.eye(3) - rays[:, :, None] * rays[:, None]
         times.append(own)
@@ -93,12 +91,6 @@ def common_path(
     bend = np.diff(np.eye(n), 3, axis=0)  # where nobody looks the acceleration goes on
     matrix += SMOOTH * np.kron(bend.T @ bend, np.eye(3))
     return BSpline(knots, np.linalg.solve(matrix, right).reshape(n, 3), 3), float(low), float(high)
-
-
-def centre_shift(phone: Phone, times: np.ndarray, centres: np.ndarray, fall: Fall) -> np.ndarray:
-    """(2,) [px] mean of where a phone sees the object minus where it falls: of its pose, and of its side of the object."""
-    free = (times >= fall.window[0]) & (times <= fall.window[1])
-    return (centres[free] - phone.camera.project(fall.at(times[free]))).mean(0)
 
 
 def exposure_of(
@@ -139,9 +131,9 @@ def common_times(
     begin, end = max(bad[bad <= low], default=-1) + 1, min(bad[bad > low], default=len(grid))
     if end - begin < 5 or low - begin < 1:
         raise DataError(
-            f"{end - begin} common frames ({low - begin} of them in free fall): expected at least five in which every phone "
-            "sees the whole object, two of them before the end of the free fall; film with more room around, longer, or "
-            "change before=, after="
+            f"{end - begin} common frames ({low - begin} of them in free fall): expected five in "
+            "which every phone sees the whole object, two of them in free fall; film with more "
+            "room around, longer, or change before=, after="
         )
     return grid[begin:end]
 
@@ -199,12 +191,9 @@ def moved(
 
 def lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
     """(n, L) weights of values at nodes (n, L) in the polynomial through them, at one place."""
-    found = np.ones_like(nodes)
-    for j in range(len(nodes)):
-        for k in range(len(nodes)):
-            if k != j:
-                found[j] *= (at - nodes[k]) / (nodes[j] - nodes[k])
-    return found
+    every = range(len(nodes))
+    factors = ([(at - nodes[k]) / (nodes[j] - nodes[k]) for k in every if k != j] for j in every)
+    return np.stack([np.prod(own, axis=0) if own else np.ones_like(nodes[0]) for own in factors])
 
 
 def blended(
@@ -229,10 +218,8 @@ def blended(
         late = np.clip((time - one) / (two - one), 0, 1).astype(np.float32)[..., None]
         shares = [1 - late, late]
 
-    def grey(p: np.ndarray) -> np.ndarray:
-        return np.round(255 * np.clip(p[..., :3].mean(-1) + 1 - p[..., 3], 0, 1)).astype(np.uint8)
-
-    greys = [grey(p) for p in parts]
+    shades = (np.clip(p[..., :3].mean(-1) + 1 - p[..., 3], 0, 1) for p in parts)
+    greys = [np.round(255 * shade).astype(np.uint8) for shade in shades]
     flow_of = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     x, y = np.meshgrid(np.arange(x1 - x0, dtype=np.float32), np.arange(y1 - y0, dtype=np.float32))
     inside = np.zeros_like(parts[0])
@@ -248,13 +235,10 @@ def blended(
     return found
 
 
-def resampled(
-    exposure: Exposure, track: Track, matting: Matting, times: np.ndarray, kind: str = "flow"
-) -> np.ndarray:
-    """(T, H, W, 4) uint8, straight alpha, of a phone at common times (T,) [s]. kind: flow | shift (the nearest frame, moved) | none
-    (the nearest frame)."""
+def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndarray) -> np.ndarray:
+    """(T, H, W, 4) uint8, straight alpha, of a phone at common times (T,) [s]."""
     pairs = [between(exposure, float(t)) for t in times]
-    used = [around(exposure, pair) if kind == "flow" else sorted(set(pair)) for pair in pairs]
+    used = [around(exposure, pair) for pair in pairs]
     first, last = min(u[0] for u in used), max(u[-1] for u in used)
     frames, needed = {}, {k for u in used for k in u}
     for i, color, matte in matted_frames(track.clip, matting, first, last):
@@ -264,18 +248,14 @@ def resampled(
     radius = float(np.median(track.radii[track.seen]))
     found = []
     for time, (k0, k1), near in zip(times, pairs, used):
-        own, time = exposure.own_times, float(time)
-        nearest = k0 if k0 == k1 or time - own[k0] <= own[k1] - time else k1
-        if kind == "none":
-            picture = frames[nearest].astype(np.float32) / 255
-        elif kind == "shift" or len(near) == 1:
-            picture, _ = moved(frames[nearest], exposure, nearest, time)
-        else:
-            pictures, when = zip(*(moved(frames[k], exposure, k, time) for k in near))
+        pictures, when = zip(*(moved(frames[k], exposure, k, float(time)) for k in near))
+        picture = pictures[0]
+        if len(near) > 1:
             anchors = [near.index(k) for k in sorted({k0, k1})]
-            centre, shown = exposure.path(np.asarray(time)), list(pictures)
-            when = np.stack(when)
-            picture = blended(shown, when, anchors, time, exposure.axis, centre, radius)
+            centre = exposure.path(np.asarray(time))
+            picture = blended(
+                list(pictures), np.stack(when), anchors, time, exposure.axis, centre, radius
+            )
         found.append(without_tunnels(straight(picture)))
     return np.stack(found)
 

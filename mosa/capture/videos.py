@@ -42,10 +42,10 @@ def find_videos(folder: str | Path) -> list[Path]:
         raise DataError(
             f"{place}: expected videos ({', '.join(VIDEOS)}), one of each phone, found none"
         )
-    stems = [file.stem for file in found]
-    if len(set(stems)) < len(stems):
+    if len({file.stem for file in found}) < len(found):
+        names = ", ".join(f.name for f in found)
         raise DataError(
-            f"{place}: expected one video of each phone, found two of one name: {', '.join(f.name for f in found)}"
+            f"{place}: expected one video of each phone, found two of one name: {names}"
         )
     return found
 
@@ -58,7 +58,7 @@ def open_clip(path: Path, fps: float | None = None) -> Clip:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise DataError(
-            f"{path}: expected a video that OpenCV can read (H.264 in .mp4 is), found {named(path)}"
+            f"{path}: expected a video that OpenCV can read (H.264), found {named(path)}"
         )
     times, nominal = [], float(video.get(cv2.CAP_PROP_FPS))
     while video.grab():
@@ -73,9 +73,7 @@ def open_clip(path: Path, fps: float | None = None) -> Clip:
         stamps = np.arange(len(stamps)) / fps
     elif not (np.diff(stamps) > 0).all():
         if not 1 < nominal < 2000:
-            raise DataError(
-                f"{path}: expected increasing times of frames, found none that can be used; set fps={{{path.stem}: 60}}"
-            )
+            raise DataError(f"{path}: expected increasing times of frames, found none; set fps=60")
         stamps = np.arange(len(stamps)) / nominal
     even = np.polyval(np.polyfit(np.arange(len(stamps)), stamps, 1), np.arange(len(stamps)))
     jitter = float(np.abs(stamps - even).max() / np.median(np.diff(stamps)))
@@ -96,9 +94,7 @@ def frames_of(
                 continue
             good, picture = video.read()
             if not good or picture.shape[1::-1] != clip.size:
-                raise DataError(
-                    f"{clip.path}: frame {i} of {len(clip.times)} cannot be decoded; export the video again"
-                )
+                raise DataError(f"{clip.path}: frame {i} of {len(clip.times)} cannot be decoded")
             yield i, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     finally:
         video.release()
@@ -123,9 +119,9 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                 return picture.astype(np.float32) / 255
     if seconds is None:
         raise DataError(
-            f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) of the empty scene in "
-            f"{folder if folder is not None else 'the folder plates='}, or plate_seconds=[0, 0.5] where the video "
-            "begins without the object, or another mattes="
+            f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) in "
+            f"{folder or 'the folder plates='}, or plate_seconds=[0, 0.5] where the video begins "
+            "without the object, or another mattes="
         )
     inside = np.flatnonzero((clip.times >= seconds[0]) & (clip.times <= seconds[1]))
     if len(inside) == 0:

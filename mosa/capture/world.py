@@ -20,16 +20,12 @@ from mosa.errors import DataError
 from mosa.system.whole_files import write_whole
 
 FILE = "capture.json"
-REACH, PITCH = 2.2, 1 / 20
-"""Radii of the object around its centre in which its lowest point is looked for, and steps of the search."""
-FOOT = 0.1
-"""Share of its widest level's area from which on a level of a hull is taken for the body's."""
+REACH, PITCH = 2.2, 1 / 20  # object radii in which the lowest point is sought, step of the search
+FOOT = 0.1  # share of its widest level's area from which on a hull's level is the body's
 AROUND, LAYER, FEWEST = 10.0, 0.06, 15
 """Radii around the landing in which points belong to the floor, half a layer's thickness in radii, and how many make one."""
-FLOOR = 3.0
-"""Radii of the object around where it lands: of the floor that phones see there one colour is expected."""
-GAIN = 3.0
-"""Largest factor between phones' colours that is still taken for exposure and white balance."""
+FLOOR = 3.0  # object radii around the landing in which the floor has one colour
+GAIN = 3.0  # largest factor between phones' colours that counts as exposure
 
 
 @dataclass(frozen=True)
@@ -52,9 +48,7 @@ class World:
 
     def lowered(self, height: float) -> World:
         """The world whose zero is at that height [m] of this one."""
-        return World(
-            self.scale, self.R, self.origin + self.R.T @ np.array([0.0, height / self.scale, 0.0])
-        )
+        return World(self.scale, self.R, self.origin + height / self.scale * self.R[1])
 
     def written(self) -> dict:
         return {"scale": self.scale, "rotation": self.R.tolist(), "origin": self.origin.tolist()}
@@ -80,16 +74,14 @@ def read_world(folder: str | Path) -> World:
     found = document.get("world") if isinstance(document, Mapping) else None
     if not isinstance(found, Mapping) or not {"scale", "rotation", "origin"} <= set(found):
         raise DataError(
-            f"{file}: expected the record of a capture with the keys world.scale, rotation and origin; name the folder that "
-            "mosa-capture wrote"
+            f"{file}: expected the record of a capture with world.scale, rotation, origin: "
+            "name the folder that mosa-capture wrote"
         )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
     scale = number(found["scale"], f"{file}, world.scale")
     R = matrix(found["rotation"], (3, 3), f"{file}, world.rotation")
     if not scale > 0:
-        raise DataError(
-            f"{file}, world.scale: expected metres per unit of the poses, above 0, found {scale:g}"
-        )
+        raise DataError(f"{file}, world.scale: expected a number above 0, found {scale:g}")
     if not (np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0):
         raise DataError(f"{file}, world.rotation: expected a rotation matrix, found {R.tolist()}")
     return World(scale, R, origin)

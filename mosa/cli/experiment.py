@@ -55,38 +55,26 @@ def main(words: list[str] | None = None) -> None:
     say_version(words)
     settle_threads()
     # or the jobs would go on without anyone who waits for them
-    signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tolerant_output():  # hours of jobs do not end with whoever read their lines
         try:
             with one_message():
                 code = run(arguments(sys.argv[1:] if words is None else words))
         except KeyboardInterrupt:
-            print(
-                "\nstopped; the same command goes on from here, and --collect writes what is complete",
-                file=sys.stderr,
+            said = (
+                "stopped; the same command goes on from here, and --collect writes what is complete"
             )
+            print(f"\n{said}", file=sys.stderr)
             code = 130
     sys.exit(code)
 
 
-def interrupt(*_) -> None:
-    raise KeyboardInterrupt
-
-
 def run(options: argparse.Namespace) -> int:
     """Exit code: 1 where jobs failed. Errors: ConfigError naming argument or file."""
-    from mosa.experiments.specification import (
-        SPECIFICATIONS,
-        estimate,
-        experiment_names,
-        jobs_of,
-        load_experiment,
-        narrowed,
-        pairs,
-        total_minutes,
-    )
+    from mosa.experiments import specification as spec
+    from mosa.experiments.specification import experiment_names, load_experiment
 
-    folder = options.specifications or SPECIFICATIONS
+    folder = options.specifications or spec.SPECIFICATIONS
     if not folder.is_dir():
         raise ConfigError(f"--specifications: expected a folder of YAML files, found {folder}")
     if options.page and not options.names:
@@ -105,16 +93,18 @@ def run(options: argparse.Namespace) -> int:
             turns.setdefault(name, turn)
     experiments = [load_experiment(folder, name, quick=options.quick) for name in turns]
     seeds = None if options.seeds is None else tuple(whole_numbers("--seeds", options.seeds))
-    experiments = [narrowed(e, pairs(options.only, experiments), seeds) for e in experiments]
+    experiments = [
+        spec.narrowed(e, spec.pairs(options.only, experiments), seeds) for e in experiments
+    ]
     more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
-    planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
+    planned = {e.name: spec.jobs_of(e, options.runs, more) for e in experiments}
     wanted: dict[Path, Job] = {}
     for name, found in planned.items():
         for job in found:
             wanted.setdefault(job.folder, replace(job, turn=turns[name]))
     jobs = list(wanted.values())
     check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
-    for line in estimate(jobs, devices, options.jobs):
+    for line in spec.estimate(jobs, devices, options.jobs):
         print(line, flush=True)
     if options.overrides:
         print(f"these minutes are of jobs without --set {' '.join(options.overrides)}", flush=True)
@@ -132,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
 
     for experiment in experiments:
         page = write_results(experiment, planned[experiment.name], results, command)
-        taken = total_minutes(planned[experiment.name])
+        taken = spec.total_minutes(planned[experiment.name])
         print(f"{experiment.name}: {page}, {taken:.1f} minutes of jobs", flush=True)
     if options.page:
         print(write_the_page(folder, options))
@@ -165,7 +155,7 @@ def whole_numbers(where: str, text: str) -> list[int]:
         raise ConfigError(f"{where}: expected whole numbers as 0,1, found {text!r}") from None
     if len(set(found)) < len(found) or min(found) < 0 or max(found) >= 2**32:
         raise ConfigError(
-            f"{where}: expected different whole numbers of at least 0 and below 2^32, found {text!r}"
+            f"{where}: expected different whole numbers from 0 to 2^32 - 1, found {text!r}"
         )
     return found
 

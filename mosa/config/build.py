@@ -37,8 +37,7 @@ from mosa.physics.world import solids_of
 from mosa.settings import call
 from mosa.types import AUTO, Ground, Scene
 
-HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
-"""heterogeneity.kind."""
+HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}  # heterogeneity.kind
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -243,11 +242,8 @@ def build_stages(
     section = FitSection.read(fit)
     stages = [section.stage(name) for name in STAGES]
     learned = {s.name: s.learns(heterogeneity, adapter) for s in stages}
-    wanted = [
-        s
-        for s in stages
-        if s.iterations > 0 and (s.calibrates or any(part is not None for part in learned[s.name]))
-    ]
+    learns = {name: any(part is not None for part in parts) for name, parts in learned.items()}
+    wanted = [s for s in stages if s.iterations > 0 and (s.calibrates or learns[s.name])]
     stages = recalibrations([s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted])
     if searching and stages and not stages[0].newton:
         raise ConfigError(

@@ -1,18 +1,19 @@
 """A run's checkpoint, read as data: its file may come from a stranger, and is checked before anything is built from it.
 
-What is promised, and what is not, is in docs/safety.md.
-"""
+What is promised, and what is not, is in docs/safety.md."""
 
 from __future__ import annotations
 
 import importlib
 import os
 import pickletools
+import re
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +46,10 @@ BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "callbacks", "tra
           "scene.cache", "scene.root", "identification.threads", "extensions")  # fmt: skip
 """Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
 `scene.path` the last part counts."""
-NODES, DEPTH = 2_000_000, 40
-"""Entries and levels of a checkpoint's containers: losses of a fit of 10,000 steps are 10,000."""
-BRIGHTEST = 10.0
-"""Of a colour, which a fit may bring beyond 1."""
-SPACING = 0.02, 5.0
-"""Distance between particles, in cells: 1/64 to 50 of them in a cell's volume, with room."""
+UNREADABLE = "not a readable checkpoint"
+NODES, DEPTH = 2_000_000, 40  # of a checkpoint's containers: entries, levels
+BRIGHTEST = 10.0  # of a colour, which a fit may bring beyond 1
+SPACING = 0.02, 5.0  # distance of particles in cells: 1/64 to 50 of them in a cell, with room
 
 
 @contextmanager
@@ -66,22 +65,17 @@ def read_checkpoint(path: str | Path) -> dict:
     """The checkpoint's dictionary: plain containers and dense tensors, nothing executed. Errors: DataError naming the file."""
     if not isinstance(path, (str, Path)):
         raise DataError(f"ckpt_path: expected the path of a checkpoint, found {path!r}")
-    try:
-        if not Path(path).is_file():
-            raise DataError(
-                f"ckpt_path: no file {path}; a run writes <run folder>/checkpoints/last.ckpt"
-            )
-        with reading(path):
-            check_archive(Path(path))
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except DataError:
-        raise
-    except Exception as error:  # whatever torch finds: the file is not what its name says
-        first = (str(error).splitlines() or [""])[0][:200]
-        raise DataError(
-            f"ckpt_path: {path} is not a readable checkpoint ({type(error).__name__}: {first})"
-        ) from error
     with reading(path):
+        try:
+            if not Path(path).is_file():
+                raise DataError("no such file; a run writes <run folder>/checkpoints/last.ckpt")
+            check_archive(Path(path))
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        except DataError:
+            raise
+        except Exception as error:  # whatever torch finds: the file is not what its name says
+            first = (str(error).splitlines() or [""])[0][:200]
+            raise DataError(f"{UNREADABLE} ({type(error).__name__}: {first})") from error
         check_containers(checkpoint)
         if not isinstance(checkpoint, dict) or "mosa" not in checkpoint:
             raise DataError("was not written by this program (no entry 'mosa')")
@@ -97,39 +91,31 @@ def read_checkpoint(path: str | Path) -> dict:
 
 def check_archive(path: Path) -> None:
     """The archive unpacks to no more than its own size, and its pickle names nothing but tensors. Errors: DataError."""
-    unreadable = "not a readable checkpoint"
     if not zipfile.is_zipfile(path):
-        raise DataError(f"{unreadable} (expected a zip archive: cut off, or another file?)")
-    if (size := path.stat().st_size) > machine_memory():
-        raise DataError(f"{size / 1e9:.1f} GB are more than this machine's memory")
+        raise DataError(f"{UNREADABLE} (expected a zip archive: cut off, or another file?)")
     with zipfile.ZipFile(path) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > size:
-            raise DataError(
-                f"unpacks to more than its {size} bytes; a run's checkpoint is not compressed"
-            )
-        names = archive.namelist()
+        names, unpacked = archive.namelist(), sum(e.file_size for e in archive.infolist())
+        if unpacked > min(path.stat().st_size, machine_memory()):
+            raise DataError("unpacks to more than its size, or than this machine's memory")
         if len(set(names)) < len(names):
-            raise DataError(f"{unreadable} (an entry of its archive is there twice)")
+            raise DataError(f"{UNREADABLE} (an entry of its archive is there twice)")
         # torch does not compare the sums: a flipped bit would be another number
         if (damaged := archive.testzip()) is not None:
             raise DataError(f"damaged: its part {damaged} is not what was written (another sum)")
-        for entry in names:
-            if not entry.endswith(".pkl"):
-                continue
+        for entry in (name for name in names if name.endswith(".pkl")):
             for code, named, _ in pickletools.genops(archive.read(entry)):
                 # STACK_GLOBAL names nothing here, and is not written
                 if "GLOBAL" in code.name and named not in NAMED:
                     raise DataError(
-                        f"refers to {named or 'a function or class'}; a run's checkpoint holds numbers, texts and tensors only, "
-                        "and nothing else is loaded"
+                        f"refers to {named or 'a function or class'}, not only to tensors and "
+                        "plain values"
                     )
 
 
 def check_plain(where: str, value: Any) -> None:
     """What is to be saved can be read again as data. Errors: ConfigError naming the part."""
     if type(value) in (dict, OrderedDict, list, tuple):
-        pairs = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, part in pairs:
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value):
             check_plain(f"{where}.{key}".strip("."), part)
     elif type(value) not in (str, int, float, bool, type(None)) and not isinstance(value, Tensor):
         raise ConfigError(
@@ -146,7 +132,7 @@ def check_containers(checkpoint: Any) -> None:
         left -= 1
         if left < 0 or depth > DEPTH:
             raise DataError(
-                f"expected at most {NODES} entries in {DEPTH} levels, found more at {where}"
+                f"{where}: expected at most {NODES} entries in {DEPTH} levels, found more"
             )
         if isinstance(value, Mapping):
             if bad := [key for key in value if not isinstance(key, (str, int))]:
@@ -157,17 +143,18 @@ def check_containers(checkpoint: Any) -> None:
         elif isinstance(value, Tensor):
             whole = dense(value) and value.device.type == "cpu"
             if not whole or value.numel() * value.element_size() > value.untyped_storage().nbytes():
+                found = tuple(value.shape)
                 raise DataError(
-                    f"{where}: expected a dense tensor of as many numbers as are stored, found one of shape "
-                    f"{tuple(value.shape)}"
+                    f"{where}: expected a dense tensor of as many numbers as are stored, found "
+                    f"{found}"
                 )
         elif not isinstance(value, (str, int, float, type(None))):
-            raise DataError(
-                f"{where}: expected numbers, texts and tensors, found {type(value).__name__}"
-            )
+            kind = type(value).__name__
+            raise DataError(f"{where}: expected numbers, texts and tensors, found {kind}")
         elif where.startswith("mosa.settings") and ("${" in str(value) or "\0" in str(value)):
+            found = value[:80]
             raise DataError(
-                f"{where}: expected a value, found {value[:80]!r}: interpolations of a stored configuration are not resolved"
+                f"{where}: expected a value, found {found!r}: interpolations are not resolved"
             )
 
 
@@ -185,8 +172,8 @@ def record_of(checkpoint: Mapping[str, Any], path: str | Path) -> RunRecord:
                 raise
             version = importlib.import_module("mosa").__version__  # beside all layers
             raise DataError(
-                f"{error}: expected the settings of this version of mosa, {version}, found those of "
-                "another one; learn it again, or use the version that wrote it"
+                f"{error}: expected the settings of this version of mosa, {version}, found those "
+                "of another one; learn it again, or use the version that wrote it"
             ) from error
     return record
 
@@ -211,9 +198,10 @@ def body_tensors(state: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_numbers(record: RunRecord, count: int, path: str | Path) -> None:
     """The posterior, where there is one, is of a body with so many learned numbers. Errors: DataError."""
-    if record.posterior is not None and len(record.posterior.names) != count:
+    found = None if record.posterior is None else len(record.posterior.names)
+    if found not in (None, count):
         raise DataError(
-            f"ckpt_path: {path}: mosa.posterior.names: expected {count} names, found {len(record.posterior.names)}"
+            f"ckpt_path: {path}: mosa.posterior.names: expected {count} names, found {found}"
         )
 
 
@@ -228,7 +216,9 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
             law, own = str(found["law"]), found["posterior"]
             values = {k: torch.tensor(own[k], dtype=torch.float64) for k in ("theta", "covariance")}
             check("posterior.names", own["names"], Names)
-            named = [_as_operator(name) for name in own["names"]]
+            # fits to films have other names for numbers of the learned stiffness
+            operator = partial(re.sub, r"^stiffness_(\d+)", lambda m: f"operator[{int(m[1]) - 1}]")
+            named = list(map(operator, own["names"]))
             ones = torch.ones(len(named), dtype=torch.float64)
             record = PosteriorRecord.read({"names": named, "mean": values["theta"], "determined": ones,
                                            "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip
@@ -255,26 +245,19 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
     return replace(posterior, covariance=inflation**2 * posterior.covariance)
 
 
-def _as_operator(name: str) -> str:
-    """A number of the learned stiffness by the name that fits to films give it."""
-    number = name.removeprefix("stiffness_")
-    return name if number == name else f"operator[{int(number) - 1}]"
-
-
 def check_tensors(tensors: Mapping[str, Any]) -> None:
     """Shapes, types and numbers of a body's tensors. Errors: DataError naming the tensor."""
     if missing := [name for name in TENSORS if not isinstance(tensors.get(name), Tensor)]:
-        raise DataError(
-            f"expected the tensors {', '.join(TENSORS)} of a body, found no {', '.join(missing)}"
-        )
+        raise DataError(f"expected the tensors {', '.join(TENSORS)}, found no {', '.join(missing)}")
     count = len(tensors["rest"]) if tensors["rest"].ndim else 0
     for name, each in TENSORS.items():
         found = tensors[name]
         known = found.dtype in (torch.float32, torch.float64)
         if tuple(found.shape) != (count, *each) or count == 0 or not known:
+            wanted = ", ".join(("N", *map(str, each)))
             raise DataError(
-                f"body.{name}: expected floating point numbers of shape ({', '.join(('N', *map(str, each)))}), N "
-                f"particles, found {found.dtype} {tuple(found.shape)}"
+                f"body.{name}: expected floating point numbers of shape ({wanted}), N particles, "
+                f"found {found.dtype} {tuple(found.shape)}"
             )
     for name, value in tensors.items():
         if not isinstance(value, Tensor):

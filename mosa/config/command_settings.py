@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Interval
+from annotated_types import Interval, Len
 from pydantic import ConfigDict, Field
 
 from mosa.evaluation.settings import EvaluationSettings
@@ -52,6 +52,11 @@ Extensions = Annotated[
     Names | None,
     Field(description="modules that register laws, adapters, loss terms, metrics, formats (docs/extending.md)"),
 ]  # fmt: skip
+
+
+Place = Annotated[
+    list[float | None], Expected("three numbers, null for one that is left as it is"), Len(3, 3)
+]
 
 
 class AdapterSection(Settings):
@@ -158,14 +163,7 @@ class SimulateSection(Settings):
     """[vx, vy, vz] m/s; any of these six starts a new simulation"""
     rotation: Four | None = None
     """[ax, ay, az, degrees] about the body's centre"""
-    position: (
-        Annotated[
-            list[float | None],
-            Expected("three numbers, null for one that is left as it is"),
-            such(lambda v: len(v) == 3),
-        ]
-        | None
-    ) = None
+    position: Place | None = None
     """[x, y, z] m of the body's centre, null for a number that is left as it is"""
     height: Number | None = None
     """m, lowest point of the body above the ground"""

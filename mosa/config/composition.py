@@ -20,10 +20,8 @@ from mosa.errors import ConfigError
 from mosa.settings import nearest, node_of
 from mosa.system.refused import causes
 
-GROUPED = "scene"
-"""The group whose option a bare name chooses."""
-CHOSEN = ("adapter", "trainer", "callbacks", "logger")
-"""Sections whose keys depend on the option that is chosen."""
+GROUPED = "scene"  # the group whose option a bare name chooses
+CHOSEN = ("adapter", "trainer", "callbacks", "logger")  # their keys depend on the option
 
 
 def current_folder() -> str:

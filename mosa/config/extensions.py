@@ -1,8 +1,7 @@
 """Laws, adapters, loss terms, metrics and data formats of other packages: modules that register them, named in `extensions`.
 
 They are code of whoever starts the program: the command line and the YAML files name them, a checkpoint never does. Who loads a
-checkpoint of a run that had some imports them before (docs/extending.md).
-"""
+checkpoint of a run that had some imports them before (docs/extending.md)."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Interval
+from annotated_types import Interval, Len
 from pydantic import Field
 
 from mosa.config.command_settings import EvalSettings, Extensions, LawSections, TrainSettings
@@ -30,6 +30,10 @@ from mosa.settings import (
 Period = Annotated[
     list[float], Expected("two numbers [from, to] in seconds"), such(lambda v: len(v) == 2 and v[0] < v[1])
 ]  # fmt: skip
+Corners = Annotated[list[Three], Expected("two corners [[x, y, z], [x, y, z]]"), Len(2, 2)]
+Direction = Annotated[
+    list[float], Expected("a direction of three numbers, not zero"), Len(3, 3), such(any)
+]
 Rate = Annotated[float, Interval(ge=1, le=1e5)]
 Readout = Annotated[float, Interval(ge=0, le=0.1)]
 Seconds = Annotated[float, Interval(gt=0, le=60)]
@@ -81,12 +85,7 @@ class SplatsSettings(LawSections):
     """m, of the object's longest side; null: the file is in metres"""
     up: Three = [0, 1, 0]
     """upwards in the file's axes, which the scene keeps; COLMAP: [0, -1, 0]"""
-    box: (
-        Annotated[
-            list[Three], Expected("two corners [[x, y, z], [x, y, z]]"), such(lambda v: len(v) == 2)
-        ]
-        | None
-    ) = None
+    box: Corners | None = None
     """[[x, y, z], [x, y, z]] in the file's units: what lies in it is the object; null: all"""
     opacity: Share = 0.1
     """Gaussians with a smaller opacity are left out"""
@@ -179,14 +178,7 @@ class CaptureSettings(Settings):
     """m/s^2"""
     scale: Annotated[float, Interval(ge=1e-6, le=1e6)] | None = None
     """metres per unit of the poses; null: from the acceleration of the fall"""
-    up: (
-        Annotated[
-            list[float],
-            Expected("a direction of three numbers, not zero"),
-            such(lambda v: len(v) == 3 and any(v)),
-        ]
-        | None
-    ) = None
+    up: Direction | None = None
     """upwards in the poses' world; null: against the acceleration of the fall"""
     ground: Three | None = None
     """a point of the floor in the poses' world; null: where the object is lowest"""
@@ -196,8 +188,6 @@ class CaptureSettings(Settings):
     """s of free fall that are written"""
     after: Seconds = 0.25
     """s after the end of the free fall that are written"""
-    interpolation: Literal["flow", "shift", "none"] = "flow"
-    """images between frames; shift: the nearest frame, moved; none: the nearest frame"""
     colours: Literal["floor", "none"] = "floor"
     """floor: the phones' colours are matched by the floor that all plates show; none: no
     matching"""
@@ -252,14 +242,7 @@ class EnvironmentsSettings(Settings):
     checkpoint: Text | None = None
     """checkpoint of a run: source of the learned and of the isotropic twin"""
     simulator: Annotated[
-        Any,
-        Expected("a name, or a list of names"),
-        such(
-            lambda v: (
-                isinstance(v, str)
-                or (isinstance(v, list) and bool(v) and all(isinstance(n, str) for n in v))
-            )
-        ),
+        str | Annotated[list[str], Len(1)], Expected("a name, or a list of names")
     ] = "learned"
     """simulator to train in: learned, isotropic or truth; a list makes a table"""
     seed: Seed = 0

@@ -1,8 +1,7 @@
 """The record of a run: what its checkpoint holds under `mosa`, beside the tensors of its body. Typed, versioned, plain data only.
 
 The settings are those that the user gave, untouched. What was measured from the data and what the run decided are fields of their
-own; nothing is read back from anywhere else.
-"""
+own; nothing is read back from anywhere else."""
 
 from __future__ import annotations
 
@@ -39,14 +38,10 @@ from mosa.settings import (
 from mosa.system.limits import machine_memory
 from mosa.types import AUTO, Ground, dense
 
-VERSION = 3
-"""Of a record; grows whenever its fields change. There is one reader, of this version."""
-STRONGEST, WIDEST = 1e4, 1e5
-"""[m/s^2] of gravity and [m] of a world's box."""
-LARGEST_MEAN = 300.0
-"""Of a posterior's numbers, most of which are logarithms."""
-BOUND_BYTES = 4000
-"""Of a splat while it is bound to its neighbours."""
+VERSION = 3  # of a record; grows whenever its fields change. There is one reader, of this version.
+STRONGEST, WIDEST = 1e4, 1e5  # [m/s^2] of gravity and [m] of a world's box
+LARGEST_MEAN = 300.0  # of a posterior's numbers, most of which are logarithms
+BOUND_BYTES = 4000  # of a splat while it is bound to its neighbours
 SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,),
           "normals": (3,)}  # fmt: skip
 

@@ -53,8 +53,7 @@ def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     """Bilinear matte at the projections of world points, (V, M) from (M, 3) and (V, H, W).
 
     Outside an image it is 0; where the matte itself runs over the image's border the view says nothing there: 1. Behind the
-    camera: 0.
-    """
+    camera: 0."""
     pixel, depth = project(points, cameras)
     size = pixel.new_tensor([cameras.width, cameras.height])
     values = sample_images(mattes[:, None], pixel, beyond="border")[:, 0]
@@ -76,9 +75,8 @@ def _smallest(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     smallest = torch.ones(len(points), dtype=points.dtype, device=points.device)
     left = torch.arange(len(points), device=points.device)
     for v in range(len(cameras)):
-        smallest[left] = torch.minimum(
-            smallest[left], matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0]
-        )
+        values = matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0]
+        smallest[left] = torch.minimum(smallest[left], values)
         left = left[smallest[left] > 0]
     return smallest
 
@@ -144,16 +142,13 @@ def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: 
     return hull.points()[hull.values > 0.5].mean(0)
 
 
-def shave_ridges(
-    volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: float = 2.0
-) -> Volume:
+def shave_ridges(volume: Volume, cameras: Cameras, *, passes=24, sigma=2.0) -> Volume:
     """The hull with its ridges rounded where no silhouette asks for them; returns 0 or 1 per voxel.
 
     A hull of few views sticks out where the cones of two silhouettes meet: by 3 to 10 % of the volume for 8 to 12 cameras,
     of which this takes a third to all (measured). Each pass moves the surface by its mean curvature (Gaussian of `sigma`
     voxels, threshold 0.5), never outwards of the hull, and then gives back the hull's voxels on every ray of a silhouette
-    that nothing covers any more: the silhouettes stay what they are.
-    """
+    that nothing covers any more: the silhouettes stay what they are."""
     hull = (volume.values > 0.5).cpu().numpy()
     index = np.argwhere(hull)
     points = volume.origin.double().cpu() + volume.pitch * torch.from_numpy(index)

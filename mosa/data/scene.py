@@ -56,8 +56,7 @@ def load_scene(
 
     root is put before a relative path; `particles` is looked for beside the images first; ground: {height [m], mode, friction} or
     None; cache: folder for made scenes.
-    Errors: ConfigError for keys (unknown, missing, out of range), DataError for files.
-    """
+    Errors: ConfigError for keys (unknown, missing, out of range), DataError for files."""
     if not isinstance(format, str) or format not in FORMATS:
         raise ConfigError(
             f"scene.format: expected one of {', '.join(sorted(FORMATS))}, found {format!r}; one of another package is known "

@@ -2,8 +2,7 @@
 
 A built-in scene brings its sequences, of which scene.also_train names some. Of other formats each sequence is a folder: scene.path,
 those in scene.also_train, and those in scene.test. An entry of these lists is a folder, or a section with `path` and keys of `OWN`
-that hold for this sequence only, such as {path: drop_2, frames: [3, 20]}.
-"""
+that hold for this sequence only, such as {path: drop_2, frames: [3, 20]}."""
 
 from __future__ import annotations
 
@@ -22,42 +21,35 @@ OWN = (
     "duration", "loads",
 )  # fmt: skip
 """What a sequence may have otherwise than the training one: not the world, of which there is one for all."""
-FILES = (".json", ".c3d", ".csv")
-"""Endings of a sequence that is a file, which are no part of its name."""
-DEPTH = 3
-"""Folders that a name is made of at most; what is then still called the same is numbered."""
-SHARED = 0.05
-"""Of a recording's pictures that may be another's to the bit."""
+FILES = (".json", ".c3d", ".csv")  # endings of a sequence that is one file
+DEPTH = 3  # folders that a name is made of at most; what is then still called the same is numbered
+SHARED = 0.05  # of a recording's pictures that may be another's to the bit
 NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 
 
 def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
     """The training sequence and the others of the same object, those of scene.also_train first where they are folders.
 
-    keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file.
-    """
+    keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file."""
     keys = dict(keys)
     also_train, test = keys.pop("also_train", None) or [], keys.pop("test", None) or []
     if keys.get("format") == "builtin":
         if test:
-            raise ConfigError(
-                "scene.test: a built-in scene brings its held-out sequences itself; expected no list"
-            )
+            raise ConfigError("scene.test: a built-in scene brings its own; expected no list")
         scene, others = load_scene(**keys), held_out_sequences(**keys)
         known = [s.sequence for s in others]
         if unknown := [name for name in also_train if name not in known]:
             found = f"has {', '.join(known)}" if known else "has none"
+            wanted = "other sequences of the scene"
             raise ConfigError(
-                f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}"
+                f"scene.also_train: expected {wanted}, found {unknown[0]!r}; it {found}"
             )
         return scene, others
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
-    others = [
-        load_scene(**keys_of(keys, where, entry), name=scene.name, sequence=name)
-        for (where, entry), name in zip(entries, names)
-    ]
+    named = zip(names, (keys_of(keys, *entry) for entry in entries))
+    others = [load_scene(**own, name=scene.name, sequence=name) for name, own in named]
     if other := next((o for o in others if o.driven != scene.driven), None):
         raise ConfigError(
             f"scene.also_train, scene.test: expected recordings in one world, found driven sets in {other.sequence} that "
@@ -107,8 +99,9 @@ def section(where: str, entry: str | Mapping[str, Any]) -> dict[str, Any]:
             f"scene.{where}: expected folders, or sections like {{path: <folder>, frames: [0, 9]}}, found {entry!r}"
         )
     if unknown := [key for key in entry if key not in OWN]:
+        wanted = ", ".join(OWN)
         raise ConfigError(
-            f"scene.{where}: {unknown[0]}: not a key of a single sequence; expected {', '.join(OWN)}"
+            f"scene.{where}: {unknown[0]}: not a key of a single sequence; expected {wanted}"
         )
     return dict(entry)
 
@@ -117,8 +110,7 @@ def keys_of(keys: Mapping[str, Any], where: str, entry: str | Mapping[str, Any])
     """Keys of `load_scene`, without name and sequence, of an entry: the training sequence's where it has none of its own.
 
     `last_free_frame` and `holdout_frames` are about the training sequence alone. Its particles are not another sequence's: a
-    relative scene.particles counts where such a folder lies beside the images.
-    """
+    relative scene.particles counts where such a folder lies beside the images."""
     own = section(where, entry)
     apart = ("name", "sequence", "last_free_frame", "holdout_frames", "particles")
     inherited = {k: v for k, v in keys.items() if k not in apart}
@@ -134,10 +126,8 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
     sections = [section(*each) for each in entries]
     root, first = keys.get("root"), keys.get("path")
     places = [("scene.path", first, keys.get("frames"))] if isinstance(first, str) else []
-    places += [
-        (f"scene.{where}", s["path"], s.get("frames", keys.get("frames")))
-        for (where, _), s in zip(entries, sections)
-    ]
+    for (where, _), own in zip(entries, sections):
+        places.append((f"scene.{where}", own["path"], own.get("frames", keys.get("frames"))))
     for k, (where, path, frames) in enumerate(places):
         for before, other, others in places[:k]:
             if place(root, path) == place(root, other) and overlap(frames, others):
@@ -150,7 +140,7 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
         name = own.get("name")
         if name is not None and (not isinstance(name, str) or not NAME.fullmatch(name)):
             raise ConfigError(
-                f"scene.{where}: name: expected letters, digits, _, - and ., found {name!r}"
+                f"scene.{where}: name: expected letters, digits, _, -, ., found {name!r}"
             )
         parts.append([name] if name is not None else pieces(place(root, own["path"])))
     depth = [1] * len(parts)
@@ -163,9 +153,8 @@ def sequence_names(keys: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) 
         for k in deeper:
             depth[k] += 1
     if named := [names[k] for k in twice if "name" in sections[k]]:
-        raise ConfigError(
-            f"scene.{entries[0][0]}: name: expected a name once, found {named[0]!r} again"
-        )
+        where = f"scene.{entries[0][0]}"
+        raise ConfigError(f"{where}: name: expected a name once, found {named[0]!r} again")
     for number, k in enumerate(sorted(twice), 1):
         names[k] = f"{names[k]}_{number}"
     return names

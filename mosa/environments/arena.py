@@ -47,11 +47,9 @@ def simulator_named(
     """
     check("simulator", name, Literal[SIMULATORS])
     if checkpoint is None and (name != "truth" or scene is None):
-        if name == "truth":
-            wanted = "a run's checkpoint, or truth.scene=<a built-in scene>"
-        else:
-            wanted = "a run's checkpoint"
-        raise ConfigError(f"checkpoint: expected {wanted} for simulator={name}, found none")
+        more = ", or truth.scene=<a built-in scene>" * (name == "truth")
+        wanted = f"a run's checkpoint{more} for simulator={name}"
+        raise ConfigError(f"checkpoint: expected {wanted}, found none")
     learned = None if checkpoint is None else Twin.load(checkpoint, device)
     if name != "truth":
         return Simulator(name, learned, "adapted" if name == "learned" else "prior")
@@ -61,26 +59,25 @@ def simulator_named(
 
 def truth_of(known: Mapping[str, Any]) -> dict[str, Any]:
     """What tells the hidden truths of built-in scenes apart, of a scene's configuration: arguments of `true_twin`."""
-    return {
-        "name": known["name"],
-        "material": known.get("material", "anisotropic"),
-        "seed": known.get("seed", 0),
-    }
+    own = {key: known[key] for key in ("name", "material", "seed") if key in known}
+    return {"material": "anisotropic", "seed": 0} | own
 
 
 def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
     """The configuration of the built-in scene that a twin was learned from. Errors: ConfigError where it was another one, DataError
     where the checkpoint does not say."""
     known = learned.record.settings.get("scene")
+    where, way = f"checkpoint: {checkpoint}: settings.scene", "name one with truth.scene="
     if not isinstance(known, Mapping) or not isinstance(known.get("format"), str):
-        raise DataError(f"checkpoint: {checkpoint}: settings.scene: expected the scene that the twin was learned from, found none; "
-                        "name a built-in one with truth.scene=")  # fmt: skip
-    if known["format"] != "builtin":
-        raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {known['format']}: the truth "
-                          "is known for built-in scenes only")  # fmt: skip
-    if not isinstance(known.get("name"), str):
-        raise DataError(f"checkpoint: {checkpoint}: settings.scene.name: expected the name of a built-in scene, found "
-                        f"{known.get('name')!r}; name one with truth.scene=")  # fmt: skip
+        raise DataError(
+            f"{where}: expected the scene that the twin was learned from, found none; {way}"
+        )
+    if (kind := known["format"]) != "builtin":
+        said = f"a run on a scene of format {kind}: the truth is known for built-in scenes only"
+        raise ConfigError(f"simulator: expected learned or isotropic for {said}")
+    if not isinstance(name := known.get("name"), str):
+        wanted = "the name of a built-in scene"
+        raise DataError(f"{where}.name: expected {wanted}, found {name!r}; {way}")
     return known
 
 
@@ -123,9 +120,8 @@ class Arena:
     ) -> Tensor:
         """Begin these trials, one a world; what is observed of them (B, O). Errors: ConfigError."""
         if len(trials) != self.count:
-            raise ConfigError(
-                f"trials: expected one for each of {self.count} worlds, found {len(trials)}"
-            )
+            found = f"{self.count} worlds, found {len(trials)}"
+            raise ConfigError(f"trials: expected one for each of {found}")
         self.trials, self.differentiable = trials, differentiable
         self.diverged = torch.zeros(self.count, dtype=torch.bool)
         self.last: list[Tensor] = []
@@ -185,13 +181,11 @@ class Arena:
         self.view = look(state, self.weights)
         if self.states is not None:
             places = torch.cat([state.rotation, state.position[..., None]], 3)
-            self.states.append(
-                tuple(value.detach().cpu() for value in (state.positions, state.F_tot, places))
-            )
+            parts = (state.positions, state.F_tot, places)
+            self.states.append(tuple(value.detach().cpu() for value in parts))
 
 
-LOST = 5.0
-"""Loss of a trial whose simulation diverged: log(1 + 12^2)."""
+LOST = 5.0  # loss of a trial whose simulation diverged: log(1 + 12^2)
 
 
 def world_of(error: SimulationDiverged) -> int | None:
@@ -200,26 +194,20 @@ def world_of(error: SimulationDiverged) -> int | None:
     return int(found.group(1)) if found else None
 
 
-def play(
-    arena: Arena,
-    trials: Trials,
-    policy: Callable[[Tensor], Tensor],
-    *,
-    differentiable: bool = False,
-    record: bool = False,
-) -> Played:
-    """One episode in each world. policy: observations (B, O) to actions (B, A) in [-1, 1]."""
-    with torch.set_grad_enabled(differentiable):
-        arena.act(policy(arena.reset(trials, differentiable=differentiable, record=record)))
+Acting = Callable[[Tensor], Tensor]  # a policy: observations (B, O) to actions (B, A) in [-1, 1]
+
+
+def play(arena: Arena, trials: Trials, policy: Acting, **how: bool) -> Played:
+    """One episode in each world. how: differentiable, record, as `Arena.reset` takes them."""
+    with torch.set_grad_enabled(how.get("differentiable", False)):
+        arena.act(policy(arena.reset(trials, **how)))
         states = None
-        if record:
+        if arena.states is not None:
             states = tuple(torch.stack(parts) for parts in zip(*arena.states))
         return Played(arena.loss(), arena.success(), arena.diverged, states)
 
 
-def play_all(
-    arena: Arena, trials: Trials, policy: Callable[[Tensor], Tensor]
-) -> tuple[Tensor, Tensor]:
+def play_all(arena: Arena, trials: Trials, policy: Acting) -> tuple[Tensor, Tensor]:
     """(loss (n,), success (n,)) of any number of trials, as many at a time as the arena has worlds."""
     losses, successes = [], []
     for first in range(0, len(trials), arena.count):

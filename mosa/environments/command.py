@@ -25,8 +25,7 @@ from mosa.system.limits import named_device
 
 log = logging.getLogger(__name__)
 
-AT_A_TIME = 8
-"""Worlds on a CPU: more would only wait for its cores."""
+AT_A_TIME = 8  # worlds on a CPU: more would only wait for its cores
 
 
 def setting_of(values: dict) -> EnvironmentsSettings:
@@ -44,15 +43,13 @@ def setting_of(values: dict) -> EnvironmentsSettings:
 
 def train_and_test(cfg: DictConfig) -> None:
     """Errors: ConfigError naming the key."""
-    setting, known = setting_of(plain(cfg)), SIMULATORS
+    setting = setting_of(plain(cfg))
     many = isinstance(setting.simulator, list)
     names = setting.simulator if many else [setting.simulator]
     if setting.jobs_only and not many:
-        raise ConfigError(
-            f"jobs_only: expected a list of simulators with it, found simulator={setting.simulator!r}"
-        )
-    if setting.jobs_only:
-        known = (*SIMULATORS, UNTRAINED)
+        found = f"simulator={setting.simulator!r}"
+        raise ConfigError(f"jobs_only: expected a list of simulators with it, found {found}")
+    known = (*SIMULATORS, *[UNTRAINED] * setting.jobs_only)
     for name in names:
         check("simulator", name, Literal[known])
     if setting.device == "cpu":

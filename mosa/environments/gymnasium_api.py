@@ -4,8 +4,7 @@
     env = TwinVectorEnv("hanging", worlds=32, simulator="learned", checkpoint="outputs/train/.../checkpoints/last.ckpt")
     observations, _ = env.reset(seed=0)
 
-or, after importing this module, gymnasium.make("mosa/Hanging-v0", checkpoint=...).
-"""
+or, after importing this module, gymnasium.make("mosa/Hanging-v0", checkpoint=...)."""
 
 from __future__ import annotations
 
@@ -36,41 +35,22 @@ except ImportError as error:
     ) from error
 
 
-def arena_of(
-    task: str | Task,
-    worlds: int,
-    simulator: str,
-    checkpoint,
-    scene,
-    device: str,
-    spacing,
-    options: dict | None,
-) -> Arena:
-    """Errors: ConfigError, DataError."""
-    made = simulator_named(simulator, checkpoint, scene=scene, device=device, spacing=spacing)
-    if not isinstance(task, Task):
-        task = task_named(task, made.twin.body.rest, **(options or {}))
-    return Arena(made, task, worlds)
-
-
-def action_space(task: Task) -> spaces.Box:
-    """Numbers in [-1, 1]; what they say is in `task.actions`."""
-    return spaces.Box(-1.0, 1.0, (len(task.actions),), np.float32)
-
-
-def observation_space(task: Task) -> spaces.Box:
-    """The ranges that a start is drawn from, a little wider than rounding."""
-    low, high = (
-        np.array([getattr(q, side) for q in task.observations], np.float32)
-        for side in ("low", "high")
-    )
-    return spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
-
-
 class _Worlds:
     """What the environments share: an arena whose trials are drawn from a seed."""
 
     arena: Arena
+
+    def _spaces(
+        self, worlds: int, task: str | Task, simulator: str, options: dict | None, **of: Any
+    ) -> tuple[spaces.Box, spaces.Box]:
+        """(observations: ranges of a start, wider by rounding; actions). Errors: ConfigError, DataError."""
+        made = simulator_named(simulator, **of)
+        if not isinstance(task, Task):
+            task = task_named(task, made.twin.body.rest, **(options or {}))
+        self.arena, self.task = Arena(made, task, worlds), task
+        low, high = np.array([(q.low, q.high) for q in task.observations], np.float32).T
+        seen = spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
+        return seen, spaces.Box(-1.0, 1.0, (len(task.actions),), np.float32)
 
     def _draw(self, random: np.random.Generator, record: bool) -> np.ndarray:
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
@@ -96,8 +76,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
     Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad], aims [m], speed [m/s]); observations:
     `self.task.observations`, in their units. A hand decides once: an episode has one step, which plays the motion to its end and
     terminates. Reward: minus log(1 + squared misses in tolerances), 0 is the most. `info["success"]`: what the table counts.
-    Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode.
-    """
+    Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode."""
 
     metadata: ClassVar[dict] = {"render_modes": ["rgb_array", "rgb_array_list"], "render_fps": 25}
 
@@ -107,10 +86,10 @@ class TwinEnv(gymnasium.Env, _Worlds):
         scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: Section | None = None,
         render_mode: Literal["rgb_array", "rgb_array_list"] | None = None, size: Pixels = 240,
     ) -> None:  # fmt: skip
-        self.arena = arena_of(task, 1, simulator, checkpoint, scene, device, spacing, options)
-        self.task, self.render_mode, self.size = self.arena.task, render_mode, size
-        self.action_space = action_space(self.task)
-        self.observation_space = observation_space(self.task)
+        of = {"checkpoint": checkpoint, "scene": scene, "device": device, "spacing": spacing}
+        found = self._spaces(1, task, simulator, options, **of)
+        self.observation_space, self.action_space = found
+        self.render_mode, self.size = render_mode, size
 
     @typed
     def reset(
@@ -137,12 +116,13 @@ def held(arena: Arena) -> tuple[Tensor, Tensor, None]:
     """(x (B, N, 3), F_tot (B, N, 3, 3), None) of bodies in the hand, before it has decided: as if it aimed at the middle."""
     nothing = torch.zeros(arena.count, len(arena.task.actions))
     starts = arena.task.starts(arena.trials, nothing, arena.rest, arena.gravity)
-    turns = torch.stack([start["rotation"] for start in starts]).to(arena.rest)
+    parts = (
+        [torch.as_tensor(start[key]) for start in starts]
+        for key in ("rotation", "position", "height")
+    )
+    turns, place, height = (torch.stack(part).to(arena.rest) for part in parts)
     x = arena.rest @ turns.mT
-    place = torch.stack([torch.as_tensor(start["position"]) for start in starts]).to(arena.rest)
-    place[:, 1] = torch.stack([torch.as_tensor(start["height"]) for start in starts]).to(
-        arena.rest
-    ) - x[..., 1].amin(1)
+    place[:, 1] = height - x[..., 1].amin(1)
     return x + place[:, None], turns[:, None].expand(*x.shape, 3), None
 
 
@@ -159,10 +139,10 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         checkpoint: str | Path | None = None, scene: str | None = None, device: str = "cpu", spacing: float | None = None,
         options: Section | None = None,
     ) -> None:  # fmt: skip
-        self.arena = arena_of(task, worlds, simulator, checkpoint, scene, device, spacing, options)
-        self.task, self.num_envs, self.render_mode = self.arena.task, worlds, None
-        self.single_action_space = action_space(self.task)
-        self.single_observation_space = observation_space(self.task)
+        of = {"checkpoint": checkpoint, "scene": scene, "device": device, "spacing": spacing}
+        found = self._spaces(worlds, task, simulator, options, **of)
+        self.single_observation_space, self.single_action_space = found
+        self.num_envs, self.render_mode = worlds, None
         self.action_space = batch_space(self.single_action_space, worlds)
         self.observation_space = batch_space(self.single_observation_space, worlds)
 
@@ -181,15 +161,10 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         ended, never = np.ones(self.num_envs, bool), np.zeros(self.num_envs, bool)
         last = np.empty(self.num_envs, dtype=object)
         last[:] = list(_array(self.arena.begun.observed))
-        info: dict[str, Any] = {
-            "final_obs": last,
-            "_final_obs": ended.copy(),
-            "final_info": {
-                "success": self.arena.success().numpy(),
-                "diverged": self.arena.diverged.numpy().copy(),
-            },
-            "_final_info": ended.copy(),
-        }
+        found = {"success": self.arena.success(), "diverged": self.arena.diverged.clone()}
+        own = {key: value.numpy() for key, value in found.items()}
+        info: dict[str, Any] = {"final_obs": last, "_final_obs": ended.copy(), "final_info": own}
+        info["_final_info"] = ended.copy()
         return self._draw(self.np_random, False), rewards, ended, never, info
 
 

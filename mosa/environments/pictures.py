@@ -20,15 +20,12 @@ from mosa.twin.rollout_file import pose
 from mosa.twin.shown_solids import OPACITY, WIDTH, lattice, shaded, surface
 from mosa.types import Cameras
 
-PITCH = 0.011
-"""[m] between the Gaussians of a solid."""
-GROUND, TILE = 0.6, 0.03
-"""Half width of the ground that is drawn [m], and its pitch."""
+PITCH = 0.011  # [m] between the Gaussians of a solid
+GROUND, TILE = 0.6, 0.03  # half width of the ground that is drawn [m], and its pitch
 COLORS = {"box": (0.96, 0.96, 0.95), "jaw left": (0.25, 0.45, 0.75), "jaw right": (0.25, 0.45, 0.75),
           "column": (0.45, 0.47, 0.52)}  # fmt: skip
 SKY = (0.80, 0.86, 0.92)
-MARK, THIN = (0.85, 0.20, 0.20), 0.004
-"""Colour of the target, and the pitch of its Gaussians [m]."""
+MARK, THIN = (0.85, 0.20, 0.20), 0.004  # colour of the target, and the pitch of its Gaussians [m]
 
 
 def solid_surface(collider: Collider, place: Tensor | None) -> Tensor:
@@ -42,9 +39,7 @@ def mark(target: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     """As `scenery`, of a disc of radius `near` [m] at target (3,) on what lies there."""
     flat = lattice(2 * near, 2 * near, THIN)
     flat = flat[flat.norm(dim=1) <= near]
-    points = target.float() + torch.stack(
-        [flat[:, 0], torch.full((len(flat),), THIN), flat[:, 1]], 1
-    )
+    points = target.float() + torch.stack([flat[:, 0], 0 * flat[:, 0] + THIN, flat[:, 1]], 1)
     return points, torch.full((len(points),), 0.5 * THIN), torch.tensor(MARK).expand(len(points), 3)
 
 
@@ -55,9 +50,8 @@ def scenery(
     those that they begin at."""
     flat = lattice(2 * GROUND, 2 * GROUND, TILE)
     ground = torch.stack([flat[:, 0], torch.full((len(flat),), -0.5 * TILE), flat[:, 1]], 1)
-    tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor(
-        [0.08, 0.08, 0.08]
-    ) + torch.tensor([0.66, 0.65, 0.62])
+    odd = ((flat / 0.12).floor().sum(1) % 2)[:, None]
+    tiles = odd * torch.tensor([0.08, 0.08, 0.08]) + torch.tensor([0.66, 0.65, 0.62])
     parts = [(ground, torch.full((len(ground),), 0.5 * TILE), tiles)]
     for k, solid in enumerate(colliders_from_config(solids, "solids")):
         points = solid_surface(solid, None if places is None else places[k])
@@ -107,16 +101,13 @@ def film(
     """`frames` pictures, from the first to the last moment, of one recorded world (`Played.states`)."""
     x, F_tot, places = states
     chosen = np.linspace(0, len(x) - 1, min(frames, len(x))).round().astype(int)
-    return [
-        picture(arena, x[t, world], F_tot[t, world], places[t, world], size, world) for t in chosen
-    ]
+    moments = ((x[t, world], F_tot[t, world], places[t, world]) for t in chosen)
+    return [picture(arena, *moment, size, world) for moment in moments]
 
 
-def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
-    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other. The paths written."""
+def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> None:
+    """`<name>.png`, a row of pictures for each film; `<name>.mp4`, the films beside each other."""
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
-    return [
-        write_strip(folder / f"{name}.png", rows, frames=6),
-        write_video(folder / f"{name}.mp4", side_by_side(rows), fps=12),
-    ]
+    write_strip(folder / f"{name}.png", rows, frames=6)
+    write_video(folder / f"{name}.mp4", side_by_side(rows), fps=12)

@@ -11,8 +11,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
-from mosa.config.leaf_settings import SearchSection
+from mosa.config.leaf_settings import SearchSection as Search
 from mosa.environments.arena import Arena, play, play_all
 from mosa.environments.task import Task, View
 from mosa.errors import DataError
@@ -24,9 +26,7 @@ class LinearPolicy(nn.Module):
 
     def __init__(self, task: Task) -> None:
         super().__init__()
-        low, high = (
-            torch.tensor([getattr(q, side) for q in task.observations]) for side in ("low", "high")
-        )
+        low, high = torch.tensor([(q.low, q.high) for q in task.observations]).T
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("spread", 0.5 * (high - low))
         self.weight = nn.Parameter(torch.zeros(len(task.actions), len(task.observations)))
@@ -58,9 +58,6 @@ class LinearPolicy(nn.Module):
         return policy
 
 
-Search = SearchSection
-
-
 @dataclass(frozen=True)
 class Found:
     """policy: (B, O) to (B, A); history: one entry for each look at it; seconds: of the search; trials: played."""
@@ -85,9 +82,8 @@ class PolicyChecks:
         say: Callable[[str], None],
     ) -> None:
         self.policy, self.check, self.search, self.say = policy, check, search, say
-        self.trials = check.task.draw(
-            search.validation, torch.Generator().manual_seed(10**6 + seed)
-        )
+        own = torch.Generator().manual_seed(10**6 + seed)
+        self.trials = check.task.draw(search.validation, own)
         self.history: list[dict[str, float]] = []
         self.best = math.inf, self.numbers()
         self.began, self.played = time.perf_counter(), 0
@@ -98,17 +94,11 @@ class PolicyChecks:
         if over or iteration % self.search.every == 0:
             loss, success = play_all(self.check, self.trials, self.policy)
             self.played += len(self.trials)
-            entry = {
-                "iteration": iteration,
-                "loss": float(loss.mean()),
-                "success": float(success.float().mean()),
-            }
-            self.history.append(entry)
-            self.say(
-                f"iteration {iteration}: loss {entry['loss']:.3f}, success {entry['success']:.2f}"
-            )
-            if entry["loss"] < self.best[0]:
-                self.best = entry["loss"], self.numbers()
+            mean, share = float(loss.mean()), float(success.float().mean())
+            self.history.append({"iteration": iteration, "loss": mean, "success": share})
+            self.say(f"iteration {iteration}: loss {mean:.3f}, success {share:.2f}")
+            if mean < self.best[0]:
+                self.best = mean, self.numbers()
         return over
 
     def numbers(self) -> dict[str, Tensor]:
@@ -134,9 +124,7 @@ def by_gradient(
     policy = LinearPolicy(task)
     checks = PolicyChecks(policy, check, search, seed, say)
     optimiser = torch.optim.Adam(policy.parameters(), lr=search.rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimiser, search.iterations, 0.1 * search.rate
-    )
+    schedule = CosineAnnealingLR(optimiser, search.iterations, 0.1 * search.rate)
 
     def bounded(observation: Tensor) -> Tensor:
         action = policy(observation)
@@ -169,18 +157,15 @@ class OutcomeModel(nn.Module):
         self.register_buffer("middle", outcomes.median(0).values)
         self.register_buffer("spread", (outcomes - self.middle).abs().mean(0).clamp_min(1e-6))
         sizes = (inputs.shape[1], HIDDEN, HIDDEN, outcomes.shape[1])
-        begun = [
-            torch.randn(MEMBERS, a, b, generator=generator) / math.sqrt(a)
-            for a, b in pairwise(sizes)
-        ]
-        self.weights = nn.ParameterList(begun)
+        drawn = (torch.randn(MEMBERS, a, b, generator=generator) for a, b in pairwise(sizes))
+        self.weights = nn.ParameterList([each / math.sqrt(each.shape[1]) for each in drawn])
         self.biases = nn.ParameterList([torch.zeros(MEMBERS, 1, b) for b in sizes[1:]])
 
     def scaled(self, inputs: Tensor) -> Tensor:
         x = inputs.expand(MEMBERS, *inputs.shape)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases)):
             x = torch.baddbmm(bias, x, weight)
-            x = torch.nn.functional.silu(x) if k + 1 < len(self.weights) else x
+            x = functional.silu(x) if k + 1 < len(self.weights) else x
         return x
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -189,26 +174,20 @@ class OutcomeModel(nn.Module):
 
 
 MEMBERS, HIDDEN = 5, 64
-FITTED, DESCENDED, IMAGINED = 400, 300, 512
-"""Steps of Adam on the model, steps on the policy, and situations drawn for those."""
-OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))
-"""Of a `View`: the numbers that a loss is made of."""
+FITTED, DESCENDED, IMAGINED = 400, 300, 512  # steps on model, on policy; situations
+OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))  # of a `View`
 
 
 def _outcome(view: View) -> Tensor:
     """(B, 10)."""
-    return (
-        torch.cat([getattr(view, name).reshape(-1, size) for name, size in OUTCOME], 1)
-        .detach()
-        .cpu()
-        .float()
-    )
+    parts = [getattr(view, name).reshape(-1, size) for name, size in OUTCOME]
+    return torch.cat(parts, 1).detach().cpu().float()
 
 
 def _seen_as(outcome: Tensor) -> View:
     """The view of numbers (B, 10)."""
     center, velocity, upright, lowest = outcome.split([size for _, size in OUTCOME], 1)
-    return View(center, velocity, torch.nn.functional.normalize(upright, dim=1), lowest[:, 0])
+    return View(center, velocity, functional.normalize(upright, dim=1), lowest[:, 0])
 
 
 @torch.enable_grad()
@@ -216,15 +195,14 @@ def _fitted_model(inputs: Tensor, outcomes: Tensor, generator: torch.Generator) 
     model = OutcomeModel(inputs, outcomes, generator)
     wanted = (outcomes - model.middle) / model.spread
     optimiser = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FITTED)
+    schedule = CosineAnnealingLR(optimiser, FITTED)
     # every member leaves out other trials, so that they differ where few were played
     counted = (torch.rand(MEMBERS, len(inputs), 1, generator=generator) < 0.8).float()
     for _ in range(FITTED):
         optimiser.zero_grad()
         # a body that was missed is thrown about: it shall not outweigh those that were not
-        away = torch.nn.functional.smooth_l1_loss(
-            model.scaled(inputs), wanted.expand(MEMBERS, -1, -1), beta=0.3, reduction="none"
-        )
+        both = model.scaled(inputs), wanted.expand(MEMBERS, -1, -1)
+        away = functional.smooth_l1_loss(*both, beta=0.3, reduction="none")
         (away * counted).mean().backward()
         optimiser.step()
         schedule.step()
@@ -250,8 +228,7 @@ def by_model(
         if checks.last(iteration):
             break
         trials = task.draw(train.count, generator)
-        seen = policy.scaled(trials.observed)
-        about = policy(trials.observed)
+        seen, about = policy.scaled(trials.observed), policy(trials.observed)
         wide = search.spread / (1 + iteration)
         action = (about + wide * torch.randn(about.shape, generator=generator)).clamp(-1, 1)
         outcome = play(train, trials, lambda _, action=action: action)
@@ -272,7 +249,7 @@ def _descend(
     trials = task.draw(IMAGINED, generator)
     observed, many = trials.observed, trials.select(torch.arange(IMAGINED).repeat(MEMBERS))
     optimiser = torch.optim.Adam(policy.parameters(), lr=0.02)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, DESCENDED)
+    schedule = CosineAnnealingLR(optimiser, DESCENDED)
     for _ in range(DESCENDED):
         ends = model(torch.cat([policy.scaled(observed), policy(observed)], 1))
         found = task.loss(many, _seen_as(ends.flatten(0, 1))).view(MEMBERS, IMAGINED)
@@ -284,11 +261,9 @@ def _descend(
 
 def _clipped(gradient: Tensor, most: float) -> Tensor:
     """Rows (B, A) of at most that norm; 0 where one is not finite."""
-    gradient = torch.where(
-        torch.isfinite(gradient).all(1, keepdim=True), gradient, torch.zeros_like(gradient)
-    )
+    finite = torch.isfinite(gradient).all(1, keepdim=True)
+    gradient = torch.where(finite, gradient, torch.zeros_like(gradient))
     return gradient * (most / gradient.norm(dim=1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
 
 
-SEARCHES = {"gradient": by_gradient, "model": by_model}
-"""By the name in `policy`."""
+SEARCHES = {"gradient": by_gradient, "model": by_model}  # by the name in `policy`

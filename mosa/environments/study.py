@@ -9,6 +9,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,7 @@ import torch
 from torch import Tensor
 
 from mosa.config.leaf_settings import EnvironmentsSettings
-from mosa.environments.arena import (
-    Arena,
-    Simulator,
-    play,
-    play_all,
-    scene_of,
-    simulator_named,
-    truth_of,
-)
+from mosa.environments.arena import Arena, play, play_all, scene_of, simulator_named, truth_of
 from mosa.environments.pictures import film, write_films
 from mosa.environments.policies import SEARCHES, Found, LinearPolicy
 from mosa.environments.task import Task
@@ -36,43 +29,37 @@ from mosa.system.whole_files import write_whole
 
 log = logging.getLogger(__name__)
 
-UNTRAINED = "none"
-"""The policy that a search begins from, which knows no simulator."""
-TEST_SEED = 20_000_000
-"""Of the tested trials: the same for all policies, and none that a search has drawn."""
+UNTRAINED = "none"  # the policy that a search begins from, which knows no simulator
+TEST_SEED = 20_000_000  # of the tested trials, the same for all policies
 
 
 class Bench:
     """The simulators and arenas of a study, each made once."""
 
     def __init__(self, setting: EnvironmentsSettings) -> None:
-        self.setting = setting
-        self._simulators: dict[str, Simulator] = {}
-        self._arenas: dict[tuple[str, int], Arena] = {}
+        s = self.setting = setting
+        self.simulator = cache(
+            lambda name: simulator_named(name, s.checkpoint, device=s.device, **s.truth.plain())
+        )
+        self.arena = cache(
+            lambda name, worlds: Arena(self.simulator(name), self.task(name), worlds)
+        )
         self._task: Task | None = None
 
-    def simulator(self, name: str) -> Simulator:
-        s = self.setting
-        if name not in self._simulators:
-            self._simulators[name] = simulator_named(
-                name, s.checkpoint, device=s.device, **s.truth.plain()
-            )
-        return self._simulators[name]
+    @property
+    def knows_truth(self) -> bool:
+        """Whether the twin was learned from a built-in scene, or one is named."""
+        try:
+            return self.simulator("truth") is not None
+        except ConfigError:
+            return False
 
     def task(self, name: str) -> Task:
         """One for all simulators, from the truth's size where it is known: `name` is the simulator to ask where it is not."""
         if self._task is None:
-            try:
-                rest = self.simulator("truth").twin.body.rest
-            except ConfigError:
-                rest = self.simulator(name).twin.body.rest
+            rest = self.simulator("truth" if self.knows_truth else name).twin.body.rest
             self._task = task_named(self.setting.task, rest, **self.setting.options)
         return self._task
-
-    def arena(self, name: str, worlds: int) -> Arena:
-        if (name, worlds) not in self._arenas:
-            self._arenas[name, worlds] = Arena(self.simulator(name), self.task(name), worlds)
-        return self._arenas[name, worlds]
 
 
 def train(bench: Bench, simulator: str, seed: int) -> Found:
@@ -120,9 +107,10 @@ def log_successes(
     log.info("%s, trained in %s, seed %d: %d of %d in %s", s.task, simulator, seed, won, s.trials, where)  # fmt: skip
 
 
-def make_jobs(
-    bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path
-) -> dict[tuple[str, int], dict[str, Any]]:
+Records = Mapping[tuple[str, int], Mapping[str, Any]]
+
+
+def make_jobs(bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path) -> Records:
     """The records of (simulator or `UNTRAINED`, seed); what lies in `folder`/jobs from the same setting is not made again. Several
     processes may make jobs of one folder."""
     records = {}
@@ -144,14 +132,11 @@ def table(
     """Every simulator and seed, and the untrained policy. Writes <task>.md, .csv and films of that many trials into `folder`; the
     page's path."""
     simulators = [name for name in simulators if name != UNTRAINED]
-    records = make_jobs(
-        bench, [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)], folder
-    )
-    page = write_table(bench.setting, records, bench.task("truth"), folder, about_twin(bench))
+    jobs = [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)]
+    records, task = make_jobs(bench, jobs, folder), bench.task("truth")
+    page = write_table(bench.setting, records, task, folder, about_twin(bench))
     policies = {
-        f"trained in {name}": LinearPolicy.read(
-            bench.task("truth"), records[name, seeds[0]]["policy"]
-        )
+        f"trained in {name}": LinearPolicy.read(task, records[name, seeds[0]]["policy"])
         for name in simulators
     }
     films(bench, policies, "truth", folder, filmed)
@@ -164,21 +149,13 @@ def _record(bench: Bench, simulator: str, seed: int) -> dict[str, Any]:
         found = Found(LinearPolicy(bench.task("truth")).requires_grad_(False), [], 0.0, 0)
     else:
         found = train(bench, simulator, seed)
-    known = s.truth.scene is not None or _of_builtin(bench)
+    known = s.truth.scene is not None or bench.knows_truth
     own = None if simulator in (UNTRAINED, "truth") else test(bench, simulator, found.policy)
     truth = test(bench, "truth", found.policy) if known else None
     return {
         "setting": _identity(bench, simulator), "simulator": simulator, "seed": seed, "policy": found.policy.written(),
         "history": found.history[-200:], "seconds": round(found.seconds, 1), "played": found.trials, "own": own, "truth": truth,
     }  # fmt: skip
-
-
-def _of_builtin(bench: Bench) -> bool:
-    try:
-        bench.simulator("truth")
-    except ConfigError:
-        return False
-    return True
 
 
 def _plain(setting: EnvironmentsSettings) -> dict[str, Any]:
@@ -212,16 +189,13 @@ def _read(file: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
         kept = dict(record["setting"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"{file}: expected the result of a job, found a damaged one ({error}); remove it and try again"
+            f"{file}: expected the result of a job, found a damaged one ({error}): remove it"
         ) from error
     if kept != wanted:
-        other = ", ".join(
-            f"{k}={kept.get(k)!r} instead of {wanted[k]!r}"
-            for k in wanted
-            if kept.get(k) != wanted[k]
-        )
+        differs = [k for k in wanted if kept.get(k) != wanted[k]]
+        other = ", ".join(f"{k}={kept.get(k)!r} instead of {wanted[k]!r}" for k in differs)
         raise DataError(
-            f"{file}: expected a job of the same setting, found {other}; choose another folder with out="
+            f"{file}: expected a job of the same setting, found {other}; choose another out="
         )
     return record
 
@@ -232,28 +206,23 @@ def films(
     simulator: str,
     folder: Path,
     filmed: int,
-) -> list[Path]:
+) -> None:
     """The first tested trials under each policy, in that simulator: one strip and one video a trial."""
     task = bench.task(simulator)
     count = min(filmed, bench.setting.trials)
     if count == 0:
-        return []
+        return
     arena = bench.arena(simulator, count)
     # the same numbers as in the test: trials are drawn column by column
-    drawn = task.draw(bench.setting.trials, torch.Generator().manual_seed(TEST_SEED)).select(
-        slice(count)
-    )
+    drawn = task.draw(bench.setting.trials, torch.Generator().manual_seed(TEST_SEED))
+    drawn = drawn.select(slice(count))
     played = {title: play(arena, drawn, policy, record=True) for title, policy in policies.items()}
-    written = []
     for b in range(count):
-        rows = {
-            f"{title}: {'success' if bool(p.success[b]) else 'failure'} ({simulator})": film(
-                arena, p.states, b, 25
-            )
-            for title, p in played.items()
-        }
-        written += write_films(folder, rows, f"{task.name}_trial_{b}")
-    return written
+        rows = {}
+        for title, p in played.items():
+            ends = "success" if bool(p.success[b]) else "failure"
+            rows[f"{title}: {ends} ({simulator})"] = film(arena, p.states, b, 25)
+        write_films(folder, rows, f"{task.name}_trial_{b}")
 
 
 def about_twin(bench: Bench) -> str:
@@ -266,11 +235,7 @@ def about_twin(bench: Bench) -> str:
 
 
 def write_table(
-    setting: EnvironmentsSettings,
-    records: Mapping[tuple[str, int], Mapping[str, Any]],
-    task: Task,
-    folder: Path,
-    about: str = "",
+    setting: EnvironmentsSettings, records: Records, task: Task, folder: Path, about: str = ""
 ) -> Path:
     """<task>.md and <task>.csv. Every row is one simulator to train in. about: a sentence on the twin."""
     lines, rows = [], []
@@ -308,14 +273,12 @@ def write_table(
     return page
 
 
-UNSAID = ("search", "options", "checkpoint")
-"""Of a setting: what a page says elsewhere, or what is a place on one machine."""
+UNSAID = ("search", "options", "checkpoint")  # said elsewhere, or of one machine
 
 
 def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()
-    )
+    shown = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in values.items()}
+    return ", ".join(f"{k} {v}" for k, v in shown.items())
 
 
 def _mean(counts: Sequence[int], trials: int) -> str:

@@ -1,7 +1,6 @@
 """What a task with an elastic body is: the trials that are drawn, what a policy sees and does, how far a trial ends from its aim.
 
-World axes: y up, the ground at y = 0. Plain tensors, no Gymnasium.
-"""
+World axes: y up, the ground at y = 0. Plain tensors, no Gymnasium."""
 
 from __future__ import annotations
 
@@ -21,15 +20,9 @@ from mosa.physics.world import World
 from mosa.system.limits import counted
 from mosa.types import Ground
 
-ROOM = 5.0
-"""Half width [m] of the world: a body that rolls away is a failure, not an error."""
-LAST = 5
-"""Control steps at the end over which a reward is averaged: the body may still quiver."""
-
-
-CLEARANCE = 0.04
-"""Height [m] of the lowest particle above what it falls on at which the simulation begins; the flight before is a parabola."""
-
+ROOM = 5.0  # half width [m] of the world: a body that rolls away is a failure, not an error
+LAST = 5  # control steps at the end over which a reward is averaged: the body may still quiver
+CLEARANCE = 0.04  # [m] above what it falls on, where the simulation begins after a parabola
 
 Length = Annotated[float, Interval(ge=0, le=ROOM)]
 Size = Annotated[float, Interval(ge=1e-4, le=ROOM)]
@@ -103,9 +96,9 @@ class Task(ABC):
         """Errors: ConfigError for a range whose end is below its beginning."""
         for low, high in (("low", "high"), ("close", "far")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):
+                most, found = getattr(self, high), getattr(self, low)
                 raise ConfigError(
-                    f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
-                    f"{getattr(self, low):g}"
+                    f"options.{low}: expected at most options.{high}={most:g}, found {found:g}"
                 )
 
     @property
@@ -201,33 +194,22 @@ class Task(ABC):
                 "train the twin on cameras in a world with y up"
             )
         box = torch.tensor([[-ROOM, -1.0, -ROOM], [ROOM, ROOM, ROOM]]).to(world.box)
-        return replace(
-            world,
-            ground=Ground(0.0, "separate", self.ground_friction),
-            box=box,
-            planes=(),
-            colliders=(),
-        )
+        ground = Ground(0.0, "separate", self.ground_friction)
+        return replace(world, ground=ground, box=box, planes=(), colliders=())
 
     def draw(self, count: int, generator: torch.Generator) -> Trials:
         """`count` trials."""
         counted("trials", (count, sum(map(len, self.drawn))), "take fewer", each=3 * 8)
         found = []
         for quantities in self.drawn:
-            low, high = (
-                torch.tensor([getattr(q, side) for q in quantities], dtype=torch.float64)
-                for side in ("low", "high")
-            )
+            low, high = torch.tensor([(q.low, q.high) for q in quantities], dtype=torch.float64).T
             part = torch.rand(count, len(quantities), generator=generator, dtype=torch.float64)
             found.append((low + (high - low) * part).float())
         return Trials(*found)
 
     def physical(self, action: Tensor) -> Tensor:
         """(B, A) in units, of actions in [-1, 1]."""
-        low, high = (
-            torch.tensor([getattr(q, side) for q in self.actions]).to(action)
-            for side in ("low", "high")
-        )
+        low, high = torch.tensor([(q.low, q.high) for q in self.actions]).to(action).T
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
     def loss(self, trials: Trials, view: View) -> Tensor:

@@ -2,8 +2,7 @@
 
 The paper names both, placing an elastic rabbit onto a white box and hanging on a tower, and their success rates on a robot; it
 gives no sizes, starts, actions or criteria of success. What is chosen here, and on what, is in docs/environments.md.
-The box or tower stands at x = z = 0.
-"""
+The box or tower stands at x = z = 0."""
 
 from __future__ import annotations
 
@@ -40,8 +39,7 @@ class Placement(Task):
 
     It was gripped askew by up to `askew` [rad], which is observed; the hand turns it and lets it fall from rest over the aim.
     Success: its centre is within `near` of the box's middle, its up axis within `lean` of the vertical, and its speed below
-    `still`. A body that fell off is beside the box.
-    """
+    `still`. A body that fell off is beside the box."""
 
     steps: Steps = 60
     low: Height = 0.08
@@ -54,9 +52,7 @@ class Placement(Task):
 
     @property
     def situation(self) -> tuple[Quantity, ...]:
-        return tuple(
-            Quantity(f"askew about {axis}", "rad", -self.askew, self.askew) for axis in "xz"
-        )
+        return tuple(Quantity(f"askew about {a}", "rad", -self.askew, self.askew) for a in "xz")
 
     def release(self, trials: Trials, given: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         return given[:, :2] + trials.observed[:, 1:3], torch.zeros_like(given[:, 2:4])
@@ -98,8 +94,7 @@ class Hanging(Task):
     a clock; after `shut` control steps the jaws close within `closing`, to a gap that is narrower than the body by the share
     `squeeze`. What is between them hangs.
     Success: at the end the centre is within `near` of the jaws' middle, along x and in height, no particle is lower than `free`,
-    and the speed is below `still`.
-    """
+    and the speed is below `still`."""
 
     steps: Steps = 32
     tilt: Angle = 0.25
@@ -184,17 +179,11 @@ class Hanging(Task):
 
     def succeeded(self, trials: Trials, view: View) -> Tensor:
         away = torch.hypot(view.center[:, 0], view.center[:, 1] - self.grip)
-        return (
-            (away < self.near)
-            & (view.lowest > self.free)
-            & (view.velocity.norm(dim=1) < self.still)
-        )
+        still = view.velocity.norm(dim=1) < self.still
+        return (away < self.near) & (view.lowest > self.free) & still
 
 
-SIDES = (("left", -1.0), ("right", 1.0))
-"""Of the jaws, and the sign of their z."""
-
-
+SIDES = (("left", -1.0), ("right", 1.0))  # of the jaws, and the sign of their z
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging)}
 
 

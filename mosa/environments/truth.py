@@ -26,10 +26,8 @@ from mosa.twin.twin import Twin
 from mosa.types import Ground
 
 MAX_SUBSTEPS = 5000
-FINEST, COARSEST = 5e-4, 4.0
-"""[m] and shares of the body's longest side: bounds of the distance between particles."""
-APPEARANCE = (0.8, 0.35)
-"""Opacity of a particle in pictures, and its standard deviation in spacings."""
+FINEST, COARSEST = 5e-4, 4.0  # particle spacing: [m], share of the longest side
+APPEARANCE = (0.8, 0.35)  # of a particle: opacity, standard deviation in spacings
 
 
 class TrueMaterial(nn.Module):
@@ -76,11 +74,8 @@ def true_twin(
     check("scene.seed", seed, Seed)
     widest = float(np.ptp(np.asarray(SHAPES[body.shape].bounds), axis=0).max()) / COARSEST
     said = f"a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the body's longest side, or null"
-    check(
-        "truth.spacing",
-        spacing,
-        Annotated[Annotated[float, Interval(ge=FINEST, le=widest)] | None, Expected(said)],
-    )
+    within = Annotated[float, Interval(ge=FINEST, le=widest)] | None
+    check("truth.spacing", spacing, Annotated[within, Expected(said)])
     spacing = body.spacing if spacing is None else float(spacing)
     surface, particles, _ = built(body.shape, body.pitch, spacing, seed)
     hidden = body.material.variant(material)

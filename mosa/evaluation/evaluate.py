@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from warnings import warn
 
@@ -55,10 +56,8 @@ def sequences(
     body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]
 ) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences."""
-    return [
-        Sequence(p, s, start, first_contact(body, start, s))
-        for (p, start), s in zip(found.items(), [training, *others])
-    ]
+    pairs = zip(found.items(), [training, *others])
+    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in pairs]
 
 
 def run_sequences(
@@ -83,14 +82,9 @@ def rollouts(
     for v in VARIANTS:
         began, counted = time.perf_counter(), len(sizes)
         try:
-            result[v] = body.simulate(
-                sequence.start,
-                world,
-                scene.frames,
-                frame_dt,
-                model=body.model(v),
-                collect=lambda found: sizes.append(float(found.mean_abs_C)),
-            )
+            collect = lambda found: sizes.append(float(found.mean_abs_C))  # noqa: E731
+            how = {"model": body.model(v), "collect": collect}
+            result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, **how)
         except (SimulationDiverged, ConfigError) as error:
             del sizes[counted:]
             warn(
@@ -108,10 +102,8 @@ def rollouts(
 def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Tensor:
     """(V, T, H, W, 3) images of a rollout from the given cameras, on the body's device: of its splats where it has some."""
     device = body.rest.device
-    shown = seen(body, rollout.x, rollout.F_tot)
-    return shown.images(
-        scene.cameras.select(cameras).to(device), scene.background.to(device)
-    ).clamp_(0, 1)
+    shown, views = seen(body, rollout.x, rollout.F_tot), scene.cameras.select(cameras).to(device)
+    return shown.images(views, scene.background.to(device)).clamp_(0, 1)
 
 
 def image_metrics(
@@ -119,22 +111,21 @@ def image_metrics(
 ) -> dict[str, float]:
     """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
 
-    images: (V, T, H, W, 3), all frames; where they lie is where they are compared.
-    """
+    images: (V, T, H, W, 3), all frames; where they lie is where they are compared."""
     if not cameras or not frames:
         return {}
     x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
+    kinds = {"psnr": metrics.psnr, "ssim": metrics.ssim}
+    kinds |= {own: metric.function for own, metric in metrics.IMAGE_METRICS.items()}
     found: dict[str, list[float]] = {
-        f"{kind}_{name}": [] for name in ("crop", "full") for kind in ("psnr", "ssim")
+        f"{kind}_{name}": [] for name in ("crop", "full") for kind in kinds
     }
     for v, (camera, x, y) in enumerate(zip(cameras, x0.tolist(), y0.tolist())):
         seen, real = images[v][frames], scene.images[camera][frames].to(images.device)
         crop = (slice(None), slice(y, y + height), slice(x, x + width))
         for name, pair in (("crop", (seen[crop], real[crop])), ("full", (seen, real))):
-            found[f"psnr_{name}"].append(metrics.psnr(*pair))
-            found[f"ssim_{name}"].append(metrics.ssim(*pair))
-            for own, metric in metrics.IMAGE_METRICS.items():
-                found.setdefault(f"{own}_{name}", []).append(metric.function(*pair))
+            for kind, function in kinds.items():
+                found[f"{kind}_{name}"].append(function(*pair))
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
@@ -148,8 +139,7 @@ def motion_metrics(
 ) -> dict[str, float]:
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
-    target: `true_motion`, where it is at hand: it is the same for all models.
-    """
+    target: `true_motion`, where it is at hand: it is the same for all models."""
     truth = sequence.scene.truth
     after = [t for t in frames if t >= sequence.contact]
     if not after:
@@ -166,20 +156,14 @@ def motion_metrics(
     else:
         target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
-        result |= {
-            name: metric.function(x[after], target[after])
-            for name, metric in metrics.MOTION_METRICS.items()
-        }
+        own = metrics.MOTION_METRICS.items()
+        result |= {name: metric.function(x[after], target[after]) for name, metric in own}
         pairs = [(x[t], truth.positions[t]) for t in after]
-    each = list(
-        threaded(lambda pair: metrics.chamfer_distances(*pair, samples=settings.samples), pairs)
-    )
+    chamfer = partial(metrics.chamfer_distances, samples=settings.samples)
+    each = list(threaded(lambda pair: chamfer(*pair), pairs))
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
-    last = pairs[:: max(1, len(pairs) // 3)]
-    result["emd_m"] = float(
-        np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=settings.assignment), last)))
-    )
-    return result
+    emd, last = partial(metrics.emd, samples=settings.assignment), pairs[:: max(1, len(pairs) // 3)]
+    return result | {"emd_m": float(np.mean(list(threaded(lambda pair: emd(*pair), last))))}
 
 
 def true_motion(body: Body, scene: Scene) -> Tensor | None:
@@ -199,9 +183,8 @@ def evaluate(
     Errors: SimulationDiverged where none of them could be."""
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
-    bar = tqdm(
-        total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True
-    )
+    every = len(sequences) * len(VARIANTS)
+    bar = tqdm(total=every, desc="evaluate", unit="rollout", dynamic_ncols=True)
     rates, measured, missing = [], set[str](), list[tuple[str, str]]()
     for sequence in sequences:
         kept[sequence.prefix] = {}
@@ -219,14 +202,12 @@ def evaluate(
                     curves = curves_of(world.forces, scene.sequence, first)
                     dt = float(scene.times[1] - scene.times[0])
                     figures |= force_figures(simulated[variant], curves, world, dt)
-                figures |= sequence_metrics(
+                found = sequence_metrics(
                     body, sequence, simulated[variant], model, settings, target
                 )
-                measured |= {
-                    key.rpartition("/")[2]
-                    for key in figures
-                    if key.startswith(f"{model}{sequence.prefix}/")
-                }
+                figures |= found
+                own = (key for key in figures if key.startswith(f"{model}{sequence.prefix}/"))
+                measured |= {key.rpartition("/")[2] for key in own}
             else:
                 missing += [(model, part) for part in parts_of(sequence)]
             bar.update()
@@ -324,18 +305,15 @@ def floor_figures(
         if scene.truth is None:
             continue
         x = floor_rollout(body, scene, world)
-        if sequence.prefix.startswith("train"):
-            frames = scene.training_frames
-        else:
-            frames = list(range(scene.frames))
+        training = sequence.prefix.startswith("train")
+        frames = scene.training_frames if training else list(range(scene.frames))
         result = motion_metrics(x, body, sequence, frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)
-    clouds = [
-        scene.truth.rest if scene.truth is not None else scene.particles[0]
-        for scene in (s.scene for s in evaluated)
-        if scene.truth is not None or scene.particles is not None
+    known = [
+        s.scene for s in evaluated if s.scene.truth is not None or s.scene.particles is not None
     ]
+    clouds = [s.particles[0] if s.truth is None else s.truth.rest for s in known]
     if clouds:
         sizes = {"samples": settings.samples, "assignment": settings.assignment}
         floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), **sizes)
@@ -350,12 +328,10 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
         model = body.model(variant)
         material, mean = model.material, float(body.factor(model.heterogeneity).detach().mean())
         for name, value in material.physical().items():
-            scale = mean if name in material.modulated else 1.0
-            figures[f"{prefix}/{name}"] = float(value.detach()) * scale
-            if name in scene.known_parameters:
-                errors = metrics.identification_errors(
-                    name, figures[f"{prefix}/{name}"], scene.known_parameters[name]
-                )
+            found = float(value.detach()) * (mean if name in material.modulated else 1.0)
+            figures[f"{prefix}/{name}"] = found
+            if (true := scene.known_parameters.get(name)) is not None:
+                errors = metrics.identification_errors(name, found, true)
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
         height = model.contact.height(scene.ground, body.settings.dx)
         figures[f"{prefix}/contact_offset_m"] = float(height.detach())
@@ -378,9 +354,8 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
     learned = body.factor(body.model().heterogeneity).detach().cpu()
     true = hidden.factor(body.rest.cpu().float())
     if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
-        found["id/stiffness_correlation"] = float(
-            torch.corrcoef(torch.stack([true, learned.float()]))[0, 1]
-        )
+        both = torch.stack([true, learned.float()])
+        found["id/stiffness_correlation"] = float(torch.corrcoef(both)[0, 1])
     return found
 
 

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 from kornia.filters import get_gaussian_kernel1d
 from kornia.metrics import ssim as kornia_ssim
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from mosa.errors import ConfigError
-from mosa.evaluation.assignment import assigned
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
-RIDGE = 1e-3
-"""Of the local fit's slopes, relative to the neighbourhood's own size."""
+NEIGHBOURS = 8  # true points that a motion is interpolated from
+RIDGE = 1e-3  # of the local fit's slopes, relative to the neighbourhood's own size
 
 
 class Metric(NamedTuple):
@@ -35,10 +35,8 @@ class Metric(NamedTuple):
     digits: int = 3
 
 
-MOTION_METRICS: dict[str, Metric] = {}
-"""Figure `<part>/<name>` -> metric of the motion, beside those that `mosa.evaluation.evaluate` always has."""
-IMAGE_METRICS: dict[str, Metric] = {}
-"""Figures `<part>/<name>_crop` and `<part>/<name>_full` -> metric of the images, likewise."""
+MOTION_METRICS: dict[str, Metric] = {}  # registered, by the figure's name
+IMAGE_METRICS: dict[str, Metric] = {}  # name -> figures <part>/<name>_crop and _full
 
 
 def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
@@ -46,26 +44,19 @@ def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
 
     Errors: ConfigError if another metric has the name."""
     known = IMAGE_METRICS if images else MOTION_METRICS
-    if (
-        re.fullmatch(r"\w+", name) is None
-        or name in RESERVED
-        or known.setdefault(name, metric) != metric
-    ):
-        raise ConfigError(
-            f"metric {name!r}: expected a name of letters and digits that no figure has yet; choose another one"
-        )
+    free = re.fullmatch(r"\w+", name) is not None and name not in RESERVED
+    if not free or known.setdefault(name, metric) != metric:
+        said = "expected a name of letters and digits that no figure has yet; choose another one"
+        raise ConfigError(f"metric {name!r}: {said}")
 
 
-RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")
-"""What `mosa.evaluation.evaluate` computes itself."""
+RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")  # by `evaluate`
 
 
 # --- motion ---------------------------------------------------------------------------------------------------------
 
 
-def interpolate_motion(
-    rest: Tensor, positions: Tensor, query: Tensor, neighbours: int = 8
-) -> Tensor:
+def interpolate_motion(rest: Tensor, positions: Tensor, query: Tensor) -> Tensor:
     """True motion at rest positions `query` (N, 3): (T, N, 3) [m], from true rest points (M, 3) and positions (T, M, 3).
 
     A linear fit to the nearest true rest points, weighted by inverse distance. A plain weighted mean lies at the
@@ -75,23 +66,20 @@ def interpolate_motion(
     """
     points, wanted = rest.cpu().double(), query.cpu().double()
     displaced = positions.cpu().double() - points
-    distance, index = cKDTree(points.numpy()).query(
-        wanted.numpy(), k=np.arange(1, min(neighbours, len(points)) + 1)
-    )
+    ranks = np.arange(1, min(NEIGHBOURS, len(points)) + 1)
+    distance, index = cKDTree(points.numpy()).query(wanted.numpy(), k=ranks)
     weight = torch.as_tensor(1 / np.maximum(distance, 1e-12))
     weight, index = weight / weight.sum(1, keepdim=True), torch.as_tensor(index)
     center = points.mean(0)
     basis = torch.nn.functional.pad(points - center, (0, 1), value=1.0)
     # (T, 4, 3), the shortest solution: clouds that are flat or have few points pass
-    affine = torch.linalg.lstsq(
-        basis.expand(len(displaced), -1, -1), displaced, driver="gelsd"
-    ).solution
+    every = basis.expand(len(displaced), -1, -1)
+    affine = torch.linalg.lstsq(every, displaced, driver="gelsd").solution
     residual = displaced - basis @ affine
     # value at the query of the fit = weighted sum of the neighbours' residuals with these coefficients
     reach = torch.as_tensor(distance).amax(1).clamp(min=1e-12)
-    local = torch.nn.functional.pad(
-        (points[index] - wanted[:, None]) / reach[:, None, None], (0, 1), value=1.0
-    )
+    away = (points[index] - wanted[:, None]) / reach[:, None, None]
+    local = torch.nn.functional.pad(away, (0, 1), value=1.0)
     moment = torch.einsum("nk,nki,nkj->nij", weight, local, local)
     moment = moment + torch.diag(torch.tensor([RIDGE, RIDGE, RIDGE, 0.0], dtype=torch.float64))
     unit = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(wanted), 4)
@@ -127,17 +115,15 @@ def chamfer_distances(
     """`cd_sq_m2`, two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m], and `cd_m` [m], the same
     of the distances themselves."""
     ab, ba = _nearest(a, b, samples, seed)
-    return {
-        "cd_sq_m2": float((ab**2).mean() + (ba**2).mean()),
-        "cd_m": float(ab.mean() + ba.mean()),
-    }
+    squares = float((ab**2).mean() + (ba**2).mean())
+    return {"cd_sq_m2": squares, "cd_m": float(ab.mean() + ba.mean())}
 
 
 def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> float:
     """`emd_m`: mean distance [m] of the exact assignment between equally many random points of (N, 3) and (M, 3) [m]."""
     count = min(samples, len(a), len(b))
     cost = cdist(subsample(a, count, seed), subsample(b, count, seed + 1))
-    return float(np.take_along_axis(cost, assigned(cost)[:, None], 1).mean())
+    return float(cost[linear_sum_assignment(cost)].mean())
 
 
 def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
@@ -171,9 +157,8 @@ def sampling_floors(
     """
     a = resample_shape(cloud, first, 2 * seed + 101)
     b = resample_shape(cloud, second, 2 * seed + 102)
-    return chamfer_distances(a, b, samples=samples, seed=seed) | {
-        "emd_m": emd(a, b, samples=assignment, seed=seed)
-    }
+    apart = emd(a, b, samples=assignment, seed=seed)
+    return chamfer_distances(a, b, samples=samples, seed=seed) | {"emd_m": apart}
 
 
 # --- images ---------------------------------------------------------------------------------------------------------
@@ -182,9 +167,8 @@ def sampling_floors(
 def psnr(rendered: Tensor, real: Tensor) -> float:
     """Mean over images (T, H, W, 3) in [0, 1] of each one's PSNR [dB]; infinite if one of them is exact."""
     a, b = rendered.movedim(-1, 1), real.movedim(-1, 1)
-    return float(
-        peak_signal_noise_ratio(a, b, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean")
-    )
+    psnrs = peak_signal_noise_ratio(a, b, 1.0, dim=(1, 2, 3), reduction="elementwise_mean")
+    return float(psnrs)
 
 
 def ssim(rendered: Tensor, real: Tensor) -> float:
@@ -192,23 +176,17 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
 
     Over all pixels, with borders reflected (torchmetrics, kornia; others leave 5 px at the border out). At least 6 x 6 px.
     """
-    if rendered.shape != real.shape:
-        raise ValueError(
-            f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}"
-        )
+    shapes = tuple(rendered.shape), tuple(real.shape)
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"ssim: expected images of one shape, found {shapes[0]} and {shapes[1]}")
     if min(rendered.shape[1:3]) < 6:
-        raise ValueError(
-            f"ssim: expected images of at least 6 x 6 px, found {tuple(rendered.shape[1:3])}"
-        )
+        raise ValueError(f"ssim: expected images of at least 6 x 6 px, found {shapes[0][1:3]}")
     if rendered.device.type == "cpu":
         pairs = zip(rendered.detach().numpy(), real.detach().numpy())
         return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))
     # in float64: convolutions on a GPU may round to TF32, and variances are small differences
-    return float(
-        kornia_ssim(
-            rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double(), 11, eps=0.0
-        ).mean()
-    )
+    a, b = (images.movedim(-1, 1).double() for images in (rendered, real))
+    return float(kornia_ssim(a, b, 11, eps=0.0).mean())
 
 
 def _ssim_on_cpu(a: np.ndarray, b: np.ndarray) -> float:

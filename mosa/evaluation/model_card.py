@@ -7,22 +7,15 @@ from collections.abc import Sequence as Ordered
 
 import torch
 
-from mosa.evaluation.analysis.tables import (
-    columns_text,
-    determined_text,
-    parameter_table,
-    results_table,
-)
+from mosa.evaluation.analysis import tables
 from mosa.evaluation.evaluate import Sequence
 from mosa.modules.body.body import Body
 from mosa.physics.world import World
 from mosa.types import Rollout
 
 FILE = "model_card.md"
-SAME = 1e-6
-"""Relative difference of stiffnesses below which a law has no direction, and a body no field."""
-SHARE = 0.001
-"""Of particles and frames at each end that the range of stretches leaves out."""
+SAME = 1e-6  # relative difference of stiffnesses that counts as none
+SHARE = 0.001  # of particles and frames at each end that the range of stretches leaves out
 
 
 def filmed(sequences: Ordered[Sequence]) -> list[str]:
@@ -50,12 +43,10 @@ def stretches(rollouts: Ordered[Rollout]) -> tuple[float, float]:
     return float(ordered[skipped]), float(ordered[len(ordered) - 1 - skipped])
 
 
-def valid(
-    sequences: Ordered[Sequence],
-    kept: Mapping[str, Mapping[str, Rollout]],
-    body: Body,
-    world: World,
-) -> list[str]:
+Kept = Mapping[str, Mapping[str, Rollout]]  # by prefix and variant
+
+
+def valid(sequences: Ordered[Sequence], kept: Kept, body: Body, world: World) -> list[str]:
     """What the motions covered that the law was learned from."""
     trained = [kept.get(s.prefix, {}) for s in sequences if s.prefix.startswith("train")]
     seen = [motions["adapted"] for motions in trained if "adapted" in motions]
@@ -99,7 +90,7 @@ def model_card(
     figures: Mapping[str, float],
     body: Body,
     sequences: Ordered[Sequence],
-    kept: Mapping[str, Mapping[str, Rollout]],
+    kept: Kept,
     world: World,
     version: str,
 ) -> str:
@@ -117,11 +108,11 @@ def model_card(
         f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."
     )
     unsure = "This fit keeps no posterior: how sure the law is, is not known."
-    errors = (results_table(figures), columns_text(figures, name))
+    errors = (tables.results_table(figures), tables.columns_text(figures, name))
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),
-        "What was learned": f"{learned}\n\n{parameter_table(figures, law)}",
-        "What is determined, and what is not": determined_text(figures, law) or unsure,
+        "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law)}",
+        "What is determined, and what is not": tables.determined_text(figures, law) or unsure,
         "Errors": "\n\n".join(filter(None, errors)),
         "Where it is valid": "\n".join(valid(sequences, kept, body, world)),
         "Licence": LICENCE,

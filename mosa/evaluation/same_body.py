@@ -18,13 +18,11 @@ from mosa.types import Scene
 MIN_OUTLINE_RATIO = 0.93
 """Overlap of rendered and true mattes, over that in the training film, below which a warning is given. The right body at the right
 start is above 0.98; other bodies reach 0.69 to 0.84 (a chick or a ball for a rabbit, three of them)."""
-TRAINING_OUTLINE = 0.9
-"""Overlap of a coarse body with its own film, where no training film was compared."""
+TRAINING_OUTLINE = 0.9  # overlap assumed where no training film was compared
 MAX_COLOR_OFFSET = 0.15
 """Largest difference of mean colour, of 0 to 1 per channel, without a warning. In one light and exposure the difference is 0.005
 (12 cameras, or four of them) to 0.1 (two), as the object turns in the light."""
-MAX_VIEWS = 4
-"""Cameras compared, evenly spread over a film's: large pictures of many splats take seconds each."""
+MAX_VIEWS = 4  # cameras compared; large pictures of many splats take seconds each
 
 
 class BodyMatch(NamedTuple):
@@ -39,13 +37,8 @@ class BodyMatch(NamedTuple):
 def body_match(body: Body, start: Start, scene: Scene) -> BodyMatch:
     """Compare the body at the start of a film with the film's first frame, in at most `MAX_VIEWS` training cameras."""
     every, rotation = scene.training_cameras, start.rotation.to(body.rest)
-    cameras = [
-        every[i]
-        for i in torch.linspace(0, len(every) - 1, min(MAX_VIEWS, len(every)))
-        .round()
-        .long()
-        .tolist()
-    ]
+    places = torch.linspace(0, len(every) - 1, min(MAX_VIEWS, len(every)))
+    cameras = [every[i] for i in places.round().long().tolist()]
     x = (body.rest - body.center) @ rotation.T + start.center.to(body.rest)
     shown = seen(body, x[None], rotation.expand(1, len(x), 3, 3))
     views = scene.cameras.select(cameras).to(x.device)
@@ -84,10 +77,8 @@ def warn_of_other_bodies(body: Body, found: Mapping[str, Start], scenes: Sequenc
             )
         off = match.color - own.color
         if float(off.abs().max()) > MAX_COLOR_OFFSET:
-            said = ", ".join(
-                f"{name} {value:+.2f}"
-                for name, value in zip(("red", "green", "blue"), off.tolist())
-            )
+            named = zip(("red", "green", "blue"), off.tolist())
+            said = ", ".join(f"{name} {value:+.2f}" for name, value in named)
             warnings.warn(
                 f"{prefix}: in its first frame the object's mean colour is not the body's ({said}): another exposure, "
                 "white balance or light, or another object? PSNR and SSIM of this sequence say that as well, and its "

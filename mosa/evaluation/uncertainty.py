@@ -28,16 +28,13 @@ are less independent than the likelihood takes them to be; chosen on the held-ou
 DRAWN = 0.3
 """Factor of the draws' standard deviation in predictions where the law has rivals. What these predict otherwise is most of the
 error; chosen on the same drops under two backbones: 95 % of the errors lie within two standard deviations on average."""
-FORMS = 0.7
-"""Factor of the standard deviation among the forms of a law."""
+FORMS = 0.7  # factor of the standard deviation among the forms of a law
 ELSEWHERE = 3.0
 """By so much more than on the drops that it was learned from a law is wrong on another one, beside what draws and forms say. Both
 were chosen on the held-out drops of these four bodies under two backbones; those of other bodies, and films by other programs, hold
 what docs/lab/2026-11-identification.md#what-is-sure says."""
-LEAST_DRAWS = 4
-"""Of those that could be simulated: fewer say nothing about a spread."""
-QUANTILES = 400
-"""Of a normal distribution, where its image under a bounded map is asked for."""
+LEAST_DRAWS = 4  # of those that could be simulated: fewer say nothing about a spread
+QUANTILES = 400  # of a normal distribution, where its image under a bounded map is asked for
 
 
 @torch.no_grad()
@@ -71,25 +68,15 @@ def predicted_spread(
         except MosaError:  # `evaluate` has said so
             continue
     sequences = [s for s in sequences if s.prefix in base]
-    if not sequences:  # of no draw would anything be simulated
-        return {
-            "posterior/draws": 0.0,
-            "posterior/rivals": 0.0,
-            "posterior/model_error_m": posterior.model_error,
-        }, {}
-
-    def positions() -> dict[str, Tensor]:
-        return {s.prefix: _positions(body, s, world) for s in sequences}
-
-    drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
-    others = rival_motions(body, posterior, positions)
-    figures: dict[str, float] = {
-        "posterior/draws": float(len(drawn)),
-        "posterior/rivals": float(len(others)),
-        "posterior/model_error_m": posterior.model_error,
-    }
+    drawn, others = [], []
+    if sequences:  # else of no draw would anything be simulated
+        predict = lambda: {s.prefix: _positions(body, s, world) for s in sequences}  # noqa: E731
+        drawn = drawn_motions(body, posterior.draws(draws, generator), predict)
+        others = rival_motions(body, posterior, predict)
+    figures = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others))}
+    figures["posterior/model_error_m"] = posterior.model_error
     spreads: dict[str, Tensor] = {}
-    if figures["posterior/draws"] < LEAST_DRAWS:
+    if len(drawn) < LEAST_DRAWS:
         return figures, spreads
     for s in sequences:
         own, *others_here = (each[s.prefix] for each in (base, *others))
@@ -125,10 +112,8 @@ def drawn_motions(
     body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False
 ) -> list[Predicted]:
     """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
-    found = []
-    for _ in tqdm(
-        each_law(body, laws), "draws of the posterior", total=len(laws), leave=False, disable=quiet
-    ):
+    found, every = [], each_law(body, laws)
+    for _ in tqdm(every, "draws of the posterior", total=len(laws), leave=False, disable=quiet):
         try:
             found.append(predict())
         except MosaError:
@@ -188,13 +173,11 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
     if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
         return sd * float(slope.abs())
     low, high = limits_of(name)
-    middle, sd = (raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9))
-    below, within = torch.special.ndtr(
-        (torch.tensor([low, high], dtype=torch.float64) - middle) / sd
-    ).tolist()
-    shares = (
-        below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
-    )
+    middle, sd = raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9)
+    ends = torch.tensor([low, high], dtype=torch.float64)
+    below, within = torch.special.ndtr((ends - middle) / sd).tolist()
+    middles = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    shares = below + (within - below) * middles
     drawn = (middle + sd * torch.special.ndtri(shares)).clamp(low, high)
     return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
 
@@ -209,9 +192,8 @@ def determined(
     determine, and the 95 % cone about the stiffest direction: of draws about every form of the law
     that explains the data, each form as likely as the others."""
     figures: dict[str, float] = {}
-    forms = torch.stack(
-        [posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())]
-    )
+    mean = posterior.mean
+    forms = torch.stack([mean, *(n.to(mean) for n in posterior.rivals.values())])
     blocks: dict[str, list[int]] = {}
     for i, name in enumerate(posterior.names):
         blocks.setdefault(name.split("[")[0], []).append(i)
@@ -222,9 +204,8 @@ def determined(
             variance += FORMS**2 * forms[:, index[0]].var(correction=0)
             sd = physical_sd(name, raw, float(variance.sqrt()))
             if name in RELATIVE:
-                figures[f"posterior/{name}_relative_sd"] = sd / float(
-                    body.material.physical_of(name, raw)
-                )
+                value = float(body.material.physical_of(name, raw))
+                figures[f"posterior/{name}_relative_sd"] = sd / value
             else:
                 figures[f"posterior/{name}_sd"] = sd
         elif name in ("operator", "stiffness"):

@@ -24,26 +24,19 @@ from mosa.evaluation.analysis.stiffness import angle_between, directional_moduli
 from mosa.evaluation.analysis.tables import markdown
 from mosa.experiments.collecting import Record
 from mosa.experiments.parameters import parameters
-from mosa.experiments.report.drawing import (
-    WIDTH,
-    legend,
-    logarithmic,
-    save,
-    say_cut,
-    style_of,
-    wide,
-)
+from mosa.experiments.report import drawing
+from mosa.experiments.report.drawing import WIDTH, legend, save, say_cut, style_of
 from mosa.experiments.run_folders import label, loaded, prefix
 from mosa.experiments.specification import Experiment
-from mosa.experiments.specimens import compression
+from mosa.experiments.specimens import compression, parameters_at_origin
 from mosa.modules.body.body import Body
 from mosa.modules.body.material import material_states
 from mosa.system.whole_files import write_table
 
 log = logging.getLogger(__name__)
 
-MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}
-"""File of a run's motions, by the prefix of the model's figures."""
+Analysed = tuple[str, list[Path]]
+MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}  # prefix -> file of motions
 
 
 # ------------------------------------------------------------------------------------------------ frame by frame
@@ -64,9 +57,7 @@ def errors_by_frame(record: Record) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def long_term(
-    experiment: Experiment, records: Sequence[Record], stem: Path
-) -> tuple[str, list[Path]]:
+def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> Analysed:
     """Error of every frame, mean over the held-out drops of an object; a band of one standard deviation over the seeds. All parts
     have one axis, which is logarithmic where a linear one would hide the least of the errors."""
     columns = [option.name for option in experiment.axes[experiment.columns]]
@@ -101,9 +92,9 @@ def long_term(
         place.set_title(f"{column}, mean of {count}", fontsize=9)
         place.set_xlabel("time [s]")
     places[0].set_ylabel("rms error [mm]", fontsize=9)
-    if wide(drawn):
+    if drawing.wide(drawn):
         for place in places:
-            logarithmic(place, min(drawn))
+            drawing.logarithmic(place, min(drawn))
     else:
         places[0].set_ylim(bottom=0)
     say_cut(places[0])
@@ -133,10 +124,7 @@ def true_modulus(name: str, variant: str, directions: Tensor) -> Tensor | None:
     if name not in OBJECTS:
         return None
     hidden = OBJECTS[name].material.variant(variant)
-    one = {
-        key: (value[0] if value.ndim else value)
-        for key, value in hidden.parameters(torch.zeros(1, 3)).items()
-    }
+    one = parameters_at_origin(hidden)
     factor = float(hidden.factor(torch.zeros(1, 3))[0])
     return directional_modulus(material_states(hidden.law, one), None, directions) / factor
 
@@ -154,13 +142,10 @@ def redistribution(body: Body, directions: Tensor) -> Tensor | None:
     return redistribution_response(stress_jacobian(adapter, zero, zero)[0], directions.double())
 
 
-MIN_RANGE = 0.05
-"""Smallest half range of the axis of E over its mean, around 1."""
+MIN_RANGE = 0.05  # smallest half range of the axis of E over its mean, around 1
 
 
-def directions(
-    experiment: Experiment, records: Sequence[Record], stem: Path
-) -> tuple[str, list[Path]]:
+def directions(experiment: Experiment, records: Sequence[Record], stem: Path) -> Analysed:
     """w(theta) and E(theta) in the plane of the true fibres (or xy), theta from the fibres; beside the truth where it is known. E
     is drawn over its mean, on axes that show MIN_RANGE at least, so that what is isotropic is a level line, and in kPa from 0."""
     found = []
@@ -198,9 +183,8 @@ def directions(
             parts = ["" if x is None else f"{float(x[i]):.6g}" for x in (w, E, truth)]
             rows.append([column, name, f"{float(angle):.1f}", *parts])
         axis = angle_between(n[int(E.argmax())], n[0])
-        ranges = [
-            "" if x is None else f"{float((x.max() - x.min()) / x.mean()):.3f}" for x in (E, truth)
-        ]
+        spans = (None if x is None else float((x.max() - x.min()) / x.mean()) for x in (E, truth))
+        ranges = ["" if span is None else f"{span:.3f}" for span in spans]
         largest = "" if w is None else f"{float(w.max()):.3f}"
         lines.append([column, name, largest, *ranges, f"{float(axis):.0f}"])
     for response, ratios, moduli in grid.T:
@@ -208,9 +192,8 @@ def directions(
         top = 1.05 * max(MIN_RANGE, highest)
         response.set_ylim(-0.04 * top, top)  # a w of 0 is a line of its own beside the axis
         low, high = ratios.get_ylim()
-        ratios.set_ylim(
-            np.floor(100 * min(low, 1 - MIN_RANGE) + 1e-6) / 100, max(high, 1 + MIN_RANGE)
-        )
+        low = np.floor(100 * min(low, 1 - MIN_RANGE) + 1e-6) / 100
+        ratios.set_ylim(low, max(high, 1 + MIN_RANGE))
         moduli.set_ylim(0, 1.05 * moduli.get_ylim()[1])
         what = ("w, response without the prior's", "E over its mean", "E [kPa]")
         for each, said in zip((response, ratios, moduli), what):
@@ -225,9 +208,7 @@ def directions(
     return text + markdown([*axes, *measures], lines), [save(canvas, path)]
 
 
-def heterogeneity(
-    experiment: Experiment, records: Sequence[Record], stem: Path
-) -> tuple[str, list[Path]]:
+def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path) -> Analysed:
     """Learned and true stiffness factor over the body, seen from the side."""
     every = list(loaded(records))
     found = [(record, twin) for record, twin in every if twin.body.heterogeneity is not None]
@@ -270,7 +251,7 @@ def heterogeneity(
     return "Stiffness over the body:\n\n" + text, [picture]
 
 
-ANALYSES: dict[str, Callable[[Experiment, Sequence[Record], Path], tuple[str, list[Path]]]] = {
+ANALYSES: dict[str, Callable[[Experiment, Sequence[Record], Path], Analysed]] = {
     "long_term": long_term, "directions": directions, "heterogeneity": heterogeneity,
     "compression": compression, "parameters": parameters,
 }  # fmt: skip

@@ -31,12 +31,10 @@ class Record:
         if self.figures is None:
             return None
         prefix = "".join(option.prefix for option in self.place.values())
-        name = figure.figure
+        name = prefix + figure.figure
         # what is identified has two names of its own (docs/figures.md)
         found = self.figures.get(
-            f"id_prior/{name[3:]}"
-            if prefix == "prior/" and name.startswith("id/")
-            else prefix + name
+            name.replace("prior/id/", "id_prior/", 1) if name.startswith("prior/id/") else name
         )
         return found * figure.scale if isinstance(found, (int, float)) else None
 
@@ -57,23 +55,17 @@ class Cell:
         return f"{self.mean:.{decimals}f}{spread}"
 
 
-FAILED = Cell(math.nan, None, 0)
-"""Of a place of which no run is complete, and one has failed."""
+FAILED = Cell(math.nan, None, 0)  # of a place of which no run is complete, and one has failed
 
 
 def footnotes(tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
     """Notes of a table: the meaning of words in place of figures, and of the means; empty if it has neither."""
-    cells = [
-        (column, cell)
-        for rows in tables.values()
-        for found in rows.values()
-        for column, cell in found.items()
-    ]
+    every = (found for rows in tables.values() for found in rows.values())
+    cells = [(column, cell) for found in every for column, cell in found.items()]
     used = {cell.text(0) for _, cell in cells if cell is not None}
     words = "; ".join(f"*{word}*: {meaning}" for word, meaning in INSTEAD.items() if word in used)
-    return " ".join(
-        [MEAN] * any(column == "mean" for column, _ in cells) + [f"{words}."] * bool(words)
-    )
+    means = [MEAN] * any(column == "mean" for column, _ in cells)
+    return " ".join([*means, f"{words}."] if words else means)
 
 
 def records_of(jobs: Sequence[Job]) -> list[Record]:
@@ -88,9 +80,8 @@ def records_of(jobs: Sequence[Job]) -> list[Record]:
 def cell(values: Sequence[float]) -> Cell | None:
     if not values:
         return None
-    spread = (
-        statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
-    )
+    several = len(values) > 1 and all(map(math.isfinite, values))
+    spread = statistics.stdev(values) if several else None
     return Cell(statistics.fmean(values), spread, len(values))
 
 
@@ -113,11 +104,10 @@ def table(
     rows = {option.name: values.get(option.name, {}) for option in experiment.axes[experiment.rows]}
     result: dict[str, dict[str, Cell | None]] = {}
     for row, found in rows.items():
-        result[row] = {column: cell(list(found.get(column, {}).values())) for column in columns}
-        result[row] |= {
-            column: FAILED
+        result[row] = {
+            column: cell(list(found.get(column, {}).values()))
+            or (FAILED if (row, column) in failed else None)
             for column in columns
-            if result[row][column] is None and (row, column) in failed
         }
         if experiment.mean and len(columns) > 1 and experiment.rows != experiment.columns:
             seeds = sorted(set.intersection(*(set(found.get(column, {})) for column in columns)))

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import mosa
 
-PROGRAM = ("mosa", "conf")
-"""Folders of the checkout that figures come from."""
+PROGRAM = ("mosa", "conf")  # folders of the checkout that figures come from
 
 
 def git(*words: str) -> str | None:

@@ -17,9 +17,7 @@ from mosa.system.whole_files import write_table
 
 def setting(overrides: Sequence[str], key: str) -> str | None:
     """The value of the last override of a key."""
-    return next(
-        (each.split("=", 1)[1] for each in reversed(overrides) if each.startswith(f"{key}=")), None
-    )
+    return {name: value for name, _, value in (each.partition("=") for each in overrides)}.get(key)
 
 
 def parameters(
@@ -36,9 +34,8 @@ def parameters(
         name = setting(overrides, "scene.name") or setting(overrides, "scene")
         if name not in OBJECTS:
             continue
-        material = OBJECTS[name].material.variant(
-            setting(overrides, "scene.material") or "anisotropic"
-        )
+        variant = setting(overrides, "scene.material") or "anisotropic"
+        material = OBJECTS[name].material.variant(variant)
         for parameter, truth in material.known.items():
             relative = parameter in RELATIVE
             deviation = f"posterior/{parameter}_{'relative_' if relative else ''}sd"

@@ -14,8 +14,7 @@ from mosa.system.whole_files import write_whole
 from mosa.training.jobs import held_back
 
 PROGRAM = "mosa.cli.train:main"
-WAIT = 0.2
-"""Seconds between looks at what the running jobs have made."""
+WAIT = 0.2  # seconds between looks at what the running jobs have made
 
 
 def words_of(job: Job) -> list[str]:
@@ -105,11 +104,8 @@ def begin(job: Job, worker: Worker) -> Future[int]:
 def in_making(job: Job) -> set[str]:
     """What a running job shares with others and does not have yet: its films, its reconstruction."""
     said = (job.folder / "screen.log").read_text(errors="replace")
-    return {
-        what
-        for what, stage in ((job.film, "data"), (job.first, "reconstruction"))
-        if f"{stage} took" not in said
-    }
+    stages = {"data": job.film, "reconstruction": job.first}
+    return {what for stage, what in stages.items() if f"{stage} took" not in said}
 
 
 def reason(job: Job, future: Future[int]) -> str:

@@ -16,18 +16,12 @@ from mosa.errors import ConfigError, DataError
 from mosa.settings import call
 from mosa.training.sweep_table import seconds
 
-SPECIFICATIONS = Path(__file__).with_name("specifications")
-"""Folder of the files of all experiments."""
-SHARED = "_shared"
-"""File of axes that several experiments name."""
-MINUTES = "minutes.txt"
-"""File of a job's folder with the wall time of its process."""
-COMMIT = "commit.txt"
-"""File of a job's folder with the state of the program that its run was last begun with."""
-FAILED = "failed.txt"
-"""File of a job's folder with the reason why its run failed."""
-PRESSED = "pressed.json"
-"""File of a job's folder with what `specimens` has measured of its laws."""
+SPECIFICATIONS = Path(__file__).with_name("specifications")  # files of all experiments
+SHARED = "_shared"  # file of axes that several experiments name
+MINUTES = "minutes.txt"  # file of a job's folder with the wall time of its process
+COMMIT = "commit.txt"  # commit that a job's run was last begun with
+FAILED = "failed.txt"  # file of a job's folder with the reason why its run failed
+PRESSED = "pressed.json"  # file of a job's folder with what `specimens` has measured of its laws
 
 
 @dataclass(frozen=True)
@@ -156,9 +150,8 @@ def shared_axes(folder: Path) -> dict[str, Any]:
 def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     """folder/<name>.yaml; quick: with its section `quick` in place of other keys. Errors: ConfigError naming the key."""
     if name not in experiment_names(folder):
-        raise ConfigError(
-            f"experiment: expected one of {', '.join(experiment_names(folder))} or all, found {name!r}"
-        )
+        known = ", ".join(experiment_names(folder))
+        raise ConfigError(f"experiment: expected one of {known} or all, found {name!r}")
     keys, shared = read_yaml(folder / f"{name}.yaml"), shared_axes(folder)
     small = keys.pop("quick", None)
     if quick:
@@ -168,22 +161,16 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     for key in ("axes", "figures"):
         if key not in keys:
             raise ConfigError(f"{name}.{key}: expected this key, found none")
-    keys["axes"] = {
-        axis: options_of(f"{name}: axes.{axis}", found, shared)
-        for axis, found in keys["axes"].items()
-    }
-    keys["figures"] = tuple(call(f"{name}.figures", Figure, each) for each in keys["figures"])
-    keys["claims"] = tuple(
-        claim_of(f"{name}: claims[{i}]", each, keys["figures"])
-        for i, each in enumerate(keys.get("claims", ()))
-    )
+    axes, claims = keys["axes"].items(), enumerate(keys.get("claims", ()))
+    keys["axes"] = {axis: options_of(f"{name}: axes.{axis}", each, shared) for axis, each in axes}
+    keys["figures"] = figures = tuple(call(f"{name}.figures", Figure, f) for f in keys["figures"])
+    keys["claims"] = tuple(claim_of(f"{name}: claims[{i}]", each, figures) for i, each in claims)
     keys |= {key: tuple(keys[key]) for key in ("seeds", "common") if key in keys}
     found = call(name, Experiment, keys, name=name, quick=quick)
     for place in (found.rows, found.columns):
         if place not in found.axes:
-            raise ConfigError(
-                f"{name}: rows, columns: expected two of {', '.join(found.axes)}, found {place!r}"
-            )
+            known = ", ".join(found.axes)
+            raise ConfigError(f"{name}: rows, columns: expected two of {known}, found {place!r}")
     return found
 
 
@@ -218,15 +205,13 @@ def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Optio
         keys = dict(content) if isinstance(content, Mapping) else {"overrides": content}
         keys["overrides"] = tuple(str(each) for each in keys.get("overrides") or ())
         options.append(call(f"{where}.{name}", Option, keys, name=str(name)))
-    return chosen(where, tuple(options), only)
+    return chosen(where, options, only)
 
 
-def chosen(
-    where: str, options: tuple[Option, ...], only: Sequence[str] | None
-) -> tuple[Option, ...]:
+def chosen(where: str, options: Sequence[Option], only: Sequence[str] | None) -> tuple[Option, ...]:
     """Those that are named, in the order they are named. Errors: ConfigError naming the axis."""
     if only is None:
-        return options
+        return tuple(options)
     known = {option.name: option for option in options}
     if unknown := [name for name in only if str(name) not in known]:
         raise ConfigError(f"{where}: expected some of {', '.join(known)}, found {unknown[0]!r}")
@@ -240,8 +225,9 @@ def pairs(words: Sequence[str], experiments: Sequence[Experiment]) -> dict[str, 
     for word in words:
         axis, mark, names = word.partition("=")
         if not mark or axis not in axes:
+            known = ", ".join(axes)
             raise ConfigError(
-                f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(axes)}, found {word!r}"
+                f"--only: expected AXIS=NAME,NAME with an axis of {known}, found {word!r}"
             )
         found[axis] = names.split(",")
     return found
@@ -251,10 +237,8 @@ def narrowed(
     experiment: Experiment, only: Mapping[str, Sequence[str]], seeds: tuple[int, ...] | None
 ) -> Experiment:
     """With these options (of `pairs`) and seeds alone."""
-    axes = {
-        axis: chosen(f"--only {axis}", options, only.get(axis))
-        for axis, options in experiment.axes.items()
-    }
+    every = experiment.axes.items()
+    axes = {axis: chosen(f"--only {axis}", options, only.get(axis)) for axis, options in every}
     return replace(experiment, axes=axes, seeds=experiment.seeds if seeds is None else seeds)
 
 
@@ -265,13 +249,9 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     found: dict[Path, Job] = {}
     for options in itertools.product(*experiment.axes.values()):
         place = dict(zip(experiment.axes, options))
+        own = [each for option in options for each in option.overrides]
         for seed in experiment.seeds:
-            overrides = (
-                *experiment.common,
-                *(each for option in options for each in option.overrides),
-                *more,
-                f"seed={seed}",
-            )
+            overrides = (*experiment.common, *own, *more, f"seed={seed}")
             folder = runs / (ALONE * experiment.alone + folder_name(overrides))
             known = found.get(folder)
             if known is not None:
@@ -282,28 +262,17 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             film = [each for each, key in parts.items() if key[0] in uses and key[1:] not in USES]
             rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
             shared = " ".join(film), " ".join([*film, *rest])
-            minutes = {
-                device: value * math.prod(option.cost_on(device) for option in options)
-                for device, value in experiment.minutes.items()
-            }
+            costs = {d: math.prod(o.cost_on(d) for o in options) for d in experiment.minutes}
+            minutes = {d: value * costs[d] for d, value in experiment.minutes.items()}
             alone = experiment.alone
             found[folder] = Job(folder, overrides, seed, (place,), minutes, *shared, alone)
     return list(found.values())
 
 
-USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])
-"""Keys of a scene that say what of its films is used, and change none of them."""
-SHARED_BY = ("scene", "reconstruction", "seed", "simulation")
-"""Parts of the configuration that a reconstruction depends on."""
-ALONE = "alone-"
-"""Before the name of a folder whose run had its device to itself: what others share was run in company."""
-QUIET = (
-    "hydra.searchpath",
-    "logger",
-    "evaluation.video",
-    "evaluation.assignment",
-    "evaluation.floor",
-)
+USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])  # keys of use, no film
+SHARED_BY = ("scene", "reconstruction", "seed", "simulation")  # what a reconstruction needs
+ALONE = "alone-"  # before the folder's name of a run that had its device to itself
+QUIET = "hydra.searchpath logger evaluation.video evaluation.assignment evaluation.floor".split()
 """Overrides that the name of a folder leaves to its digest."""
 
 

@@ -31,14 +31,10 @@ from mosa.twin.twin import Twin
 
 log = logging.getLogger(__name__)
 
-MODELS = {"": "adapted", "prior/": "prior"}
-"""Of a run, by the prefix of their figures."""
-ANGLES = 12
-"""Directions over half a turn of the plane of x and the vertical; along the fibres it is pressed too."""
-STRAIN = 0.04
-"""At which the force is compared."""
-ASKED = 5.0
-"""Per cent that E of the default shall be within."""
+MODELS = {"": "adapted", "prior/": "prior"}  # of a run, by the prefix of their figures
+ANGLES = 12  # directions over half a turn in the plane of x and the vertical
+STRAIN = 0.04  # at which the force is compared
+ASKED = 5.0  # per cent that E of the default shall be within
 
 
 def pressed_modulus(body: Body, variant: str, directions: Tensor) -> list[Pressed]:
@@ -74,6 +70,12 @@ def plane(name: str) -> tuple[list[float], Tensor]:
     return [degrees[i] for i in order], torch.stack([vectors[i] for i in order])
 
 
+def parameters_at_origin(hidden: Any) -> dict[str, Tensor]:
+    """Of a hidden material, by name: () each."""
+    found = hidden.parameters(torch.zeros(1, 3)).items()
+    return {key: value[0] if value.ndim else value for key, value in found}
+
+
 Truths = dict[tuple[str, str], list[Pressed]]
 
 
@@ -90,7 +92,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
             return found
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"{kept}: not what a specimen has measured ({error}); remove it to measure again"
+                f"{kept}: a damaged file ({error}); remove it to measure again"
             ) from error
     twin = Twin.load(checkpoint(record))
     scene = twin.record.settings["scene"]
@@ -100,10 +102,7 @@ def measured(record: Record, truths: Truths) -> dict[str, Any] | None:
     degrees, n = plane(name)
     if (name, variant) not in truths:
         hidden = OBJECTS[name].material.variant(variant)
-        one = {
-            key: (value[0] if value.ndim else value)
-            for key, value in hidden.parameters(torch.zeros(1, 3)).items()
-        }
+        one = parameters_at_origin(hidden)
         truths[name, variant] = [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.nu,
                                        density=hidden.density, stiffening=1.0) for k in n]  # fmt: skip
     true, models = truths[name, variant], {}

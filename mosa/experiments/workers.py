@@ -17,8 +17,7 @@ from loky.process_executor import ProcessPoolExecutor
 
 from mosa.system.refused import let_go
 
-IDLE_SECONDS = 300.0
-"""Seconds without a job after which a worker process ends. One whose command was killed finishes its job first."""
+IDLE_SECONDS = 300.0  # after which a worker process ends; a running job ends first
 
 
 class Worker:

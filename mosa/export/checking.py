@@ -20,6 +20,7 @@ from mosa.evaluation.analysis.law_stress import deformations, kirchhoff, tangent
 from mosa.export.source import Source
 from mosa.physics.launching import launch
 
+Pair = tuple[Tensor, Tensor]
 ABAQUS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -29,7 +30,7 @@ def relative(found: Tensor, expected: Tensor) -> float:
     return float((away / expected.abs().flatten(1).amax(1)).max())
 
 
-def expected(found: Source, F: Tensor) -> tuple[Tensor, Tensor]:
+def expected(found: Source, F: Tensor) -> Pair:
     """Kirchhoff stress (n, 3, 3) and its derivative d tau/dF (n, 3, 3, 3, 3) [Pa], by the kernels."""
     parts = found.material, found.adapter, F
     return kirchhoff(*parts), tangent(*parts)
@@ -115,17 +116,13 @@ def check_ufl(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> tuple[float
     psi = energy_of(text, F)
     (P,) = torch.autograd.grad(psi.sum(), F, create_graph=True)
     found = P @ F.mT
-    rows = [
-        torch.autograd.grad(found[:, i, j].sum(), F, retain_graph=True)[0]
-        for i in range(3)
-        for j in range(3)
-    ]
-    return relative(found.detach(), tau), relative(
-        torch.stack(rows, 1).unflatten(1, (3, 3)), derivative
-    )
+    sums = (found[:, i, j].sum() for i in range(3) for j in range(3))
+    rows = [torch.autograd.grad(each, F, retain_graph=True)[0] for each in sums]
+    slopes = torch.stack(rows, 1).unflatten(1, (3, 3))
+    return relative(found.detach(), tau), relative(slopes, derivative)
 
 
-def check_warp(text: str, F: Tensor, truth: tuple[Tensor, Tensor]) -> float:
+def check_warp(text: str, F: Tensor, truth: Pair) -> float:
     """Relative difference of the stress, in a kernel."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "law_warp.py"

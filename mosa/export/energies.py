@@ -1,8 +1,7 @@
 """Energies per rest volume of all laws that have one, as symbols: what every exported text is generated from.
 
 An energy has two parts: one of the entries of C = F^T F, and one of the principal stretches l_1, l_2, l_3. The same
-energies as torch functions are in `tests/helpers/energies.py`.
-"""
+energies as torch functions are in `tests/helpers/energies.py`."""
 
 from __future__ import annotations
 
@@ -51,8 +50,7 @@ def p(name: str) -> Symbol:
 
 mu, lam = p("mu"), p("lam")
 VOLUMETRIC = (lam + Rational(2, 3) * mu) / 2 * ((DET - 1) / 2 - log(DET) / 2)
-J1, J2 = DET ** Rational(-1, 3) * I1, DET ** Rational(-2, 3) * I2
-"""Invariants of the isochoric part of C."""
+J1, J2 = DET ** Rational(-1, 3) * I1, DET ** Rational(-2, 3) * I2  # isochoric invariants of C
 
 
 def neo_hookean() -> Parts:

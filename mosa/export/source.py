@@ -53,9 +53,8 @@ def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
         adapter = None
         if (stiffness := found["stiffness"]) is not None:
             if stiffness["strain"] != "green":
-                raise ValueError(
-                    f"expected a stiffness in Green's strain, found {stiffness['strain']}"
-                )
+                found_in = stiffness["strain"]
+                raise ValueError(f"expected a stiffness in Green's strain, found {found_in}")
             adapter = HyperelasticAdapter().double()
             with torch.no_grad():
                 adapter.numbers.copy_(torch.tensor(stiffness["numbers"], dtype=torch.float64))
@@ -77,9 +76,8 @@ def source(material: Material, adapter: object) -> Source:
             "mosa.export.energies.ENERGIES, by a module of --extensions"
         )
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
-        raise ConfigError(
-            "export: expected a run with adapter=operator or none, found another adapter: its law has no energy"
-        )
+        found = "found another adapter: its law has no energy"
+        raise ConfigError(f"export: expected a run with adapter=operator or none, {found}")
     material = in_double(material, configured=False)
     adapter = None if adapter is None else adapter.double()
     values: dict[str, float] = {}
@@ -90,12 +88,11 @@ def source(material: Material, adapter: object) -> Source:
         else:
             values[name] = float(value)
     law = law_named(material.law)
-    order = [
-        n
-        for name, size in law.parameters.items()
-        for n in ([name] if size == 1 else [f"{name}_{k}" for k in (1, 2, 3)])
-    ]
-    values = {name: values[name] for name in order}
+    parts = {
+        k: [k] if size == 1 else [f"{k}_{i}" for i in (1, 2, 3)]
+        for k, size in law.parameters.items()
+    }
+    values = {name: values[name] for own in parts.values() for name in own}
     form = energy(material.law, tuple(values), adapter is not None)
     if adapter is not None:
         G, h = operator(material, adapter)

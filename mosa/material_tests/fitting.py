@@ -20,18 +20,12 @@ from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
 
-ORTHOTROPIC = 7
-"""The first numbers of `anisotropic_basis` keep the planes of x, y and z as mirrors; the others do not."""
-SPREAD = 0.7
-"""Of the starts, in unconstrained numbers."""
-UNKNOWN = 100.0
-"""Standard deviation of an unconstrained number that the tests do not determine."""
-HOPELESS = 1e3
-"""Residual in units of the measured stresses' root mean square, where the law has no equilibrium."""
-UNSURE = 3.0
-"""Standard deviation of an unconstrained number, which may be a logarithm, above which it is not determined."""
-LEAST = 1e-5
-"""Noise, in the unit of the residuals: of a test that a law meets exactly."""
+ORTHOTROPIC = 7  # numbers of `anisotropic_basis` that keep the planes as mirrors
+SPREAD = 0.7  # of the starts, in unconstrained numbers
+UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests do not determine
+HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
+UNSURE = 3.0  # sd of an unconstrained number above which it is not determined
+LEAST = 1e-5  # noise, in the unit of the residuals: of a test that a law meets exactly
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 """Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
 
@@ -57,9 +51,7 @@ class Law:
 
     symmetry: full | orthotropic, of the stiffness."""
 
-    def __init__(
-        self, material: Material, adapter: HyperelasticAdapter | None, symmetry: str
-    ) -> None:
+    def __init__(self, material: Material, adapter: HyperelasticAdapter | None, symmetry: str):
         self.material, self.adapter = in_double(material), adapter
         self.count = 0
         if adapter is not None:
@@ -135,24 +127,20 @@ class Fitting:
 
         best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
         if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:
-            raise SimulationDiverged(
-                "the law has no stress in these tests at any start; start prior.parameters elsewhere"
-            )
+            where = "in these tests at any start; start prior.parameters elsewhere"
+            raise SimulationDiverged(f"the law has no stress {where}")
         for _ in range(LOOKS):
             before = noise, sigma
             J, misfit = best.jac[: rows.sum()] * noise, best.fun[: rows.sum()] * noise
             prior = np.diag(self.own / sigma**2) + self.root.T @ self.root
-            covariance = np.linalg.inv(
-                J.T @ J / noise**2 + prior + UNKNOWN**-2 * np.eye(len(prior))
-            )
+            known = J.T @ J / noise**2 + prior
+            covariance = np.linalg.inv(known + UNKNOWN**-2 * np.eye(len(prior)))
             shares = 1 - np.diag(covariance @ prior)
             determined, effective = shares[self.own], float(shares.sum())
             noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0) + LEAST**2))
             if self.own.any():
-                own = best.x[self.own]
-                sigma = float(
-                    np.clip(np.sqrt((own**2).sum() / max(determined.sum(), 1e-3)), FEWEST, MOST)
-                )
+                own = (best.x[self.own] ** 2).sum() / max(determined.sum(), 1e-3)
+                sigma = float(np.clip(np.sqrt(own), FEWEST, MOST))
             best = solve(best.x, 100)
             if max(abs(np.log(np.array(before) / (noise, sigma)))) < 0.02:
                 break
@@ -170,10 +158,9 @@ class Fitting:
     def drawn(self, rows: np.ndarray) -> list[np.ndarray]:
         """Starts: the configured one with its stiffness scaled to the tests, and others about it."""
         theta = self.begin.copy()
+        moduli = ("E", "mu", "kappa", "fibre_stiffness")
         stiff = [
-            i
-            for i, n in enumerate(self.law.names)
-            if n in ("E", "mu", "kappa") or n.startswith("fibre_stiffness")
+            i for i, n in enumerate(self.law.names) if n in moduli[:3] or n.startswith(moduli[3])
         ]
         try:
             found = self.predicted(theta)[rows] / self.sd[rows]
@@ -183,10 +170,8 @@ class Fitting:
             pass
         generator = np.random.default_rng(self.seed)
         spread = np.where(self.own, 0.1, SPREAD)
-        others = [
-            theta + spread * generator.standard_normal(len(theta)) for _ in range(self.starts - 1)
-        ]
-        return [theta, *others]
+        drawn = (generator.standard_normal(len(theta)) for _ in range(self.starts - 1))
+        return [theta, *(theta + spread * each for each in drawn)]
 
     def left_out(self) -> dict[str, np.ndarray]:
         """By test: its stresses (m_test,) [Pa] as predicted by a fit to all others."""

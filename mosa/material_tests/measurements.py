@@ -10,8 +10,7 @@ a, the other two faces free), `biaxial ab` (first and second: the stretches alon
 second = 1, equibiaxial second = first), `shear ab` (first: gamma; the face of normal a slides along b). stress_1, stress_2: force
 over the undeformed area, along the first and the second axis, of shear along b; an empty cell was not measured. sd_1, sd_2: their
 standard deviations, of all rows or of none. angle [degrees]: of the specimen's x axis from the material's, about z. The columns
-angle, second, stress_2, sd_1 and sd_2 may be left out.
-"""
+angle, second, stress_2, sd_1 and sd_2 may be left out."""
 
 from __future__ import annotations
 
@@ -31,8 +30,7 @@ UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COLUMNS = ("test", "mode", "angle", "first", "second", "stress_1", "stress_2", "sd_1", "sd_2")
 NEEDED = ("test", "mode", "first", "stress_1")
 AXES = "xyz"
-KINDS = {"uniaxial": 1, "biaxial": 2, "shear": 2}
-"""Axes that a mode names."""
+KINDS = {"uniaxial": 1, "biaxial": 2, "shear": 2}  # axes that a mode names
 
 
 @dataclass(frozen=True)

@@ -138,26 +138,19 @@ def table(
     ]
     for name, value in totals.items():
         plain = name in ("R2", "numbers", "numbers_determined", "rms_of_sd")
-        lines.append(
-            f"- {name}: {value:.4g}" if plain else f"- {name}: {float(value) / scale:.4g} {unit}"
-        )
+        said = f"{value:.4g}" if plain else f"{float(value) / scale:.4g} {unit}"
+        lines.append(f"- {name}: {said}")
     lines += ["", "| number | value | standard deviation | unit |", "|---|---|---|---|"]
-    lines += [
-        f"| {n} | {v:.4g} | {sd if isinstance(sd, str) else f'{sd:.2g}'} | {u} |"
-        for n, v, sd, u in uncertain(law, fit)
-    ]
-    lines += [
-        "",
-        f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |",
-        "|---|---|---|---|---|",
-    ]
+    for n, v, sd, u in uncertain(law, fit):
+        lines.append(f"| {n} | {v:.4g} | {sd if isinstance(sd, str) else f'{sd:.2g}'} | {u} |")
+    lines += ["", f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |"]
+    lines += ["|---|---|---|---|---|"]
     for k, name in enumerate(data.names):
         chosen = ~data.without(k)
         value, found = data.value[chosen], fit.predicted[chosen]
         out = f"{rms(left_out[name] - value) / scale:.3g}" if name in left_out else ""
-        lines.append(
-            f"| {name} | {chosen.sum()} | {rms(found - value) / scale:.3g} | {explained(value, found):.3f} | {out} |"
-        )
+        off, share = rms(found - value) / scale, explained(value, found)
+        lines.append(f"| {name} | {chosen.sum()} | {off:.3g} | {share:.3f} | {out} |")
     return "\n".join(lines) + "\n"
 
 
@@ -198,11 +191,8 @@ def plot(
 
 def written(law: Law, fit: Fit, note: str = "") -> dict[str, Any]:
     """The material as plain data, with the posterior of the unconstrained numbers; note: a warning of `mosa-export-law`."""
-    posterior = {
-        "names": list(fit.names),
-        "theta": fit.theta.tolist(),
-        "covariance": fit.covariance.tolist(),
-    }
+    numbers = {"theta": fit.theta.tolist(), "covariance": fit.covariance.tolist()}
+    posterior = {"names": list(fit.names)} | numbers
     return described(law.material, law.adapter) | {"posterior": posterior, "note": note}
 
 

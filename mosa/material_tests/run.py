@@ -31,18 +31,15 @@ def build_law(values: dict) -> Law:
     material, _ = build_prior(values["prior"])
     law = law_named(material.law)
     if material.candidates or values["prior"]["law"] == AUTO:
-        raise ConfigError(
-            "prior: expected one law, found prior=auto; fit its candidates one by one"
-        )
+        raise ConfigError("prior: expected one law, found auto; fit its candidates one by one")
     if law.plastic or law.viscosity is not None or law.reference is not None:
         raise ConfigError(
             f"prior: expected an elastic law that turns with the body, found {law.name}: tests are states without a history"
         )
     adapter = build_adapter(values["adapter"])
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
-        raise ConfigError(
-            f"adapter: expected operator or none, found {values['adapter']['name']}: others have no energy"
-        )
+        found = f"{values['adapter']['name']}: others have no energy"
+        raise ConfigError(f"adapter: expected operator or none, found {found}")
     check_own(material)
     if adapter is None and values["incompressible"] and "nu" in material.raw:
         material.raw["nu"].requires_grad_(False)  # the pressure replaces it

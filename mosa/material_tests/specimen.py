@@ -2,8 +2,7 @@
 
 Free faces carry no stress: an incompressible specimen gets the pressure that frees one, and a free stretch is solved for by
 Newton's method. The deformation is diagonal in the specimen's axes, or a simple shear: the clamps hold it so where the material
-would shear by itself, as a strip at an angle to its fibres does.
-"""
+would shear by itself, as a strip at an angle to its fibres does."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """A 3DGS file of an object becomes a body that falls, without any video.
 
 The Gaussians' inside is filled with particles, a law is chosen (`prior=...`) or taken from a checkpoint (`ckpt_path=...`), and the
-rollout carries the Gaussians, harmonics and all.
-"""
+rollout carries the Gaussians, harmonics and all."""
 
 from __future__ import annotations
 
@@ -10,7 +9,6 @@ import copy
 import logging
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -45,35 +43,23 @@ from mosa.types import Appearance, Splats
 
 log = logging.getLogger(__name__)
 
-ROOM = 4.0
-"""Of the object's size, to each side of what it falls through."""
-PLAUSIBLE = (0.01, 2.0)
-"""[m] of an object's longest side: without `size` others are asked for, with it a warning."""
-WIDE = 0.25
-"""Of the object's longest side: most Gaussians are smaller by far, their standard deviations."""
-ANYWHERE = 1e4
-"""[m] from the origin, how far the command lets the object fly."""
-NEAR = 3.0
-"""Spacings from the nearest particle beyond which a Gaussian does not belong to the body."""
-HALF_CELL = 0.35
-"""Standard deviation of a particle's own Gaussian, in spacings, as in the reconstruction."""
+ROOM = 4.0  # of the object's size, to each side of what it falls through
+PLAUSIBLE = (0.01, 2.0)  # [m] of the longest side; others need `size`, or are warned of
+WIDE = 0.25  # of the longest side: standard deviations of most Gaussians are below
+ANYWHERE = 1e4  # [m] from the origin, how far the command lets the object fly
+NEAR = 3.0  # spacings from the nearest particle beyond which a Gaussian does not belong to the body
+HALF_CELL = 0.35  # sd of a particle's own Gaussian, in spacings (reconstruction)
 
 
 def read_object(
-    path: str | Path,
-    *,
-    box: Sequence[Sequence[float]] | None = None,
-    opacity: float = 0.1,
-    size: float | None = None,
-    up: Sequence[float] | None = None,
+    path: str | Path, *, box=None, opacity: float = 0.1, size: float | None = None, up=None
 ) -> Appearance:
     """The Gaussians of a 3DGS PLY that are the object.
 
     box: two corners in the file's units; opacity: the least that is kept; size [m] that the longest side gets, None where the file
     is in metres, which is refused where that is implausible; up: compared with the file's header.
     Strays away from the object are left out before it is sized.
-    Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument.
-    """
+    Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument."""
     splats, harmonics, offset, vertical = read_ply(path, centred=True)
     axis = "xyz".find(vertical[-1:] or "?")
     if up is not None and axis >= 0 and abs(up[axis]) < 0.9 * math.hypot(*up):
@@ -89,9 +75,7 @@ def read_object(
             raise ConfigError(f"box: expected {expected}, found {box}")
         chosen &= ((splats.means > corners[0]) & (splats.means < corners[1])).all(1)
     if int(chosen.sum()) < 100:
-        low, high = (
-            [round(v, 3) for v in x.tolist()] for x in (splats.means.amin(0), splats.means.amax(0))
-        )
+        low, high = ([round(v, 3) for v in x.tolist()] for x in splats.means.aminmax(dim=0))
         where = "" if box is None else " in the box"
         raise DataError(
             f"{path}: expected at least 100 Gaussians of an opacity of {opacity:g} or more{where}, found "
@@ -140,9 +124,8 @@ def fill_object(
     else:
         spacing = grid.dx / grid_spacing(1.0, grid.particles_per_cell)
     found = fill(solid, spacing=spacing)
-    near = torch.from_numpy(
-        cKDTree(found.positions.numpy()).query(appearance.splats.means.numpy())[0]
-    )
+    tree = cKDTree(found.positions.numpy())
+    near = torch.from_numpy(tree.query(appearance.splats.means.numpy())[0])
     kept = near < NEAR * found.spacing
     splats = Splats(*(getattr(appearance.splats, f.name)[kept] for f in fields(Splats)))
     n = len(found.positions)
@@ -159,8 +142,7 @@ def object_twin(
     """A twin of the object that Gaussians show.
 
     learned: of which material, adapter and contact are taken in place of those of the settings, and no stiffness field, which is of
-    another body's places; most: as `fill_object` takes it. Errors: ConfigError, DataError.
-    """
+    another body's places; most: as `fill_object` takes it. Errors: ConfigError, DataError."""
     if (density := settings.density) is None:
         density = 1000.0 if learned is None else learned.body.density
     check_density("density", density)
@@ -177,9 +159,8 @@ def object_twin(
         tensors["rest"] = rest = rest - origin
         means = shown.splats.means - origin.to(shown.splats.means)
         shown = replace(shown, splats=replace(shown.splats, means=means))
-    if learned is None:
-        given, chosen = settings.plain(), None
-    else:
+    given, chosen = settings.plain(), None
+    if learned is not None:
         given, chosen = copy.deepcopy(dict(learned.record.settings)), learned.record.law
     given["heterogeneity"] = {**given.get("heterogeneity", {}), "enabled": False}
     given["world"] = {"colliders": [dict(each) for each in settings.colliders or ()]}
@@ -212,52 +193,36 @@ def object_twin(
 def take_law(body: Body, learned: Body) -> None:
     """Material, adapter and contact of another body, calibrated variants included; a stiffness field stays with its own."""
     foreign = ("heterogeneity", "rest", "volume", "colors", "opacities", "covariances")
-    state = {
-        k: v
-        for k, v in learned.state_dict().items()
-        if not any(part in foreign for part in k.split("."))
-    }
+    state = learned.state_dict()
+    state = {k: state[k] for k in state if not set(foreign) & set(k.split("."))}
     missing, unexpected = body.load_state_dict(state, strict=False)
-    if unexpected or [name for name in missing if name not in foreign]:
-        raise DataError(
-            f"ckpt_path: expected a law that fits the object, found {unexpected or missing}"
-        )
+    if found := unexpected or [name for name in missing if name not in foreign]:
+        raise DataError(f"ckpt_path: expected a law that fits the object, found {found}")
 
 
 def drop(cfg: DictConfig) -> None:
     """`python -m mosa.splats`: fill the Gaussians of a file, let them fall, write frames, video and a checkpoint of the body."""
     quiet()
     if OmegaConf.is_missing(cfg, "ply"):
-        raise ConfigError(
-            "ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply"
-        )
+        way = "python -m mosa.splats ply=object.ply"
+        raise ConfigError(f"ply: expected a 3DGS PLY file of an object, found none; {way}")
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
     settings = check_splats(values)
     device = named_device(settings.device)
-    found = read_object(
-        settings.ply, box=settings.box, opacity=settings.opacity, size=settings.size, up=settings.up
-    )
+    given = {key: getattr(settings, key) for key in ("box", "opacity", "size", "up")}
+    found = read_object(settings.ply, **given)
     learned = None if settings.ckpt_path is None else Twin.load(settings.ckpt_path)
     twin = object_twin(found, settings, learned, most_particles(device))
     twin.body.to(device)
-    volume, size = float(twin.body.volume.sum()), twin.body.size
-    log.info(
-        "object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long",
-        len(found.splats.means if twin.body.splats is None else twin.body.splats),
-        len(twin.body.rest),
-        1e6 * volume,
-        size,
-    )
-    up = ", ".join(f"{v:.3g}" for v in twin.world.up.tolist())
+    cm3, size, world = 1e6 * float(twin.body.volume.sum()), twin.body.size, twin.world
+    count = len(found.splats.means if twin.body.splats is None else twin.body.splats)
+    said = "object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long"
+    log.info(said, count, len(twin.body.rest), cm3, size)
+    up = ", ".join(f"{v:.3g}" for v in world.up.tolist())
     middle = ", ".join(f"{v:.4g}" for v in twin.body.center.tolist())
-    log.info(
-        "scene: up (%s), ground at %.4g m along it, the object's centre at (%s) m; %d obstacles",
-        up,
-        twin.world.ground.height,
-        middle,
-        len(twin.world.colliders),
-    )
+    said = "scene: up (%s), ground at %.4g m along it, the object's centre at (%s) m; %d obstacles"
+    log.info(said, up, world.ground.height, middle, len(world.colliders))
     if settings.preset is not None:
         twin.material.preset(settings.preset)
         if settings.density is not None:

@@ -43,9 +43,8 @@ def counted(where: str, sizes: Iterable[float], remedy: str, *, each: float = 8,
 def named_device(name: str | torch.device) -> str:
     """The name of a device that torch can use here. Errors: ConfigError."""
     wanted = "device: expected cpu, or cuda on a machine with a GPU, found"
-    if not isinstance(name, (str, torch.device)) or (
-        str(name) != "cpu" and str(name).split(":")[0] != "cuda"
-    ):
+    known = str(name) == "cpu" or str(name).split(":")[0] == "cuda"
+    if not isinstance(name, (str, torch.device)) or not known:
         raise ConfigError(f"{wanted} {name!r}")
     try:
         torch.empty(0, device=name)

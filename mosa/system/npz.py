@@ -30,48 +30,35 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
-            counted(
-                f"{path}: bytes",
-                [sum(entry.file_size for entry in entries)],
-                "more than is read",
-                each=1,
-                error=DataError,
-            )
+            size = [sum(entry.file_size for entry in entries)]
+            counted(f"{path}: bytes", size, "more than is read", each=1, error=DataError)
             for entry in entries:
                 check_entry(archive, entry, path)
         with np.load(path, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
     except DataError:
         raise
-    except (
-        Exception
-    ) as error:  # whatever zip, zlib and numpy find: the file is not what its name says
-        raise DataError(
-            f"{path}: expected a readable npz file, found a damaged one ({type(error).__name__}: {error})"
-        ) from error
+    except Exception as error:  # whatever zip, zlib and numpy find: it is not what its name says
+        found = f"a damaged one ({type(error).__name__}: {error})"
+        raise DataError(f"{path}: expected a readable npz file, found {found}") from error
 
 
 def check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
     """An array has as many bytes as its header says: numpy would believe the header, and ask for that much. Errors: DataError."""
+    where = f"{path}: {entry.filename}"
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         if version not in HEADERS:
             raise DataError(
-                f"{path}: {entry.filename}: expected an array of numbers, found one of version {version}"
+                f"{where}: expected an array of numbers, found one of version {version}"
             )
         shape, _, dtype = HEADERS[version](file)
         if dtype.kind not in "fiub":
-            raise DataError(
-                f"{path}: {entry.filename}: expected numbers, found {dtype}: nothing else is read"
-            )
-        if (
-            min(shape, default=1) < 0
-            or file.tell() + math.prod(shape) * dtype.itemsize != entry.file_size
-        ):
-            raise DataError(
-                f"{path}: {entry.filename}: expected as many numbers as are stored, found a header of shape {shape} "
-                f"over {entry.file_size} bytes"
-            )
+            raise DataError(f"{where}: expected numbers, found {dtype}: nothing else is read")
+        size = file.tell() + math.prod(shape) * dtype.itemsize
+        if min(shape, default=1) < 0 or size != entry.file_size:
+            found = f"a header of shape {shape} over {entry.file_size} bytes"
+            raise DataError(f"{where}: expected as many numbers as are stored, found {found}")
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ BEGINNINGS = {
     b"{": "a text in JSON; give the file that it describes",
 }
 """Of files that lie where another one is expected."""
-HEADER = 1 << 16
-"""Bytes that a header may have."""
+HEADER = 1 << 16  # bytes that a header may have
 
 
 def named(path: Path) -> str:

@@ -7,8 +7,7 @@ from typing import TextIO
 
 from tqdm import tqdm as bar
 
-LINE_SECONDS = 15.0
-"""Between two lines of what is under way."""
+LINE_SECONDS = 15.0  # between two lines of what is under way
 
 
 class Lines:

@@ -33,30 +33,22 @@ UNLOADABLE = re.compile(
     r"Failed to (load C(PU|UDA) module|find (forward|backward) kernel)|was not found in the cache"
 )
 """What Warp says of a compiled kernel that it cannot use."""
-LAST = Path("checkpoints", "last.ckpt")
-"""Of a run, in its folder."""
+LAST = Path("checkpoints", "last.ckpt")  # of a run, in its folder
 
 
 def disk_message(error: OSError) -> str | None:
     """One sentence on what the disk refused; None for any other error."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
-    if (
-        error.errno == errno.ENOENT
-        and isinstance(error.filename, (str, os.PathLike))
-        and not Path(error.filename).parent.is_dir()
-    ):
-        return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
+    named = isinstance(error.filename, (str, os.PathLike))
+    if error.errno == errno.ENOENT and named and not Path(error.filename).parent.is_dir():
+        return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile"
     if error.errno not in DISK:
         return None
-    if str(error.filename).startswith(cache_home()):
-        keys = "XDG_CACHE_HOME"
-    else:
-        keys = "hydra.run.dir= and scene.cache= (eval.py: cache=)"
-    return (
-        f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
-        f"{keys}"
-    )
+    cached = str(error.filename).startswith(cache_home())
+    keys = "XDG_CACHE_HOME" if cached else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
+    refused = f"{error.filename or 'a file'}: cannot be written or read ({error.strerror})"
+    return f"{refused}; free space, or choose other folders with {keys}"
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -70,9 +62,9 @@ def gpu_memory() -> tuple[float, float] | None:
     """Bytes (free, in all) of the GPU that this process computes on; None without one, or where it does not answer any more."""
     torch = sys.modules.get("torch")
     try:
-        return (
-            torch.cuda.mem_get_info() if torch is not None and torch.cuda.is_initialized() else None
-        )
+        if torch is None or not torch.cuda.is_initialized():
+            return None
+        return torch.cuda.mem_get_info()
     except Exception:  # a GPU that has no memory for the question either
         return None
 
@@ -108,20 +100,14 @@ def kernels_message(error: BaseException) -> str | None:
     """One sentence on compiled kernels that a killed compiler or a full disk left damaged; None for any other error, as one of the
     compiler is: that is a mistake of the program."""
     for one in causes(error):
-        files = (
-            Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(one.__traceback__)
-        )
+        frames = traceback.walk_tb(one.__traceback__)
+        files = (Path(frame.f_code.co_filename) for frame, _ in frames)
         said = UNLOADABLE.search(str(one)) or isinstance(one, JSONDecodeError)
         if said and any(file.match("warp/*/context.py") for file in files):
-            warp = sys.modules.get("warp")
-            place = (
-                getattr(getattr(warp, "config", None), "kernel_cache_dir", None)
-                or "the folder warp of the cache"
-            )
-            return (
-                f"{place}: expected kernels as they were compiled, found some that cannot be loaded "
-                f"({' '.join(str(one).split())[:120]}); remove that folder, and they are compiled again"
-            )
+            own = getattr(sys.modules.get("warp"), "config", None)
+            place = getattr(own, "kernel_cache_dir", None) or "the folder warp of the cache"
+            found = f"found some that cannot be loaded ({' '.join(str(one).split())[:120]})"
+            return f"{place}: expected kernels as they were compiled, {found}; remove that folder"
     return None
 
 
@@ -136,11 +122,8 @@ def explained(error: Exception, folder: str | Path | None = None) -> str | None:
     if (reason := memory_message(error)) is None:
         kernels = kernels_message(error)
         return None if kernels is None else f"DataError: {kernels}"
-    last = None if folder is None else Path(folder) / LAST
-    if last is not None and last.is_file():
-        reason += (
-            f"; the fit is kept in {last}, and the same command with resume=auto goes on from there"
-        )
+    if folder is not None and (last := Path(folder) / LAST).is_file():
+        reason += f"; the fit is kept in {last}: the same command with resume=auto goes on from it"
     return f"MemoryError: {reason}"
 
 
@@ -150,9 +133,8 @@ def one_message() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        said = (
-            f"{type(error).__name__}: {error}" if isinstance(error, MosaError) else explained(error)
-        )
+        own = isinstance(error, MosaError)
+        said = f"{type(error).__name__}: {error}" if own else explained(error)
         if said is None:
             raise
         print(f"\n{said}", file=sys.stderr)

@@ -8,6 +8,7 @@ import platform
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from mosa.errors import ConfigError
 
@@ -18,8 +19,9 @@ def made_folder(folder: str | Path, where: str = "export") -> Path:
         made = Path(folder)
         made.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
+        found = f"{str(folder)[:100]!r} ({error})"
         raise ConfigError(
-            f"{where}: expected a folder that can be written, found {str(folder)[:100]!r} ({error})"
+            f"{where}: expected a folder that can be written, found {found}"
         ) from error
     return made
 
@@ -55,9 +57,7 @@ def write_whole(path: str | Path, text: str) -> None:
         partial.write_bytes(text.encode())
 
 
-def write_table(
-    path: str | Path, header: Sequence[object], rows: Iterable[Sequence[object]]
-) -> None:
+def write_table(path: str | Path, header: Sequence[object], rows: Iterable[Any]) -> None:
     """A csv file."""
     with written_whole(path) as partial, open(partial, "w", newline="") as file:
         csv.writer(file).writerows([header, *rows])

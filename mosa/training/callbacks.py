@@ -56,9 +56,7 @@ class KeepLast(Checkpoint):
         if module.stage is None:
             log.info("the fit was complete: no further step")
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         """Within an epoch; at its end, and at that of a stage, the next hook saves what the next epoch begins with."""
         if not (trainer.fit_loop.epoch_loop.batch_progress.is_last_batch or module.stage_over):
             trainer.save_checkpoint(self.path)
@@ -79,24 +77,15 @@ class FitProgress(L.Callback):
         self.bar: tqdm | None = None
         self.shown: int | None = None  # number of the stage
 
-    def on_train_batch_start(
-        self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         if module.stage is not None and self.shown != module.stage_index:
             self._close()
             self.shown = module.stage_index
-            self.bar = tqdm(
-                total=module.stage.iterations,
-                initial=len(module.losses),
-                desc=f"fit {module.stage.name}",
-                unit="it",
-                dynamic_ncols=True,
-                mininterval=2.0,
-            )
+            count = {"total": module.stage.iterations, "initial": len(module.losses)}
+            look = {"unit": "it", "dynamic_ncols": True, "mininterval": 2.0}
+            self.bar = tqdm(desc=f"fit {module.stage.name}", **count, **look)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         if self.bar is not None:
             self.bar.set_postfix(figures_of(module.last), refresh=False)
             self.bar.update()
@@ -116,9 +105,7 @@ class FitProgress(L.Callback):
 def figures_of(last: dict[str, float]) -> dict[str, str]:
     """Loss and parameters of the last step, as they are shown."""
     found = {"loss": f"{last['loss/total']:.5f}"} if "loss/total" in last else {}
-    return found | {
-        k.removeprefix("id/"): f"{v:.4g}" for k, v in last.items() if k.startswith("id/")
-    }
+    return found | {k[len("id/") :]: f"{v:.4g}" for k, v in last.items() if k.startswith("id/")}
 
 
 class StageNotes(L.Callback):
@@ -128,9 +115,7 @@ class StageNotes(L.Callback):
         self.stage: Stage | None = None
         self.began, self.steps = 0.0, 0
 
-    def on_train_batch_start(
-        self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         if self.stage is not None and module.stage is not self.stage:  # ended by a callback
             self._note(module)
         if module.stage is not None and self.stage is None:
@@ -138,9 +123,7 @@ class StageNotes(L.Callback):
             done = f", going on after {len(module.losses)}" if module.losses else ""
             log.info("stage %s: at most %d steps%s", self.stage.name, self.stage.iterations, done)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         self.steps += 1
         if self.stage is not None and module.stage_over:
             self._note(module)
@@ -164,28 +147,16 @@ class Pace(L.Callback):
     def __init__(self) -> None:
         self.began, self.rates = 0.0, dict[str, float]()
 
-    def on_train_batch_start(
-        self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         self.began = time.perf_counter()
-        if module.stage is None or module.stage.newton:
-            self.rates = {}
-        else:
-            self.rates = {
-                f"lr/{group['name']}": group["lr"]
-                for optimizer in trainer.optimizers
-                for group in optimizer.param_groups
-            }
+        rated = module.stage is not None and not module.stage.newton
+        groups = [g for each in trainer.optimizers if rated for g in each.param_groups]
+        self.rates = {f"lr/{group['name']}": group["lr"] for group in groups}
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         values = {"time/step_s": time.perf_counter() - self.began} | self.rates
-        module.log_dict(
-            {k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()},
-            on_step=True,
-            on_epoch=False,
-        )
+        tensors = {k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}
+        module.log_dict(tensors, on_step=True, on_epoch=False)
 
 
 class ImageStrips(L.Callback):
@@ -194,18 +165,14 @@ class ImageStrips(L.Callback):
     def __init__(self, every: int) -> None:
         self.every = every
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         shown = [each for each in module.loggers if isinstance(each, PICTURED)]
         if shown and self.every > 0 and module.steps_done % self.every == 0:
-            add_picture(
-                shown, "real_above_rendered_below", enlarged(module.strip()), module.steps_done
-            )
+            picture = enlarged(module.strip())
+            add_picture(shown, "real_above_rendered_below", picture, module.steps_done)
 
 
-LEGIBLE = 320
-"""Height [px] that a strip of two rows has at least: windows around an object are often 60 px high."""
+LEGIBLE = 320  # [px] least height of a strip of two rows
 
 
 def enlarged(picture: Tensor) -> Tensor:

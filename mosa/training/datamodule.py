@@ -7,8 +7,7 @@
     data.setup("fit")                               # checks, reconstructs (cached) and finds the starts
     batch = next(iter(data.train_dataloader()))     # some views of every frame, with their cues
 
-It stands alone; `LitMosa` asks it for the particles that a body is made of.
-"""
+It stands alone; `LitMosa` asks it for the particles that a body is made of."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from mosa.config.command_settings import DataSections
 from mosa.config.composition import composed
 from mosa.config.record import BodyRecord
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule, on_device
-from mosa.data.observations import Observations, cropped, training_observations
+from mosa.data.observations import cropped, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError
 from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
@@ -45,21 +44,15 @@ from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
 from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequence_start
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.rest_shape import RestShape
-from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.system.caches import default_cache
 from mosa.system.progress import tqdm
 from mosa.training.run_folder import most_particles
 from mosa.types import Reconstruction, Scene
 
 
-def unchanged(batch: Any) -> Any:
-    """Batches are made whole: nothing is collated."""
-    return batch
-
-
 def served(batches: Any) -> DataLoader[Any]:
     """Batches that are made whole, one after another. batches: an iterable data set, or a sequence."""
-    return DataLoader(batches, batch_size=None, collate_fn=unchanged)
+    return DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch)
 
 
 class SceneDataModule(L.LightningDataModule):
@@ -129,11 +122,11 @@ class SceneDataModule(L.LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """Keyword arguments of `Twin.simulate`, one mapping a start."""
-        given = self.predict or [
-            {"rotation": s.start.rotation, "position": s.start.center, "velocity": s.start.velocity,
-             "angular_velocity": s.start.angular_velocity, "frames": s.scene.frames} for s in self.sequences
-        ]  # fmt: skip
-        return served(given)
+        names = {"position": "center"} | {
+            k: k for k in ("rotation", "velocity", "angular_velocity")
+        }
+        begins = (({k: getattr(s.start, v) for k, v in names.items()}, s) for s in self.sequences)
+        return served(self.predict or [own | {"frames": s.scene.frames} for own, s in begins])
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
@@ -175,22 +168,19 @@ class SceneDataModule(L.LightningDataModule):
         cache = self.settings.scene.cache
         return Path(cache) if cache else default_cache()
 
-    @property
-    def reconstruction_settings(self) -> ReconstructionSettings:
-        return self.settings.reconstruction
-
     @cached_property
     def spacing(self) -> float:
         """Of the particles [m]."""
         settings = self.settings.simulation
-        dx, particles, per_cell = settings.dx, settings.particles, settings.particles_per_cell
+        dx, per_cell = settings.dx, settings.particles_per_cell
+        particles = None if settings.particles == "auto" else settings.particles
         if dx is not None:
             return float(dx / grid_spacing(1.0, per_cell))
         if self.scene.markers is not None:
-            return marker_spacing(self.scene, None if particles == "auto" else int(particles))
+            return marker_spacing(self.scene, particles)
         device = self.device or "cpu"
         return spacing_for(
-            self.scene, None if particles == "auto" else particles, self.reconstruction_settings, per_cell=per_cell,
+            self.scene, particles, self.settings.reconstruction, per_cell=per_cell,
             most=most_particles(device), cache_dir=self.cache, device=device,
         )  # fmt: skip
 
@@ -202,8 +192,9 @@ class SceneDataModule(L.LightningDataModule):
     @property
     def _found_with(self) -> dict[str, Any]:
         """What is the same for the reconstruction of every sequence."""
-        return {"settings": self.reconstruction_settings, "cache_dir": self.cache, "seed": self.settings.seed,
-                "device": self.device or "cpu"}  # fmt: skip
+        settings, device = self.settings, self.device or "cpu"
+        return {"settings": settings.reconstruction, "cache_dir": self.cache, "seed": settings.seed,
+                "device": device}  # fmt: skip
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
@@ -257,12 +248,9 @@ class SceneDataModule(L.LightningDataModule):
     @cached_property
     def takes(self) -> list[Take]:
         """The sequences that are learned from, the training one first."""
+        others = [s for s in self.scenes[1] if s.sequence in self.taught]
         seen = [("train", self.scene, self.reconstruction)]
-        seen += [
-            (f"train/{s.sequence}", s, self.followed(s))
-            for s in self.scenes[1]
-            if s.sequence in self.taught
-        ]
+        seen += [(f"train/{s.sequence}", s, self.followed(s)) for s in others]
         return [self.take(scene, self.starts[prefix], found) for prefix, scene, found in seen]
 
     def take(self, scene: Scene, start: Start, reconstruction: Reconstruction) -> Take:
@@ -277,7 +265,7 @@ class SceneDataModule(L.LightningDataModule):
 
     def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
         """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
-        settings = self.reconstruction_settings
+        settings = self.settings.reconstruction
         if not settings.looks_again or scene.markers is not None:
             return None
         return SecondLook(scene, reconstruction, settings, self.settings.seed, self.device or "cpu")
@@ -313,13 +301,11 @@ class SceneDataModule(L.LightningDataModule):
         scene, margin = self.scene, self.settings.rendering.margin
         parts = {"cameras": (scene.holdout_cameras, scene.training_frames),
                  "frames": (range(len(scene.cameras)), scene.holdout_frames)}  # fmt: skip
-        return [self.seen_in(name, cropped(scene, views, frames, margin), views, frames)
-                for name, (views, frames) in parts.items() if views and frames]  # fmt: skip
-
-    def seen_in(
-        self, name: str, seen: Observations, views: Sequence[int], frames: Sequence[int]
-    ) -> MotionBatch:
-        own = SequenceBatch(
-            name=name, index=0, views=list(views), frames=list(frames), observations=seen, cues=None, extra={},
-        )  # fmt: skip
-        return MotionBatch(sequences=(own,))
+        found = []
+        for name, (views, frames) in parts.items():
+            if views and frames:
+                seen = {"cues": None, "observations": cropped(scene, views, frames, margin)}
+                where = {"index": 0, "views": list(views), "frames": list(frames)}
+                own = SequenceBatch(name=name, extra={}, **where, **seen)
+                found.append(MotionBatch(sequences=(own,)))
+        return found

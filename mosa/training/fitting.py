@@ -58,10 +58,8 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
     try:
         return instantiate(entry, **arguments)
     except Exception as error:
-        if isinstance(error, InstantiationException) and error.__cause__ is not None:
-            cause = error.__cause__
-        else:
-            cause = error
+        hydras = isinstance(error, InstantiationException)
+        cause = error.__cause__ or error if hydras else error
         if str(error).startswith("Error locating target"):
             target, why = str(entry.get("_target_")), str(cause.__cause__ or cause)
             module, _, name = target.rpartition(".")
@@ -71,10 +69,8 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
                 f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found {target} ({why})"
             ) from error
         lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
-        if isinstance(cause, ModuleNotFoundError) and cause.name:
-            way = f"; pip install {cause.name}"
-        else:
-            way = ""
+        lacks = isinstance(cause, ModuleNotFoundError) and cause.name
+        way = f"; pip install {cause.name}" if lacks else ""
         if where == "trainer" and "gpu" in str(cause):
             way = "; trainer=cpu runs without one"
         raise ConfigError(
@@ -88,14 +84,9 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     given, begin = plain(cfg.trainer), L.Trainer.__init__
     arguments_of(begin, "trainer", "precision", *untold(begin)).part(given)
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
-    trainer = made(
-        "trainer",
-        cfg.trainer,
-        logger=loggers or False,
-        callbacks=callbacks,
-        default_root_dir=str(folder),
-        plugins=[AtomicCheckpointIO(), LightningEnvironment()],
-    )
+    own = {"logger": loggers or False, "callbacks": callbacks, "default_root_dir": str(folder)}
+    own["plugins"] = [AtomicCheckpointIO(), LightningEnvironment()]
+    trainer = made("trainer", cfg.trainer, **own)
     check_trainer(trainer, given.get("precision"))
     check_monitors(cfg, callbacks)
     return trainer
@@ -121,8 +112,9 @@ def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: s
     Errors: DataError for a checkpoint of another run."""
     if ckpt_path is not None:
         stored = read_checkpoint(ckpt_path)
-        record = check_same(stored, module, ckpt_path)
-        check_numbers(record, len(read_numbers(module.body)), ckpt_path)
+        check_numbers(
+            check_same(stored, module, ckpt_path), len(read_numbers(module.body)), ckpt_path
+        )
     device = module.body.rest.device
     begun: list[bool] = []
     trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))

@@ -37,8 +37,7 @@ from mosa.training.sweep_table import FAILED, text_of, write_table
 
 log = logging.getLogger(__name__)
 
-LONGEST = 120
-"""Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
+LONGEST = 120  # bytes of a job's folder name from its overrides; a file system takes 255
 
 
 def folder_name(overrides: str) -> str:
@@ -47,11 +46,8 @@ def folder_name(overrides: str) -> str:
     name = re.sub(r"[^\w.+-]", "_", overrides.replace("=", "-"))
     if len(name.encode()) <= LONGEST:
         return name
-    return (
-        name.encode()[:LONGEST].decode(errors="ignore")
-        + "_"
-        + hashlib.sha256(overrides.encode()).hexdigest()[:8]
-    )
+    digest = hashlib.sha256(overrides.encode()).hexdigest()[:8]
+    return f"{name.encode()[:LONGEST].decode(errors='ignore')}_{digest}"
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
@@ -88,20 +84,16 @@ def check_folders(arguments: Sequence[str]) -> None:
     try:
         os.getcwd()
     except OSError as error:
-        raise ConfigError(
-            "the folder that this was started in is no more; change to another one"
-        ) from error
+        raise ConfigError("the folder that this was started in is no more") from error
     for argument in arguments:
         key, _, value = argument.partition("=")
         if key in ("hydra.run.dir", "hydra.sweep.dir") and not value.strip("'\" "):
-            raise ConfigError(
-                f"{key}: expected a folder, found nothing; . is the one that this was started in"
-            )
+            raise ConfigError(f"{key}: expected a folder, found nothing; . is the current one")
         many = {"-m", "--multirun"} & set(arguments)
         if key == "hydra.sweep.subdir" and many and "$" not in value:
             raise ConfigError(
-                f"{key}: expected a name that is another one for each job, as ${{hydra.job.num}} is: {value}: each would "
-                "take the place of the one before"
+                f"{key}: expected a name that is another one for each job, as ${{hydra.job.num}} "
+                f"is, found {value}"
             )
 
 
@@ -130,8 +122,7 @@ def run_command(run: Callable[[], None]) -> None:
             sys.exit(2)
 
 
-begun: list[bool] = []
-"""Whether this process has begun a job or a sweep."""
+begun: list[bool] = []  # whether this process has begun a job or a sweep
 
 
 class Failures(Callback):
@@ -147,9 +138,8 @@ class Failures(Callback):
         begun.append(True)
 
     def on_multirun_end(self, config: DictConfig, **_) -> None:
-        files = sorted(
-            (Path(config.hydra.sweep.dir) / FAILED).glob("*.txt"), key=lambda file: int(file.stem)
-        )
+        failed = (Path(config.hydra.sweep.dir) / FAILED).glob("*.txt")
+        files = sorted(failed, key=lambda file: int(file.stem))
         Failures.count = len(files)
         summarize(config.hydra.sweep.dir)
         if files:
@@ -169,8 +159,7 @@ def summarize(folder: str | Path) -> None:
     print(f"\n{text_of(rows)}\n\nall figures: {', '.join(map(str, files))}")
 
 
-signals: list[int] = []
-"""Received. Lightning turns what stops a fit into an exit of its own, which no longer says which one it was."""
+signals: list[int] = []  # received; Lightning's own exit does not say which
 
 
 def terminated(number: int, *_) -> None:
@@ -210,12 +199,10 @@ def held(folder: str | Path, wait: bool = False) -> Iterator[None]:
         except BlockingIOError:
             if not wait:
                 raise ConfigError(
-                    f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this "
-                    "run a folder of its own"
+                    f"hydra.run.dir: another process is at work in {folder}; wait, or give this "
+                    "run another folder"
                 ) from None
-            log.info(
-                "another process is at work in %s: waiting until it has ended (resume=auto)", folder
-            )
+            log.info("another process is at work in %s: waiting (resume=auto)", folder)
             fcntl.flock(number, fcntl.LOCK_EX)
         except OSError:  # a file system that knows no locks
             pass
@@ -252,35 +239,23 @@ def held_back() -> Iterator[None]:
         before[waiting[0]](waiting[0], None)
 
 
+@tolerant_output()  # also in a launcher's worker, and for the message
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2. In a sweep
     every error is kept for the end, the result is infinite, and the other jobs go on.
     A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
-    with tolerant_output():  # also in a launcher's worker, and for the message
-        return attempted(job, cfg)
-
-
-def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     begun.append(True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
-    if HydraConfig.initialized():
-        folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir")
-    else:
-        folder = None
+    hydra = HydraConfig.get() if HydraConfig.initialized() else OmegaConf.create()
+    folder = OmegaConf.select(hydra, "runtime.output_dir")
     try:
-        with (
-            held(folder, wait=(cfg or {}).get("resume") == "auto")
-            if folder is not None
-            else nullcontext()
-        ):
+        with held(folder, (cfg or {}).get("resume") == "auto") if folder else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
-        where = folder or "<run folder>"
-        resume = (
-            f"stopped; resume with ckpt_path={where}/checkpoints/last.ckpt, where the fit had begun"
-        )
-        leave(resume, 143 if signal.SIGTERM in signals else 130)
+        last = f"{folder or '<run folder>'}/checkpoints/last.ckpt"
+        message = f"stopped; resume with ckpt_path={last}, where the fit had begun"
+        leave(message, 143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
     except Exception as error:
@@ -304,7 +279,5 @@ def keep(message: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{hydra.job.num}.txt").write_text(message + "\n")
-    except (
-        OSError
-    ) as error:  # a full disk: the sweep cannot say it at its end, so that it ends here
+    except OSError as error:  # a full disk: the sweep cannot say it at its end
         raise SystemExit(f"\n{folder}: cannot be written ({error.strerror})") from error

@@ -10,8 +10,7 @@
 
 Any Trainer drives it. A stage runs by Gauss-Newton (`newton_steps.py`: an epoch is one iteration, over all views) or by Adam
 (`adam_steps.py`: an epoch is a pass over the training views). `Stages`, a callback that the module brings along, leads from one
-stage to the next.
-"""
+stage to the next."""
 
 from __future__ import annotations
 
@@ -74,16 +73,9 @@ from mosa.types import Ground, Rollout
 
 log = logging.getLogger(__name__)
 
-PRECISIONS = ("32-true",)
-"""Of a Trainer. The simulation has its own: simulation.precision=64."""
-
-
-MADE = ("trainer", "callbacks", "logger")
-"""Sections that Hydra makes objects of. A checkpoint does not keep them: what it holds is data."""
-OF_DATA = ("scene", "reconstruction", "rendering", "seed")
-"""Sections of the configuration that the data module decides."""
-
-
+PRECISIONS = ("32-true",)  # of a Trainer. The simulation has its own: simulation.precision=64.
+MADE = ("trainer", "callbacks", "logger")  # made by Hydra, so not kept in a checkpoint
+OF_DATA = ("scene", "reconstruction", "rendering", "seed")  # the data module's
 KEPT = (
     "steps_done", "stage_over", "misfit", "compared", "grounds", "ground_gains", "law_gains", "parts",
 )  # fmt: skip
@@ -101,8 +93,8 @@ def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
     """Errors: ConfigError naming an argument that no fit can do with. precision: as it was given, which a Trainer may change."""
     if trainer.world_size != 1:
         raise ConfigError(
-            f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.world_size}: a fit "
-            "runs on one device, and the runs of a sweep on several (docs/sweeps.md)"
+            "trainer.devices: expected 1, or a list with the index of one GPU, found "
+            f"{trainer.world_size} (docs/sweeps.md)"
         )
     if trainer.precision not in PRECISIONS:
         raise ConfigError(
@@ -187,11 +179,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.informed = False  # whether the takes have the cues about the calibrated backbone
         # what was found: mean distances [m] of the calibrated candidates for the backbone and of the
         # contacts, gains of others about the learned law, errors [m] of held-back frames by parts
-        self.compared: dict[str, float] = {}
-        self.grounds: dict[str, float] = {}
-        self.law_gains: dict[str, float] = {}
-        self.ground_gains: dict[str, float] = {}
-        self.parts: dict[str, float] = {}
+        self.compared, self.grounds, self.parts = {}, {}, {}
+        self.law_gains, self.ground_gains = {}, {}
         self.posterior: Posterior | None = None
         self._known: dict[str, Posterior] = {}  # by law
         begins_again = body is not None and (self.ground_is_sought or body.material.candidates)
@@ -236,13 +225,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 "loader reads films in a format of your own (docs/extending.md, 'A data format')"
             )
         # what is saved at the end of an epoch belongs to the stage that comes next
-        callbacks = self.trainer.callbacks
-        own = [each for each in callbacks if isinstance(each, Stages)]
-        others = [each for each in callbacks if not isinstance(each, Stages)]
-        place = next(
-            (i for i, each in enumerate(others) if isinstance(each, Checkpoint)), len(others)
-        )
-        self.trainer.callbacks = [*others[:place], *own, *others[place:]]
+        kinds = Checkpoint, Stages
+        self.trainer.callbacks.sort(key=lambda each: [isinstance(each, kind) for kind in kinds])
 
     def configure_callbacks(self) -> list[L.Callback]:
         """Asked for first of all, before the data take their time."""
@@ -266,19 +250,22 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self._begin(record, body, (), background, **parts_of(record, body))
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
-            raise ConfigError(
-                f"ckpt_path: expected a scene whose body has {len(self.body.rest)} particles, found "
-                f"{len(data.shape.rest)}: the checkpoint belongs to another scene, reconstruction or "
-                "simulation.particles"
-            )
+            raise self.of_another_body(len(data.shape.rest))
         if fitting and not self.takes:
-            self.takes = [
-                replace(take, again=take.again and replace(take.again, plastic=self.is_plastic))
-                for take in data.takes
-            ]
+            again = (
+                take.again and replace(take.again, plastic=self.is_plastic) for take in data.takes
+            )
+            self.takes = [replace(take, again=each) for take, each in zip(data.takes, again)]
             self.first_takes = list(self.takes)
             if self.saved_cues is not None:
                 self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
+
+    def of_another_body(self, found: int | None) -> ConfigError:
+        return ConfigError(
+            f"ckpt_path: expected a fit to a body of {len(self.body.rest)} particles, found "
+            f"{found}: the checkpoint belongs to another scene, reconstruction or "
+            "simulation.particles"
+        )
 
     def is_plastic(self) -> bool:
         """Whether the law yields, which candidates for it may not agree on."""
@@ -300,29 +287,24 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             particles=len(self.body.rest), identification=self.identification.state() if self.identification else None,
             retreat=self.retreat.written(), cues=cues, responses=responses,
         )  # fmt: skip
+        posterior, splats = self.posterior, self.body.splats
         record = RunRecord(
             **dict(self.record),
             start=self.start,
             fit=fit,
-            posterior=self.posterior.written() if self.posterior else None,
-            splats=self.body.splats.written() if self.body.splats is not None else None,
+            posterior=posterior and posterior.written(),
+            splats=None if splats is None else splats.written(),
         )
         check_plain("", checkpoint)  # with what callbacks and data modules of anyone's added
         checkpoint["mosa"] = record.plain()
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if "mosa" not in checkpoint:
-            raise ConfigError(
-                "ckpt_path: the checkpoint was not written by this program (no entry 'mosa')"
-            )
+            raise ConfigError("ckpt_path: the checkpoint was not written by this program")
         record = RunRecord.read(checkpoint["mosa"])
         saved = record.fit
         if saved is None or saved.particles != len(self.body.rest):
-            raise ConfigError(
-                f"ckpt_path: expected a fit to a body of {len(self.body.rest)} particles, found "
-                f"{'none' if saved is None else saved.particles}: the checkpoint belongs to another scene, reconstruction or "
-                "simulation.particles"
-            )
+            raise self.of_another_body(None if saved is None else saved.particles)
         if self.record is not None:
             check_same_scene(record, self.record.settings, "the checkpoint")
             check_same_data(record, self.record.data, "the checkpoint")
@@ -335,8 +317,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if self.compared and (candidates := self.body.material.candidates):
             if (law := record.law) not in candidates:
                 raise ConfigError(
-                    f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
-                    "the checkpoint: it belongs to another configuration"
+                    f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, "
+                    f"found {law!r}"
                 )
             self.choose(law)
         if self.ground_is_sought and record.ground is not None and not record.ground_is_sought:
@@ -349,8 +331,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
               and any(take.again for take in self.takes)):  # fmt: skip
             raise ConfigError(
-                "ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
-                "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it"
+                "ckpt_path: expected the motion that reconstruction.informed finds, found none: "
+                "set reconstruction.informed.iterations=0, as the run had it"
             )
 
     def choose(self, law: str) -> None:
@@ -412,10 +394,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor | None:
         """The loss before the step. By Gauss-Newton: minus the logarithm of the posterior; by Adam: the weighted terms of the views
         of `batch`, None where the step before was taken back."""
-        stage, iteration = self.stage, len(self.losses)
-        if stage.newton:
-            return self.newton_loss(stage, iteration)
-        return self.gradient_loss(stage, iteration, batch)
+        running = self.stage, len(self.losses)
+        return (
+            self.newton_loss(*running) if self.stage.newton else self.gradient_loss(*running, batch)
+        )
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
         if loss.requires_grad:  # Gauss-Newton's has none
@@ -450,17 +432,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         else:
             seen = part.observations
             shown = self.shown(rollout.x[part.frames], rollout.F_tot[part.frames], seen)
-            terms = {
-                "image": losses.image_loss(shown.images, seen.images),
-                "mask": losses.mask_loss(shown.mattes, seen.mattes),
-            }
-            loss = sum(self.weights.get(name, 0.0) * float(value) for name, value in terms.items())
+            image = float(losses.image_loss(shown.images, seen.images))
+            mask = float(losses.mask_loss(shown.mattes, seen.mattes))
+            loss = self.weights.get("image", 0.0) * image + self.weights.get("mask", 0.0) * mask
             psnr = metrics.psnr(shown.images.clamp(0, 1).flatten(0, 1), seen.images.flatten(0, 1))
             values = {"loss": loss, "psnr": psnr}
         for place in ("val", f"val/{part.name}"):
-            self.log_dict(
-                {f"{place}/{name}": value for name, value in values.items()}, batch_size=1
-            )
+            self.log_dict({f"{place}/{k}": value for k, value in values.items()}, batch_size=1)
 
     def shown(self, x: Tensor, F_tot: Tensor, observations: Observations) -> Views:
         """Images of the body's particles in the cameras of `observations`."""
@@ -503,8 +481,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         the scene's data module goes on from there.
 
         The file is read as data (docs/safety.md); Lightning's other arguments (`strict`, `hparams_file`, ...) change nothing.
-        Errors: DataError naming the file.
-        """
+        Errors: DataError naming the file."""
         from mosa.twin.twin import Twin
 
         twin = Twin.load(checkpoint_path, "cpu" if map_location is None else map_location)
@@ -579,11 +556,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
         found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
         found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}
-        touched = {f"{contact}_m": each for contact, each in self.grounds.items()}
-        touched |= {f"{contact}_gain": gain for contact, gain in self.ground_gains.items()}
-        return found | {
-            f"id_prior/ground/{name}": each for name, each in touched.items() if math.isfinite(each)
-        }
+        found |= {f"id_prior/ground/{k}_m": v for k, v in self.grounds.items() if math.isfinite(v)}
+        gains = self.ground_gains.items()
+        return found | {f"id_prior/ground/{k}_gain": v for k, v in gains if math.isfinite(v)}
 
     def log_values(self, values: dict[str, Tensor | float]) -> None:
         """These scalars and the parameters, into the logs and `last`."""

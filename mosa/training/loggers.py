@@ -12,20 +12,11 @@ import numpy as np
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
-OUTCOME = (
-    "train/rms_m",
-    "test/rms_m",
-    "prior/test/rms_m",
-    "prior_eta/test/rms_m",
-    "train/psnr_crop",
-    "test/psnr_crop",
-    "camera/psnr_crop",
-    "test/mean_abs_C",
-)
+OUTCOME = """train/rms_m test/rms_m prior/test/rms_m prior_eta/test/rms_m train/psnr_crop
+test/psnr_crop camera/psnr_crop test/mean_abs_C""".split()
 
 
-PICTURED = (TensorBoardLogger, WandbLogger)
-"""Loggers that show pictures."""
+PICTURED = (TensorBoardLogger, WandbLogger)  # loggers that show pictures
 
 
 def add_picture(loggers: Sequence[Logger], name: str, picture: Tensor, step: int) -> None:
@@ -42,16 +33,10 @@ def log_outcome(
 ) -> None:
     """The run's configuration beside its final figures, as `final/...`: TensorBoard's table of hyper-parameters, the summary of
     wandb's run, which ends here. A table of steps has no place for them; metrics.json has them all."""
-    final = {
-        f"final/{k}": v
-        for k, v in figures.items()
-        if k in OUTCOME or k.startswith(("id/", "id_prior/"))
-    }
-    parameters = {
-        k: v
-        for k, v in cfg.items()
-        if k not in ("evaluation", "logger", "callbacks", "trainer", "hydra")
-    }
+    said = [k for k in figures if k in OUTCOME or k.startswith(("id/", "id_prior/"))]
+    final = {f"final/{k}": figures[k] for k in said}
+    without = ("evaluation", "logger", "callbacks", "trainer", "hydra")
+    parameters = {k: v for k, v in cfg.items() if k not in without}
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
             # the fit left an empty one, which would be kept

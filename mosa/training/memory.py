@@ -16,12 +16,9 @@ from mosa.system.limits import machine_memory
 from mosa.system.threads import cores
 from mosa.types import Scene
 
-BASE = 1.15e9
-"""Bytes of a process on a CPU with its libraries and kernels, without data."""
-PAIR_BYTES = 61.0
-"""Bytes of a particle over its neighbours squared, while the deformation modes are found; most that a particle takes."""
-MODE_BYTES, FRAME_BYTES = 32.0, 96.0
-"""Of a particle: for each deformation mode; for each frame of a rollout."""
+BASE = 1.15e9  # bytes of a process on a CPU with its libraries and kernels, without data
+PAIR_BYTES = 61.0  # of a particle, over its neighbours squared, while modes are found
+MODE_BYTES, FRAME_BYTES = 32.0, 96.0  # of a particle: per deformation mode, per frame
 
 
 @dataclass(frozen=True)
@@ -39,14 +36,10 @@ def particle_bytes(cfg: Mapping[str, Any], size: Size) -> float:
     """Bytes of a particle in that part of the run that takes most."""
     settings = cfg["reconstruction"]
     modes = settings["dynamic"]["modes"]
-    found = (
-        PAIR_BYTES * settings["neighbours"] ** 2 + MODE_BYTES * modes + FRAME_BYTES * size.frames
-    )
-    kept = (
-        FRAME_BYTES * 3 * size.sequences * size.frames
-        + 12 * (DRAWS + len(RIVALS)) * size.sequences * size.frames
-    )
-    return 1500 + max(found, cores() * FRAME_BYTES * size.frames + 1500, kept)
+    moving = FRAME_BYTES * size.frames
+    found = PAIR_BYTES * settings["neighbours"] ** 2 + MODE_BYTES * modes + moving
+    kept = (3 * FRAME_BYTES + 12 * (DRAWS + len(RIVALS))) * size.sequences * size.frames
+    return 1500 + max(found, cores() * moving + 1500, kept)
 
 
 def memory_of(cfg: Mapping[str, Any], size: Size) -> float:
@@ -65,26 +58,24 @@ def check_memory(cfg: Mapping[str, Any], size: Size) -> None:
     if most < 8 and empty < 0.5 * there:
         settings = cfg["reconstruction"]
         raise ConfigError(
-            f"reconstruction.neighbours: {settings['neighbours']}, with reconstruction.dynamic.modes of "
-            f"{settings['dynamic']['modes']}, take {particle_bytes(cfg, size) / 1e9:.2g} GB for each particle, of "
-            f"this machine's {there / 1e9:.1f} GB; lower them"
+            f"reconstruction.neighbours: {settings['neighbours']}, with "
+            f"reconstruction.dynamic.modes: {settings['dynamic']['modes']}, take "
+            f"{particle_bytes(cfg, size) / 1e9:.2g} GB for each particle, of this machine's "
+            f"{there / 1e9:.1f} GB"
         )
     if most < 8:
         raise ConfigError(
-            f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of {size.pixels} px take "
-            f"{empty / 1e9:.1f} GB, which this machine's {there / 1e9:.1f} GB do not hold; lower scene.scale, or "
-            "restrict scene.frames"
+            f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of "
+            f"{size.pixels} px take {empty / 1e9:.1f} GB, of this machine's {there / 1e9:.1f} GB; "
+            "lower it or scene.frames"
         )
-    if cfg["simulation"]["dx"] is not None:
-        dx = cfg["simulation"]["dx"]
-        raise ConfigError(
-            f"simulation.dx: {dx} m make about {size.particles} particles and take {wanted / 1e9:.1f} GB; this "
-            f"machine has {there / 1e9:.1f} GB; expected at most {most} particles, a spacing of "
-            f"{dx * (size.particles / most) ** (1 / 3):.3g} m"
-        )
+    key, above, dx = "particles", "", cfg["simulation"]["dx"]
+    if dx is not None:
+        coarser = dx * (size.particles / most) ** (1 / 3)
+        key, above = f"dx: {dx} m", f" particles, a spacing of {coarser:.3g} m"
     raise ConfigError(
-        f"simulation.particles: {size.particles} take about {wanted / 1e9:.1f} GB, this machine has "
-        f"{there / 1e9:.1f} GB; expected at most {most}"
+        f"simulation.{key}: {size.particles} take about {wanted / 1e9:.1f} GB, this machine has "
+        f"{there / 1e9:.1f} GB; expected at most {most}{above}"
     )
 
 

@@ -46,7 +46,7 @@ from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.whole_files import written_whole
 from mosa.training.run_folder import VALIDATION, write_figures
 from mosa.twin.rollout_file import save_rollout, save_spread, save_truth
-from mosa.types import Rollout, Scene
+from mosa.types import Rollout
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,9 @@ def figures_of(
         body, posterior, evaluated, world, folder, known
     )
     if settings.floor:
-        figures |= floor_figures(body, evaluated, world, settings) | true_geometry(body, scene)
+        figures |= floor_figures(body, evaluated, world, settings)
+        if scene.synthetic and scene.truth is not None:
+            figures |= geometry_figures(body.rest, body.volume, scene)
     return figures, kept
 
 
@@ -88,18 +90,9 @@ def posterior_figures(
     return figures | test_means(figures) | determined(body, posterior)
 
 
-def true_geometry(body: Body, scene: Scene) -> dict[str, float]:
-    """Figures of the body against the true shape, where that is known."""
-    if scene.synthetic and scene.truth is not None:
-        return geometry_figures(body.rest, body.volume, scene)
-    return {}
-
-
 def start_figures(start: Start) -> dict[str, float]:
-    names = ("x", "y", "z")
-    return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
-        f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)
-    }
+    motions = {"v0": start.velocity, "omega0": start.angular_velocity}
+    return {f"id/{k}_{n}": float(v) for k, vector in motions.items() for n, v in zip("xyz", vector)}
 
 
 def write_outputs(
@@ -115,13 +108,10 @@ def write_outputs(
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
     all; tables in results.md, below the note; a model card beside the checkpoint; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
-        motions = {
-            prefix: variants[variant] for prefix, variants in kept.items() if variant in variants
-        }
+        motions = {prefix: each[variant] for prefix, each in kept.items() if variant in each}
         save_rollout(folder / name, motions, world.solids)
-    if known := {
-        s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None
-    }:
+    told = [s for s in evaluated if s.scene.truth is not None]
+    if known := {s.prefix: true_motion(body, s.scene) for s in told}:
         save_truth(folder / "truth.npz", known)
     if body.splats is not None:
         known = body.splats.appearance
@@ -135,9 +125,8 @@ def write_outputs(
         if shown:
             far = (distances(body, s.scene, kept[s.prefix]).values() for s in shown)
             limit = error_limit(d for each in far for d in each)
-            write_comparisons(
-                folder, {s.prefix: compare(body, s, kept[s.prefix], limit=limit) for s in shown}
-            )
+            compared = {s.prefix: compare(body, s, kept[s.prefix], limit=limit) for s in shown}
+            write_comparisons(folder, compared)
     law = body.material.law
     parts = (note, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
              determined_text(figures, law), force_lines(figures), geometry_lines(figures))  # fmt: skip
@@ -159,6 +148,5 @@ def optimized(figures: dict[str, float], wanted: str) -> float | None:
     for key in (wanted, "test/rms_m", "train/rms_m"):
         if key in figures:
             return figures[key]
-    return next(
-        (-figures[key] for key in ("test/psnr_crop", "train/psnr_crop") if key in figures), None
-    )
+    psnrs = ("test/psnr_crop", "train/psnr_crop")
+    return next((-figures[key] for key in psnrs if key in figures), None)

@@ -15,7 +15,7 @@ from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
 from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
-from mosa.config.leaf_settings import CaptureSettings, SplatsSettings
+from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import RunRecord
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
@@ -33,11 +33,9 @@ from mosa.twin.presets import preset
 from mosa.twin.twin import Twin, viewed_from
 from mosa.types import REST, Scene
 
-PARTICLE_BYTES = 5e3
-"""Of a particle through reconstruction and fit, at least: modes, neighbours, frames, buffers of the rollout."""
+PARTICLE_BYTES = 5e3  # of a particle in reconstruction and fit, at least
 FEWEST = 8
-DEFORMED = 3
-"""Frames after first contact: of three a smoke run on the tiny scene finds E to 15 %, of one to a seventh of it."""
+DEFORMED = 3  # frames after contact that a fit needs (tiny scene: three find E to 15 %)
 
 
 def check_configuration(values: Mapping[str, Any]) -> TrainSettings:
@@ -85,11 +83,6 @@ def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> Sp
     return settings
 
 
-def check_capture(values: Mapping[str, Any]) -> CaptureSettings:
-    """All that the configuration of `python -m mosa.capture` says by itself. Errors: ConfigError naming the key."""
-    return CaptureSettings.read(values)
-
-
 def check_particles(key: str, count: float) -> None:
     """Errors: ConfigError where the machine cannot hold as many."""
     counted(key, [count], "take as many as this machine has memory for", each=PARTICLE_BYTES / 2)
@@ -101,13 +94,11 @@ def check_begin(cfg: DictConfig) -> RunRecord | None:
     if cfg.ckpt_path is None:
         return None
     try:
-        found = read_checkpoint(cfg.ckpt_path)
-        record = check_resumed(found, cfg.ckpt_path)
+        record = check_resumed(read_checkpoint(cfg.ckpt_path), cfg.ckpt_path)
     except DataError as error:
-        again = (
-            "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
-        )
-        raise DataError(f"{error}{again}") from error
+        if cfg.resume != "auto":
+            raise
+        raise DataError(f"{error}; remove the file, and resume=auto begins the fit anew") from error
     check_same_scene(record, plain(cfg), cfg.ckpt_path)
     return record
 
@@ -115,8 +106,7 @@ def check_begin(cfg: DictConfig) -> RunRecord | None:
 def check_seen(cfg: DictConfig, scene: Scene) -> None:
     """The object as frame 0 shows it, before its reconstruction: no solid contains it, a grid suits its size, ground and walls.
 
-    Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
-    """
+    Errors: ConfigError naming the key. Silent where fewer than two mattes are whole."""
     world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
     ground = [] if world.ground is None else [ground_plane(world.ground, world.up)]
     turn_along([*ground, *world.planes])
@@ -129,7 +119,7 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
         count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
         if count < FEWEST:
             raise ConfigError(
-                f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
+                f"simulation.dx: expected less than the object's radius of {radius:.3g} m, found "
                 f"{dx} m"
             )
 
@@ -149,9 +139,7 @@ def warn_of_little(
     if world.colliders or world.planes or world.driven:
         solids: list[Collider | Driven] = [*world.colliders, *world.driven]
         rests = all(
-            scene.start == REST
-            for prefix, scene in zip(found, scenes)
-            if prefix.startswith("train")
+            s.start == REST for prefix, s in zip(found, scenes) if prefix.startswith("train")
         )
         if rests and not world.forces and any(each.motion.max_speed(1.0) > 0 for each in solids):
             warnings.warn(
@@ -175,16 +163,15 @@ def warn_of_little(
 def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
     """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
     from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
-    stored = twin.record.settings.get("scene")
-    if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
-        stored = None
-    if not cfg.get("scene") and stored is None:
-        raise DataError(
-            f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>"
-        )
-    keys = plain(cfg.scene) if cfg.get("scene") else {**(stored or {}), "cache": None}
-    if not cfg.get("scene") and keys.get("path") is not None:
-        print(
-            f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)"
-        )
+    if cfg.get("scene"):
+        keys = plain(cfg.scene)
+    else:
+        stored = twin.record.settings.get("scene")
+        if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
+            raise DataError(f"ckpt_path: {cfg.ckpt_path}: its run has no scene; set scene=<option>")
+        keys = stored | {"cache": None}
+        if (path := keys.get("path")) is not None:
+            below = keys.get("root")
+            way = "as the checkpoint says (scene=... reads another)"
+            print(f"scene: reads {path} below {below}, {way}")
     return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})

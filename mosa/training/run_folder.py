@@ -22,8 +22,7 @@ from mosa.system.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
-VALIDATION = "val/"
-"""Begins the names of figures of what is held out of the training sequence."""
+VALIDATION = "val/"  # begins the names of figures of what is held out of the training sequence
 MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 """Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
@@ -62,14 +61,12 @@ def read_figures(path: Path) -> dict[str, float | str]:
     """What `write_figures` wrote: infinite figures and those that are not numbers are floats again."""
     try:
         found = json.loads(path.read_text())
-        if not isinstance(found, dict) or not all(
-            isinstance(v, (int, float, str)) for v in found.values()
-        ):
+        if not all(isinstance(v, (int, float, str)) for v in dict(found).values()):
             raise ValueError("no figures by name")
-    except (ValueError, RecursionError, OSError) as error:
+    except (ValueError, TypeError, RecursionError, OSError) as error:
         raise DataError(
-            f"{path}: expected the figures of a complete run, found a damaged file ({error}); remove it and the run is "
-            "made again"
+            f"{path}: expected the figures of a complete run, found a damaged file ({error}): "
+            "remove it"
         ) from error
     return {k: SPECIAL.get(v, v) if isinstance(v, str) else v for k, v in found.items()}
 
@@ -81,8 +78,7 @@ def finished(cfg: DictConfig, folder: Path) -> dict[str, float] | None:
         raise ConfigError(
             f"resume: expected null or auto, found {cfg.resume!r}; a checkpoint's path is ckpt_path"
         )
-    path = folder / "metrics.json"
-    if cfg.resume != "auto" or not path.is_file():
+    if cfg.resume != "auto" or not (path := folder / "metrics.json").is_file():
         return None
     check_own(cfg, folder)
     return read_figures(path)
@@ -130,10 +126,7 @@ def peak_memory() -> float:
 
 def cost(device: str) -> dict[str, float | str]:
     """Device and peak memory of this process: `time/device`, `time/peak_memory_gb`, and of a GPU what torch took."""
-    figures = {
-        "time/device": device_label(device),
-        "time/peak_memory_gb": peak_memory(),
-    }
+    figures = {"time/device": device_label(device), "time/peak_memory_gb": peak_memory()}
     if device != "cpu":
         figures["time/peak_gpu_memory_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
     return figures

@@ -12,8 +12,7 @@ import yaml
 from mosa.errors import DataError
 from mosa.system.whole_files import written_whole
 
-FAILED = "failed"
-"""Folder in that of a sweep: a file for each job that ended in an error, named after its number."""
+FAILED = "failed"  # folder of a sweep: <number>.txt of each job that failed
 SHOWN = ("test/rms_m", "train/rms_m", "val/loss", "id/E", "id/nu", "posterior/E_relative_sd")
 """Figures of the table on the screen, where a job has them; the file has all."""
 Row = dict[str, object]
@@ -60,12 +59,8 @@ def sweep_table(folder: str | Path) -> list[Row]:
 
 def seconds(figures: Mapping[str, object]) -> float:
     """All stages of a run together [s]; 0 where none was measured."""
-    return sum(
-        value
-        for key, value in figures.items()
-        if key.startswith("time/") and key.endswith("_s") and "_per_" not in key
-        if isinstance(value, int | float)
-    )
+    keys = (k for k in figures if k.startswith("time/") and k.endswith("_s") and "_per_" not in k)
+    return sum(value for key in keys if isinstance(value := figures[key], int | float))
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:
@@ -97,14 +92,12 @@ def write_table(folder: str | Path) -> tuple[list[Row], list[Path]]:
 def text_of(rows: Sequence[Row]) -> str:
     """For a screen: the overrides that differ among the jobs, some figures, time and state."""
     fixed = {"job", "folder", "state", "message", "time_s"}
-    varied = [
-        name
-        for name in columns_of(rows)
-        if name not in fixed
-        and not any(isinstance(row.get(name), float | int) for row in rows)
-        and len({row.get(name) for row in rows}) > 1
-        and "/" not in name
-    ]
+    varied = []
+    for name in columns_of(rows):
+        values = {row.get(name) for row in rows}
+        numbers = any(isinstance(value, float | int) for value in values)
+        if name not in fixed and "/" not in name and len(values) > 1 and not numbers:
+            varied.append(name)
     shown = [name for name in SHOWN if any(name in row for row in rows)]
     header = ["job", *varied, *shown, "time_s", "state"]
     cells = [header, *([said(row.get(name, "")) for name in header] for row in rows)]

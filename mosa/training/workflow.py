@@ -68,19 +68,13 @@ ANOTHER_START = (
 """Keys of `simulate` that ask eval.py for a rollout from a new start."""
 
 
-class StageTimes:
-    """Wall time per stage, into `time/<stage>_s`."""
-
-    def __init__(self) -> None:
-        self.figures: dict[str, float] = {}
-
-    @contextmanager
-    def measure(self, stage: str):
-        began = time.perf_counter()
-        yield
-        took, name = time.perf_counter() - began, f"time/{stage}_s"
-        self.figures[name] = self.figures.get(name, 0.0) + took
-        log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory())
+@contextmanager
+def timed(times: dict[str, float], stage: str):
+    """The wall time of a stage, into `time/<stage>_s`."""
+    began = time.perf_counter()
+    yield
+    times[f"time/{stage}_s"] = took = time.perf_counter() - began
+    log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory())
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -91,7 +85,7 @@ def train(cfg: DictConfig) -> float | None:
     cfg = with_defaults(cfg, "train")
     L.seed_everything(cfg.seed, verbose=False)
     exact_sums.use(cfg.deterministic)
-    clock, folder = StageTimes(), run_folder()
+    times, folder = dict[str, float](), run_folder()
     log.info("mosa %s: %s", __version__, " ".join(HydraConfig.get().overrides.task))
     if (done := finished(cfg, folder)) is not None:
         log.info("skipped: %s has its metrics.json (resume=auto)", folder)
@@ -103,7 +97,7 @@ def train(cfg: DictConfig) -> float | None:
     data = SceneDataModule(cfg, device=device)
     most = most_particles(device)
     check_before_data(settings.plain(), most)
-    with clock.measure("data"):
+    with timed(times, "data"):
         scene, others = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
@@ -115,7 +109,7 @@ def train(cfg: DictConfig) -> float | None:
         log.info("tracked points only: no reconstruction from images, no figures of images")
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
-    with clock.measure("reconstruction"):
+    with timed(times, "reconstruction"):
         shape, dx = data.shape, data.dx
     cm3 = 1e6 * float(shape.volume.sum())
     log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), cm3, dx)
@@ -127,35 +121,29 @@ def train(cfg: DictConfig) -> float | None:
             f"than its prior; take about {resolved.particles} particles{', or adapter=none' if cfg.adapter.name else ''}",
             stacklevel=1,
         )
-    with clock.measure("starts"):
+    with timed(times, "starts"):
         starts = data.starts
     for prefix, start in starts.items():
         velocity = ", ".join(f"{v:.3f}" for v in start.velocity.tolist())
         log.info("start of %s: velocity (%s) m/s", prefix, velocity)
-    with clock.measure("fit"):
+    with timed(times, "fit"):
         module = LitMosa(plain(cfg))
         module.attach(data)
         cut = learn(module, data, trainer, cfg.ckpt_path)
-    body, world = (
-        module.body,
-        module.world,
-    )  # where how the ground is touched was sought, it has been found
+    body, world = module.body, module.world  # with the contact that was found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]
     if filmed:
         seen = {prefix: take.cues for prefix, take in zip(learned_from, module.takes)}
         save_observed(folder / "observed.npz", seen)
-    with clock.measure("evaluation"):
-        evaluated = data.sequences
-        figures, kept = figures_of(
-            settings.evaluation, body, evaluated, world, module.posterior, folder
-        )
+    with timed(times, "evaluation"):
+        evaluated, posterior = data.sequences, module.posterior
+        figures, kept = figures_of(settings.evaluation, body, evaluated, world, posterior, folder)
         figures |= start_figures(starts["train"]) | data.reconstruction.geometry | module.figures()
     sizes = {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
-    figures |= clock.figures | cost(device) | sizes
+    figures |= times | cost(device) | sizes
     figures["geometry/cells_across"] = resolved.cells
-    figures |= {
-        k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith(VALIDATION)
-    }
+    logged = trainer.callback_metrics.items()
+    figures |= {k: float(v) for k, v in logged if k.startswith(VALIDATION)}
     log_outcome(trainer.loggers, plain(cfg), figures)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world, cut)
     return optimized(figures, cfg.optimized_metric)
@@ -172,12 +160,8 @@ def learn(module: LitMosa, data: SceneDataModule, trainer: L.Trainer, ckpt_path:
             "scene=markers: expected stages that run Gauss-Newton, which compares tracked points, "
             "found Adam (fit.<stage>.optimizer): choose adapter=operator or adapter=none"
         )
-    log.info(
-        "fit: %d particles, %d frames, at most %d steps",
-        len(body.rest),
-        len(module.takes[0].cues.positions),
-        sum(stage.iterations for stage in module.stages),
-    )
+    frames, steps = len(module.takes[0].cues.positions), sum(s.iterations for s in module.stages)
+    log.info("fit: %d particles, %d frames, at most %d steps", len(body.rest), frames, steps)
     cut = fit(trainer, module, data, ckpt_path)
     warn_of_ends(body.material)
     return cut
@@ -207,11 +191,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if any(simulate[k] is not None for k in ANOTHER_START):
         rollout = twin.simulate(**simulate, progress=True)
         readers = {"colliders": colliders_from_config, "driven": driven_from_config}
-        given = {
-            k: read(simulate[k], f"simulate.{k}")
-            for k, read in readers.items()
-            if simulate[k] is not None
-        }
+        asked = {k: simulate[k] for k in readers if simulate[k] is not None}
+        given = {k: readers[k](value, f"simulate.{k}") for k, value in asked.items()}
         world = replace(twin.world, **given)
         written = twin.export(rollout, folder, colliders=world.solids, video=cfg.evaluation.video)
         log.info("simulated %d frames into %s", len(rollout.x), written)
@@ -220,10 +201,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     body, world = twin.body, twin.world
     if cfg.get("scene"):
         seen = appearance_of(body)
-        found = {
-            f"test/{s.sequence}": sequence_start(body, seen, s, register=True)
-            for s in (scene, *held_out)
-        }
+        shown = {f"test/{s.sequence}": s for s in (scene, *held_out)}
+        found = {k: sequence_start(body, seen, s, register=True) for k, s in shown.items()}
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = world_of(measured(twin.record.settings, scene, twin.record.dx))
         if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
@@ -234,8 +213,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         found = {k: Start.read(s.plain(), body.rest) for k, s in twin.record.starts.items()}
         if len(found) != 1 + len(held_out):
             raise DataError(
-                f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
-                f"found {len(found)}: the scene is another one than the run's"
+                f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's "
+                f"{1 + len(held_out)} sequences, found {len(found)}: another scene than the run's"
             )
         here = zip(found, (scene, *held_out), strict=True)
         check_same_data(twin.record, {name: s.fingerprint for name, s in here}, cfg.ckpt_path)
@@ -250,8 +229,7 @@ def show(body: Body, appearance: str | None) -> None:
     """What the body's images show from now on: splats or particles, None for what they are. Errors: ConfigError without splats."""
     if appearance == "splats" and body.splats is None:
         raise ConfigError(
-            "appearance: expected particles, found splats: the run kept none (rendering.appearance=particles, or an "
-            "older one)"
+            "appearance: expected particles, found splats: the run kept none (rendering.appearance)"
         )
     if appearance == "particles":
         body.splats = None

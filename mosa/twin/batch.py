@@ -73,9 +73,8 @@ class TwinWorlds:
         """
         check_frames(frames, self.count * len(self.body.rest))
         if not differentiable:
-            check_wants_no_gradients(
-                starts=starts, colliders=colliders, gravity=gravity, box=box, driven=driven
-            )
+            world = {"colliders": colliders, "gravity": gravity, "box": box, "driven": driven}
+            check_wants_no_gradients(starts=starts, **world)
         found = self._found(starts, range(self.count), colliders, box, driven)
         if gravity is not None:
             shape = (self.count, 3)
@@ -98,11 +97,8 @@ class TwinWorlds:
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
         which, episode = list(which), self._going()
-        if starts is None:
-            given = None
-        else:
-            given = [start for start, _ in self._found(starts, which, (), self._box, ())]
-        return episode.restart(which, given)
+        found = [] if starts is None else self._found(starts, which, (), self._box, ())
+        return episode.restart(which, None if starts is None else [start for start, _ in found])
 
     def _found(
         self,
@@ -110,7 +106,7 @@ class TwinWorlds:
         which: Sequence[int],
         colliders: Any,
         box: Any,
-        driven: Any = None,
+        driven: Any,
     ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
         each = [starts or {}] * len(which) if isinstance(starts, Mapping | None) else starts
@@ -120,7 +116,7 @@ class TwinWorlds:
             )
         if len(each) != len(which):
             raise ConfigError(
-                f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}"
+                f"starts: expected one, or {len(which)}, one a world, found {len(each)}"
             )
         found: list[tuple[Start, World]] = []
         more = {"colliders": colliders, "box": box, "driven": driven}

@@ -22,8 +22,7 @@ from mosa.system.progress import tqdm
 from mosa.twin.start import rotation_matrix
 from mosa.twin.twin import Twin
 
-INDEPENDENT = 30.0
-"""Data in a frame, as `identification.count`."""
+INDEPENDENT = 30.0  # data in a frame, as `identification.count`
 LEAST_DRAWS = 4
 SQUEEZED, AWAY = 0.2, 1.5
 """Share of the body's height that a press takes; particle spacings of the plate from the body at first."""
@@ -54,10 +53,8 @@ def information(drawn: Tensor, noise: float) -> float:
 def drawn_starts(count: int, seed: int) -> list[tuple[float, float, float, float]]:
     """(axis, degrees) of `count` rotations, evenly drawn; the first is the rest pose, which the training drop shows already."""
     quaternions = np.random.default_rng(seed).normal(size=(count - 1, 4))
-    rotations = [Rotation.from_quat(q) for q in quaternions]
     found = [(0.0, 1.0, 0.0, 0.0)]
-    for rotation in rotations:
-        vector = rotation.as_rotvec()
+    for vector in (Rotation.from_quat(q).as_rotvec() for q in quaternions):
         angle = float((vector @ vector) ** 0.5)
         found.append((*(float(v) / angle for v in vector), math.degrees(angle)))
     return found
@@ -88,12 +85,10 @@ def plan(
     presses: the body also stands on the ground in each of these poses, and a plate comes down on it. What the force on the plate
     would tell is left out.
 
-    Errors: ConfigError where the run kept no posterior, or no start can be simulated.
-    """
+    Errors: ConfigError where the run kept no posterior, or no start can be simulated."""
     if twin.posterior is None:
-        raise ConfigError(
-            "plan: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)"
-        )
+        way = "a fit by Gauss-Newton does (fit.joint.optimizer=auto)"
+        raise ConfigError(f"plan: this run kept no posterior; {way}")
     speed = tuple(float(v) for v in twin.training_start.velocity)
     up, ground = twin.world.up, twin.world.ground
     lowest = float((twin.body.rest.cpu() @ up).min())
@@ -116,25 +111,21 @@ def plan(
                 gain = information(torch.stack(motions), max(twin.posterior.model_error, 1e-3))
                 ranked.append(Candidate(**start, gain=gain, plate=plate))
     if not ranked:
-        raise ConfigError(
-            "plan: none of the candidate starts can be simulated: the body leaves the box of the scene"
-        )
+        why = "the body leaves the box of the scene"
+        raise ConfigError(f"plan: none of the candidate starts can be simulated: {why}")
     return sorted(ranked, key=lambda each: -each.gain)
 
 
 def plan_text(ranked: list[Candidate]) -> str:
     """What a person does next, in lines."""
-    lines = [
-        "Film this next (rotation: axis and degrees from the pose of the training drop's first frame):",
-        "",
-    ]
-    for i, each in enumerate(ranked):
+    from_ = "axis and degrees from the pose of the training drop's first frame"
+    lines = [f"Film this next (rotation: {from_}):", ""]
+    for i, each in enumerate(ranked, 1):
         x, y, z, degrees = each.rotation
         speed = ", ".join(f"{v:.2f}" for v in each.velocity)
         way = f"lowest point {each.height:.3f} m above the ground, thrown at ({speed}) m/s"
         if each.plate:
             way = f"stands, pressed by {SQUEEZED:.0%} of its height by a plate that comes down at {each.plate:.3f} m/s"
-        lines.append(
-            f"{i + 1}. {each.gain:6.2f} nats: turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f}), {way}"
-        )
+        turned = f"turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f})"
+        lines.append(f"{i}. {each.gain:6.2f} nats: {turned}, {way}")
     return "\n".join(lines)

@@ -2,14 +2,14 @@
 
 twin.reset(height=0.2, colliders=[{"type": "box", "name": "paddle", "size": [0.1, 0.1, 0.1], "position": [-0.2, 0.1, 0]}])
 for _ in range(50):
-    state, reactions = twin.step({"paddle": {"velocity": (0.3, 0, 0)}})
-"""
+    state, reactions = twin.step({"paddle": {"velocity": (0.3, 0, 0)}})"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -47,8 +47,7 @@ class TwinState:
     x, v: (N, 3) [m], [m/s]; C_affine: (N, 3, 3) [1/s]; F, F_tot: (N, 3, 3): particles, in the simulation's type; lift: (3,), the
     contact's offset, by which x is above where the body is seen; position, rotation: (K, 3) [m], (K, 3, 3) of the colliders now;
     driven: (K,) bool, whether an action has moved a collider yet; frames, substeps: () steps and substeps since the start; time: ()
-    [s]; lag: () [s], length of the last substep.
-    """
+    [s]; lag: () [s], length of the last substep."""
 
     __repr__ = in_brief
 
@@ -90,19 +89,16 @@ def in_order(states: Sequence[TwinState]) -> bool:
     """Whether they are states of one body and world, in the order of time, equally far apart."""
     times = torch.tensor([float(each.time) for each in states], dtype=torch.float64)
     apart = times.diff()
-    return (
-        len(states) > 0
-        and all(each.x.ndim == 2 and each.x.shape == states[0].x.shape for each in states)
-        and bool((apart > 0).all() and ((apart - apart[:1]).abs() < 1e-6 * apart).all())
-    )
+    alike = all(each.x.ndim == 2 and each.x.shape == states[0].x.shape for each in states)
+    even = (apart > 0).all() and ((apart - apart[:1]).abs() < 1e-6 * apart).all()
+    return len(states) > 0 and alike and bool(even)
 
 
 def rollout_of(states: Sequence[TwinState]) -> Rollout:
     """The motion through T states as a rollout without reactions, whose times begin at 0 s."""
-    x, v, F, F_tot, times = (
-        torch.stack([getattr(each, name).detach() for each in states])
-        for name in ("positions", "v", "F", "F_tot", "time")
-    )
+    names = "positions", "v", "F", "F_tot", "time"
+    parts = ([getattr(each, name).detach() for each in states] for name in names)
+    x, v, F, F_tot, times = map(torch.stack, parts)
     last = ParticleState(*(getattr(states[-1], name).detach() for name in State._fields))
     counts = torch.stack([each.substeps for each in states]).diff().tolist()
     return Rollout(x.to(v), v, F, F_tot, (times - times[0]).to(v), last, counts=tuple(counts))
@@ -111,10 +107,8 @@ def rollout_of(states: Sequence[TwinState]) -> Rollout:
 def placed_as(states: Sequence[TwinState], solids: Sequence[Collider]) -> tuple[Collider, ...]:
     """K solids where they are in the states."""
     x, R = (torch.stack([getattr(s, n).detach() for s in states]) for n in ("position", "rotation"))
-    return tuple(
-        replace(solid, motion=Trajectory(x[:, k], R[:, k], 0 * x[:, k], 0 * x[:, k]))
-        for k, solid in enumerate(solids)
-    )
+    ways = (Trajectory(a, turned, 0 * a, 0 * a) for a, turned in zip(x.unbind(1), R.unbind(1)))
+    return tuple(replace(solid, motion=way) for solid, way in zip(solids, ways))
 
 
 class Stepped(NamedTuple):
@@ -138,23 +132,16 @@ class Episode:
         frames: int = 30, substeps: int | None = None, laws: Tensor | None = None, gravity: Tensor | None = None,
         differentiable: bool = False, together: int | None = None,
     ) -> None:  # fmt: skip
-        self.world = world
-        self.colliders = world.solids
-        self.frame_dt = frame_dt
-        self.differentiable = differentiable
+        self.world, self.colliders = world, world.solids
+        self.frame_dt, self.differentiable = frame_dt, differentiable
         self.worlds = None if isinstance(starts, Start) else len(starts)
         self.names = [collider.name or str(i) for i, collider in enumerate(world.solids)]
         if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ConfigError(
                 f"colliders: expected names of their own, found {', '.join(twice)} more than once"
             )
-        options = {
-            "frames": frames,
-            "frame_dt": frame_dt,
-            "model": body.model(variant),
-            "substeps": substeps,
-            "enough": True,
-        }
+        options = {"frames": frames, "frame_dt": frame_dt, "substeps": substeps, "enough": True}
+        options["model"] = body.model(variant)
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)
@@ -256,9 +243,8 @@ class Episode:
                 after.append(ends)
                 return found
 
-            moment, reactions, _ = self._stepper.step(
-                self._moment, poses if self.colliders else None, speed
-            )
+            wanted = poses if self.colliders else None
+            moment, reactions, _ = self._stepper.step(self._moment, wanted, speed)
             self._moment, self._driven = moment, driven
             self._poses = after[0] if after else self._poses
             self._look()
@@ -287,21 +273,15 @@ class Episode:
                 begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
                 check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
                             tuple(part[b] for part in poses))  # fmt: skip
-                now[b] = entered(
-                    begun, self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx
-                )
+                dx = self._stepper.prepared.numerics.dx
+                now[b] = entered(begun, self._stepper.axes, now[b].x.dtype, dx)
             fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
-            state = ParticleState(
-                *(
-                    _where(chosen, getattr(fresh, n), getattr(moment.state, n))
-                    for n in State._fields
-                )
-            )
-            self._poses = poses
-            self._moment = moment._replace(state=state)
+            pairs = ((getattr(fresh, n), getattr(moment.state, n)) for n in State._fields)
+            state = ParticleState(*(_where(chosen, *pair) for pair in pairs))
+            self._poses, self._moment = poses, moment._replace(state=state)
             return self.state
 
     def _look(self) -> None:
@@ -318,23 +298,20 @@ class Episode:
     def _placed(self, moment: Moment, after: int, dt: float | None = None) -> tuple[Tensor, Tensor]:
         """(position, rotation) of all colliders on their own motions, `after` substeps after `moment`, where they are seen."""
         if not self.colliders:
-            return torch.zeros(*self._leading(), 0, 3).double(), torch.zeros(
-                *self._leading(), 0, 3, 3
-            ).double()
+            none = torch.zeros(*self._leading(), 0, 3, 3).double()
+            return none[..., 0], none
         found = self._own(moment, 1, self._stepper.clock.dt if dt is None else dt, after)
         return found.position[0] - self._up(), found.rotation[0]
 
     def _own(self, moment: Moment, count: int, dt: float, after: int = 0) -> Poses:
         """(S, [B,] K, ...) of the colliders' own motions, where the simulation sees them."""
-        each = [
-            self._stepper.sample(moment, count, dt, motions, after) for motions in self._motions
-        ]
+        sample = self._stepper.sample
+        each = [sample(moment, count, dt, motions, after) for motions in self._motions]
         if self.worlds is None:
             return each[0]
         if len(each) == 1:
-            return Poses(
-                *(part[:, None].expand(-1, self.worlds, *part.shape[1:]) for part in each[0])
-            )
+            shape = self.worlds
+            return Poses(*(part[:, None].expand(-1, shape, *part.shape[1:]) for part in each[0]))
         return Poses(*(torch.stack(parts, 1) for parts in zip(*each)))
 
     def _up(self) -> Tensor:
@@ -349,9 +326,8 @@ class Episode:
         if not bool(driven.all()):
             own, ends = self._own(self._moment, count, dt), self._placed(self._moment, count, dt)
         columns, last = [], []
-        times = dt * torch.arange(count, dtype=torch.float64).view(
-            -1, *(1,) * (1 + len(self._leading()))
-        )
+        rest = (1,) * (1 + len(self._leading()))
+        times = dt * torch.arange(count, dtype=torch.float64).view(-1, *rest)
         for k in range(len(self.colliders)):
             if not driven[k]:
                 columns.append([part.select(1 + len(self._leading()), k) for part in own])
@@ -368,10 +344,7 @@ class Episode:
         axis = 1 + len(self._leading())
         # of one collider without a copy: what is the same at all substeps stays one row
         poses = Poses(
-            *(
-                torch.stack(parts, axis) if len(parts) > 1 else parts[0].unsqueeze(axis)
-                for parts in zip(*columns)
-            )
+            *(torch.stack(p, axis) if len(p) > 1 else p[0].unsqueeze(axis) for p in zip(*columns))
         )
         return poses, tuple(torch.stack(parts, axis - 1) for parts in zip(*last))
 
@@ -386,10 +359,9 @@ class Episode:
             v = (end["position"] - x) / self.frame_dt
         if "rotation" in command:
             end["rotation"] = command["rotation"].expand_as(R)
+            known = command.get("turn")
             w = (
-                rotation_vector(end["rotation"] @ R.mT)
-                if "turn" not in command
-                else command["turn"]
+                rotation_vector(end["rotation"] @ R.mT) if known is None else known
             ) / self.frame_dt
         return v.expand_as(x), w.expand_as(x), end
 
@@ -401,13 +373,9 @@ class Episode:
             if not driven[k]:
                 fastest = max(fastest, collider.motion.max_speed(far))
             elif k in commands:
-                v, w, _ = self._twist(
-                    commands[k],
-                    *(part.select(len(self._leading()), k).detach() for part in self._poses),
-                )
-                fastest = max(
-                    fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max())
-                )
+                pose = (part.select(len(self._leading()), k).detach() for part in self._poses)
+                v, w = (each.detach() for each in self._twist(commands[k], *pose)[:2])
+                fastest = max(fastest, float((v.norm(dim=-1) + far * w.norm(dim=-1)).max()))
         return fastest
 
     def _checked(self, action: Mapping[str, Any]) -> dict[int, dict[str, Tensor]]:
@@ -425,14 +393,13 @@ class Episode:
             if not isinstance(command, Mapping):
                 command = {"velocity": command}
             if not command or not (set(command) <= set(TWISTS) or set(command) <= set(TARGETS)):
+                found = ", ".join(map(str, command)) or "nothing"
                 raise ConfigError(
-                    f"{where}: expected {' and '.join(TWISTS)}, or {' and '.join(TARGETS)} after the step, or one of them, found "
-                    f"{', '.join(map(str, command)) or 'nothing'}"
+                    f"{where}: expected {' and '.join(TWISTS)}, or {' and '.join(TARGETS)} after "
+                    f"the step, or one of them, found {found}"
                 )
             k, given = self.names.index(name), command.get("rotation")
-            commands[k] = {
-                key: self._vector(f"{where}.{key}", value) for key, value in command.items()
-            }
+            commands[k] = {kind: self._vector(f"{where}.{kind}", v) for kind, v in command.items()}
             said = None if given is None else torch.as_tensor(given, dtype=torch.float64).cpu()
             if said is None or said.shape[-2:] == (3, 3):
                 continue
@@ -469,12 +436,8 @@ def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 def _fastest(body: Body, starts: Sequence[Start]) -> Start:
     """The start for which the time step must be smallest."""
-    return max(
-        starts,
-        key=lambda s: float(
-            s.velocity.detach().norm() + s.angular_velocity.detach().norm() * body.size
-        ),
-    )
+    parts = ((s, s.velocity.detach().norm(), s.angular_velocity.detach().norm()) for s in starts)
+    return max(parts, key=lambda each: float(each[1] + each[2] * body.size))[0]
 
 
 def _worlds(
@@ -498,22 +461,18 @@ def _worlds(
         pulls = list(gravity.to(body.rest))
     # the time step is one for all
     quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
-    hardest = max(
-        (replace(world, gravity=pull) for pull in pulls),
-        key=lambda each: each.fastest(quick, body.size, time),
-    )
+    pulled = (replace(world, gravity=pull) for pull in pulls)
+    hardest = max(pulled, key=lambda each: each.fastest(quick, body.size, time))
+    ready_with = partial(body.ready, quick, hardest)
     if laws is None:
-        found = [body.ready(quick, hardest, **options)]
+        found = [ready_with(**options)]
     else:
-        counts = [
-            body.ready(quick, hardest, **options).simulator.substeps for _ in each_law(body, laws)
-        ]
-        fixed = {**options, "substeps": max(counts)}
-        found = [body.ready(quick, hardest, **fixed).answered() for _ in each_law(body, laws)]
+        counts = [ready_with(**options).simulator.substeps for _ in each_law(body, laws)]
+        fixed = options | {"substeps": max(counts)}
+        found = [ready_with(**fixed).answered() for _ in each_law(body, laws)]
     first = found[0].simulator
-    simulator = body.simulator(
-        first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic
-    )
+    own = first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic
+    simulator = body.simulator(*own)
 
     def begin(b: int, start: Start) -> ParticleState:
         state = body.initial_state(start, simulator.dt, pulls[b])
@@ -527,6 +486,5 @@ def _worlds(
         places = [state.x - found[b % len(found)].lift for b, state in enumerate(states)]
         held = [held_in(world.driven, x, len(world.colliders)) for x in places]
         arguments = {**arguments, "held": stack_held(held)}
-    return replace(
-        ready, simulator=simulator, state=ParticleState.stack(states), arguments=arguments
-    ), begin
+    state = ParticleState.stack(states)
+    return replace(ready, simulator=simulator, state=state, arguments=arguments), begin

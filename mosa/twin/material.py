@@ -114,9 +114,7 @@ class TwinMaterial:
                 )
             adapter.follow(body.material.poisson())
             known, E_ref = adapter.in_double(), float(adapter.E_ref)
-            vech = (
-                C / scale[:, None] / scale * torch.tensor([1.0, 1, 1, 2, 2, 2], dtype=torch.float64)
-            )
+            vech = C / scale[:, None] / scale * torch.tensor([1.0, 1, 1, 2, 2, 2]).double()
 
         def stress(strain: Tensor) -> Tensor:
             prior = vech @ strain / E_ref

@@ -4,8 +4,7 @@ The mesh has the resolution of the twin's grid: cells of about its spacing that 
 full, each as six tetrahedra around its diagonal (Kuhn 1960). MuJoCo's elasticity is St. Venant and
 Kirchhoff's; its damping is a time [s] by which the strain's rate counts with the strain, so that
 damping / mu makes the shear viscosities equal. A contact gives within the time in which a pressure
-wave crosses a cell: what is faster only shakes the nodes at the surface.
-"""
+wave crosses a cell: what is faster only shakes the nodes at the surface."""
 
 from __future__ import annotations
 
@@ -20,13 +19,10 @@ from mosa.errors import ConfigError
 from mosa.system.whole_files import write_whole
 from mosa.twin.start import as_started
 
-COURANT = 0.2
-"""Time step, over the time of a pressure wave through a cell: flexes are stepped explicitly."""
+COURANT = 0.2  # time step over a pressure wave's time through a cell
 
 
-def tetrahedra(
-    rest: np.ndarray, volume: np.ndarray, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
+def tetrahedra(rest: np.ndarray, volume: np.ndarray, spacing: float) -> tuple[np.ndarray, ...]:
     """Nodes (M, 3) [m] and elements (K, 4), of positive volume, of cells that particles (N, 3) [m]
     fill at least by half. volume: (N,) [m^3]; spacing [m]: of the cells, about.
 
@@ -65,9 +61,8 @@ def meshed(twin: Any, values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 def save_surface(path: Path, twin: Any, values: dict[str, np.ndarray]) -> Path:
     """Write the mesh's closed surface [m] as OBJ, normals outwards, where the training starts."""
     points, _, elements = meshed(twin, values)
-    faces = np.concatenate(
-        [elements[:, list(f)] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))]
-    )
+    sides = [1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]
+    faces = np.concatenate([elements[:, side] for side in sides])
     _, first, count = np.unique(np.sort(faces, 1), axis=0, return_index=True, return_counts=True)
     used, faces = np.unique(faces[first[count == 1]], return_inverse=True)
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in points[used]]

@@ -12,9 +12,7 @@ import numpy as np
 from mosa.errors import ConfigError
 from mosa.system.whole_files import written_whole
 
-STEP = 0.01
-"""Relative difference of E within which particles share a material: USD has a material a set of
-points."""
+STEP = 0.01  # relative difference of E within which particles share a material
 
 
 def save_newton(

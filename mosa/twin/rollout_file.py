@@ -31,8 +31,7 @@ def save_rollout(
     Where there are K colliders also reactions [T - 1, substeps, K, 6]: force (N) and torque about each one's origin (N m) of
     every substep (one mean where the substeps vary), and collider_position [T, K, 3] (m), collider_rotation [T, K, 3, 3] at the
     frames, in the order of the configuration, and collider_shape [K, 4]: 1 sphere, 2 capsule,
-    3 cylinder (radius, length), 4 box (edges) (m), 0 others, -1 driven particles.
-    """
+    3 cylinder (radius, length), 4 box (edges) (m), 0 others, -1 driven particles."""
     arrays: dict[str, np.ndarray] = {}
     for name, rollout in parts.items():
         tensors = {key: getattr(rollout, key) for key in ("x", "v", "F", "F_tot", "times")}
@@ -40,12 +39,10 @@ def save_rollout(
         if rollout.reactions is not None:
             tensors["reactions"] = rollout.reactions
         if colliders:
-            tensors["collider_position"], tensors["collider_rotation"] = poses(
-                colliders, rollout.times
-            )
-            tensors["collider_shape"] = torch.tensor(
-                [_numbers(each.shape) for each in colliders], dtype=torch.float64
-            )
+            position, rotation = poses(colliders, rollout.times)
+            tensors |= {"collider_position": position, "collider_rotation": rotation}
+            shapes = [_numbers(each.shape) for each in colliders]
+            tensors["collider_shape"] = torch.tensor(shapes, dtype=torch.float64)
         arrays |= {f"{name}/{key}": t.detach().cpu().numpy() for key, t in tensors.items()}
     write_npz(path, arrays)
 

@@ -17,8 +17,7 @@ from mosa.system.npz import Arrays, read_npz, write_npz
 from mosa.types import Ground
 
 FILE = "body.npz"
-SPLATS = "splats/"
-"""Before the names of the carried splats' tensors in the file."""
+SPLATS = "splats/"  # before the names of the carried splats' tensors in the file
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,9 @@ from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.twin.rollout_file import poses
 
-WIDTH, OPACITY = 0.45, 0.95
-"""Of a surface's Gaussians: standard deviation in pitches."""
-MOST = 30_000
-"""Gaussians of one solid."""
-SOLID = (150, 160, 175)
-"""8-bit colour of rigid solids."""
+WIDTH, OPACITY = 0.45, 0.95  # of a surface's Gaussians: standard deviation in pitches
+MOST = 30_000  # gaussians of one solid
+SOLID = (150, 160, 175)  # 8-bit colour of rigid solids
 
 
 def lattice(a: float, b: float, pitch: float) -> Tensor:
@@ -52,10 +49,8 @@ def surface(shape: Shape, pitch: float) -> Tensor:
         if length
     ]
     if isinstance(shape, Cylinder):
-        caps = [
-            (r, 0.5 * length)
-            for r in torch.linspace(0, radius, max(2, round(radius / pitch))).tolist()
-        ]
+        radii = torch.linspace(0, radius, max(2, round(radius / pitch))).tolist()
+        caps = [(r, 0.5 * length) for r in radii]
     else:
         angles = torch.linspace(0, 0.5 * math.pi, max(2, round(0.5 * math.pi * radius / pitch)))
         caps = [
@@ -81,10 +76,8 @@ def _ring(radius: float, z: float, pitch: float) -> Tensor:
 def shaded(points: Tensor, up: Tensor, color: Tensor) -> Tensor:
     """(K, 3) a colour (3,) that is a little darker below: edges then show without a light."""
     high = points @ up
-    return (
-        color
-        * (0.8 + 0.2 * (high - high.min()) / (high.max() - high.min()).clamp_min(1e-6))[:, None]
-    )
+    share = (high - high.min()) / (high.max() - high.min()).clamp_min(1e-6)
+    return color * (0.8 + 0.2 * share)[:, None]
 
 
 def with_solids(

@@ -65,12 +65,8 @@ class StartArguments(Settings):
 
 def check_frames(frames: int, particles: int) -> None:
     """Errors: ConfigError where they are more than the machine can hold."""
-    counted(
-        "frames",
-        (frames, particles),
-        "frames times particles, of which this machine can hold fewer",
-        each=STORED_BYTES,
-    )
+    said = "frames times particles, of which this machine can hold fewer"
+    counted("frames", (frames, particles), said, each=STORED_BYTES)
 
 
 def check_wants_no_gradients(**given: Any) -> None:
@@ -81,8 +77,8 @@ def check_wants_no_gradients(**given: Any) -> None:
     for name, value in given.items():
         if asks_for_gradients(value):
             raise ConfigError(
-                f"{name}: expected a tensor without gradients, found one that requires them: they come through "
-                "reset(differentiable=True) and step alone; else pass tensor.detach(), or call it in torch.no_grad()"
+                f"{name}: expected a tensor without gradients, found one that requires them: use "
+                "reset(differentiable=True) and step, or tensor.detach()"
             )
 
 
@@ -144,10 +140,8 @@ def start_in(
     Q = first.rotation if rotation is None else rotation_matrix(rotation)
     Q = Q.to(body.rest)
     velocity_ = first.velocity if velocity is None else vector("velocity", velocity)
-    if angular_velocity is None:
-        spin = first.angular_velocity
-    else:
-        spin = vector("angular_velocity", angular_velocity)
+    given = angular_velocity is not None
+    spin = vector("angular_velocity", angular_velocity) if given else first.angular_velocity
     center = first.center.to(body.rest)
     if position is not None:
         center = placed(position, center)
@@ -159,11 +153,8 @@ def start_in(
         ground, low = world.ground.height if world.ground is not None else 0.0, arms @ up
         # it is met by balls, where it was found to be
         if world.ground is not None and world.ground.mode == "touch":
-            low = (
-                low
-                - 0.5 * body.volume.to(low) ** (1 / 3)
-                + body.contact.lift(world.ground, body.settings.dx).detach()
-            )
+            lift = body.contact.lift(world.ground, body.settings.dx).detach()
+            low = low - 0.5 * body.volume.to(low) ** (1 / 3) + lift
         center = center + up * (ground + height - low.min() - center @ up)
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
     if colliders is not None:
@@ -183,8 +174,8 @@ def start_in(
     pressed = check_clear(world.colliders, center + arms, "the body", field, body.spacing)
     if pressed > 0.25 * body.spacing:
         warnings.warn(
-            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} mm "
-            "deep in a contact, which throws it off at once: contact begins "
+            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} "
+            "mm deep in a contact, which throws it off at once: contact begins "
             f"{500 * body.spacing:.3g} mm, half the particles' spacing, outside of a solid",
             stacklevel=4,
         )
@@ -206,11 +197,8 @@ def start_in(
                 stacklevel=4,
             )
     if world.ground is not None:
-        below = float(
-            (((center + arms) @ up).detach() < world.ground.height - 0.25 * body.spacing)
-            .double()
-            .mean()
-        )
+        heights = ((center + arms) @ up).detach()
+        below = float((heights < world.ground.height - 0.25 * body.spacing).double().mean())
         if below > UNDER:
             raise ConfigError(
                 f"position: expected a body that starts above the ground of {world.ground.height:g} m, "
@@ -223,18 +211,16 @@ def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | Non
     """Warn where two or more solids may hold the body by friction, and it would slide down faster
     than `CREEP`. Contact takes a share of a particle's sliding velocity in a substep: the speed
     grows with the substep (docs/verification.md). substeps: None where they are chosen."""
-    holds = [
-        HOLD if each.mode == "sticky" else GRIP
-        for each in world.colliders
-        if (each.mode == "sticky" or each.friction > 0) and not isinstance(each.shape, HalfSpace)
-    ]
+    rough = [each for each in world.colliders if each.mode == "sticky" or each.friction > 0]
+    rough = [each for each in rough if not isinstance(each.shape, HalfSpace)]
+    holds = [HOLD if each.mode == "sticky" else GRIP for each in rough]
     if len(holds) < 2 or substeps is None:
         return
     pull = float(world.gravity.norm()) * body.size / (min(holds) * body.spacing)
     speed, enough = pull * frame_dt / substeps, math.ceil(pull * frame_dt / CREEP)
     if speed > CREEP:
         warnings.warn(
-            f"substeps: solids that hold the body by friction let it slide at about "
+            "substeps: solids that hold the body by friction let it slide at about "
             f"{1e3 * speed:.2g} mm/s with {substeps} substeps; substeps={enough} give "
             f"{1e3 * CREEP:.2g} mm/s",
             stacklevel=4,

@@ -3,8 +3,7 @@
 from mosa.twin import Twin
 twin = Twin.load("outputs/train/.../checkpoints/last.ckpt")
 rollout = twin.simulate(rotation=(1, 0, 0, 45), height=0.2, velocity=(0.5, -2, 0), frames=30)
-twin.export(rollout, "falling/")
-"""
+twin.export(rollout, "falling/")"""
 
 from __future__ import annotations
 
@@ -117,12 +116,11 @@ class Twin:
             world, start = world_of(record), Start.read(record.start.plain())
         except (
             Exception
-        ) as error:  # every part has been checked; a file of a stranger may still fit no body
-            reason = (
-                str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
-            )
+        ) as error:  # every part has been checked; a stranger's may still fit no body
+            kind = "" if isinstance(error, MosaError) else f"{type(error).__name__}: "
+            reason = " ".join(f"{kind}{error}".split())[:300]
             raise DataError(
-                f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})"
+                f"ckpt_path: {path}: no body can be built from it ({reason})"
             ) from error
         check_numbers(record, len(read_numbers(body)), path)
         posterior = None if record.posterior is None else Posterior.read(record.posterior.plain())
@@ -137,8 +135,7 @@ class Twin:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
         start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
-        (a fit by Adam), or where fewer than two of the draws can be simulated.
-        """
+        (a fit by Adam), or where fewer than two of the draws can be simulated."""
         if self.posterior is None:
             raise ConfigError(
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
@@ -149,13 +146,12 @@ class Twin:
         found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(
-                f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
-                f"found {len(found)}"
+                f"predict: expected at least two of {draws} draws of the law that can be "
+                f"simulated, found {len(found)}"
             )
         others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
-        return rollout, total_spread(
-            torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others)
-        )
+        forms = among_forms(rollout.x, others)
+        return rollout, total_spread(torch.stack(found), self.posterior.model_error, forms)
 
     @typed
     def simulate(
@@ -187,8 +183,7 @@ class Twin:
         the world stay where they are. substeps: of a frame, as `reset` takes them.
         No gradients: `reset(differentiable=True)` and `step` have
         them, and a tensor that requires them is refused. Errors: ConfigError naming the argument
-        (also a solid that the body starts in), SimulationDiverged (the body leaves the box).
-        """
+        (also a solid that the body starts in), SimulationDiverged (the body leaves the box)."""
         check_frames(frames, len(self.body.rest))
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
@@ -236,8 +231,7 @@ class Twin:
         the `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
         motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
         (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
-        require gradients are refused. Errors: ConfigError.
-        """
+        require gradients are refused. Errors: ConfigError."""
         check_frames(frames, len(self.body.rest))
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
@@ -259,8 +253,7 @@ class Twin:
         `angular_velocity` (3,) [rad/s] in world axes, about the collider's origin, for this step, or the `position` (3,) [m] and
         `rotation` ((3,) vector [rad] or (3, 3)) where it shall be after it; three numbers alone are a velocity. A collider that
         was never in an action follows its own motion; one that was, but is not in this one, stands still.
-        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged.
-        """
+        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged."""
         return self.episode.step(action)
 
     @property
@@ -322,10 +315,8 @@ class Twin:
                 high = torch.maximum(high, at.amax(0).to(high) + far)
         target = 0.5 * (low + high)
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
-        if float((side - (side @ up) * up).norm()) > 1e-3:
-            side = side - (side @ up) * up
-        else:
-            side = torch.roll(up, 1)
+        level = side - (side @ up) * up
+        side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
         focal = 1.6 * size
         distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
         toward = side / side.norm() + 0.25 * up
@@ -383,8 +374,8 @@ class Twin:
             solids += world.solids[len(world.colliders) :]
         if met != len(solids):
             raise ConfigError(
-                f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
-                f"{len(solids)}"
+                f"colliders: expected the {met} that the rollout was simulated with, as simulate takes "
+                f"them, found {len(solids)}"
             )
         return rollout, solids if isinstance(motion, Rollout) else placed_as(motion, solids)
 
@@ -412,20 +403,13 @@ class Twin:
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
         write_frames(folder / "ply", rollout.x.cpu().numpy(), self.body.colors.cpu().numpy())
-        save_frames(
-            seen(self.body, rollout.x, rollout.F_tot),
-            folder / "splats",
-            formats,
-            rate=1 / apart,
-            up=self.world.up,
-        )
+        splats = seen(self.body, rollout.x, rollout.F_tot)
+        save_frames(splats, folder / "splats", formats, rate=1 / apart, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             images = self._pictures(rollout, solids, size, view, shadow)
-            if caption:
-                frames = side_by_side({title: images}, footer=moments)
-            else:
-                frames = [to_uint8(image) for image in images]
+            plain = map(to_uint8, images)
+            frames = side_by_side({title: images}, footer=moments) if caption else list(plain)
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))
         return folder
 

@@ -31,12 +31,10 @@ from mosa.viewer.pages import cell, horizontal
 BODIES = ("observed", "truth", "prior", "learned")
 """What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
 COLORS = ("appearance", "heterogeneity", "deviation", "uncertainty")
-DISTANCE = 1.4
-"""From one body to the next, in widths of what they take up together in the frame where that is most."""
-GRAY = 0.6
-"""Of what has no value, and of a body under another one: white would not be seen on viser's white."""
-FAINT = 0.25
-"""Opacity of a body under another one, relative to its own: where both lie together the upper one's colours are to be seen."""
+MOTIONS = {"observed": "observed", "truth": "true"}  # what they are called
+DISTANCE = 1.4  # from one body to the next, in their largest common width
+GRAY = 0.6  # of what has no value, and of a body under another one
+FAINT = 0.25  # opacity of a body under another one, relative to its own
 
 
 @dataclass(frozen=True)
@@ -52,9 +50,8 @@ class Scale:
 
     def paint(self, values: np.ndarray) -> np.ndarray:
         """(N, 3) colours in [0, 1] of (N,) values."""
-        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[
-            :, :3
-        ]
+        shares = (values - self.low) / (self.high - self.low)
+        return matplotlib.colormaps[self.colors](shares)[:, :3]
 
     def legend(self) -> np.ndarray:
         """(H, W, 3) picture of the colour bar, 8 bit."""
@@ -169,19 +166,15 @@ class Clip:
     def side(self) -> np.ndarray:
         """(3,) shift of a body beside the one before it [m]."""
         along = [motion.centers @ self.across for motion in self.bodies.values()]
-        widths = [
-            np.ptp(np.concatenate([x[t] for x in along if t < len(x)]))
-            for t in range(len(self.times))
-        ]
+        frames = ([x[t] for x in along if t < len(x)] for t in range(len(self.times)))
+        widths = [np.ptp(np.concatenate(each)) for each in frames]
         return DISTANCE * float(max(widths)) * self.across
 
     def deviation(self, frame: int, model: str = "learned") -> np.ndarray | None:
         """(N,) distance [m] of a model's particles from those of the reference; None where it has no such frame."""
-        if self.reference is None or frame >= len(self.bodies[self.reference].centers):
+        if self.reference is None or frame >= len(right := self.bodies[self.reference].centers):
             return None
-        return np.linalg.norm(
-            self.bodies[model].centers[frame] - self.bodies[self.reference].centers[frame], axis=-1
-        )
+        return np.linalg.norm(self.bodies[model].centers[frame] - right[frame], axis=-1)
 
     @cached_property
     def scales(self) -> dict[str, Scale]:
@@ -189,23 +182,14 @@ class Clip:
         found = {"heterogeneity": stiffness_scale(self.factor)}
         if self.reference is not None:
             frames = range(len(self.bodies[self.reference].centers))
-            high = max(
-                float(np.quantile(self.deviation(t, model), 0.99))
-                for t in frames
-                for model in self.models
-            )
-            label = {
-                "observed": "distance to the observed motion [mm]",
-                "truth": "distance to the true motion [mm]",
-            }
-            found["deviation"] = Scale(
-                label[self.reference], "viridis", 0, max(1e3 * high, 1e-3), "max"
-            )
+            far = (self.deviation(t, model) for t in frames for model in self.models)
+            high = max(1e3 * max(float(np.quantile(each, 0.99)) for each in far), 1e-3)
+            label = f"distance to the {MOTIONS[self.reference]} motion [mm]"
+            found["deviation"] = Scale(label, "viridis", 0, high, "max")
         if self.spread is not None:
-            high = float(np.quantile(self.spread, 0.99, axis=1).max())
-            found["uncertainty"] = Scale(
-                "predicted standard deviation [mm]", "magma", 0, max(1e3 * high, 1e-3), "max"
-            )
+            high = max(1e3 * float(np.quantile(self.spread, 0.99, axis=1).max()), 1e-3)
+            label = "predicted standard deviation [mm]"
+            found["uncertainty"] = Scale(label, "magma", 0, high, "max")
         return found
 
     def paint(self, frame: int, by: str, model: str = "learned") -> np.ndarray:
@@ -217,22 +201,16 @@ class Clip:
         if by == "appearance":
             return self.appearance
         if by == "heterogeneity":
-            return self.scales[by].paint(
-                self.factor if model == "learned" else np.ones_like(self.factor)
-            )
-        if by == "uncertainty":
-            known = self.spread is not None and model == "learned"
-            if known:
-                return self.scales[by].paint(1e3 * self.spread[frame])
-            return np.full_like(self.appearance, GRAY)
+            factor = self.factor if model == "learned" else np.ones_like(self.factor)
+            return self.scales[by].paint(factor)
         far = self.deviation(frame, model)
+        if by == "uncertainty":
+            far = self.spread[frame] if self.spread is not None and model == "learned" else None
         return (
             np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
         )
 
-    def splats(
-        self, name: str, frame: int, by: str
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def splats(self, name: str, frame: int, by: str) -> tuple[np.ndarray, ...]:
         """Centers (M, 3) [m], covariances (M, 3, 3) [m^2], colours (M, 3) and opacities (M,) of a body's splats: those it carries,
         where it carries some, painted as the particles nearest to them at rest; else the particles themselves."""
         motion = self.bodies[name]
@@ -257,22 +235,17 @@ class Clip:
         elif self.deviation(frame) is None:
             said += "Not observed in this frame."
         else:
-            far = {
-                model: 1e3 * float(np.sqrt(np.square(self.deviation(frame, model)).mean()))
-                for model in self.models
-            }
-            motion = {"observed": "observed", "truth": "true"}[self.reference]
-            said += f"rms distance to the {motion} motion: " + ", ".join(
-                f"{model} {value:.1f} mm" for model, value in far.items()
+            squares = {model: np.square(self.deviation(frame, model)) for model in self.models}
+            said += f"rms distance to the {MOTIONS[self.reference]} motion: "
+            said += ", ".join(
+                f"{model} {1e3 * np.sqrt(e.mean()):.1f} mm" for model, e in squares.items()
             )
         if self.world.ground is not None:
             said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
         solids = len(self.world.colliders) if self.solid_poses is None else self.solids.count(None)
         hidden = {"walls": len(self.world.planes), "colliders": solids}
-        if any(hidden.values()):
-            said += "  \nNot drawn: " + ", ".join(
-                f"{kind} ({count})" for kind, count in hidden.items() if count
-            )
+        if left_out := [f"{kind} ({count})" for kind, count in hidden.items() if count]:
+            said += f"  \nNot drawn: {', '.join(left_out)}"
         return said
 
 
@@ -283,10 +256,8 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
     the folder's own, or else its body.npz. Errors: DataError naming the file that is missing or of another run."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise DataError(
-            f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
-            f"found no folder {folder}"
-        )
+        wanted = "a finished run (run=outputs/train/<date>/<time>), or of an exported motion"
+        raise DataError(f"run: expected the folder of {wanted}, found no folder {folder}")
     learned = Arrays.of(folder / "rollout.npz")
     if not learned.path.is_file():  # what a run that has not ended lacks
         raise DataError(

@@ -25,10 +25,8 @@ from mosa.viewer.clips import Scale, stiffness_scale
 from mosa.viewer.pages import horizontal
 
 COLORS = ("appearance", "stretch", "heterogeneity")
-FASTEST = 4.0
-"""Of the ball, in sizes of the body per second: a mouse jumps, a solid that jumps passes through what it should push."""
-COURANT = 0.45
-"""Cells per substep that the ball moves at most, below the half that a step allows."""
+FASTEST = 4.0  # of the ball, body sizes per second: a jumping solid passes through the body
+COURANT = 0.45  # cells per substep that the ball moves at most, below the half that a step allows
 STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 """Where the scale of stretches may end [%]: the next one above what was seen since the drop."""
 
@@ -53,15 +51,12 @@ class Live:
     """
 
     def __init__(self, twin: Twin) -> None:
-        self.twin = twin
-        body, world = twin.body, twin.world
-        self.up = world.up.double().numpy()
-        self.up = self.up / np.linalg.norm(self.up)
+        self.twin, body, world = twin, twin.body, twin.world
+        self.up = (world.up.double() / world.up.double().norm()).numpy()
         self.across = horizontal(self.up)
         self.arms = (body.rest - body.center).double().cpu().numpy()
         self.reach = float(np.linalg.norm(self.arms, axis=1).max())
-        self.size = body.size
-        self.dt = twin.frame_dt
+        self.size, self.dt = body.size, twin.frame_dt
         self.ground = 0.0 if world.ground is None else float(world.ground.height)
         # at least two cells thick, that no material on both sides of it touches
         self.radius = max(0.12 * self.size, 1.25 * body.settings.dx)
@@ -70,10 +65,8 @@ class Live:
         self.hand = "hand"
         while self.hand in self.names:
             self.hand += "_"
-        corners = np.stack(np.meshgrid(*world.box.double().numpy().T, indexing="ij"), -1).reshape(
-            -1, 3
-        )
-        self.highest = max(float((corners @ self.up).max()) - self.ground - 2 * self.reach, 0.0)
+        corners = torch.cartesian_prod(*world.box.double().T).numpy() @ self.up
+        self.highest = max(float(corners.max()) - self.ground - 2 * self.reach, 0.0)
         begun = twin.training_start
         Q, middle = begun.rotation.double().cpu().numpy(), begun.center.double().cpu().numpy()
         low = float(((self.arms @ Q.T + middle) @ self.up).min()) - self.ground
@@ -114,10 +107,8 @@ class Live:
         twin, given = self.twin, self.start(drop)
         try:
             start, _ = start_in(twin.body, twin.world, twin.training_start, **given)
-            x = (
-                self.arms @ start.rotation.double().cpu().numpy().T
-                + start.center.double().cpu().numpy()
-            )
+            Q, place = (each.double().cpu().numpy() for each in (start.rotation, start.center))
+            x = self.arms @ Q.T + place
             if np.linalg.norm(x - self.target, axis=1).min() < self.radius + twin.body.settings.dx:
                 self.target = self.home()
             solids = [*twin.world.colliders, self.ball(self.target)]
@@ -174,8 +165,8 @@ class Live:
         self.running = False
         if isinstance(error, SimulationDiverged):
             self.message = (
-                f"The simulation diverged at {self.time:.3f} s; what is shown is the last state before. Drop the body "
-                f"again, from lower or slower, or push more gently. ({error})"
+                f"The simulation diverged at {self.time:.3f} s; what is shown is the state before. "
+                f"Drop the body again, from lower or slower, or push more gently. ({error})"
             )
         else:
             self.message = f"{type(error).__name__}: {error}"
@@ -197,19 +188,16 @@ class Live:
         """((3,) position [m], (3, 3) rotation) of the twin's own colliders now."""
         if self.state is None:
             return []
-        return [
-            (x.numpy(), R.numpy())
-            for x, R in zip(self.state.position[: self.column], self.state.rotation)
-        ]
+        pairs = zip(self.state.position[: self.column], self.state.rotation)
+        return [(x.numpy(), R.numpy()) for x, R in pairs]
 
     @property
     def positions(self) -> Tensor:
         """(N, 3) [m] of the particles; as the training began where no drop could be made yet."""
         if self.state is None:
             begun, rest = self.twin.training_start, self.twin.body.rest
-            return (rest - self.twin.body.center) @ begun.rotation.to(rest).T + begun.center.to(
-                rest
-            )
+            arms = (rest - self.twin.body.center) @ begun.rotation.to(rest).T
+            return arms + begun.center.to(rest)
         return self.state.positions.detach().to(self.twin.body.rest)
 
     @property
@@ -253,9 +241,7 @@ class Live:
         return scale.paint(values), scale
 
     @torch.no_grad()
-    def splats(
-        self, by: str, colors: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def splats(self, by: str, colors: np.ndarray) -> tuple[np.ndarray, ...]:
         """Centers (M, 3) [m], covariances (M, 3, 3) [m^2], colours (M, 3) and opacities (M,) of what the body shows now; `colors`
         (N, 3) are those of `paint(by)`, which the splats take from the particles nearest to them at rest."""
         shown: Seen = seen(self.twin.body, self.positions[None], self.F_tot[None])
@@ -263,12 +249,9 @@ class Live:
             colors = shown.colors()[0].cpu().numpy()
         elif self.nearest is not None:
             colors = colors[self.nearest]
-        return (
-            shown.means[0].cpu().numpy(),
-            shown.covariances[0].cpu().numpy(),
-            colors,
-            shown.opacities.cpu().numpy(),
-        )
+        parts = (shown.means[0], shown.covariances[0], shown.opacities)
+        means, covariances, opacities = (part.cpu().numpy() for part in parts)
+        return means, covariances, colors, opacities
 
     def caption(self) -> str:
         """Of the moment."""

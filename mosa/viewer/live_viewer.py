@@ -27,8 +27,7 @@ from mosa.viewer.pages import (
 log = logging.getLogger(__name__)
 
 GEOMETRY = ("splats", "particles")
-BALL = (235, 110, 60)
-"""8-bit colour of the ball that the mouse moves."""
+BALL = (235, 110, 60)  # 8-bit colour of the ball that the mouse moves
 
 
 class LiveViewer:
@@ -116,9 +115,8 @@ class LiveViewer:
             if self.stiffness is not None and offered(self.stiffness) != self.set_stiffness:
                 self.set_stiffness = float(offered(self.stiffness))
                 self.live.soften(10**self.set_stiffness)
-            self.live.change(
-                **{name: float(offered(slider)) for name, slider in self.sliders.items()}
-            )
+            said = {name: float(offered(slider)) for name, slider in self.sliders.items()}
+            self.live.change(**said)
             self.live.drop()
             self.follow()
             self.draw()
@@ -153,11 +151,8 @@ class LiveViewer:
 
     def dragged(self, event: Any) -> None:
         """The ball is dragged: from the point where it was taken to the mouse."""
-        self.pushed(
-            self.live.hand_position
-            + np.asarray(event.end_position)
-            - np.asarray(event.start_position)
-        )
+        moved = np.asarray(event.end_position) - np.asarray(event.start_position)
+        self.pushed(self.live.hand_position + moved)
         self.follow()
 
     def draw(self) -> None:
@@ -168,9 +163,8 @@ class LiveViewer:
             if offered(self.geometry) == "splats":
                 parts = splat_parts(self.unit, *live.splats(by, colors))
                 if self.splats is None:
-                    self.splats = self.server.scene.add_gaussian_splats(
-                        "/splats", *parts, scale=self.unit
-                    )
+                    scene = self.server.scene
+                    self.splats = scene.add_gaussian_splats("/splats", *parts, scale=self.unit)
                 else:
                     self.splats.set_gaussians(*parts)
             else:

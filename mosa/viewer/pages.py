@@ -18,10 +18,8 @@ from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Shape, Sphere
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.twin.shown_solids import SOLID, surface
 
-PANEL = 0.12
-"""Of the window's height, by which the first view's contents stand left of the middle: viser's panel covers its right."""
-FIELD_OF_VIEW = math.radians(40)
-"""Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
+PANEL = 0.12  # of the window's height: the first view leaves room for viser's panel
+FIELD_OF_VIEW = math.radians(40)  # vertical, of the first view
 
 
 def open_server(host: str, port: int) -> Any:
@@ -30,19 +28,16 @@ def open_server(host: str, port: int) -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ConfigError(
-            "viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
-            "pip install viser elsewhere"
-        ) from error
+        way = "pip install -e '.[viewer]' in a clone, pip install viser elsewhere"
+        raise ConfigError(f"viewer: expected the package viser, found none: {way}") from error
     try:  # viser's own server would try port after port and then wait for ever
         with socket.create_server((host, 0)):
             pass
         if not host:  # all addresses of the machine, which nobody asked for by name
             raise ValueError("an empty name")
     except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(
-            f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})"
-        ) from error
+        wanted = "127.0.0.1, 0.0.0.0 or this machine's address"
+        raise ConfigError(f"host: expected {wanted}, found {host!r} ({error})") from error
     import websockets.asyncio.server as sockets  # viser brings it
 
     def serve(
@@ -51,9 +46,8 @@ def open_server(host: str, port: int) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             if own_page(request.headers.get("Origin"), request.headers.get("Host"), host):
                 return process_request(connection, request)
-            return connection.respond(
-                403, f"expected a page of this server, by its address or the name {host}\n"
-            )
+            said = f"expected a page of this server, by its address or the name {host}\n"
+            return connection.respond(403, said)
 
         return begin(*arguments, process_request=answer, **options)
 
@@ -114,20 +108,12 @@ def aim(eye: np.ndarray, target: np.ndarray, *cameras: Any) -> None:
         camera.near = 1e-3 * float(np.linalg.norm(eye - target))
 
 
-def beside_panel(
-    eye: np.ndarray, target: np.ndarray, up: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def beside_panel(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, ...]:
     """A first view (camera (3,), point looked at (3,)) moved to the right by `PANEL`, so that the panel covers nothing of it in a
     window of 1280 x 800."""
     right = np.cross(target - eye, up)
-    move = (
-        PANEL
-        * 2
-        * math.tan(FIELD_OF_VIEW / 2)
-        * np.linalg.norm(target - eye)
-        * right
-        / np.linalg.norm(right)
-    )
+    wide = 2 * math.tan(FIELD_OF_VIEW / 2) * np.linalg.norm(target - eye)
+    move = PANEL * wide * right / np.linalg.norm(right)
     return eye + move, target + move
 
 
@@ -168,13 +154,7 @@ def add_points(
     return scene.add_point_cloud(name, points.astype(np.float32), colors, **look, **options)
 
 
-def splat_parts(
-    unit: float,
-    means: np.ndarray,
-    covariances: np.ndarray,
-    colors: np.ndarray,
-    opacities: np.ndarray,
-) -> tuple[np.ndarray, ...]:
+def splat_parts(unit: float, means, covariances, colors, opacities) -> tuple[np.ndarray, ...]:
     """What viser takes of splats, in units of `unit` [m]: it keeps covariances as float16, whose steps are 6e-8 below 6e-5, and in
     m^2 a splat of 0.5 mm would lose its shape."""
     return (means / unit).astype(np.float32), covariances / unit**2, colors, opacities[:, None]

@@ -3,8 +3,7 @@
 With --live its twin, to be dropped and pushed (`mosa.viewer.live_viewer`).
 
 The observed motion (the reconstruction's, of the sequences learned from) or, of other sequences, the true one where it is
-known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`.
-"""
+known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`."""
 
 from __future__ import annotations
 
@@ -14,6 +13,7 @@ import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,9 +45,8 @@ GEOMETRY = ("splats", "particles")
 def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
     """((3,) camera, (3,) point looked at) [m]: a clip's motions side by side, seen from the front and a little above."""
     seen = np.concatenate([clip.moved, clip.moved + (len(clip.bodies) - 1) * clip.side])
-    return view_of(
-        seen, clip.up, clip.across, None if clip.world.ground is None else clip.world.ground.height
-    )
+    height = None if clip.world.ground is None else clip.world.ground.height
+    return view_of(seen, clip.up, clip.across, height)
 
 
 def layouts(clip: Clip) -> tuple[str, ...]:
@@ -75,9 +74,8 @@ class Viewer:
         self.play = gui.add_checkbox("play", False)
         self.rate = gui.add_slider("frames per second", 1, 30, 1, 5)
         self.geometry = gui.add_dropdown("geometry", GEOMETRY, initial_value=GEOMETRY[0])
-        self.color = gui.add_dropdown(
-            "color", COLORS, initial_value=COLORS[0], hint="of the prior and the learned body"
-        )
+        hint = "of the prior and the learned body"
+        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint=hint)
         self.legend = gui.add_image(np.full((1, 1, 3), 255, np.uint8), format="png", visible=False)
         self.caption = gui.add_markdown("")
         self.sequence.on_update(lambda _: self.choose())
@@ -96,9 +94,8 @@ class Viewer:
         self.look(self.server.initial_camera)
         if clip.world.ground is not None:
             far = max(float(np.linalg.norm(first_view(each)[0] - target)) for each in clips)
-            add_ground(
-                scene, clip.up, clip.across, clip.world.ground.height, clip.size, target, far
-            )
+            height = clip.world.ground.height
+            add_ground(scene, clip.up, clip.across, height, clip.size, target, far)
         whole = clip.splats("learned", 0, "appearance")
         self.unit = float(np.sqrt(np.linalg.eigvalsh(whole[1]).max()))
         self.nodes, centers = {}, clip.learned.centers[0]
@@ -111,14 +108,11 @@ class Viewer:
                 scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False),
             )  # fmt: skip
 
-        self.solids = {
-            (each.name, place): [
-                add_solid(scene, f"/solids/{each.name}/{place}/{k}", shape, visible=False)
-                for k, shape in enumerate(each.solids)
-            ]
-            for each in clips
-            for place in range(len(each.bodies))
-        }
+        places = [(each.name, place) for each in clips for place in range(len(each.bodies))]
+        self.solids: dict[tuple[str, int], list[Any]] = {each: [] for each in places}
+        for (name, place), nodes in self.solids.items():
+            for k, shape in enumerate(self.clips[name].solids):
+                nodes.append(add_solid(scene, f"/solids/{name}/{place}/{k}", shape, visible=False))
         none, size = np.zeros((1, 3)), 0.02 * clip.size
         self.points = [add_points(scene, f"/points/{kind}", none, color, size, visible=False)
                        for kind, color in (("measured", MEASURED), ("predicted", PREDICTED))]  # fmt: skip
@@ -141,10 +135,8 @@ class Viewer:
             self.frame.max, self.frame.value = len(self.clip.times) - 1, 0
             self.explain()
             self.draw()
-            self.look(
-                self.server.initial_camera,
-                *(client.camera for client in self.server.get_clients().values()),
-            )
+            clients = self.server.get_clients().values()
+            self.look(self.server.initial_camera, *(client.camera for client in clients))
 
     def explain(self) -> None:
         """The colours' legend."""
@@ -178,9 +170,8 @@ class Viewer:
                         node.position, node.wxyz = at + place * clip.side, turn(turned)
             place = list(clip.bodies).index("learned") if layout == "side by side" else 0
             for k, node in enumerate(self.points):
-                node.visible = clip.points is not None and (
-                    layout == "side by side" or "learned" in (above, below)
-                )
+                learned = layout == "side by side" or "learned" in (above, below)
+                node.visible = clip.points is not None and learned
                 if node.visible:
                     places = clip.points[k, frame]
                     places = places[np.isfinite(places).all(-1)] + place * clip.side
@@ -195,9 +186,8 @@ class Viewer:
             means, covariances, colors, opacities = clip.splats(name, frame, offered(self.color))
             if under:
                 colors, opacities = np.full_like(colors, GRAY), FAINT * opacities
-            splats.set_gaussians(
-                *splat_parts(self.unit, means + shift, covariances, colors, opacities)
-            )
+            parts = splat_parts(self.unit, means + shift, covariances, colors, opacities)
+            splats.set_gaussians(*parts)
         else:
             colors = clip.appearance
             if name != clip.reference:
@@ -238,30 +228,28 @@ def options(arguments: Sequence[str]) -> dict[str, str | None]:
         key, mark, value = argument.partition("=")
         if key not in known and known["run"] is None and Path(argument).exists():
             key, mark, value = "run", "=", argument
+        way = "python -m mosa.viewer --help lists the options"
         if not mark and known["run"] is None and not argument.startswith("-"):
             raise ConfigError(
-                f"run: expected the folder of a run, found no folder {argument!r}; "
-                "python -m mosa.viewer --help lists the options"
+                f"run: expected the folder of a run, found no folder {argument!r}; {way}"
             )
         if not mark or key not in known:
             raise ConfigError(
                 "viewer: expected the folder of a run, --live, checkpoint=<file>, host=<address>, port=<number>, "
-                f"device=<name>, found {argument!r}; python -m mosa.viewer --help lists them"
+                f"device=<name>, found {argument!r}; {way}"
             )
         known[key] = value
     known["run"] = known["run"] or known["checkpoint"]
     if known["run"] is None:
-        raise ConfigError(
-            "run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>"
-        )
+        way = "python -m mosa.viewer run=<run folder>"
+        raise ConfigError(f"run: expected the folder of a finished run, found none; {way}")
     if not re.fullmatch(r"[0-9]{1,5}", known["port"]) or not 0 < int(known["port"]) < 65536:
         raise ConfigError(f"port: expected a number from 1 to 65535, found {known['port']!r}")
     if known["live"] not in ("true", "false"):
         raise ConfigError(f"live: expected true or false, found {known['live']!r}")
     if known["live"] == "false" and Path(known["run"]).is_file():
-        raise ConfigError(
-            f"run: expected a folder, found the file {known['run']!r}; --live shows the twin of a checkpoint"
-        )
+        way = "--live shows the twin of a checkpoint"
+        raise ConfigError(f"run: expected a folder, found the file {known['run']!r}; {way}")
     return known
 
 
@@ -271,8 +259,8 @@ def checkpoint_of(run: str, checkpoint: str | None) -> Path:
     path = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
     if not path.is_file():
         raise DataError(
-            f"run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no file {path}; of "
-            "a folder that was exported the checkpoint is given by checkpoint="
+            "run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found "
+            f"no file {path}; of an exported folder it is given by checkpoint="
         )
     return path
 
@@ -281,10 +269,8 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
     """The page that `options` ask for, served. Errors: ConfigError, DataError."""
     place = {"host": chosen["host"], "port": int(chosen["port"])}
     if chosen["live"] == "true":
-        twin = Twin.load(
-            checkpoint_of(chosen["run"], chosen["checkpoint"]), named_device(chosen["device"])
-        )
-        return LiveViewer(Live(twin), **place)
+        path = checkpoint_of(chosen["run"], chosen["checkpoint"])
+        return LiveViewer(Live(Twin.load(path, named_device(chosen["device"]))), **place)
     return Viewer(read_run(chosen["run"], chosen["checkpoint"]), **place)
 
 

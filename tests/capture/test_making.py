@@ -86,7 +86,6 @@ def test_a_second_drop_gets_the_first_ones_world_and_points_give_the_floor(filme
             folder,
             output=str(tmp_path),
             like=str(folder / "scene"),
-            interpolation="none",
             rate=30.0,
         )
     )

@@ -58,12 +58,9 @@ def right(film, time):
 def test_frames_are_brought_to_common_times(made):
     film, track, exposure = made
     times = CONTACT - np.array([0.11, 0.0957, 0.0721, 0.05, 0.0333])
-    overlap = {}
-    for kind in ("flow", "shift", "none"):
-        found = resampled(exposure, track, None, times, kind)[..., 3] > 127
-        wanted = [right(film, t) for t in times]
-        overlap[kind] = np.mean([(a & b).sum() / (a | b).sum() for a, b in zip(found, wanted)])
-    assert overlap["none"] < 0.92 and min(overlap["shift"], overlap["flow"]) > 0.975, overlap
+    found = resampled(exposure, track, None, times)[..., 3] > 127
+    wanted = [right(film, t) for t in times]
+    assert np.mean([(a & b).sum() / (a | b).sum() for a, b in zip(found, wanted)]) > 0.975
 
 
 def test_a_time_lies_between_the_frames_around_it(made):

@@ -35,7 +35,7 @@ from markdown_it import MarkdownIt
 from mosa.cli import configured
 from mosa.config.build import plain
 from mosa.config.extensions import load_extensions
-from mosa.config.leaf_settings import MaterialSettings
+from mosa.config.leaf_settings import CaptureSettings, MaterialSettings
 from mosa.environments.command import setting_of
 from mosa.export import run as exported
 from mosa.training import preflight
@@ -50,7 +50,7 @@ NO_CODE = ("bibtex", "csv", "math", "text")
 CANNOT = {"trainer=gpu": "the tests have no GPU"}
 """Words of commands that cannot run here, and why: they are parsed and checked, as on the other pages."""
 CHECKS = {"train": preflight.check_configuration, "eval": preflight.check_evaluation, "splats": preflight.check_splats,
-          "capture": preflight.check_capture, "environments": setting_of, "material": MaterialSettings.read}  # fmt: skip
+          "capture": CaptureSettings.read, "environments": setting_of, "material": MaterialSettings.read}  # fmt: skip
 
 attempt, opened = configured.attempt, recorded.opened
 

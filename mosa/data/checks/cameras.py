@@ -13,16 +13,14 @@ from mosa.types import Scene
 AGREEMENT = 0.4
 """Distance between a line of sight and the object's centre, over the object's radius, above which a camera does not fit. Largest
 of all frames with a right calibration: 0.15 (PAC-NeRF bird), 0.10 (rabbit), 0.08 (peanut)."""
-HOLE = 0.01
-"""Enclosed holes up to this share of a matte's area are suspected to be mistakes of matting."""
+HOLE = 0.01  # share of a matte's area up to which an enclosed hole is suspected
 
 
 def lines_of_sight(scene: Scene, frame: int) -> tuple[list[int], Tensor, Tensor, Tensor]:
     """Cameras whose matte is whole, and per camera the line through the matte's centroid and the matte's radius.
 
     Returns indices (C), origins (C, 3) [m], unit directions (C, 3), tangents of the angular radius (C,), float64. A matte
-    that is empty or touches the image's border has no known centroid and is left out.
-    """
+    that is empty or touches the image's border has no known centroid and is left out."""
     chosen, origins, directions, radii = [], [], [], []
     for v in range(len(scene.cameras)):
         mask = scene.mattes[v, frame] > 0.5
@@ -54,8 +52,7 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
     """The lines of sight through the mattes' centroids meet, inside the scene's box.
 
     Errors: DataError naming the one camera without which the others agree, or all that disagree; and where they meet outside
-    of the box (wrong box, unit or axis). Silent where fewer than three mattes are whole.
-    """
+    of the box (wrong box, unit or axis). Silent where fewer than three mattes are whole."""
     chosen, origins, directions, radii = lines_of_sight(scene, frame)
     if len(chosen) < 3:
         return

@@ -1,8 +1,7 @@
 """Does the film move as a thrown object can? Wrong frame rates, units and orders of frames show before anything is learned.
 
 The track is the point where the lines of sight through the mattes' centroids meet, frame by frame. What contradicts mechanics by a
-factor of two or more beyond its own noise is refused, what does by less is a warning.
-"""
+factor of two or more beyond its own noise is refused, what does by less is a warning."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ of the built-in scenes and the bird fall with 0.93 to 1.07 of the stated gravity
 ODD, ASIDE = 1.6, 0.25
 """Factor of the acceleration, and its share across gravity, that is said even where the noise assumed could explain it. That noise
 is cautious: in the films above, three frames alone find gravity to 9 %, with 0.1 of it across."""
-WEIGHTLESS = 1.0
-"""[m/s^2] that a film without gravity may show before it touches anything."""
+WEIGHTLESS = 1.0  # [m/s^2] that a film without gravity may show before it touches anything
+SIZES, FASTEST = (1e-4, 1e3), 1e3  # [m], [m/s] of a falling object, with much room
 SWAPPED = 3.0
 """Factor by which swapping two frames makes a track smoother from which on they are swapped. It is 0.9 to 1.02 for films as they
 are; two swapped frames of the bird give 1.0 (at rest) to 100."""
@@ -37,10 +36,6 @@ are; two swapped frames of the bird give 1.0 (at rest) to 100."""
 COARSE, ABRUPT, MOVED = 160, 10.0, 0.1
 """Pictures are compared at about so many pixels across. They stop where they change that many times less than in the frame beside;
 radii that the object then moves at least where data are refused."""
-
-
-SIZES, FASTEST = (1e-4, 1e3), 1e3
-"""[m], [m/s]: what cameras around an object film as it falls and deforms lies far inside."""
 
 
 class Track(NamedTuple):
@@ -86,8 +81,7 @@ def parabola(track: Track, frames: int) -> tuple[Tensor, float]:
     """Acceleration (3,) [m/s^2] of a parabola through the first frames, at least three, and what it may be off by.
 
     That is three standard errors of the assumed noise, or Student's quantile of the same probability of the residuals', whichever
-    is more. Three frames leave no residuals: the noise assumed is then that of a coarse track.
-    """
+    is more. Three frames leave no residuals: the noise assumed is then that of a coarse track."""
     t = torch.arange(frames, dtype=torch.float64)
     design = torch.stack([torch.ones_like(t), t, 0.5 * t * t], 1)
     x = track.points[:frames]
@@ -137,7 +131,7 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
                           for (a, m), (b, n) in pairwise(frames)])  # fmt: skip
     if not bool(change.any()):
         raise DataError(
-            f"{label}: all {scene.frames} frames are identical: expected a film of a moving object"
+            f"{label}: all {scene.frames} frames are identical: expected a moving object"
         )
     same = change <= torch.minimum(2 * change.min(), change.max() / ABRUPT)
     ends = torch.nn.functional.pad(same.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
@@ -178,9 +172,8 @@ def check_size(track: Track, label: str) -> None:
         )
     speed = float(track.points.diff(dim=0).norm(dim=1).max()) / track.dt
     if speed > FASTEST:
-        raise DataError(
-            f"{label}: expected an object of at most {FASTEST:g} m/s, found {speed:.3g} m/s: check {keys}"
-        )
+        wanted = f"an object of at most {FASTEST:g} m/s"
+        raise DataError(f"{label}: expected {wanted}, found {speed:.3g} m/s: check {keys}")
 
 
 def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:

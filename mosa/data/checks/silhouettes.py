@@ -20,20 +20,15 @@ from mosa.errors import DataError
 from mosa.rendering.cameras import project
 from mosa.types import Cameras, Scene
 
-RESOLUTION = 40
-"""Voxels along the hull's longest side."""
+RESOLUTION = 40  # voxels along the hull's longest side
 OPEN, SUSPECT = 0.2, 0.04
 """Share of a matte that the hull leaves open from which on data are refused, and warned of. With a right calibration it is at most
 0.001 (built-in films of 64 to 400 px, PAC-NeRF's bird)."""
-ISLAND = 4
-"""Pixels of a matte in wholly uncovered pieces, above which a warning is given; single pixels are noise of matting."""
-SUNK = 0.25
-"""Share of the hull below the ground in frame 0, above which scene.ground.height is taken for wrong."""
+ISLAND = 4  # pixels of a matte apart from the hull that are warned of, above noise
+SUNK = 0.25  # share of the hull below ground in frame 0 that means a wrong height
 MAX_GROUND_GAP = 0.35
 """Distance between the ground and the lowest point of the hull at the turning point, in radii, above which a warning is given.
 In correct films it is below 0.15."""
-
-
 STRAY, LOST = 0.3, 0.6
 """Radii from the middle of the true particles to where the cameras see the object, from which on they are warned of, and refused.
 Of the built-in films it is at most 0.1."""
@@ -108,8 +103,7 @@ def check_outlines(scene: Scene, label: str) -> None:
     """The mattes of a frame are those of one solid, and it meets the ground where the ground is said to be.
 
     Looks at frame 0 and at the one where the object is lowest. Errors: DataError naming cameras and frame, or scene.ground.height
-    and scene.up. Silent where fewer than three mattes are whole.
-    """
+    and scene.up. Silent where fewer than three mattes are whole."""
     track = track_of(scene)
     turn = 0 if track is None else int((track.points @ scene.up.double()).argmin())
     worst = (0.0, "")

@@ -2,8 +2,7 @@
 
 Of all planes through two cameras the first and the last that meet the object touch both of its outlines, whatever its shape: each
 pair of cameras compares two angles a frame, to a fraction of a pixel. Outlines of a camera that disagrees with most others are
-tried mirrored, in other cameras' places and at other frames.
-"""
+tried mirrored, in other cameras' places and at other frames."""
 
 from __future__ import annotations
 

@@ -22,24 +22,17 @@ from mosa.rendering.cameras import centers
 from mosa.settings import Expected, Positive, Text, Whole, check_values, fits, such
 from mosa.types import FALLING, REST, Cameras, Ground, KnownBody, Markers, Scene, Truth, dense
 
-FULL = 0.99
-"""Share of an image from which on a matte says nothing."""
-CLEAR = 0.9
-"""Coverage that a camera's matte has somewhere in a film."""
-FLASH = 0.2
-"""By which an object's mean colour, of 0 to 1, may leave the line between the frames beside it. Built-in films stay
-below 0.04."""
+FULL = 0.99  # share of an image from which on a matte says nothing
+CLEAR = 0.9  # coverage that a camera's matte has somewhere in a film
+FLASH = 0.2  # jump of the mean colour (0 to 1) in one frame; built-in films stay below 0.04
 DRIFT = 0.15
 """By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
 body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
-OUTSIDE = 1e-3
-"""By which images and mattes may leave [0, 1]: rounding."""
+OUTSIDE = 1e-3  # by which images and mattes may leave [0, 1]: rounding
 COMPOSITED = 0.05
 """Mean distance of colours, of 0 to 1, from the background outside of a matte: compression leaves less, another background more."""
-CORNER = 0.1
-"""Share of an image's size from its corner within which a principal point was measured from the image's centre."""
-FARTHEST = 100.0
-"""[m] of a camera from the origin: float32 rounds positions to 0.008 mm there, a thousandth of a pixel."""
+CORNER = 0.1  # share of an image: a principal point in it was measured from the centre
+FARTHEST = 100.0  # [m] of a camera from the origin: float32 rounds to 0.008 mm there
 MAX_ORIGIN_RATIO = 3.0
 """Distance from the origin, over the cameras' spread, above which the capture is off the origin rather than in another unit."""
 MAX_FOCAL_RATIO, USUAL_FOCAL_RATIO = 2.0, 1.05
@@ -85,9 +78,8 @@ def validate(scene: Scene) -> Scene:
         low, high = map(float, value.aminmax()) if value.numel() else (0.0, 0.0)
         if not math.isfinite(low) or not math.isfinite(high):  # NaN is the least and the largest
             v, t = (~value.isfinite()).flatten(2).any(2).nonzero()[0].tolist()
-            raise DataError(
-                f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
-            )
+            where = f"camera {scene.cameras.names[v]}, frame {t}"
+            raise DataError(f"{label}: {name}: NaN or infinite pixels in {where}")
         if low < -OUTSIDE or high > 1 + OUTSIDE:
             raise DataError(
                 f"{label}: {name}: expected numbers in [0, 1], found {low:.4g} to {high:.4g}; divide bytes by 255"
@@ -134,10 +126,8 @@ def check_types(film: Scene | Footage, label: str) -> None:
               "cameras.w2c": (V, 4, 4)}  # fmt: skip
     own = vars(film) | {"cameras.K": cameras.K, "cameras.w2c": cameras.w2c}
     for name, shape in shapes.items():
-        if name in own and tuple(own[name].shape) != shape:
-            raise DataError(
-                f"{label}: {name}: expected shape {shape}, found {tuple(own[name].shape)}"
-            )
+        if name in own and (found := tuple(own[name].shape)) != shape:
+            raise DataError(f"{label}: {name}: expected shape {shape}, found {found}")
     if isinstance(film, Footage):
         return
     last = range(T - len(film.holdout_frames), T)
@@ -191,15 +181,17 @@ def check_cameras(scene: Scene, label: str) -> None:
                 f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids"
             )
         if not bool((cameras.K[v].diagonal()[:2] > 0).all()):
+            found = cameras.K[v].diagonal()[:2].tolist()
             raise DataError(
-                f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}"
+                f"{label}: camera {name}: expected positive focal lengths, found {found}"
             )
         check_pixels(cameras.K[v], f"{label}: camera {name}")
         R = cameras.w2c[v, :3, :3].double()
         bent = float((R @ R.T - torch.eye(3).double()).abs().max())
         if bent > 2e-3 or float(torch.linalg.det(R)) < 0:
+            found = R.tolist()
             raise DataError(
-                f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}"
+                f"{label}: camera {name}: expected a rotation in its pose, found {found}"
             )
         cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
         inside = 0 < cx < cameras.width and 0 < cy < cameras.height
@@ -208,11 +200,9 @@ def check_cameras(scene: Scene, label: str) -> None:
             f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
             f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: "
         )
-        said += (
-            "measured from their centre? Expected from the upper left corner: add half of their size"
-            if centred
-            else "intrinsics of another resolution?"
-        )
+        corner = "Expected from the upper left corner: add half of their size"
+        other = "intrinsics of another resolution?"
+        said += f"measured from their centre? {corner}" if centred else other
         if not inside:
             raise DataError(said)
         if centred:
@@ -224,9 +214,8 @@ def check_pixels(K: torch.Tensor, label: str) -> None:
     they differ visibly."""
     fixed = K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])
     if float(fixed.abs().max()) > 1e-6:
-        raise DataError(
-            f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
-        )
+        wanted = "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
+        raise DataError(f"{label}: intrinsics: expected {wanted}, found {K.tolist()}")
     across, down = K[0, 0].item(), K[1, 1].item()
     ratio = max(across / down, down / across)
     said = (

@@ -22,13 +22,11 @@ WHITE = np.ones(3, np.float32)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 FirstLast = Annotated[list[int], Expected("[first, last]"), such(lambda v: len(v) == 2)]
-LARGEST = 1e30
-"""Of a number in a file: single precision holds it."""
+LARGEST = 1e30  # of a number in a file: single precision holds it
 
 # relative jitter of frame times that still counts as a constant frame rate
 TIME_JITTER = 1e-3
-RATE = 0.005
-"""Share by which scene.fps may differ from the rate of a file's times without a word: 59.94 and 60 frames per second are one."""
+RATE = 0.005  # share by which scene.fps may differ from the file's rate: 59.94 and 60 are one
 
 
 @dataclass(frozen=True)

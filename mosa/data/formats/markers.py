@@ -26,13 +26,10 @@ log = logging.getLogger(__name__)
 Places = Annotated[dict[str, Three], Expected("a section of places like {a: [0, 0, 0.1]} [m]")]
 KINDS: dict[str, Any] = {"points": Places | None, "tracked": Annotated[Names, MinLen(1)] | None, "fps": Positive | None,
                          "duration": Positive | None, "holdout_frames": Whole}  # fmt: skip
-FOUND = {AUTO: released, "swing": swung}
-"""How scene.start is found."""
+FOUND = {AUTO: released, "swing": swung}  # how scene.start is found
 MOST_FRAMES = 100_000
-MISALIGNED = 0.1
-"""Of the points' extent: a distance (rms) of aligned points that is refused."""
-WIDE = 3.0
-"""The world reaches so many sizes of the body beyond it."""
+MISALIGNED = 0.1  # of the points' extent: a distance (rms) of aligned points that is refused
+WIDE = 3.0  # the world reaches so many sizes of the body beyond it
 
 
 def load_markers(
@@ -53,8 +50,7 @@ def load_markers(
     the end; fps: frames per second that it is resampled to, None for the recording's; loads: sets
     with a mass that goes with the body in this recording, as in world.driven; holdout_frames: how
     many last frames are not learned from.
-    Errors: ConfigError naming the key, DataError naming the file.
-    """
+    Errors: ConfigError naming the key, DataError naming the file."""
     check_density("scene.density", density)
     given = {"points": points, "tracked": tracked, "duration": duration, "fps": fps}
     check_values(given | {"holdout_frames": holdout_frames}, KINDS, "scene")

@@ -59,9 +59,8 @@ def read_pacnerf(
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise DataError(
-            f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)"
-        )
+        wanted = "set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)"
+        raise DataError(f"{folder}: folder not found; {wanted}")
     listing = folder / "all_data.json"
     calibration, times = read_listing(listing, fps)
     prefix, present = usable_frames(folder, calibration)
@@ -73,7 +72,8 @@ def read_pacnerf(
 
     @lru_cache(maxsize=1)  # one at a time: cameras come one after the other
     def plate(camera: str) -> np.ndarray | None:
-        return read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None
+        file = folder / "data" / f"r_{camera}_-1.png"
+        return three_channels(read_image(file)) if prefix == "r" else None
 
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / "data" / f"{prefix}_{camera}_{frame}.png",
@@ -89,17 +89,15 @@ def read_listing(
     for where, entry in read_entries(path, "image", "file_path", "time", "c2w", "intrinsic"):
         found = NAME.search(str(entry["file_path"]))
         if found is None:
-            raise DataError(
-                f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}"
-            )
+            wanted = "a file_path like ./data/r_<camera>_<frame>.png"
+            raise DataError(f"{where}: expected {wanted}, found {entry['file_path']!r}")
         camera, frame = found[2], int(found[3])
         K = matrix(entry["intrinsic"], (3, 3), f"{where}, intrinsic")
         w2c = world_to_camera(matrix(entry["c2w"], (3, 4), f"{where}, c2w"), f"{where}, c2w")
         if not same_camera(known := calibration.setdefault(camera, (K, w2c)), K, w2c):
             other = "another pose" if same_camera(known, K, known[1]) else "other intrinsics"
-            raise DataError(
-                f"{where}: camera {camera} has {other} than before; cameras must not move, focus or zoom"
-            )
+            why = f"has {other} than before; cameras must not move, focus or zoom"
+            raise DataError(f"{where}: camera {camera} {why}")
         if frame >= 0:
             merge_time(times, frame, number(entry["time"], f"{where}, time"), where, fps)
     return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times
@@ -132,14 +130,7 @@ def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
     raise DataError(f"{folder / 'data'}: expected images a_<camera>_<frame>.png, found none")
 
 
-def read_plate(file: Path) -> np.ndarray:
-    """Colour (H, W, 3) of an image without the object."""
-    return three_channels(read_image(file))
-
-
-def split(
-    file: Path, pixels: np.ndarray, plate: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
+def split(file: Path, pixels: np.ndarray, plate: np.ndarray | None) -> tuple[np.ndarray, ...]:
     """Colour (H, W, 3) and matte (H, W): the alpha channel of an a_ file, what is not white in an m_ file, what differs from the
     plate in an r_ file."""
     if file.name.startswith("a_"):
@@ -153,17 +144,10 @@ def split(
 
 
 def load_pacnerf(
-    path: str | Path,
-    *,
-    frames=None,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
-    **world,
+    path: str | Path, *, frames=None, scale=1.0, fill_holes=0, name=None, **world
 ) -> Scene:
     """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_pacnerf(path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes)
     folder = Path(path).resolve().name
-    return scene_from_footage(
-        footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world
-    )
+    known = PUBLISHED.get(folder, {})
+    return scene_from_footage(footage, name=name or folder, known_parameters=known, **world)

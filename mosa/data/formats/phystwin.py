@@ -26,23 +26,22 @@ from mosa.errors import DataError
 from mosa.settings import Positive, check
 from mosa.types import REST, Scene
 
-HAND = "hand"
-"""Name of the masks that are not the body's."""
+HAND = "hand"  # name of the masks that are not the body's
 
 
 def load_phystwin(
     path: str | Path,
     *,
     frames=None,
-    fps: float = 30.0,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
-    reach: float = 0.04,
+    fps=30.0,
+    scale=1.0,
+    fill_holes=0,
+    name=None,
+    reach=0.04,
     body: dict[str, Any] | None = None,
-    start: str = REST,
+    start=REST,
     holdout_frames=None,
-    cache: str | Path | None = None,
+    cache=None,
     **world,
 ) -> Scene:
     """Scene of the folder of a case, with the driven set `controller`.
@@ -66,9 +65,8 @@ def load_phystwin(
         calibration, numbers, lambda camera, frame: folder / "color" / camera / f"{frame}.png",
         lambda camera, picture, pixels: split_mask(picture, pixels, masks[camera] / picture.name),
         "metadata.json", scale=scale, fill=fill_holes)  # fmt: skip
-    footage = footage_of(
-        scaled, images, mattes, numbers, [k / fps for k in numbers], str(folder / "metadata.json")
-    )
+    times, where = [k / fps for k in numbers], str(folder / "metadata.json")
+    footage = footage_of(scaled, images, mattes, numbers, times, where)
     given = {} if body is None else dict(body)
     if given.get("shape") is None:
         given = {"shape": kept_cloud(rest, cache), "scale": given.get("scale") or 1.0}
@@ -126,9 +124,8 @@ def read_points(
                 f"{len(value)}; restrict scene.frames"
             )
         found[key] = value.astype(np.float64)
-    body = np.concatenate(
-        [found["object_points"][frames[0]], found["surface_points"], found["interior_points"]]
-    )
+    parts = found["object_points"][frames[0]], found["surface_points"], found["interior_points"]
+    body = np.concatenate(parts)
     body = body[np.isfinite(body).all(1)]
     hand = found["controller_points"][frames]
     hand = hand[:, np.isfinite(hand).all((0, 2))]
@@ -175,6 +172,5 @@ def numbers_of(file: Path) -> Any:
         with open(file, "rb") as stream:
             return Numbers(stream).load()
     except Exception as error:  # whatever is found: the file is not what its name says
-        raise DataError(
-            f"{file}: expected a pickle of lists, dictionaries and arrays of numbers alone, found {error}"
-        ) from error
+        wanted = "a pickle of lists, dictionaries and arrays of numbers alone"
+        raise DataError(f"{file}: expected {wanted}, found {error}") from error

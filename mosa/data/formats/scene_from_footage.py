@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import torch
 from annotated_types import Interval
 from pydantic import Field
+from torch import Tensor
 
 from mosa.data.checks.validation import check_types, fingerprint
 from mosa.data.formats.footage import Footage
@@ -22,16 +23,11 @@ from mosa.errors import ConfigError, DataError
 from mosa.settings import Positive, Settings, Text, Three, Whole, check
 from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth
 
-DENSITIES = 0.1, 1e5
-"""[kg/m^3]: aerogel has 1, osmium 22,590."""
-LIGHT = 10.0
-"""[kg/m^3] below which a density is asked about: foams of polystyrene have 15."""
-STEEP = 3.0
-"""[degrees] of an incline that is said."""
-SHAPES = (".ply", ".obj", ".stl")
-"""Endings of files of a body's rest shape."""
-WIDEST = 1e5
-"""[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
+DENSITIES = 0.1, 1e5  # [kg/m^3]: aerogel has 1, osmium 22,590
+LIGHT = 10.0  # [kg/m^3] below which a density is asked about: foams of polystyrene have 15
+STEEP = 3.0  # [degrees] of an incline that is said
+SHAPES = (".ply", ".obj", ".stl")  # endings of files of a body's rest shape
+WIDEST = 1e5  # [m] of scene.box: with gravity and seconds, nothing that cameras film is larger
 
 
 def check_density(key: str, density: float) -> None:
@@ -104,11 +100,10 @@ def scene_from_footage(
     last_free_frame and holdout_frames: frame numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one
     per frame; body: {shape: file, scale} of a known rest shape; driven: as of
     `Scene`; fps overrides times.
-    Errors: ConfigError naming the key, DataError for particle files.
-    """
+    Errors: ConfigError naming the key, DataError for particle files."""
     check_types(footage, f"scene {name} ({sequence})")
     up, pull = directions(up, gravity, ground)
-    if not isinstance(box, (list, tuple, torch.Tensor)) or len(box) != 2:
+    if not isinstance(box, (list, tuple, Tensor)) or len(box) != 2:
         raise ConfigError(f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}")
     box = torch.stack([vector(corner, "box") for corner in box])
     if not bool((box[1] > box[0]).all()) or float(box.abs().max()) > WIDEST:
@@ -119,22 +114,22 @@ def scene_from_footage(
     times = footage.times
     if fps is not None:
         check("scene.fps", fps, Positive)
-        times = torch.tensor(
-            [(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32
-        )
+        moments = [(f - footage.frames[0]) / fps for f in footage.frames]
+        times = torch.tensor(moments, dtype=torch.float32)
     if start not in (FALLING, REST):
         raise ConfigError(f"scene.start: expected {FALLING} or {REST}, found {start!r}")
     if start == REST:
         if last_free_frame is not None:
+            wanted = f"null with scene.start={REST}, where no frame is one of free flight"
             raise ConfigError(
-                f"scene.last_free_frame: expected null with scene.start={REST}, where no frame is one of "
-                f"free flight, found {last_free_frame!r}"
+                f"scene.last_free_frame: expected {wanted}, found {last_free_frame!r}"
             )
         last_free_frame = footage.frames[0]
     if last_free_frame is not None:
         if isinstance(last_free_frame, bool) or last_free_frame not in footage.frames:
+            there = f"{footage.frames[0]} to {footage.frames[-1]}"
             raise ConfigError(
-                f"scene.last_free_frame: no frame {last_free_frame}; the scene has {footage.frames[0]} to {footage.frames[-1]}"
+                f"scene.last_free_frame: no frame {last_free_frame}; the scene has {there}"
             )
         last_free_frame = footage.frames.index(last_free_frame)
     check_ground(ground, up, pull, box)
@@ -152,9 +147,7 @@ def scene_from_footage(
     return replace(scene, fingerprint=fingerprint(scene))
 
 
-def check_ground(
-    ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, box: torch.Tensor
-) -> None:
+def check_ground(ground: Ground | None, up: Tensor, pull: Tensor, box: Tensor) -> None:
     """The ground lies in the box, and what falls falls onto it: a warning where it is an incline. up: (3,) unit vector.
 
     Errors: ConfigError naming scene.box."""
@@ -168,15 +161,14 @@ def check_ground(
             f"{box.tolist()}, which reaches from {low:.4g} to {high:.4g} m along scene.up"
         )
     if float(pull.norm()) > 0:
-        angle = math.degrees(
-            math.acos(min(1.0, float(-(pull.double() @ up.double()) / pull.double().norm())))
-        )
+        cosine = float(-(pull.double() @ up.double()) / pull.double().norm())
+        angle = math.degrees(math.acos(min(1.0, cosine)))
         if angle > STEEP:
             warnings.warn(f"scene.gravity: pulls at {angle:.3g} degrees from scene.up, so that the ground is an incline: set "
                           "scene.up along -scene.gravity where it is not", stacklevel=5)  # fmt: skip
 
 
-def directions(up, gravity, ground: Ground | None) -> tuple[torch.Tensor, torch.Tensor]:
+def directions(up, gravity, ground: Ground | None) -> tuple[Tensor, Tensor]:
     """(scene.up of unit length, scene.gravity [m/s^2]), (3,) each. Errors: ConfigError naming the key."""
     up, pull = vector(up, "up"), vector(gravity, "gravity")
     if not 0 < float(up.norm()) < torch.inf:
@@ -188,10 +180,10 @@ def directions(up, gravity, ground: Ground | None) -> tuple[torch.Tensor, torch.
     return up / up.norm(), pull
 
 
-def vector(value, key: str) -> torch.Tensor:
+def vector(value, key: str) -> Tensor:
     """(3,) float32. Errors: ConfigError naming the key."""
     value = list(value) if isinstance(value, tuple) else value
-    if isinstance(value, torch.Tensor):
+    if isinstance(value, Tensor):
         value = value.tolist()
     check(f"scene.{key}", value, Three)
     return torch.tensor(value, dtype=torch.float32)
@@ -206,9 +198,8 @@ def held_out_cameras(names, footage_names: tuple[str, ...], fewest: int = 2) -> 
     indices = set()
     for name in names or ():
         if str(name) not in footage_names:
-            raise ConfigError(
-                f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}"
-            )
+            known = ", ".join(footage_names)
+            raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {known}")
         indices.add(footage_names.index(str(name)))
     if len(footage_names) - len(indices) < fewest:
         raise ConfigError(
@@ -224,18 +215,16 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
     Errors: ConfigError where a number is unknown, where they are not the end of the sequence, or under three are left.
     """
     if isinstance(numbers, bool) or not isinstance(numbers, (int, list, tuple, type(None))):
-        raise ConfigError(
-            f"scene.holdout_frames: expected a list of frame numbers or how many are held out, found {numbers!r}"
-        )
+        wanted = "a list of frame numbers or how many are held out"
+        raise ConfigError(f"scene.holdout_frames: expected {wanted}, found {numbers!r}")
     if isinstance(numbers, int):
         check("scene.holdout_frames", numbers, Whole)
         numbers = frames[max(0, len(frames) - numbers) :]
     indices = set()
     for number in numbers or ():
         if number not in frames:
-            raise ConfigError(
-                f"scene.holdout_frames: no frame {number}; the scene has {frames[0]} to {frames[-1]}"
-            )
+            there = f"{frames[0]} to {frames[-1]}"
+            raise ConfigError(f"scene.holdout_frames: no frame {number}; the scene has {there}")
         indices.add(frames.index(number))
     if indices and sorted(indices) != list(range(len(frames) - len(indices), len(frames))):
         raise ConfigError(

@@ -43,9 +43,8 @@ def read_spring_gaus(
     present = sorted({int(found[1]) for camera in calibration for file in pictures(folder / camera)
                       if (found := PICTURE.fullmatch(file.name)) is not None})  # fmt: skip
     if not present:
-        raise DataError(
-            f"{folder}: expected pictures {next(iter(calibration))}/000.png and so on, found none"
-        )
+        wanted = f"pictures {next(iter(calibration))}/000.png and so on"
+        raise DataError(f"{folder}: expected {wanted}, found none")
     numbers, listing = frame_range(present, frames, str(folder)), str(folder / "frame.json")
     if numbers[-1] >= len(times):
         raise DataError(
@@ -74,9 +73,8 @@ def read_cameras(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     for where, entry in read_entries(path, "camera", "camera", "K", "c2w"):
         name = entry["camera"]
         if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
-            raise DataError(
-                f"{where}, camera: expected the name of a folder beside {path.name}, found {str(name)[:80]!r}"
-            )
+            wanted = f"the name of a folder beside {path.name}"
+            raise DataError(f"{where}, camera: expected {wanted}, found {str(name)[:80]!r}")
         if name in calibration:
             raise DataError(f"{where}: camera {name!r} twice")
         calibration[name] = (matrix(entry["K"], (3, 3), f"{where}, K"),
@@ -95,16 +93,9 @@ def read_times(path: Path) -> list[float]:
 
 
 def load_spring_gaus(
-    path: str | Path,
-    *,
-    frames=None,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
-    **world,
+    path: str | Path, *, frames=None, scale=1.0, fill_holes=0, name=None, **world
 ) -> Scene:
     """Scene of a folder in Spring-Gaus' layout. `world`: the keyword arguments of `scene_from_footage`."""
-    footage = read_spring_gaus(
-        path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes
-    )
+    fps = world.get("fps")
+    footage = read_spring_gaus(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
     return scene_from_footage(footage, name=name or Path(path).resolve().name, **world)

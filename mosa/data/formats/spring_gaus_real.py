@@ -21,25 +21,22 @@ from mosa.data.io.colmap import Camera, read_model
 from mosa.errors import DataError
 from mosa.types import Cameras, Scene
 
-WIDE = 640
-"""Pixels across the reduced masks of photographs."""
-VOXELS = 64
-"""Along the longest side of the rest shape."""
-AROUND = 0.9
-"""Of the distance of the nearest photograph from where they look: half of the box that is searched."""
+WIDE = 640  # pixels across the reduced masks of photographs
+VOXELS = 64  # along the longest side of the rest shape
+AROUND = 0.9  # half of the searched box, over the nearest photograph's distance
 
 
 def load_spring_gaus_real(
     path: str | Path,
     *,
     frames=None,
-    fps: float = 120.0,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
+    fps=120.0,
+    scale=1.0,
+    fill_holes=0,
+    name=None,
     body: dict[str, Any] | None = None,
-    last_free_frame: int | None = None,
-    cache: str | Path | None = None,
+    last_free_frame=None,
+    cache=None,
     **world,
 ) -> Scene:
     """Scene of <capture>/dynamic/sequences/<object>/<sequence>.json.
@@ -50,9 +47,8 @@ def load_spring_gaus_real(
     `scene_from_footage`. Errors: DataError naming file and field, ConfigError."""
     file = Path(path)
     if file.suffix != ".json" or file.parent.parent.name != "sequences" or len(file.parents) < 4:
-        raise DataError(
-            f"scene.path: expected <capture>/dynamic/sequences/<object>/<sequence>.json, found {file}"
-        )
+        wanted = "<capture>/dynamic/sequences/<object>/<sequence>.json"
+        raise DataError(f"scene.path: expected {wanted}, found {file}")
     capture, thing = file.parents[3], file.parent.name
     photographs = read_model(capture / "static" / "colmap" / thing)
     footage, hit = read_sequence(file, photographs, frames, fps, scale, fill_holes)

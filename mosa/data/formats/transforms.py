@@ -28,8 +28,7 @@ from mosa.data.images.lens import COEFFICIENTS, FOREIGN, Lens, is_fisheye, lens_
 from mosa.errors import DataError
 from mosa.types import Scene
 
-LONGEST = 1000
-"""Characters of a path: a file system takes 4096 bytes, of names of 255 each."""
+LONGEST = 1000  # characters of a path: a file system takes 4096 bytes, of names of 255 each
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 JITTER = 0.01
@@ -145,9 +144,8 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
 def locate(folder: Path, name: str, where: str) -> Path:
     """The file a path names, its extension left out or not. Errors: DataError where there is none."""
     if len(name) > LONGEST or "\0" in name:
-        raise DataError(
-            f"{where}: expected a path of at most {LONGEST} characters, found {len(name)}: {name[:60]!r} ..."
-        )
+        found = f"found {len(name)}: {name[:60]!r} ..."
+        raise DataError(f"{where}: expected a path of at most {LONGEST} characters, {found}")
     for extension in EXTENSIONS:
         candidate = folder / (name + extension)
         if candidate.is_file():
@@ -159,9 +157,8 @@ def counted_time(image: Path, fps: float | None, where: str, place: int) -> floa
     """Time [s] from the number at that place of a file name."""
     counter = re.findall(r"\d+", image.stem)
     if fps is None or not counter:
-        raise DataError(
-            f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps"
-        )
+        way = "add `time`, or number the files and set scene.fps"
+        raise DataError(f"{where}: expected a time in seconds, found none; {way}")
     return int(counter[place]) / fps
 
 
@@ -176,16 +173,14 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
     """Camera name -> the shot whose pose is nearest to the mean, and all its shots; by label, or by equal pose.
 
     A warning where the poses of a label differ by a little. Errors: DataError where a camera has several intrinsics or moves, or
-    unlabelled ones all do.
-    """
+    unlabelled ones all do."""
     members: dict[str, list[Shot]] = {}
     for shot in shots:
-        same = (
-            n
-            for n, (s, *_) in members.items()
-            if s.camera is None and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
-        )
-        name = next(same, str(len(members))) if shot.camera is None else shot.camera
+        eye, name = np.eye(3), shot.camera
+        if name is None:
+            bare = ((n, own[0].w2c) for n, own in members.items() if own[0].camera is None)
+            same = (n for n, w2c in bare if same_camera((eye, w2c), eye, shot.w2c))
+            name = next(same, str(len(members)))
         members.setdefault(name, []).append(shot)
     places = np.array([shot.place for shot in shots])
     spread = float(np.linalg.norm(places - places.mean(0), axis=1).max()) or 1.0
@@ -197,11 +192,9 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
     if len(shots) > 2 and len(members) == len(shots):
         close = sum(any(apart(a, b) < JITTER for b in shots if b is not a) for a in shots)
         still = 2 * close > len(shots) >= 2 * len({shot.time for shot in shots})
-        cause = (
-            "they seem to, with poses solved for each image: name the camera of each entry (`camera`)"
-            if still
-            else "a single moving camera cannot be used"
-        )
+        cause = "a single moving camera cannot be used"
+        if still:
+            cause = "they seem to, with poses solved for each image: name the camera of each entry"
         raise DataError(
             f"{file}: {len(shots)} entries with {len(members)} different poses: expected cameras that stand still and "
             f"see every frame; {cause}"
@@ -248,10 +241,9 @@ def synchronise(
         row: list[Shot | None] = [None] * len(times)
         for shot in shots:
             index = int(np.abs(np.array(times) - shot.time).argmin())
-            if row[index] is not None:
-                raise DataError(
-                    f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}"
-                )
+            if (other := row[index]) is not None:
+                found = f"two images at {shot.time:.6f} s, the other in {other.where}"
+                raise DataError(f"{shot.where}: camera {name} has {found}")
             row[index] = shot
         missing = [round(t, 6) for t, s in zip(times, row) if s is None]
         if missing:
@@ -291,39 +283,30 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
     known = shot.intrinsics
     for key, size in (("w", width), ("h", height)):
         if key in known and known[key] != size:
+            found = f"{shot.image.name} is {width}x{height}"
             raise DataError(
-                f"{shot.where}: intrinsics are for {key} = {known[key]:g} px, but {shot.image.name} is {width}x{height}"
+                f"{shot.where}: intrinsics are for {key} = {known[key]:g} px, but {found}"
             )
     if "fl_x" in known:
         focal = known["fl_x"], known.get("fl_y", known["fl_x"])
     elif "camera_angle_x" in known:
-        if not 0 < known["camera_angle_x"] < math.pi:
-            raise DataError(
-                f"{shot.where}: camera_angle_x: expected radians between 0 and pi, found {known['camera_angle_x']:g}"
-            )
-        focal = (0.5 * width / math.tan(0.5 * known["camera_angle_x"]),) * 2
+        if not 0 < (angle := known["camera_angle_x"]) < math.pi:
+            wanted = "expected radians between 0 and pi"
+            raise DataError(f"{shot.where}: camera_angle_x: {wanted}, found {angle:g}")
+        focal = (0.5 * width / math.tan(0.5 * angle),) * 2
     else:
-        raise DataError(
-            f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither"
-        )
+        wanted = "fl_x (and fl_y) in pixels or camera_angle_x in radians"
+        raise DataError(f"{shot.where}: expected {wanted}, found neither")
     K = np.diag([*focal, 1.0])
     K[:2, 2] = known.get("cx", width / 2), known.get("cy", height / 2)
     return K
 
 
 def load_transforms(
-    path: str | Path,
-    *,
-    frames=None,
-    fps: float | None = None,
-    scale: float = 1.0,
-    fill_holes: int = 0,
-    name: str | None = None,
-    **world,
+    path: str | Path, *, frames=None, fps=None, scale=1.0, fill_holes=0, name=None, **world
 ) -> Scene:
     """Scene of a transforms.json. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_transforms(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
     folder = Path(path).resolve()
-    return scene_from_footage(
-        footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world
-    )
+    name = name or (folder.parent if folder.suffix else folder).name
+    return scene_from_footage(footage, name=name, **world)

@@ -5,8 +5,7 @@ fx x' + cx, fy y' + cy where (Brown 1971)
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 or, fisheye (Kannala and Brandt 2006), (x', y') = (x, y) theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)/r with
-theta = atan r.
-"""
+theta = atan r."""
 
 from __future__ import annotations
 
@@ -19,14 +18,12 @@ import numpy as np
 from mosa.errors import DataError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-FOREIGN = ("k5", "k6", "s1", "s2", "s3", "s4")
-"""Of the rational and thin prism models, which are not undone."""
+FOREIGN = ("k5", "k6", "s1", "s2", "s3", "s4")  # other lens models, not undone
 MODELS = {
     name: False for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 } | {name: True for name in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")}
 """camera_model as COLMAP names it -> whether it is a fisheye's."""
-ZOOM = 4.0
-"""Largest change of the focal length that still counts as undoing a lens."""
+ZOOM = 4.0  # largest change of the focal length that still counts as undoing a lens
 
 
 @dataclass(frozen=True)
@@ -44,8 +41,7 @@ class Lens:
         """A picture (H, W, 3) composited on a background colour (3,) and its matte (H, W) as the pinhole camera sees them.
 
         What the lens did not show is background. Bicubic: 2 dB closer to a pinhole's picture than bilinear. Overshoots at edges are
-        cut off; they would leave 2 % of a colour where there is no matte.
-        """
+        cut off; they would leave 2 % of a colour where there is no matte."""
         x, y = self.places[..., 0], self.places[..., 1]
 
         def seen_by(image: np.ndarray, behind) -> np.ndarray:
@@ -86,8 +82,7 @@ def lens_of(
 
     The pinhole camera's view is the largest rectangle that the lens shows in full, so that all its pixels are seen ones (but for
     a fisheye's corners): its K differs from the lens'. Errors: DataError beginning with `where` for coefficients that fold the
-    image or belong to another model.
-    """
+    image or belong to another model."""
     k1, k2, k3, k4, p1, p2 = (float(coefficients.get(name, 0.0)) for name in COEFFICIENTS)
     if not fisheye and not any((k1, k2, k3, k4, p1, p2)):
         return None

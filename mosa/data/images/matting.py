@@ -13,10 +13,8 @@ import numpy as np
 RESIDUAL = 0.08
 """Colour left over, in [0, sqrt 3], above which a pixel belongs to the object: 1.3 times the largest elsewhere in the plates and
 shadows of the PAC-NeRF bird (0.060 to 0.074), 0.6 times the 0.1 % quantile inside of it."""
-DARKEST, BRIGHTEST = 0.5, 1.25
-"""Factors on the plate's colour that still count as its shadow or highlight."""
-SPECK = 0.01
-"""Pieces smaller than this share of the largest are dropped."""
+DARKEST, BRIGHTEST = 0.5, 1.25  # factors on the plate's colour: shadow, highlight
+SPECK = 0.01  # pieces smaller than this share of the largest are dropped
 
 
 def matte_from_plate(image: np.ndarray, plate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,8 +4,7 @@ Images of many more pixels than the smallest are reduced to as many (area averag
 object in all of them; what is then narrower or lower than another is surrounded by background and an empty matte. That is no guess:
 a camera that sees the whole object says that it is nowhere else. Where the object runs over a border the image says nothing about
 what lies beyond, so such a border stays a border of the larger image, at which `mosa.data.hull` and `mosa.data.checks.cameras`
-look for objects that are cut.
-"""
+look for objects that are cut."""
 
 from __future__ import annotations
 
@@ -18,8 +17,7 @@ from mosa.errors import DataError
 
 log = logging.getLogger(__name__)
 
-FINER = 1.5
-"""Times as many pixels as the smallest image above which one is reduced."""
+FINER = 1.5  # times as many pixels as the smallest image above which one is reduced
 
 
 def one_size(

@@ -15,8 +15,7 @@ from mosa.settings import Whole, check
 from mosa.system.limits import counted
 from mosa.system.ply import named
 
-MOST_PIXELS = 2**26
-"""Of one picture: twice an 8K frame."""
+MOST_PIXELS = 2**26  # of one picture: twice an 8K frame
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -37,36 +36,29 @@ def read_image(path: Path) -> np.ndarray:
         raise DataError(
             f"{path}: expected a readable image, found {named(path)} ({error})"
         ) from error
-    if pixels.dtype == np.uint8:
-        pixels = pixels.astype(np.float32) / 255
-    elif pixels.dtype == np.uint16:
-        pixels = pixels.astype(np.float32) / 65535
-    elif np.issubdtype(pixels.dtype, np.floating) or pixels.dtype == bool:
-        pixels = pixels.astype(np.float32)
-    else:
+    kind = pixels.dtype
+    if kind not in (np.uint8, np.uint16, bool) and not np.issubdtype(kind, np.floating):
         raise DataError(
-            f"{path}: expected 8 or 16 bits per channel or floating point, found {pixels.dtype}"
+            f"{path}: expected 8 or 16 bits per channel or floating point, found {kind}"
         )
+    most = np.iinfo(kind).max if np.issubdtype(kind, np.integer) else 1
+    pixels = pixels.astype(np.float32) / most
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
-        raise DataError(
-            f"{path}: expected a picture with 1, 3 or 4 channels, found an array of shape {pixels.shape}"
-        )
+        wanted = "a picture with 1, 3 or 4 channels"
+        raise DataError(f"{path}: expected {wanted}, found an array of shape {pixels.shape}")
     if not np.isfinite(pixels).all():
-        raise DataError(
-            f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite"
-        )
+        found = int((~np.isfinite(pixels)).sum())
+        raise DataError(f"{path}: expected finite pixels, found {found} that are NaN or infinite")
     return np.clip(pixels, 0, 1)
 
 
 FAINT = 0.5
 """Of a matte that has anything in it at least. Labels are numbers from 1 on, of 255; and a pixel belongs to the object from half
 coverage on, so that one which is fainter everywhere would be an empty one in all that looks at outlines."""
-SLIVER = 50
-"""Pixels of a matte that may all be so faint: the edge of an object that is nearly out of the picture."""
-GREY = 8 / 255
-"""By which the channels of a grey mask differ at most, which JPEG may have written."""
+SLIVER = 50  # pixels that may all be so faint: the edge of an object leaving the picture
+GREY = 8 / 255  # by which the channels of a grey mask differ at most, which JPEG may have written
 
 
 def matte_of(path: Path, pixels: np.ndarray) -> np.ndarray:
@@ -104,13 +96,10 @@ def check_pixels(path: Path) -> None:
         # pages of a TIFF are small copies too, and the second picture of a phone's JPEG is its preview
         several = getattr(picture, "n_frames", 1) if picture.format in ("PNG", "GIF", "WEBP") else 1
     if several > 1:
-        raise DataError(
-            f"{path}: expected one picture, found an animation of {several}; write each of them as a file"
-        )
+        raise DataError(f"{path}: expected one picture, found an animation of {several}")
     if width * height > MOST_PIXELS:
-        raise DataError(
-            f"{path}: expected at most {MOST_PIXELS / 1e6:.0f} million pixels, found {width}x{height}: scale it down"
-        )
+        most = f"at most {MOST_PIXELS / 1e6:.0f} million pixels"
+        raise DataError(f"{path}: expected {most}, found {width}x{height}: scale it down")
 
 
 def check_amount(pictures: int, width: int, height: int) -> None:
@@ -144,8 +133,7 @@ def deep_png(path: Path) -> np.ndarray | None:
 def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
     """A matte (H, W) whose enclosed holes of at most `largest` pixels are covered; 0 leaves it as it is.
 
-    Errors: ConfigError for a size that is none.
-    """
+    Errors: ConfigError for a size that is none."""
     check("scene.fill_holes", largest, Whole)
     if largest == 0:
         return matte
@@ -156,9 +144,8 @@ def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
 def enclosed_holes(matte: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels (H, W) of the pieces of a matte (H, W) below half coverage, and the area (n,) [px] of each label: 0 of what is covered
     and of pieces that reach the border."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(
-        (matte < 0.5).astype(np.uint8), connectivity=4
-    )
+    below = (matte < 0.5).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(below, connectivity=4)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
     areas[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 0

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mosa.errors import DataError
 
-HALF = 0.5
-"""Pixel centres lie at half integers here and in COLMAP, at whole numbers in OpenCV."""
+HALF = 0.5  # pixel centres lie at half integers here and in COLMAP, at whole numbers in OpenCV
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
@@ -29,10 +28,8 @@ MODELS = {
 }
 """Model -> number in binary files, names of its parameters. Others (FULL_OPENCV, FOV, THIN_PRISM_FISHEYE) are refused."""
 BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
-POINTS = re.compile(r"[-+.\deE\s]+")
-"""A line of an image's points: numbers by threes."""
-MAX_ENTRIES = 100_000
-"""Cameras or images of a model. The count of a damaged file may be any number."""
+POINTS = re.compile(r"[-+.\deE\s]+")  # A line of an image's points: numbers by threes
+MAX_ENTRIES = 100_000  # cameras or images; the count of a damaged file may be any number
 
 Intrinsics = tuple[np.ndarray, dict[str, float], bool, tuple[int, int]]
 
@@ -97,31 +94,29 @@ def read_model(folder: Path) -> dict[str, Camera]:
             try:
                 return assembled(cameras_of(cameras), images_of(images), images)
             except (struct.error, UnicodeDecodeError, OverflowError) as error:
-                raise DataError(
-                    f"{folder}: expected a COLMAP model, found a damaged file ({error}); export it again"
-                ) from error
+                found = f"found a damaged file ({error}); export it again"
+                raise DataError(f"{folder}: expected a COLMAP model, {found}") from error
     raise DataError(f"{folder}: expected images.bin or images.txt of a COLMAP model, found neither")
 
 
-def assembled(
-    cameras: dict[int, Intrinsics],
-    images: list[tuple[str, int, np.ndarray, np.ndarray]],
-    file: Path,
-) -> dict[str, Camera]:
+Images = list[tuple[str, int, np.ndarray, np.ndarray]]  # name, camera, quaternion, translation
+
+
+def assembled(cameras: dict[int, Intrinsics], images: Images, file: Path) -> dict[str, Camera]:
     found = {}
     for name, number, quaternion, shift in images:
         where = f"{file}, image {name}"
         if name in found:
             raise DataError(f"{where}: expected every image once, found it twice")
         if number not in cameras:
+            known = sorted(cameras)
             raise DataError(
-                f"{where}: expected one of the cameras {sorted(cameras)}, found CAMERA_ID {number}"
+                f"{where}: expected one of the cameras {known}, found CAMERA_ID {number}"
             )
         norm = float(np.linalg.norm(quaternion))
         if not np.isfinite([*quaternion, *shift]).all() or abs(norm - 1) > 1e-3:
-            raise DataError(
-                f"{where}: expected a unit quaternion and a finite translation, found {list(quaternion)}, {list(shift)}"
-            )
+            found = f"{list(quaternion)}, {list(shift)}"
+            raise DataError(f"{where}: expected a unit quaternion, a finite shift, found {found}")
         K, coefficients, fisheye, size = cameras[number]
         w2c = np.eye(4)
         # COLMAP writes w first, scipy last
@@ -141,16 +136,14 @@ def intrinsics(model: str, width: int, height: int, values: list[float], where: 
         )
     names = MODELS[model][1]
     if len(values) != len(names):
-        raise DataError(
-            f"{where}: expected the {len(names)} parameters {', '.join(names)} of {model}, found {len(values)}"
-        )
+        wanted = f"the {len(names)} parameters {', '.join(names)} of {model}"
+        raise DataError(f"{where}: expected {wanted}, found {len(values)}")
     given = dict(zip(names, values))
     fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
     sized = 0 < width < 1e5 and 0 < height < 1e5
     if not (np.isfinite(values).all() and fx > 0 and fy > 0 and sized):
-        raise DataError(
-            f"{where}: expected positive focal lengths and sizes, found {given} for {width}x{height} px"
-        )
+        found = f"{given} for {width}x{height} px"
+        raise DataError(f"{where}: expected positive focal lengths and sizes, found {found}")
     K = np.array([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]])
     coefficients = {name: value for name, value in given.items() if name[0] in "kp"}
     return K, coefficients, model.endswith("FISHEYE"), (width, height)
@@ -175,9 +168,8 @@ def lines_of(file: Path) -> list[tuple[int, str]]:
     try:
         lines = file.read_text("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise DataError(
-            f"{file}: expected the text of a COLMAP model, found a damaged file ({error}); export it again"
-        ) from error
+        found = f"found a damaged file ({error}); export it again"
+        raise DataError(f"{file}: expected the text of a COLMAP model, {found}") from error
     return [(i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#")]
 
 
@@ -188,9 +180,8 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
         if not words:
             continue
         if len(words) < 5:
-            raise DataError(
-                f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line[:80]!r}"
-            )
+            wanted = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
+            raise DataError(f"{where}: expected {wanted}, found {line[:80]!r}")
         number, width, height = whole([words[0], *words[2:4]], where)
         if number in found:
             raise DataError(f"{where}: expected every CAMERA_ID once, found {number} twice")
@@ -198,7 +189,7 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
     return found
 
 
-def text_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
+def text_images(file: Path) -> Images:
     """An image takes two lines, the second of which, its points, is passed over; some programs leave it out where it is empty."""
     found, named = [], False
     for i, line in lines_of(file):
@@ -208,9 +199,8 @@ def text_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
         named = True
         words, where = line.split(maxsplit=9), f"{file}, line {i}"
         if len(words) < 10:
-            raise DataError(
-                f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line[:80]!r}"
-            )
+            wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise DataError(f"{where}: expected {wanted}, found {line[:80]!r}")
         (_, number), values = whole([words[0], words[8]], where), numbers(words[1:8], where)
         found.append((words[9], number, np.array(values[:4]), np.array(values[4:])))
     return found
@@ -223,9 +213,8 @@ def binary_cameras(file: Path) -> dict[int, Intrinsics]:
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         where = f"{file}, camera {number}"
         if model not in BY_NUMBER:
-            raise DataError(
-                f"{where}: expected a camera model of {', '.join(MODELS)}, found number {model}; undistort the images"
-            )
+            known = ", ".join(MODELS)
+            raise DataError(f"{where}: expected a camera model of {known}, found number {model}")
         names = MODELS[BY_NUMBER[model]][1]
         values = struct.unpack_from(f"<{len(names)}d", data, at + 24)
         at += 24 + 8 * len(names)
@@ -233,16 +222,14 @@ def binary_cameras(file: Path) -> dict[int, Intrinsics]:
     return found
 
 
-def binary_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
+def binary_images(file: Path) -> Images:
     data, found = file.read_bytes(), []
     count, at = counted(data, file), 8
     for _ in range(count):
         _, *values, number = struct.unpack_from("<i7di", data, at)
         end = data.find(b"\0", at + 64)
         if end < 0:
-            raise DataError(
-                f"{file}: expected an image's name, found the end of the file; export the model again"
-            )
+            raise DataError(f"{file}: expected an image's name, found the end of the file")
         name = data[at + 64 : end].decode()
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * points
@@ -260,9 +247,8 @@ def read_points(folder: Path) -> np.ndarray:
                 found.append(struct.unpack_from("<3d", data, at + 8))
                 at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
         except (struct.error, OverflowError) as error:
-            raise DataError(
-                f"{binary}: expected points of a COLMAP model, found a damaged file ({error}); export it again"
-            ) from error
+            found = f"found a damaged file ({error}); export it again"
+            raise DataError(f"{binary}: expected points of a COLMAP model, {found}") from error
     elif text.is_file():
         lines = [(line.split(maxsplit=4), i) for i, line in lines_of(text) if line]
         found = [point(words, f"{text}, line {i}") for words, i in lines]
@@ -281,7 +267,5 @@ def point(words: list[str], where: str) -> list[float]:
 def counted(data: bytes, file: Path, most: int = MAX_ENTRIES) -> int:
     (count,) = struct.unpack_from("<Q", data, 0)
     if count > most:
-        raise DataError(
-            f"{file}: expected at most {most} entries, found {count}: not a file of a COLMAP model"
-        )
+        raise DataError(f"{file}: expected at most {most} entries, found {count}: no COLMAP model")
     return count

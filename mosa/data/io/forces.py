@@ -21,10 +21,8 @@ from mosa.settings import LARGEST, Entries, Positive, Settings, Text, check
 from mosa.types import Rollout
 
 COLUMNS = ("time", "fx", "fy", "fz")
-MODEL_ERROR = 0.01
-"""Of the largest force: what a grid gets wrong of plates and clamps (docs/driven.md)."""
-FAR = 5.0
-"""Standard deviations of a misfit (rms) beyond which it is warned of."""
+MODEL_ERROR = 0.01  # of the largest force: error of a grid (docs/driven.md)
+FAR = 5.0  # standard deviations of a misfit (rms) beyond which it is warned of
 
 
 class Measured(Settings):

@@ -1,8 +1,7 @@
 """Gaussians in the PLY layout of 3D Gaussian Splatting (Kerbl et al. 2023), which its trainers write and its viewers open.
 
 Per vertex, float32: x y z, nx ny nz (unused), f_dc_0..2 and f_rest_* (spherical harmonics: the rest channel by channel),
-opacity (logit), scale_0..2 (log of the standard deviations), rot_0..3 (quaternion wxyz).
-"""
+opacity (logit), scale_0..2 (log of the standard deviations), rot_0..3 (quaternion wxyz)."""
 
 from __future__ import annotations
 
@@ -48,8 +47,7 @@ def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = Non
     """Write Gaussians as a binary 3DGS PLY; folders are made.
 
     coefficients: spherical harmonics (N, K, 3), K = 1, 4, 9 or 16; None: the constant colours of `splats`.
-    Errors: DataError where a field holds a number that is not finite; ConfigError for another K.
-    """
+    Errors: DataError where a field holds a number that is not finite; ConfigError for another K."""
     path = Path(path)
     if coefficients is None:
         coefficients = constant_coefficients(splats.colors)
@@ -100,8 +98,9 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         document = PlyData.read(io.BytesIO(plain + end + body))
         vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
     except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
+        found = f"a damaged or other one ({error})"
         raise DataError(
-            f"{path}: expected a PLY file with an element vertex, found a damaged or other one ({error})"
+            f"{path}: expected a PLY file with an element vertex, found {found}"
         ) from error
     if any(name.startswith("scalar_") for name in vertices):  # as CloudCompare writes them
         vertices = {name.removeprefix("scalar_"): column for name, column in vertices.items()}
@@ -157,14 +156,12 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
         wide = (scales.square() + read(("filter_3D",)).square()).sqrt()
         opacities, scales = opacities * (scales / wide).prod(1), wide
     if not bool(torch.isfinite(scales).all()):
-        raise DataError(
-            f"{path}: field scale_*: expected logarithms of standard deviations, found some too large for exp"
-        )
+        wanted = "logarithms of standard deviations"
+        raise DataError(f"{path}: field scale_*: expected {wanted}, found some too large for exp")
     length = rotations.norm(dim=1, keepdim=True)
     if float(length.min()) == 0:
-        raise DataError(
-            f"{path}: field rot_*: expected quaternions, found zero at vertex {int(length.argmin())}"
-        )
+        found = f"zero at vertex {int(length.argmin())}"
+        raise DataError(f"{path}: field rot_*: expected quaternions, found {found}")
     higher = read(tuple(f"f_rest_{i}" for i in range(len(rest))))
     higher = higher.view(len(means), 3, per_channel).transpose(1, 2)
     coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)

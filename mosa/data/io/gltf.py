@@ -5,8 +5,7 @@ Source: the extension's text (KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaus
 quaternions xyzw, OPACITY in [0, 1], SH_DEGREE_l_COEF_n harmonics with Condon-Shortley phase, m = -l
 ... l. All are float32: smaller integers are allowed, but not for harmonics. The colours are display
 values (`srgb_rec709_display`); COLOR_0, linear by glTF, is for readers that show points. The text
-defines no animation of splats: a motion is a file for each frame.
-"""
+defines no animation of splats: a motion is a file for each frame."""
 
 from __future__ import annotations
 

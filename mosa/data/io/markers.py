@@ -53,10 +53,8 @@ class Recording:
     def of(self, names: Sequence[str], where: str) -> np.ndarray:
         """(n, len(names), 3) [m] of the points of these names. Errors: ConfigError."""
         if unknown := [name for name in names if name not in self.names]:
-            raise ConfigError(
-                f"{where}: expected points of the recording ({', '.join(self.names)}), "
-                f"found {unknown[0]!r}"
-            )
+            known = ", ".join(self.names)
+            raise ConfigError(f"{where}: expected points of {known}, found {unknown[0]!r}")
         return self.positions[:, [self.names.index(name) for name in names]]
 
     def at(self, times: np.ndarray) -> np.ndarray:

@@ -2,8 +2,7 @@
 
 Each frame is written in the world's axes and in its own light: covariances are taken apart into scales and rotations, harmonics are
 turned with the body, and a factor of the colours becomes part of the harmonics, which no format keeps apart. glTF alone has a
-vertical of its own, y, to which its frames are turned.
-"""
+vertical of its own, y, to which its frames are turned."""
 
 from __future__ import annotations
 
@@ -34,12 +33,10 @@ FORMATS = ("ply", "gltf", "sog", "usd", "rrd")
 Formats = Annotated[
     Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: all(name in FORMATS for name in v))
 ]  # fmt: skip
-FRAMES = {"ply": ".ply", "gltf": ".glb", "sog": ".sog"}
-"""Formats of a file for each frame, and how its name ends."""
+FRAMES = {"ply": ".ply", "gltf": ".glb", "sog": ".sog"}  # one file a frame
 PACKAGES = {"usd": ("pxr.UsdVol", "ParticleField3DGaussianSplat", "usd-core, 26.3 or newer", "usd"),
             "rrd": ("rerun", "GaussianSplats3D", "rerun-sdk, 0.41 or newer", "rerun")}  # fmt: skip
-CONVERTER = "splat-transform"
-"""PlayCanvas' program, which writes SOG."""
+CONVERTER = "splat-transform"  # playCanvas' program, which writes SOG
 
 
 def check_formats(formats: Sequence[str]) -> None:
@@ -51,9 +48,8 @@ def check_formats(formats: Sequence[str]) -> None:
             try:
                 getattr(importlib.import_module(module), known)
             except (ImportError, AttributeError) as error:
-                raise ConfigError(
-                    f"formats: {name} needs the package {package}: pip install 'mosa[{extra}]'"
-                ) from error
+                way = f"pip install 'mosa[{extra}]'"
+                raise ConfigError(f"formats: {name} needs the package {package}: {way}") from error
     if "sog" in formats and shutil.which(CONVERTER) is None:
         raise ConfigError(
             f"formats: sog needs the program {CONVERTER} on the PATH: npm install --global "
@@ -165,15 +161,14 @@ def save_rrd(path: str | Path, frames: Iterable[Appearance], *, rate: float, up:
             colors = torch.cat([splats.colors, splats.opacities[:, None]], 1).clamp(0, 1)
             padded = torch.nn.functional.pad(higher, (0, 0, 0, 15 - higher.shape[1])).numpy()
             recording.set_time("time", duration=t / rate)
-            shown = rr.GaussianSplats3D(
-                splats.means.numpy(),
-                scales=splats.scales.numpy(),
-                quaternions=splats.rotations[:, [1, 2, 3, 0]].numpy(),
-                colors=(255 * colors + 0.5).byte().numpy(),
-                sh_coefficients=padded if higher.shape[1] else None,
-                spherical_harmonics_degree=degree_of(frame.harmonics),
-            )
-            recording.log("body", shown)
+            harmonics = {
+                "sh_coefficients": padded if higher.shape[1] else None,
+                "spherical_harmonics_degree": degree_of(frame.harmonics),
+            }
+            turns, painted = splats.rotations[:, [1, 2, 3, 0]], (255 * colors + 0.5).byte()
+            look = {"quaternions": turns.numpy(), "colors": painted.numpy()} | harmonics
+            own = splats.means.numpy(), splats.scales.numpy()
+            recording.log("body", rr.GaussianSplats3D(own[0], scales=own[1], **look))
         recording.disconnect()
     return path
 
@@ -186,18 +181,12 @@ def drop_later_frames(folder: Path, suffix: str, count: int) -> None:
 
 
 def save_frames(
-    shown: Seen,
-    folder: str | Path,
-    formats: Sequence[str],
-    *,
-    rate: float = 30.0,
-    up: Tensor | None = None,
+    shown: Seen, folder: str | Path, formats: Sequence[str], *, rate: float = 30.0, up=None
 ) -> Path:
     """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `gltf/000.glb`,
     `sog/000.sog` and so on, and for all of them `splats.usdc` and `splats.rrd`.
 
-    rate [1/s], up (3,): of the motion. Errors: ConfigError as `check_formats`; DataError.
-    """
+    rate [1/s], up (3,): of the motion. Errors: ConfigError as `check_formats`; DataError."""
     check_formats(formats)
     folder, count = Path(folder), len(shown.means)
     up = torch.tensor([0.0, 1, 0]) if up is None else up

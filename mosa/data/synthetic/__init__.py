@@ -45,8 +45,7 @@ def load_builtin(
 ) -> Scene:
     """Scene of a built-in sequence, made and cached on first use. material: anisotropic | isotropic (its twin).
 
-    Errors: ConfigError naming the key.
-    """
+    Errors: ConfigError naming the key."""
     check("scene.seed", seed, Whole)
     body = object_named(name)
     film, hidden = body.footage, body.material.variant(material)

@@ -70,10 +70,8 @@ def simulate(
     # velocities half a substep early: symplectic Euler then follows the parabola exactly
     early = tensor(velocity) - 0.5 * frame_dt / substeps * tensor(GRAVITY)
     x, v = tensor(start + lift), early.expand(n, 3).contiguous()
-    state, volume = (
-        ParticleState(x, v, torch.zeros(n, 3, 3), F, F),
-        torch.full((n,), body.spacing**3),
-    )
+    state = ParticleState(x, v, torch.zeros(n, 3, 3), F, F)
+    volume = torch.full((n,), body.spacing**3)
     given = material.parameters(tensor(rest)), volume, material.density, body.footage.frames
     with torch.no_grad():
         rollout = simulator.rollout(state, *given, progress=progress)

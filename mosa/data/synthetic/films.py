@@ -13,31 +13,18 @@ import torch
 
 from mosa.data.formats.footage import WHITE
 from mosa.data.images.reading import composite, resize
-from mosa.data.synthetic.bodies.objects import (
-    OBJECTS,
-    BuiltinObject,
-    Meeting,
-    drop_named,
-    object_named,
-)
+from mosa.data.synthetic import surface as surfaces
+from mosa.data.synthetic.bodies import objects
+from mosa.data.synthetic.bodies.objects import BuiltinObject, drop_named, object_named
 from mosa.data.synthetic.bodies.shapes import SHAPES
 from mosa.data.synthetic.drop import simulate
 from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
-from mosa.data.synthetic.surface import (
-    LEVEL,
-    Skin,
-    Surface,
-    bind,
-    extract_surface,
-    fill,
-    flowing_surface,
-)
+from mosa.data.synthetic.surface import Skin, Surface, extract_surface, flowing_surface
 from mosa.errors import ConfigError, DataError
 from mosa.system.caches import default_cache
-from mosa.system.npz import read_npz
+from mosa.system.npz import read_npz, write_npz
 from mosa.system.progress import tqdm
 from mosa.system.threads import threaded
-from mosa.system.whole_files import written_whole
 from mosa.types import Cameras
 
 log = logging.getLogger(__name__)
@@ -45,6 +32,7 @@ log = logging.getLogger(__name__)
 # part of the key of a cached sequence: raise it whenever what is made changes
 VERSION = 1
 TRUTH_PARTICLES = 8000
+Built = tuple[Surface, np.ndarray, Skin]
 
 
 @dataclass(frozen=True)
@@ -69,15 +57,13 @@ def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
     )  # fmt: skip
 
 
-def film_file(
-    name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None
-) -> Path:
+def film_file(name: str, sequence: str, material: str, seed: int, cache=None) -> Path:
     """Where a take lies once it has been made."""
     hidden = object_named(name).material.variant(material)
     made_of: tuple = (VERSION, object_named(name), hidden, drop_named(name, sequence), seed)
     if object_named(name).remesh:
-        made_of += (LEVEL,)
-    if object_named(name).meeting != Meeting():
+        made_of += (surfaces.LEVEL,)
+    if object_named(name).meeting != objects.Meeting():
         made_of += (object_named(name).meeting, hidden.law)
     key = hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]
     folder = Path(cache) if cache is not None else default_cache()
@@ -98,34 +84,31 @@ def make(
     Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
     """
     file = film_file(name, sequence, material, seed, cache)
-    kept = read_film(file)
-    if kept is not None:
+    if (kept := read_film(file)) is not None:
         return kept
     take = film_drop(name, sequence, material, seed, progress)
     try:
-        write_film(file, take)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_npz(file, vars(take))
     except OSError as error:
-        raise ConfigError(
-            f"scene.cache: cannot write {file} ({error.strerror}); set XDG_CACHE_HOME to another folder"
-        ) from error
+        found = f"cannot write {file} ({error.strerror}); set XDG_CACHE_HOME to another folder"
+        raise ConfigError(f"scene.cache: {found}") from error
     return take
 
 
 @functools.lru_cache(maxsize=1)
-def built(
-    shape_name: str, pitch: float, spacing: float, seed: int
-) -> tuple[Surface, np.ndarray, Skin]:
+def built(shape_name: str, pitch: float, spacing: float, seed: int) -> Built:
     """Surface, particles (N, 3) [m] and skin of an object, the same in every sequence and material: not to be changed."""
     shape = SHAPES[shape_name]
     # one generator a purpose: the same texture, lattice and cameras in every sequence and material of a seed
     surface = extract_surface(shape, pitch, np.random.default_rng([seed, 1]))
-    particles = fill(shape, spacing, np.random.default_rng([seed, 2]))
-    return surface, particles, bind(surface.vertices, particles, spacing)
+    particles = surfaces.fill(shape, spacing, np.random.default_rng([seed, 2]))
+    return surface, particles, surfaces.bind(surface.vertices, particles, spacing)
 
 
 def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Film:
     """Simulate and film, without the cache."""
-    body, drop = OBJECTS[name], drop_named(name, sequence)
+    body, drop = objects.OBJECTS[name], drop_named(name, sequence)
     film = body.footage
     surface, particles, skin = built(body.shape, body.pitch, body.spacing, seed)
     label = f"{name}/{sequence} (synthetic, {material})"
@@ -171,16 +154,7 @@ def read_film(file: Path) -> Film | None:
         return None
 
 
-def write_film(file: Path, take: Film) -> None:
-    """Write atomically: a process that is stopped leaves no half file, two that write at once leave one whole."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(file) as partial, open(partial, "wb") as stream:
-        np.savez_compressed(stream, **vars(take))
-
-
-def pictures_to_footage(
-    pictures: np.ndarray, size: tuple[int, int]
-) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, ...]:
     """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
     V, T, H, W = pictures.shape[:4]
     mattes = np.empty((V, T, size[1], size[0]), np.float32)
@@ -193,10 +167,8 @@ def pictures_to_footage(
         if len(rows):  # around the object there is nothing but white
             window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
             part = pictures[*index, *window].astype(np.float32) / 255
-            image[window], matte[window] = (
-                composite(part[..., :3], part[..., 3], WHITE),
-                part[..., 3],
-            )
+            image[window] = composite(part[..., :3], part[..., 3], WHITE)
+            matte[window] = part[..., 3]
         images[index], mattes[index] = resize(image, *size), resize(matte, *size)
 
     for _ in threaded(convert, list(np.ndindex(V, T))):

@@ -13,8 +13,7 @@ from mosa.data.synthetic.bodies.parts import Shape
 from mosa.system.warp_start import start_warp
 
 start_warp()
-NEIGHBOURS = 32
-"""Particles that a point of the surface follows."""
+NEIGHBOURS = 32  # particles that a point of the surface follows
 
 
 @dataclass(frozen=True)
@@ -107,8 +106,7 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
 
 
-AROUND = 3.0
-"""Spacings within which particles make the surface of what flows."""
+AROUND = 3.0  # spacings within which particles make the surface of what flows
 LEVEL = 0.76
 """Spacings of that surface from the mean of the particles around it: bodies at rest then have their volume to 0.6 % (0.85: 3 to 4 %
 too much), or every silhouette would be that of a larger body than the one that fell."""

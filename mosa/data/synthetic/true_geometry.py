@@ -12,12 +12,9 @@ from mosa.data.synthetic.surface import extract_surface
 from mosa.errors import ConfigError
 from mosa.types import Scene
 
-LATTICE = 0.004
-"""Spacing of the points that stand for the true body [m]; less where the truth's own particles are closer."""
-OUTSIDE = 0.7
-"""Spacings beyond the true surface from which a particle counts as outside."""
-FARTHEST = 1.0
-"""Spacings from every particle from which a point of the body counts as missing: none of a full cubic lattice is beyond 0.87."""
+LATTICE = 0.004  # [m] of the true body's points, at most the truth's own spacing
+OUTSIDE = 0.7  # spacings beyond the true surface from which a particle counts as outside
+FARTHEST = 1.0  # spacings to every particle beyond which a point is missing
 
 
 def origin(name: str) -> np.ndarray:
@@ -34,8 +31,7 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
 
     outside_share: farther than 0.7 spacings outside of the true body; missing_share: part of the true body that is farther than one
     spacing from every particle; volume_error: relative; center_error_m: of the centre of mass.
-    Errors: ConfigError where the scene is not a built-in one.
-    """
+    Errors: ConfigError where the scene is not a built-in one."""
     if scene.truth is None or not scene.synthetic:
         raise ConfigError(f"scene {scene.name}: the true shape is known for built-in scenes only")
     shape = SHAPES[object_named(scene.name).shape]

@@ -1,8 +1,7 @@
 """Directions of a learned law: its redistribution w(n) and its directional modulus E(n) (paper, appendix A).
 
 Everything is in the material frame and in Mandel scaling, where the double contraction of symmetric tensors is a dot
-product; in plain 6-vectors even an isotropic law would look anisotropic.
-"""
+product; in plain 6-vectors even an isotropic law would look anisotropic."""
 
 from __future__ import annotations
 
@@ -52,13 +51,11 @@ def directions_in_plane(
     a, b = (torch.tensor(v, dtype=torch.float64) for v in (first, second))
     b = b - (b @ a) / (a @ a) * a
     if not (float(a.norm()) > 0 and float(b.norm()) > 1e-9):
-        raise ConfigError(
-            f"plane: expected two directions that differ, found {list(first)} and {list(second)}"
-        )
+        found = f"{list(first)} and {list(second)}"
+        raise ConfigError(f"plane: expected two directions that differ, found {found}")
     angles = torch.linspace(0, math.pi, count, dtype=torch.float64)
-    return angles, torch.cos(angles)[:, None] * a / a.norm() + torch.sin(angles)[
-        :, None
-    ] * b / b.norm()
+    cosine, sine = torch.cos(angles)[:, None], torch.sin(angles)[:, None]
+    return angles, cosine * a / a.norm() + sine * b / b.norm()
 
 
 def golden_turns(count: int) -> Tensor:
@@ -136,17 +133,11 @@ def uniaxial_stress(
         H = H.detach().requires_grad_(True)
         with torch.enable_grad():
             stress = response(H)
-            tangent = torch.stack(
-                [
-                    torch.autograd.grad(stress[:, i].sum(), H, retain_graph=True)[0]
-                    for i in range(6)
-                ],
-                1,
-            )
-        stress = stress.detach()
-        residual = torch.cat(
-            [stress - axial[:, None] * N, ((N * H).sum(-1) - strain)[:, None].detach()], -1
-        )
+            sums = (stress[:, i].sum() for i in range(6))
+            rows = [torch.autograd.grad(each, H, retain_graph=True)[0] for each in sums]
+            tangent = torch.stack(rows, 1)
+        off_strain = ((N * H).sum(-1) - strain)[:, None]
+        residual = torch.cat([stress - axial[:, None] * N, off_strain], -1).detach()
         matrix = torch.zeros(K, 7, 7, dtype=torch.float64)
         matrix[:, :6, :6], matrix[:, :6, 6], matrix[:, 6, :6] = tangent, -N, N
         # in units of the stiffness, or the strain equation would drown in the stress equations
@@ -183,22 +174,18 @@ def directions_about(axis: Tensor, radius: float, count: int) -> Tensor:
     turn = golden_turns(count)
     off = math.tan(radius) * torch.linspace(0, 1, count, dtype=torch.float64).sqrt()
     across = torch.linalg.svd(axis.double()[None]).Vh[1:]
-    return torch.nn.functional.normalize(
-        axis.double() + off[:, None] * torch.stack([turn.cos(), turn.sin()], -1) @ across, dim=-1
-    )
+    beside = off[:, None] * torch.stack([turn.cos(), turn.sin()], -1) @ across
+    return torch.nn.functional.normalize(axis.double() + beside, dim=-1)
 
 
-def stiffest_axis(
-    states: States, adapter: Adapter | None, count: int = 200, strain: float = 5e-3
-) -> tuple[Tensor, float]:
-    """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of `count` directions, and as many about the best of
-    them: which way a learned law is stiff, to be compared with a known fibre. 200: to 1.2 degrees, where those of the half sphere
-    alone are up to 8 away."""
-    directions = directions_on_sphere(count)
-    modulus = directional_modulus(states, adapter, directions, strain)
-    beyond_neighbours = math.sqrt(4 * math.pi / count)
-    nearby = directions_about(directions[int(modulus.argmax())], beyond_neighbours, count)
-    closer = directional_modulus(states, adapter, nearby, strain)
-    return nearby[int(closer.argmax())], float(
-        max(modulus.max(), closer.max()) / min(modulus.min(), closer.min())
-    )
+def stiffest_axis(states: States, adapter: Adapter | None) -> tuple[Tensor, float]:
+    """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of 200 directions, and as
+    many about the best of them, which are within 1.2 degrees of it: the half sphere's alone, within 8."""
+    directions = directions_on_sphere()
+    modulus = directional_modulus(states, adapter, directions)
+    beyond_neighbours = math.sqrt(4 * math.pi / len(directions))
+    best = directions[int(modulus.argmax())]
+    nearby = directions_about(best, beyond_neighbours, len(directions))
+    closer = directional_modulus(states, adapter, nearby)
+    both = torch.cat([modulus, closer])
+    return nearby[int(closer.argmax())], float(both.max() / both.min())

@@ -30,13 +30,11 @@ from mosa.rendering.observer import deformed_covariances, observe
 from mosa.types import Cameras, Rollout, Scene
 
 TITLES = {"prior": "prior", "adapted": "adapted (learned law)"}
-DIFFERENCE = 0.5
-"""Largest image difference that has a colour of its own."""
+DIFFERENCE = 0.5  # largest image difference that has a colour of its own
 NEAR_BACKGROUND = 12
 """8-bit levels: ground lines are drawn where a pixel is as close to the background as that, so that they lie behind the object."""
 
-DARK = 0.45
-"""Of the light that a shadow takes where it is deepest."""
+DARK = 0.45  # of the light that a shadow takes where it is deepest
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,7 @@ def compare(
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
-    limit [m]: the distance that has the last colour (`error_limit` of this sequence).
-    """
+    limit [m]: the distance that has the last colour (`error_limit` of this sequence)."""
     scene = shown.scene
     camera = (scene.training_cameras or [0])[0]
     x0, y0, w, h = crop_boxes(scene.mattes[[camera]], margin=16)
@@ -81,27 +78,19 @@ def compare(
     seen = {v: drawn(body, variants[v], cameras, scene) for v in TITLES if v in variants}
 
     def finished(images: Tensor) -> np.ndarray:
-        return np.stack(
-            [
-                on_ground(enlarge(to_uint8(image), times), lines, times, scene.background)
-                for image in images
-            ]
-        )
+        large = (enlarge(to_uint8(image), times) for image in images)
+        return np.stack([on_ground(each, lines, times, scene.background) for each in large])
 
     far = distances(body, scene, variants)
     if not far:
         label, high, colors = "difference of the images", f"{DIFFERENCE:g}", "Reds"
-        errors = {
-            v: paint((images - real).abs().mean(-1) / DIFFERENCE, colors)
-            for v, images in seen.items()
-        }
+        off = {v: (images - real).abs().mean(-1) / DIFFERENCE for v, images in seen.items()}
+        errors = {v: paint(share, colors) for v, share in off.items()}
     else:
         limit = limit or error_limit(far.values())
         label, high, colors = "distance to the true motion", f"{1e3 * limit:g} mm", "viridis"
-        errors = {
-            v: drawn(body, variants[v], cameras, scene, paint(d / limit, colors))
-            for v, d in far.items()
-        }
+        painted = {v: paint(d / limit, colors) for v, d in far.items()}
+        errors = {v: drawn(body, variants[v], cameras, scene, p) for v, p in painted.items()}
     return Comparison(
         {"real": finished(real)} | {TITLES[v]: finished(images) for v, images in seen.items()},
         {TITLES[v]: finished(images) for v, images in errors.items()},
@@ -144,9 +133,8 @@ def drawn(
 
 def paint(share: Tensor, colors: str) -> Tensor:
     """(..., 3) colours of values (...), of which 1 has the last colour and what is above too."""
-    return torch.from_numpy(
-        matplotlib.colormaps[colors](share.clamp(0, 1).numpy())[..., :3]
-    ).float()
+    painted = matplotlib.colormaps[colors](share.clamp(0, 1).numpy())
+    return torch.from_numpy(painted[..., :3]).float()
 
 
 def round_up(value: float) -> float:
@@ -162,9 +150,8 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
         return []
     up, w2c, K = scene.up.double(), cameras.w2c[0].double(), cameras.K[0].double()
     eye = -w2c[:3, :3].T @ w2c[:3, 3]
-    ray = w2c[:3, :3].T @ torch.linalg.solve(
-        K, K.new_tensor([cameras.width / 2, cameras.height, 1.0])
-    )
+    lowest = K.new_tensor([cameras.width / 2, cameras.height, 1.0])
+    ray = w2c[:3, :3].T @ torch.linalg.solve(K, lowest)
     fall = float(ray @ up)
     # a camera below the ground, or looking up
     if fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height:
@@ -259,11 +246,8 @@ def legend(shown: Comparison) -> np.ndarray:
     """(H, W, 3) uint8: the colours of the errors, as large as an image."""
     height, width = shown.images["real"].shape[1:3]
     picture = np.full((height, width, 3), 255, np.uint8)
-    bar = to_uint8(
-        paint(torch.linspace(0, 1, int(0.8 * width)), shown.colors)[None].expand(
-            max(8, height // 20), -1, -1
-        )
-    )
+    colors = paint(torch.linspace(0, 1, int(0.8 * width)), shown.colors)
+    bar = to_uint8(colors[None].expand(max(8, height // 20), -1, -1))
     top, left = height // 2, int(0.1 * width)
     picture[top : top + bar.shape[0], left : left + bar.shape[1]] = bar
     text, scale = fitted(shown.label, width - left, 0.42)
@@ -288,10 +272,8 @@ def write_comparisons(folder: Path, shown: Mapping[str, Comparison]) -> None:
     for prefix, each in shown.items():
         notes[f"{prefix}: real"] = each.moments
         rows |= {f"{prefix}: {title}": images for title, images in each.images.items()}
-        rows |= {
-            f"{prefix}: {title}, {each.label}, 0 to {each.high}": images
-            for title, images in each.errors.items()
-        }
+        until = f"{each.label}, 0 to {each.high}"
+        rows |= {f"{prefix}: {title}, {until}": images for title, images in each.errors.items()}
     for each in shown.values():  # the scale once, under the first frame
         scale = np.full_like(each.images["real"], 255)
         scale[0] = legend(each)

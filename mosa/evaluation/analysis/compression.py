@@ -1,8 +1,7 @@
 """A cylinder of a law pressed between two plates: Young's modulus in any direction of the material, from the plates' force.
 
 The test that would be made on a real specimen: nothing is read from the law but the force. The specimen is always the same, the
-material is turned in it.
-"""
+material is turned in it."""
 
 from __future__ import annotations
 
@@ -22,12 +21,9 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.time_step import required_substeps
 from mosa.types import ParticleState
 
-HEIGHT, RADIUS, CELLS = 0.2, 0.08, 8
-"""Of the specimen [m]; cells of the grid along its height."""
-STROKE, FRAMES = 0.06, 24
-"""Share of the height by which the plates come together, in so many frames."""
-SWINGS = 6.0
-"""Periods of the specimen's longitudinal vibration that the stroke takes: slower does not change the modulus by a percent."""
+HEIGHT, RADIUS, CELLS = 0.2, 0.08, 8  # of the specimen [m]; cells of the grid along its height
+STROKE, FRAMES = 0.06, 24  # share of the height that the plates close, frames of it
+SWINGS = 6.0  # periods of the specimen's vibration in the stroke, slow enough for 1 %
 
 
 @dataclass(frozen=True)
@@ -61,8 +57,7 @@ def press(
 
     parameters: numbers by the law's own names; modulus [Pa], poisson: about those of the law, for the time scale and the start;
     adapter: switched on, or None; stiffening: of the P wave modulus, which the time step allows for.
-    Errors: SimulationDiverged, ConfigError (time step).
-    """
+    Errors: SimulationDiverged, ConfigError (time step)."""
     dx = HEIGHT / cells
     axis = (torch.arange(2 * cells).double() + 0.5) * dx / 2 - HEIGHT / 2
     side = torch.arange(-2 * cells, 2 * cells).double() * dx / 2 + dx / 4

@@ -69,8 +69,7 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
     return np.concatenate([bar(image.shape[1], [text]), image])
 
 
-Images = Mapping[str, Tensor | np.ndarray]
-"""Name -> (T, H, W, 3), float in [0, 1] or uint8."""
+Images = Mapping[str, Tensor | np.ndarray]  # name -> (T, H, W, 3), float in [0, 1] or uint8
 
 
 def side_by_side(
@@ -79,11 +78,9 @@ def side_by_side(
     """Frames with the columns beside each other. below: a second row, of as many; footer: a text under each frame."""
     frames = []
     for t in range(min(len(c) for c in columns.values())):
-        rows = [
-            np.concatenate([label(to_uint8(images[t]), name) for name, images in row.items()], 1)
-            for row in (columns, below)
-            if row
-        ]
+        shown = (row.items() for row in (columns, below) if row)
+        named = ([label(to_uint8(images[t]), name) for name, images in row] for row in shown)
+        rows = [np.concatenate(row, 1) for row in named]
         if footer is not None:
             rows.append(bar(rows[0].shape[1], [footer[t]]))
         frames.append(np.concatenate(rows))
@@ -116,14 +113,10 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
         finally:
             writer.close()
         # ffmpeg says nothing of it
-        if (found := int(cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT))) != len(
-            frames
-        ):
-            raise OSError(
-                errno.EIO,
-                f"{found} of {len(frames)} pictures are in it: is the disk full?",
-                str(path),
-            )
+        found = int(cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT))
+        if found != len(frames):
+            said = f"{found} of {len(frames)} pictures are in it: is the disk full?"
+            raise OSError(errno.EIO, said, str(path))
     return path
 
 
@@ -146,10 +139,8 @@ def write_strip(
             row = np.concatenate([bar(row.shape[1], [notes[name][t] for t in chosen], 22), row])
         rows.append(label(row, name))
     width = max(row.shape[1] for row in rows)
-    rows = [
-        np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255)
-        for row in rows
-    ]
+    room = (((0, 0), (0, width - row.shape[1]), (0, 0)) for row in rows)
+    rows = [np.pad(row, each, constant_values=255) for row, each in zip(rows, room)]
     with written_whole(path) as partial:
         imageio.imwrite(partial, np.concatenate(rows), format="PNG")
     return path

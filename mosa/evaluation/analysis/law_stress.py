@@ -21,8 +21,7 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.physics.launching import launch
 from mosa.settings import typed
 
-KINDS = [field_types(wp.float64)[k] for k in (0, 0, 3, 2, 1, 0)]
-"""Of a stress kernel's arrays: F, C_affine, parameters, G, h, tau."""
+KINDS = [field_types(wp.float64)[k] for k in (0, 0, 3, 2, 1, 0)]  # F, C_affine, p, G, h, tau
 
 
 @cache
@@ -142,8 +141,7 @@ def deformations(count: int, seed: int = 0, strain: float = 0.2) -> Tensor:
     return found[:count]
 
 
-WRONG = 1e-6
-"""Relative error above which a law is warned of; rounding is at 1e-9."""
+WRONG = 1e-6  # relative error above which a law is warned of; rounding is at 1e-9
 PROPERTIES = {
     "symmetry": "a symmetric Kirchhoff stress: a skew part is a torque from nothing",
     "objectivity": "tau(Q F) = Q tau(F) Q^T of every rotation Q: a turned body has the turned stress (F F^T in place of F^T F?)",

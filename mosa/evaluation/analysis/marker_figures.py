@@ -18,10 +18,8 @@ from mosa.rendering.cameras import look_at, project
 from mosa.system.npz import write_npz
 from mosa.types import Cameras, Rollout
 
-SHOWN = 3
-"""Points of a sequence that are drawn: those that move most."""
-SIZE = (320, 220)
-"""Width and height [px] of the film."""
+SHOWN = 3  # points of a sequence that are drawn: those that move most
+SIZE = (320, 220)  # width and height [px] of the film
 MEASURED, PREDICTED = (200, 30, 30), (20, 60, 200)
 
 
@@ -53,11 +51,8 @@ def write_markers(
         predicted = cues.seen(kept[s.prefix]["adapted"].x.cpu()).numpy()
         measured, names = cues.positions.numpy(), s.scene.markers.names
         times = s.scene.times.numpy()
-        arrays |= {
-            f"{s.prefix}/measured": measured,
-            f"{s.prefix}/predicted": predicted,
-            f"{s.prefix}/times": times,
-        }
+        own = {"measured": measured, "predicted": predicted, "times": times}
+        arrays |= {f"{s.prefix}/{name}": values for name, values in own.items()}
         moved = measured - s.scene.markers.rest.numpy()
         if video:
             films[s.prefix] = film(body, s.scene, kept[s.prefix]["adapted"], measured, predicted)
@@ -72,12 +67,8 @@ def write_markers(
                 times, 1e3 * (predicted[:, m, along] - rest), lw=1, color=f"C{k}", label=names[m]
             )
         axis.set(title=s.prefix, ylabel=f"{'xyz'[along]} displacement [mm]")
-        axis.legend(
-            loc="center left",
-            bbox_to_anchor=(1, 0.5),
-            fontsize=8,
-            title="dots measured,\nlines predicted",
-        )
+        look = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "fontsize": 8}
+        axis.legend(title="dots measured,\nlines predicted", **look)
     axes[-1, 0].set_xlabel("time [s]")
     figure.savefig(folder / "markers.png", dpi=110)
     pyplot.close(figure)

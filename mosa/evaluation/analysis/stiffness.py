@@ -9,14 +9,12 @@ from torch import Tensor
 
 from mosa.evaluation.analysis.anisotropy import directions_on_sphere, dyads
 
-DIRECTIONS = 3000
-"""On a half sphere: 1.5 degrees apart."""
+DIRECTIONS = 3000  # on a half sphere: 1.5 degrees apart
 
 
 def directional_moduli(stiffness: Tensor, directions: Tensor) -> Tensor:
     """(..., K) Young's modulus along unit vectors (K, 3) of stiffnesses (..., 6, 6) in Mandel scaling, in their unit: 1/(n n :
-    C^-1 : n n).
-    """
+    C^-1 : n n)."""
     N = dyads(directions).to(stiffness)
     return 1 / torch.einsum("ka,...ab,kb->...k", N, torch.linalg.inv(stiffness), N)
 

@@ -49,9 +49,8 @@ def results_table(
         for name, prefix in MODELS:
             values = [figures.get(f"{prefix}{s}/{metric}") for s in sequences]
             if any(v is not None for v in values):
-                rows.append(
-                    [label, name, *("" if v is None else f"{v * scale:.{digits}f}" for v in values)]
-                )
+                shown = ("" if v is None else f"{v * scale:.{digits}f}" for v in values)
+                rows.append([label, name, *shown])
     return markdown(["figure", "model", *sequences], rows)
 
 
@@ -62,12 +61,11 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
     if "train" not in columns:
         return ""
     parts = [f"`train` is the recording {recording}"]
-    parts += ["`train/...` the others that were learned from"] * any(
-        column.startswith("train/") for column in columns
-    )
-    parts += ["`test/...` those held out, `test` their mean"] * any(
-        column.startswith("test/") for column in columns
-    )
+    others = {
+        "train/": "`train/...` the others that were learned from",
+        "test/": "`test/...` those held out, `test` their mean",
+    }
+    parts += [about for start, about in others.items() if any(c.startswith(start) for c in columns)]
     prefixes = dict(MODELS)
     rows = [f"*{name}*: {about}" for name, about in ROWS.items()
             if any(f"{prefixes[name]}{column}/{metric}" in figures for column in columns for metric in UNITS)]  # fmt: skip
@@ -76,23 +74,15 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
 
 def _sequences(figures: Mapping[str, float]) -> list[str]:
     names = {key.rsplit("/", 1)[0] for key in figures if key.endswith(("/psnr_crop", "/rms_m"))}
-    plain = {
-        n for n in names if n.split("/")[0] in ("train", "frames", "camera") and n.count("/") == 0
-    }
-    others = [sorted(n for n in names if n.startswith(start)) for start in ("train/", "test")]
-    return sorted(plain, key=("train", "frames", "camera").index) + others[0] + others[1]
+    others = [n for start in ("train/", "test") for n in sorted(names) if n.startswith(start)]
+    return [n for n in ("train", "frames", "camera") if n in names] + others
 
 
 def parameter_table(figures: Mapping[str, float], law: str) -> str:
     """Markdown table of identified parameters: of the prior and of the learned law, each with its relative error where the
     truth is known. law: of the prior, which says what they are measured in."""
-    names = [
-        k.split("/", 1)[1]
-        for k in figures
-        if k.startswith("id_prior/")
-        and k.count("/") == 1
-        and not k.endswith(("_relative_error", "_ratio"))
-    ]
+    found = (k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and k.count("/") == 1)
+    names = [name for name in found if not name.endswith(("_relative_error", "_ratio"))]
     stages = ("id_prior", "id")
     rows = [[with_unit(law, n), *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
@@ -106,14 +96,9 @@ def with_unit(law: str, name: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-SURE_DEGREES = 30.0
-"""Half angle of a direction's 95 % cone above which it counts as not determined."""
-NOTICEABLE = 1.1
-"""Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
-
-
-LISTED = 3
-"""So many contacts the sentence lists; more are in a table."""
+SURE_DEGREES = 30.0  # half angle of a direction's 95 % cone above which it counts as not determined
+NOTICEABLE = 1.1  # ratio of Young's moduli below which a law counts as isotropic
+LISTED = 3  # so many contacts the sentence lists; more are in a table
 
 
 def ground_table(distances: Mapping[str, float], gains: Mapping[str, float]) -> str:
@@ -139,11 +124,13 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     touches, said = (learned_on(taken, gains), [_asked(gains)]) if gains else (taken, [])
     # only the isotropic law was asked for its friction
     if touches != "sticky" and (taken == "sticky" or not gains):
-        said.append(_guessed(distances, contact(touches)[0]))
-    listed = ", ".join(
-        f"{_words(name)} {distances[name] * 1e3:.2f} mm"
-        for name in sorted(distances, key=distances.get)
-    )
+        near = ", ".join(f"{friction:.3g}" for friction in alike(distances, contact(touches)[0]))
+        said.append(
+            "Its friction is *not* determined: the isotropic law comes within a tenth of the "
+            f"nearest with {near}, and is wrong itself."
+        )
+    nearest = sorted(distances, key=distances.get)
+    listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in nearest)
     where = f": {listed}" if len(distances) <= LISTED else " in the table below"
     first = f"Ground: the body {_words(touches)} (mean distance from the training motion after calibration{where})."
     if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
@@ -153,12 +140,12 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
 
 def _asked(gains: Mapping[str, float]) -> str:
     """What the learned law says of the best of the contacts that it was asked for, and what is left open."""
-    best = max(gains, key=gains.get)
-    gain = gains[best]
-    better = (
-        f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f} of the logarithm of the likelihood"
+    best, gain = max(gains.items(), key=lambda each: each[1])
+    better = f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f}"
+    said = (
+        f"With the learned law, a body that {_words(best)} explains the motion {better} of the "
+        "logarithm of the likelihood."
     )
-    said = f"With the learned law, a body that {_words(best)} explains the motion {better}."
     if -EXPLAINED < gain <= EXPLAINED:
         said += f" Which of the two it is, is *not* determined: that takes {EXPLAINED:g}."
     return said
@@ -172,49 +159,37 @@ def form_text(errors: Mapping[str, float]) -> str:
     listed = "; ".join(f"{words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
     taken = chosen(errors)
     said = (
-        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, plus the "
-        f"error of the grid: {listed}."
+        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, "
+        f"plus the error of the grid: {listed}."
     )
     if taken == named(()) and len(errors) > 1:
         said += (
-            f" A richer law is only learned where this error is below {WORTH:g} of the isotropic one, because "
-            "errors of contact and cues can look like slight anisotropy."
+            f" A richer law is only learned where this error is below {WORTH:g} of the isotropic "
+            "one, because errors of contact and cues can look like slight anisotropy."
         )
     return said
 
 
 def _part(figures: Mapping[str, float], prefix: str, suffix: str = "_m") -> dict[str, float]:
     """The figures with a prefix and a suffix, by what is between the two."""
-    return {
-        key.removeprefix(prefix).removesuffix(suffix): value
-        for key, value in figures.items()
-        if key.startswith(prefix) and key.endswith(suffix)
+    named = {
+        key: v for key, v in figures.items() if key.startswith(prefix) and key.endswith(suffix)
     }
+    return {key.removeprefix(prefix).removesuffix(suffix): value for key, value in named.items()}
 
 
 def _words(name: str) -> str:
     """A contact by `named` in words; both modes with friction leave the ground freely, so the mode is said as well."""
     mode, friction = contact(name)
-    return (
-        f"leaves it freely, friction {friction:.3g} ({mode})" if mode in RUBBING else "sticks to it"
-    )
-
-
-def _guessed(distances: Mapping[str, float], mode: str) -> str:
-    near = ", ".join(f"{friction:.3g}" for friction in alike(distances, mode))
-    return (
-        "Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
-        f"{near}, and is wrong itself."
-    )
+    freely = f"leaves it freely, friction {friction:.3g} ({mode})"
+    return freely if mode in RUBBING else "sticks to it"
 
 
 def _backbones(compared: Mapping[str, float], gained: Mapping[str, float]) -> str:
     """How the backbones compare. compared: error [m] after calibration; gained: how much better than the one that was nearest then
     others explain the motion once the adapter is learned."""
-    listed = ", ".join(
-        f"{name} {error * 1e3:.2f} mm"
-        for name, error in sorted(compared.items(), key=lambda e: e[1])
-    )
+    nearest = sorted(compared, key=compared.get)
+    listed = ", ".join(f"{name} {compared[name] * 1e3:.2f} mm" for name in nearest)
     said = f"Error of the isotropic laws after calibration: {listed}."
     yielding = {name for name in compared if law_named(name).plastic}
     if yielding and yielding != set(compared):
@@ -243,11 +218,11 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]
+    says = "with a standard deviation of"
     for name in RELATIVE:
-        if f"posterior/{name}_relative_sd" in figures:
+        if (sd := figures.get(f"posterior/{name}_relative_sd")) is not None:
             lines.append(
-                f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, with a standard deviation of "
-                f"{figures[f'posterior/{name}_relative_sd']:.1%}."
+                f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, {says} {sd:.1%}."
             )
     if "posterior/friction_angle_sd" in figures:
         lines.append(
@@ -266,36 +241,39 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
         spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
         if ratio < NOTICEABLE:
-            lines.append(
-                f"- No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as its prior."
-            )
+            said = f"No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as "
+            said += "its prior."
         elif half > SURE_DEGREES:
-            lines.append(
-                f"- Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* "
-                f"determined: the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees."
+            said = (
+                f"Some anisotropy (largest over smallest Young's modulus {spread}), but its "
+                f"direction is *not* determined: the 95 % cone about ({axis}) has a half angle of "
+                f"{half:.0f} degrees."
             )
         else:
-            lines.append(
-                f"- The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest "
-                f"Young's modulus is {spread}."
+            said = (
+                f"The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the "
+                f"largest over the smallest Young's modulus is {spread}."
             )
-    for name, what in (
-        ("operator", "numbers of the anisotropic stiffness"),
-        ("stiffness", "modes of the stiffness over the body"),
-    ):
-        if f"posterior/{name}_numbers" in figures and name not in left_out:
+        lines.append(f"- {said}")
+    numbers = {
+        "operator": "numbers of the anisotropic stiffness",
+        "stiffness": "modes of the stiffness over the body",
+    }
+    for name, what in numbers.items():
+        if (count := figures.get(f"posterior/{name}_numbers")) is not None and name not in left_out:
+            known = figures[f"posterior/{name}_determined"]
             lines.append(
-                f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
-                f"{figures[f'posterior/{name}_determined']:.1f}; the others keep their prior values."
+                f"- Of {count:.0f} {what} the data determine {known:.1f}; the others keep their "
+                "prior values."
             )
-    if "posterior/test/sd_m" in figures:
+    if (sd := figures.get("posterior/test/sd_m")) is not None:
         sure = figures.get("posterior/test/coverage")
         covered = (
             "" if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations"
         )
         lines.append(
             "- Held-out positions after contact have a predicted standard deviation (not an error) of "
-            f"{figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms){covered}."
+            f"{sd * 1e3:.1f} mm (rms){covered}."
         )
     return "\n".join(lines)
 

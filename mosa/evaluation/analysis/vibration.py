@@ -16,12 +16,9 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.physics.time.time_step import step_rate
 from mosa.types import ParticleState
 
-GROWTH_LIMIT = 1.05
-"""Of the kinetic maximum in one period, above which a law is said to make energy (docs/verification.md, check 26)."""
-FRAMES = 40
-"""Per period: a kinetic maximum between two samples is then missed by at most 2.5 %."""
-NEGLIGIBLE = 1e-3
-"""Share of the first period's kinetic maximum below which a vibration has ended."""
+GROWTH_LIMIT = 1.05  # of kinetic maxima in a period: above, a law makes energy
+FRAMES = 40  # per period: a kinetic maximum between two samples is then missed by at most 2.5 %
+NEGLIGIBLE = 1e-3  # share of the first period's kinetic maximum below which a vibration has ended
 
 
 def longitudinal_modulus(material: Material) -> float:
@@ -110,9 +107,6 @@ def vibration_growth(
         return max(
             later / before for before, later in zip(itertools.accumulate(maxima, max), maxima[1:])
         )
-    ratios = [
-        later / earlier
-        for earlier, later in itertools.pairwise(maxima)
-        if earlier > NEGLIGIBLE * maxima[0]
-    ]
+    pairs = (pair for pair in itertools.pairwise(maxima) if pair[0] > NEGLIGIBLE * maxima[0])
+    ratios = [later / earlier for earlier, later in pairs]
     return max(ratios, default=0.0)

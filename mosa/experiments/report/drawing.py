@@ -16,11 +16,10 @@ from mosa.experiments.collecting import Cell
 from mosa.experiments.specification import Experiment, Figure
 from mosa.system.whole_files import written_whole
 
-Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
-
-
-WIDTH = 9.0
-"""Of a picture [inch], the width of a page: what has more parts grows downwards, so that its letters stay as large."""
+Rows = Mapping[str, Mapping[str, Cell | None]]
+Tables = Mapping[str, Rows]
+Styles = Mapping[str, Mapping]
+WIDTH = 9.0  # [inch] of a picture: a page's; more parts grow downwards
 
 STYLES: Mapping[str, Mapping[str, Any]] = {
     "truth": {"color": "black", "linestyle": "--", "linewidth": 1.6, "zorder": 3.5},
@@ -32,9 +31,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
     "NeuMA": {"color": "#23803c"},
     "black box": {"color": "#7a5ab5"},
     "four networks (paper)": {"color": "#f2a12e"},
-    "full": {
-        "color": "#f2a12e"
-    },  # of the ablations: the same four networks with all of their parts
+    "full": {"color": "#f2a12e"},  # of the ablations: the same four networks with all their parts
     "ours": {"color": "#d4111f", "linewidth": 2.6, "zorder": 3},
 }
 """How a method is drawn in every picture, by its name in specifications/_shared.yaml."""
@@ -52,12 +49,9 @@ AXES: Mapping[str, str] = {
 """What a stranger is told of an axis, where its name does not say it."""
 
 BETTER = {"most": ", more is better", "least": ", less is better", None: ""}
-MARKS = {"x": "diverged", "+": "failed"}
-"""Of a cell without a finite mean: on the axis, where a bar or a point would be."""
-MANY = 16
-"""Bars from which on a part of the picture has a row for itself."""
-DECADE = 10.0
-"""Errors whose largest is more than so many times their least have a logarithmic axis."""
+MARKS = {"x": "diverged", "+": "failed"}  # of a cell without a finite mean, on the axis
+MANY = 16  # bars from which on a part of the picture has a row for itself
+DECADE = 10.0  # errors whose largest is more than so many times their least have a logarithmic axis
 
 
 def style_of(name: str, names: Sequence[str] = ()) -> dict[str, Any]:
@@ -72,14 +66,10 @@ def say_cut(place) -> None:
     """Adds to the label of the y axis where it begins, unless it shows the 0."""
     low, high = place.get_ylim()
     if not low <= 0 <= high:
-        said = (
-            f"{'logarithmic axis from' if place.get_yscale() == 'log' else 'axis cut at'} {low:.4g}"
-        )
-        known = place.get_ylabel()
-        place.set_ylabel(
-            f"{known} ({said})" if known else said,
-            fontsize=place.yaxis.label.get_size() if known else 8,
-        )
+        what = "logarithmic axis from" if place.get_yscale() == "log" else "axis cut at"
+        known, said = place.get_ylabel(), f"{what} {low:.4g}"
+        size = place.yaxis.label.get_size() if known else 8
+        place.set_ylabel(f"{known} ({said})" if known else said, fontsize=size)
 
 
 def wide(values: Sequence[float]) -> bool:
@@ -126,14 +116,10 @@ def limit(place, figure: Figure, least: float, values: Sequence[float]) -> None:
 def save(canvas: Canvas, stem: Path) -> Path:
     """<stem>.png and .pdf; the path of the first."""
     with matplotlib.rc_context({"pdf.fonttype": 42}):
-        with written_whole(stem.with_suffix(".pdf")) as partial:
-            canvas.savefig(
-                partial, format="pdf", bbox_inches="tight", metadata={"CreationDate": None}
-            )
-        with written_whole(stem.with_suffix(".png")) as partial:
-            canvas.savefig(
-                partial, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None}
-            )
+        for kind, stamp, dpi in (("pdf", "CreationDate", "figure"), ("png", "Software", 150)):
+            with written_whole(stem.with_suffix(f".{kind}")) as partial:
+                look = {"dpi": dpi, "bbox_inches": "tight", "metadata": {stamp: None}}
+                canvas.savefig(partial, format=kind, **look)
     return stem.with_suffix(".png")
 
 
@@ -151,10 +137,7 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
         run = {
             row for rows in tables.values() for row, cells in rows.items() if any(cells.values())
         }
-        tables = {
-            label: {row: cells for row, cells in rows.items() if row in run}
-            for label, rows in tables.items()
-        }
+        tables = {k: {row: rows[row] for row in rows if row in run} for k, rows in tables.items()}
     elif experiment.plot == "lines":
         names = [option.name for option in experiment.axes[experiment.columns]]
     styles = {name: style_of(name, names) for name in names}
@@ -188,19 +171,16 @@ def legend(
 ) -> None:
     """One above all parts, in the order of `names`, with the words for the marks and gaps of the cells of rows. without: what is
     said of those of `names` that no part shows."""
-    known = {
-        text: handle
-        for place in canvas.axes
-        for handle, text in zip(*place.get_legend_handles_labels())
-    }
+    every = (place.get_legend_handles_labels() for place in canvas.axes)
+    known = {text: handle for handles, texts in every for handle, text in zip(handles, texts)}
     ordered = [name for name in names if name in known] + [t for t in known if t not in names]
     found = [cell for row in rows for cell in row.values() if cell is not None]
     marks = {mark_of(cell) for cell in found if not np.isfinite(cell.mean)}
-    handles = [known[name] for name in ordered] + [
+    handles, words = [known[name] for name in ordered], []
+    handles += [
         Line2D([], [], linestyle="", marker=mark, color="black", label=MARKS[mark])
         for mark in sorted(marks, reverse=True)
     ]
-    words = []
     if any(cell is None for row in rows for column, cell in row.items() if column != "mean"):
         words.append("gap: not run")
     if any("mean" in row and row["mean"] is None for row in rows):
@@ -224,10 +204,6 @@ def marked(place, at: float, cell: Cell, color: str) -> None:
     """The mark of what has no finite mean, on the lower axis."""
     place.plot([at], [0.025], transform=place.get_xaxis_transform(), marker=mark_of(cell), markersize=5.5, markeredgewidth=1.5,
                color=color, linestyle="", zorder=4, clip_on=False)  # fmt: skip
-
-
-Rows = Mapping[str, Mapping[str, Cell | None]]
-Styles = Mapping[str, Mapping]
 
 
 def measured(
@@ -293,13 +269,11 @@ def heat_map(place, experiment: Experiment, rows: Rows, figure: Figure, styles: 
     cells = [[of.get(name) for name in names] for of in rows.values()]
     finite = [[c is not None and np.isfinite(c.mean) for c in row] for row in cells]
     values = np.array(
-        [[c.mean if f else np.nan for c, f in zip(*pair)] for pair in zip(cells, finite)]
+        [[c.mean if f else np.nan for c, f in zip(*both)] for both in zip(cells, finite)]
     )
     less = figure.best == "least"
     image = place.imshow(values, aspect="auto", cmap="viridis_r" if less else "viridis")
-    middle = (
-        np.nanmean([np.nanmin(values), np.nanmax(values)]) if np.isfinite(values).any() else 0.0
-    )
+    middle = (np.nanmin(values) + np.nanmax(values)) / 2 if np.isfinite(values).any() else 0.0
     for (i, j), value in np.ndenumerate(values):
         if cells[i][j] is None:
             continue

@@ -9,8 +9,8 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.tables import markdown
@@ -19,7 +19,9 @@ from mosa.experiments.commits import commits_since
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
 from mosa.system.whole_files import write_whole, written_whole
 
-Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
+Cells = Mapping[str, Cell | None]
+Rows = Mapping[str, Cells]
+Tables = Mapping[str, Rows]
 NOT_RUN, OURS = "not run", "ours"
 INTRODUCTION = """# Results
 
@@ -76,8 +78,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
     for name in sorted(names, key=lambda name: not name.startswith("table_")):
         experiment = load_experiment(folder, name)
         parts.append(f"## {experiment.title}")
-        found = read_tables(results / f"{name}.json")
-        tables, provenance = found if found is not None else ({}, [])
+        tables, provenance = read_tables(results / f"{name}.json") or ({}, [])
         # results of before may have other rows
         known = {option.name for option in experiment.axes[experiment.rows]}
         tables = {
@@ -181,7 +182,7 @@ def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
     return ahead(figure, claim, rows)
 
 
-def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | None:
+def place_of(cells: Cells, column: str | None) -> Cell | None:
     """The cell of a column; of none the mean, or the only one."""
     if column is not None:
         return cells.get(column)
@@ -190,51 +191,40 @@ def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | Non
     return next(iter(cells.values())) if len(cells) == 1 else None
 
 
-@dataclass(frozen=True)
-class Compared:
+class Compared(NamedTuple):
     """Two rows over the columns in which both have finite figures. mine, other: means over them; without: the other columns;
     better: in how many of those that were run of both the first is ahead, or the other one diverged or failed; of: their number."""
 
     mine: Cell
     other: Cell
-    without: tuple[str, ...]
+    without: list[str]
     better: int
     of: int
 
 
-def compared(
-    mine: Mapping[str, Cell | None], other: Mapping[str, Cell | None], column: str | None, sign: int
-) -> Compared | None:
+def compared(mine: Cells, other: Cells, column: str | None, sign: int) -> Compared | None:
     """None where they share no column. sign: 1 where more is better, -1 where less is."""
-    names = (
-        [column] if column is not None else [each for each in mine if each != "mean"] or list(mine)
-    )
-    run = [each for each in names if mine.get(each) is not None and other.get(each) is not None]
-    shared = [
-        each for each in run if math.isfinite(mine[each].mean) and math.isfinite(other[each].mean)
-    ]
-    if not shared:
+    names = [column] if column is not None else [c for c in mine if c != "mean"] or list(mine)
+    pairs = {c: (mine.get(c), other.get(c)) for c in names}
+    pairs = {c: pair for c, pair in pairs.items() if None not in pair}
+    both = {c: p for c, p in pairs.items() if all(math.isfinite(cell.mean) for cell in p)}
+    if not both:
         return None
-    better = sum(1 for each in run if math.isfinite(mine[each].mean)
-                 and not (each in shared and sign * (mine[each].mean - other[each].mean) <= 0))  # fmt: skip
-    means = (mine.get("mean"), other.get("mean"))
-    if len(shared) < len(names) or column is not None or None in means:
-        means = (
-            averaged([mine[each] for each in shared]),
-            averaged([other[each] for each in shared]),
-        )
-    return Compared(
-        means[0], means[1], tuple(each for each in names if each not in shared), better, len(run)
+    better = sum(
+        math.isfinite(a.mean) and (c not in both or sign * (a.mean - b.mean) > 0)
+        for c, (a, b) in pairs.items()
     )
+    means = mine.get("mean"), other.get("mean")
+    if len(both) < len(names) or column is not None or None in means:
+        means = tuple(averaged(cells) for cells in zip(*both.values()))
+    return Compared(*means, [c for c in names if c not in both], better, len(pairs))
 
 
 def averaged(cells: Sequence[Cell]) -> Cell:
     """Mean of means; their seeds differ independently."""
-    sds = [each.sd for each in cells]
-    sd = None if None in sds else math.sqrt(sum(each**2 for each in sds)) / len(sds)
-    return Cell(
-        sum(each.mean for each in cells) / len(cells), sd, min(each.count for each in cells)
-    )
+    sds, count = [each.sd for each in cells], len(cells)
+    sd = None if None in sds else math.hypot(*sds) / count
+    return Cell(sum(each.mean for each in cells) / count, sd, min(each.count for each in cells))
 
 
 def outcome(found: Compared, sign: int, spread: float) -> str:
@@ -245,7 +235,7 @@ def outcome(found: Compared, sign: int, spread: float) -> str:
     return "close" if abs(gain) <= spread and gain != 0 else "ahead" if gain > 0 else "behind"
 
 
-def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]]) -> str:
+def ahead(figure: Figure, claim: Claim, rows: Rows) -> str:
     """Whether a row is better than others, by more than the spread of the two over the seeds."""
     mine, sign = rows.get(claim.row, {}), -1 if figure.best == "least" else 1
     if claim.each:
@@ -254,66 +244,45 @@ def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | N
     known = {row: each for row, each in found.items() if each is not None}
     if not known:
         return NOT_RUN
-    said = {row: outcome(each, sign, claim.spread) for row, each in known.items()}
+    said = {outcome(each, sign, claim.spread) for each in known.values()}
     missing = [row for row in claim.against if row not in known]
-    word = ("does not hold" if "behind" in said.values() else "within the spread" if "close" in said.values()
+    word = ("does not hold" if "behind" in said else "within the spread" if "close" in said
             else "holds" + bool(missing) * " against those that were run")  # fmt: skip
     parts = []
     for row, each in known.items():
-        own = each.mine.text(figure.decimals)
-        notes = [row] + ([f"better in {each.better} of {each.of}"] if each.of > 1 else [])
-        notes += [f"without {', '.join(each.without)}"] if each.without else []
-        parts.append(f"{own} against {each.other.text(figure.decimals)} ({'; '.join(notes)})")
-    text = f"{word}, " + ", ".join(parts)
-    one = any(each.mine.sd is None for each in known.values())
-    return (
-        text
-        + (f"; {NOT_RUN}: {', '.join(missing)}" if missing else "")
-        + ("; one seed" if one else "")
-    )
+        notes = [row] + [f"better in {each.better} of {each.of}"] * (each.of > 1)
+        notes += [f"without {', '.join(each.without)}"] * bool(each.without)
+        own, other = (cell.text(figure.decimals) for cell in (each.mine, each.other))
+        parts.append(f"{own} against {other} ({'; '.join(notes)})")
+    text = f"{word}, {', '.join(parts)}" + f"; {NOT_RUN}: {', '.join(missing)}" * bool(missing)
+    return text + "; one seed" * any(each.mine.sd is None for each in known.values())
 
 
-def ahead_in_each(
-    figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], sign: int
-) -> str:
+def ahead_in_each(figure: Figure, claim: Claim, rows: Rows, sign: int) -> str:
     """Whether a row is better than all others in every column, with those in which it is not."""
-    mine = rows.get(claim.row, {})
-    known: dict[str, str] = {}
-    for column in mine:
-        others = {
-            row: cell
-            for row in claim.against
-            if (cell := rows.get(row, {}).get(column)) is not None
-        }
-        if column == "mean" or mine[column] is None or not others:
+    mine, known = rows.get(claim.row, {}), dict[str, str]()
+    for column, own in mine.items():
+        others = {row: rows.get(row, {}).get(column) for row in claim.against}
+        others = {row: cell for row, cell in others.items() if cell is not None}
+        if column == "mean" or own is None or not others:
             continue
-        if not math.isfinite(mine[column].mean):
-            known[column] = f"{column}: {mine[column].text(figure.decimals)}"
+        if not math.isfinite(own.mean):
+            known[column] = f"{column}: {own.text(figure.decimals)}"
             continue
         # None: the other one diverged
         found = {row: compared(mine, rows[row], column, sign) for row in others}
-        bad = [
-            row
-            for row, each in found.items()
-            if each is not None and outcome(each, sign, claim.spread) != "ahead"
-        ]
-        known[column] = (
-            ""
-            if not bad
-            else f"{column}: {mine[column].text(figure.decimals)} against "
-            + ", ".join(f"{others[row].text(figure.decimals)} ({row})" for row in bad)
-        )
+        both = {row: each for row, each in found.items() if each is not None}
+        bad = [row for row in both if outcome(both[row], sign, claim.spread) != "ahead"]
+        worse = ", ".join(f"{others[row].text(figure.decimals)} ({row})" for row in bad)
+        known[column] = f"{column}: {own.text(figure.decimals)} against {worse}" if bad else ""
     if not known:
         return NOT_RUN
     good = [column for column, said in known.items() if not said]
-    text = "holds" if len(good) == len(known) else "does not hold"
-    text += f", ahead in {len(good)} of {len(known)}" + (
-        f" ({', '.join(good)})" if good and len(good) < len(known) else ""
-    )
-    text += "".join(f"; {said}" for said in known.values() if said)
-    return text + (
-        "; one seed" if all(cell is None or cell.sd is None for cell in mine.values()) else ""
-    )
+    some = 0 < len(good) < len(known)
+    said = "holds" if len(good) == len(known) else "does not hold"
+    text = f"{said}, ahead in {len(good)} of {len(known)}"
+    text += f" ({', '.join(good)})" * some + "".join(f"; {said}" for said in known.values() if said)
+    return text + "; one seed" * all(cell is None or cell.sd is None for cell in mine.values())
 
 
 def covered(off: float, sd: float, scale: float | None) -> bool:
@@ -326,12 +295,7 @@ def covered(off: float, sd: float, scale: float | None) -> bool:
     return 2 * sd >= (math.log1p(off) if off >= 1 else -math.log1p(-off))
 
 
-def within(
-    experiment: Experiment,
-    claim: Claim,
-    rows: Mapping[str, Mapping[str, Cell | None]],
-    tables: Tables,
-) -> str:
+def within(experiment: Experiment, claim: Claim, rows: Rows, tables: Tables) -> str:
     """Of how many rows a figure is at most what is claimed; of the others, whether twice the posterior's deviation covers it."""
     known = {row: cell for row in rows if (cell := place_of(rows[row], claim.column)) is not None}
     if not known:
@@ -342,19 +306,15 @@ def within(
         row for row, cell in above.items()
         if (sd := place_of(tables.get(claim.unless, {}).get(row, {}), claim.column)) is not None
         and covered(cell.mean, sd.mean, scales.get(claim.unless))]  # fmt: skip
-    wrong = {row: cell for row, cell in above.items() if row not in unsure}
-    undetermined = (
-        "none is determined" if len(unsure) == len(known) else "holds where it is determined"
-    )
-    text = f"{'holds' if not above else 'does not hold' if wrong else undetermined}, "
+    wrong = [row for row in above if row not in unsure]
+    open_ = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
     unit = match[1] if (match := re.search(r"\[(.+)\]$", claim.figure)) else ""
+    text = f"{'holds' if not above else 'does not hold' if wrong else open_}, "
     text += f"{len(known) - len(above)} of {len(known)} within {claim.most:g} {unit}".rstrip()
-    if unsure:
-        text += "; not determined, and the posterior says so: " + ", ".join(
-            f"{row} ({above[row].text(1)})" for row in unsure
-        )
-    if wrong:
-        text += "; beyond it: " + ", ".join(
-            f"{row} ({cell.text(1)})" for row, cell in wrong.items()
-        )
+    for which, said in (
+        (unsure, "not determined, and the posterior says so"),
+        (wrong, "beyond it"),
+    ):
+        listed = ", ".join(f"{row} ({above[row].text(1)})" for row in which)
+        text += f"; {said}: {listed}" * bool(which)
     return text

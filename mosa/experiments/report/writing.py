@@ -10,12 +10,12 @@ from pathlib import Path
 
 import mosa
 from mosa.evaluation.analysis.tables import markdown
-from mosa.experiments.collecting import Cell, Record, best_of, footnotes, records_of, table
+from mosa.experiments.collecting import Record, best_of, footnotes, records_of, table
 from mosa.experiments.commits import commit
 from mosa.experiments.report.drawing import BETTER, draw, save
 from mosa.experiments.report.page import listed, verdict, write_json
 from mosa.experiments.report.printed import printed_table
-from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
+from mosa.experiments.specification import Experiment, Job, commit_of, minutes_taken
 from mosa.system.whole_files import write_table, write_whole
 
 SHOWN = 4
@@ -50,9 +50,7 @@ def markdown_page(
 ) -> str:  # fmt: skip
     parts = [f"# {experiment.title}"]
     if experiment.quick:
-        parts.append(
-            "Quick variant: small and short. It shows that the experiment runs; its figures say nothing about the methods."
-        )
+        parts.append("Quick variant: small and short. Its figures say nothing about the methods.")
     if experiment.claims and not experiment.quick:
         whole = (listed(c.text, verdict(experiment, c, tables)) for c in experiment.claims)
         parts.append("\n".join(each.partition("\n")[0] for each in whole))
@@ -62,40 +60,29 @@ def markdown_page(
     for figure in experiment.figures:
         rows = tables[figure.label]
         header = [experiment.rows, *next(iter(rows.values()))]
-        body = [
-            [row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])]
-            for row in rows
-        ]
-        parts.append(
-            f"{figure.label}{BETTER[figure.best]} (`{figure.figure}`)\n\n" + markdown(header, body)
-        )
+        best = {column: best_of(rows, column, figure.best) for column in header[1:]}
+        body = []
+        for row, cells in rows.items():
+            texts = [(c, cells[c].text(figure.decimals) if cells.get(c) else "") for c in best]
+            ahead = {c for c, text in texts if text and best[c] == row}
+            body.append([row, *(bold.format(text) if c in ahead else text for c, text in texts)])
+        title = f"{figure.label}{BETTER[figure.best]} (`{figure.figure}`)"
+        parts.append(f"{title}\n\n{markdown(header, body)}")
     parts += [said] if (said := footnotes(tables)) else []
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
     if experiment.printed is not None:
         parts.append(printed_table(experiment.printed))
-    missing = [
-        f"failed: {job.folder.name} ({' '.join(job.overrides)}): {job.failed}"
-        for job in jobs
-        if not job.finished and job.failed
-    ]
-    waiting = [job.folder.name for job in jobs if not job.finished and not job.failed]
+    left = [job for job in jobs if not job.finished]
+    bad = [job for job in left if job.failed]
+    missing = [f"failed: {j.folder.name} ({' '.join(j.overrides)}): {j.failed}" for j in bad]
+    waiting = [job.folder.name for job in left if not job.failed]
     if waiting:
         shown = ", ".join(waiting[:SHOWN]) + (", ..." if len(waiting) > SHOWN else "")
         missing.append(f"not run: {len(waiting)} jobs ({shown})")
     parts.append("\n".join(f"- {line}" for line in (*lines, *missing)))
     return "\n\n".join(parts) + "\n"
-
-
-def cell_text(
-    rows: Mapping[str, Mapping[str, Cell | None]], row: str, column: str, figure: Figure, bold: str
-) -> str:
-    found = rows[row].get(column)
-    if found is None:
-        return ""
-    text = found.text(figure.decimals)
-    return bold.format(text) if best_of(rows, column, figure.best) == row else text
 
 
 def provenance(

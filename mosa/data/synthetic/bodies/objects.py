@@ -195,8 +195,7 @@ OBJECTS = {
 }  # fmt: skip
 
 
-PACNERF = {"train": Drop(speed=0.5, contact=0.21)}
-"""As the bird's: half a metre a second at frame 0, the ground five frames later."""
+PACNERF = {"train": Drop(speed=0.5, contact=0.21)}  # as the bird's
 
 
 def stand_in(shape: str, height: float, law: str, *, spacing: float = 0.0125, remesh: bool = False, frames: int = 14,
@@ -248,8 +247,7 @@ OBJECTS |= {
 # of its contact, the height that the scene states, the contact's mode and, where the body is
 # elastic, the form of its law. Gorilla, rabbit and rainbowball yield, as in the paper. Fixed:
 # figures depend on it.
-SUFFIX = "_v2"
-"""Of the names: `scene.name=calf_v2`."""
+SUFFIX = "_v2"  # of the names: `scene.name=calf_v2`
 NAMES = (
     "rabbit", "peanut", "mandarin", "chick1", "gorilla", "chick2", "rainbowball", "calf", "ring",
 )  # fmt: skip

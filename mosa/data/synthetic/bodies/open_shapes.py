@@ -38,11 +38,8 @@ def limb(points: np.ndarray, joints, radii) -> np.ndarray:
 def gorilla_distance(points: np.ndarray) -> np.ndarray:
     """A gorilla walking on its knuckles, 0.26 m high: a leaning trunk, a head with a muzzle, arms and legs away from the body."""
     body = capsule(points, (-0.062, 0.116, 0.0), (0.040, 0.166, 0.0), 0.058, 0.066)
-    head = join(
-        sphere(points, (0.104, 0.214, 0.006), 0.044),
-        sphere(points, (0.136, 0.198, 0.010), 0.028),
-        0.016,
-    )
+    muzzle = sphere(points, (0.136, 0.198, 0.010), 0.028)
+    head = join(sphere(points, (0.104, 0.214, 0.006), 0.044), muzzle, 0.016)
     body = join(body, head, 0.024)
     for joints in ARMS:
         body = join(body, limb(points, joints, (0.034, 0.028, 0.028)), 0.016)

@@ -1,8 +1,7 @@
 """What the bodies of the built-in scenes are made of: signed distances of parts, their joints, and paint.
 
 A shape lives in its own frame: y up, the ground at y = 0, looking along +x; lengths in metres. Distances are exact for spheres
-and capsules, first order near the surface for ellipsoids, and grow a little inside a blend.
-"""
+and capsules, first order near the surface for ellipsoids, and grow a little inside a blend."""
 
 from __future__ import annotations
 

@@ -54,11 +54,8 @@ def rabbit_distance(points: np.ndarray) -> np.ndarray:
     feet = capsule(both, (0.000, 0.022, 0.054), (0.060, 0.020, 0.048), 0.022, 0.020)
     paws = capsule(both, (0.050, 0.085, 0.032), (0.078, 0.040, 0.026), 0.024, 0.020)
     body = join(join(body, feet, 0.020), paws, 0.016)
-    head = join(
-        ellipsoid(points, (0.036, 0.145, 0.0), (0.062, 0.052, 0.058)),
-        sphere(both, (0.080, 0.132, 0.012), 0.024),
-        0.020,
-    )
+    cheeks = sphere(both, (0.080, 0.132, 0.012), 0.024)
+    head = join(ellipsoid(points, (0.036, 0.145, 0.0), (0.062, 0.052, 0.058)), cheeks, 0.020)
     body = join(body, head, 0.030)
     for start, end in (LEFT_EAR, RIGHT_EAR):
         body = join(body, ear(points, start, end), 0.016)

@@ -1,7 +1,6 @@
 """Bodies that stand in for the nine scenes of PAC-NeRF, whose own shapes are not used: half a metre large, and named alike.
 
-The tube of toothpaste is a tenth of that, as there.
-"""
+The tube of toothpaste is a tenth of that, as there."""
 
 from __future__ import annotations
 
@@ -51,11 +50,8 @@ def bird_distance(points: np.ndarray) -> np.ndarray:
 def cat_distance(points: np.ndarray) -> np.ndarray:
     """A sitting cat: a pear of a body, head with two ears, forelegs, a tail laid round."""
     both = mirrored(points)
-    body = join(
-        ellipsoid(points, (-0.030, 0.130, 0.0), (0.150, 0.130, 0.130)),
-        sphere(points, (0.030, 0.240, 0.0), 0.095),
-        0.060,
-    )
+    chest = sphere(points, (0.030, 0.240, 0.0), 0.095)
+    body = join(ellipsoid(points, (-0.030, 0.130, 0.0), (0.150, 0.130, 0.130)), chest, 0.060)
     body = join(body, sphere(points, (0.065, 0.350, 0.0), 0.095), 0.040)
     part = capsule(both, (0.055, 0.400, 0.055), (0.050, 0.455, 0.075), 0.048, 0.042)
     body = join(body, part, 0.020)
@@ -67,21 +63,15 @@ def cat_distance(points: np.ndarray) -> np.ndarray:
 
 def playdoh_distance(points: np.ndarray) -> np.ndarray:
     """A lump of dough, pressed flat on two sides."""
-    lump = join(
-        ellipsoid(points, (0.0, 0.160, 0.0), (0.170, 0.160, 0.140)),
-        sphere(points, (0.110, 0.120, 0.070), 0.110),
-        0.060,
-    )
+    beside = sphere(points, (0.110, 0.120, 0.070), 0.110)
+    lump = join(ellipsoid(points, (0.0, 0.160, 0.0), (0.170, 0.160, 0.140)), beside, 0.060)
     return np.maximum(lump, np.abs(points @ np.array([0.28, 0.10, 0.955])) - 0.115)
 
 
 def droplet_distance(points: np.ndarray) -> np.ndarray:
     """A drop with a blunt tip."""
-    return join(
-        sphere(points, (0.0, 0.150, 0.0), 0.150),
-        capsule(points, (0.0, 0.190, 0.0), (0.0, 0.330, 0.0), 0.120, 0.045),
-        0.050,
-    )
+    tip = capsule(points, (0.0, 0.190, 0.0), (0.0, 0.330, 0.0), 0.120, 0.045)
+    return join(sphere(points, (0.0, 0.150, 0.0), 0.150), tip, 0.050)
 
 
 def letter_distance(points: np.ndarray) -> np.ndarray:
@@ -97,11 +87,8 @@ def letter_distance(points: np.ndarray) -> np.ndarray:
 def cream_distance(points: np.ndarray) -> np.ndarray:
     """A swirl of cream: three rings one on the other, each narrower, and a tip."""
     up = np.array([0.0, 1.0, 0.0])
-    body = join(
-        torus(points, (0.0, 0.070, 0.0), up, 0.110, 0.070),
-        sphere(points, (0.0, 0.080, 0.0), 0.080),
-        0.040,
-    )
+    middle = sphere(points, (0.0, 0.080, 0.0), 0.080)
+    body = join(torus(points, (0.0, 0.070, 0.0), up, 0.110, 0.070), middle, 0.040)
     body = join(body, torus(points, (0.010, 0.165, 0.0), up, 0.065, 0.062), 0.030)
     part = capsule(points, (0.0, 0.200, 0.0), (0.020, 0.320, 0.010), 0.075, 0.045)
     return join(body, part, 0.040)

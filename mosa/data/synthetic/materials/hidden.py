@@ -42,8 +42,7 @@ class Hidden:
     def variant(self, kind: str) -> Self:
         """`anisotropic`: this one; `isotropic`: its twin without directions and with one stiffness everywhere.
 
-        Errors: ConfigError for another kind.
-        """
+        Errors: ConfigError for another kind."""
         if kind == "anisotropic":
             return self
         if kind == "isotropic":

@@ -49,16 +49,14 @@ def fibre_corotated(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParam
 NEEDS = {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}
 register_law("fibre_corotated", fibre_corotated, NEEDS, uses_rotation=True)
 register_law(LAW, fibre_neo_hookean, NEEDS, needs_positive_J=True)
-FORMS = {LAW: 1.0, "fibre_corotated": 3.0}
-"""Laws of this material, each with how much stiffer its fibres get than at rest, for the time step."""
+FORMS = {LAW: 1.0, "fibre_corotated": 3.0}  # law -> how much stiffer its fibres get
 
 
 def fibre_stiffness(E: float, nu: float, ratio: float) -> float:
     """kf [Pa] with which Young's modulus along the fibre is `ratio` times the one across it, at small strain.
 
     With k = 4 kf the fibre's own modulus: E_along = E + k; across, the fibre holds the lateral contraction back,
-    E_across = E/(1 - nu^2 k/(E + k)); their ratio is 1 + (1 - nu^2) k/E.
-    """
+    E_across = E/(1 - nu^2 k/(E + k)); their ratio is 1 + (1 - nu^2) k/E."""
     return 0.25 * (ratio - 1) * E / (1 - nu**2)
 
 

@@ -1,7 +1,6 @@
 """A truth that yields in directions: Hill's quadratic criterion in axes fixed to the material, with its associated flow.
 
-For reference data; not a learner's prior. The elastic part is the isotropic `stvk`.
-"""
+For reference data; not a learner's prior. The elastic part is the isotropic `stvk`."""
 
 # ruff: noqa: UP018, RUF046, RUF059
 # (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
