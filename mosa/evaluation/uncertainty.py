@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mosa.errors import MosaError
 from mosa.evaluation.analysis.stiffness import cone, stiffest
-from mosa.evaluation.evaluate import Sequence, true_motion
+from mosa.evaluation.evaluate import Sequence, apart, true_motion
 from mosa.modules.body.body import Body, World
 from mosa.modules.body.material import FORMS as RANGES
 from mosa.modules.body.material import RELATIVE, Form, Material
@@ -79,7 +79,8 @@ def predicted_spread(
         }, {}
 
     def positions() -> dict[str, Tensor]:
-        return {s.prefix: _positions(body, s, world) for s in sequences}
+        found = apart(body, sequences, lambda own, s: _positions(own, s, world))
+        return {s.prefix: x for s, x in zip(sequences, found)}
 
     drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
     others = rival_motions(body, posterior, positions)
