@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from mosa.data.checks.validation import validate
 from mosa.data.formats.scene_from_footage import scene_from_footage
@@ -114,16 +114,21 @@ def check_names(**names) -> None:
             )
 
 
-def held_out_sequences(**keys) -> list[Scene]:
-    """The held-out sequences that a built-in scene brings: all besides its training sequence. Those of folders are named by the
-    user (`mosa.data.sequences`)."""
+def held_out_of(keys: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the held-out sequences that a built-in scene brings: all besides its training sequence. Those of folders are named
+    by the user (`mosa.data.sequences`)."""
     if keys.get("format") != "builtin" or keys.get("sequence", "train") != "train":
-        return []
+        return ()
     from mosa.data.synthetic import held_out_names
 
+    return held_out_names(keys["name"])
+
+
+def held_out_sequences(**keys) -> list[Scene]:
+    """Those of `held_out_of`."""
     return [
         load_scene(**{**keys, "sequence": s, "holdout_frames": None, "last_free_frame": None})
-        for s in held_out_names(keys.get("name"))
+        for s in held_out_of(keys)
     ]
 
 

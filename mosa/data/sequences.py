@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mosa.data.scene import beside, held_out_sequences, load_scene, under
+from mosa.data.scene import beside, held_out_of, held_out_sequences, load_scene, under
 from mosa.errors import ConfigError, DataError
 from mosa.types import Scene
 
@@ -30,21 +30,30 @@ NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
     """The training sequence and the others of the same object, those of scene.also_train first where they are folders.
 
-    keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file."""
+    keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file.
+    """
+    scene, others = load_first(keys)
+    return scene, others()
+
+
+def load_first(keys: Mapping[str, Any]) -> tuple[Scene, Callable[[], list[Scene]]]:
+    """The training sequence, and what gives the others: of a built-in scene it makes their films when it is called, which takes as
+    long; those of folders have been read and checked. Arguments and errors as of `load_sequences`."""
     keys = dict(keys)
     also_train, test = keys.pop("also_train", None) or [], keys.pop("test", None) or []
     if keys.get("format") == "builtin":
         if test:
-            raise ConfigError("scene.test: a built-in scene brings its own; expected no list")
-        scene, others = load_scene(**keys), held_out_sequences(**keys)
-        known = [s.sequence for s in others]
+            raise ConfigError(
+                "scene.test: a built-in scene brings its held-out sequences itself; expected no list"
+            )
+        scene, known = load_scene(**keys), held_out_of(keys)
         if unknown := [name for name in also_train if name not in known]:
             found = f"has {', '.join(known)}" if known else "has none"
             wanted = "other sequences of the scene"
             raise ConfigError(
                 f"scene.also_train: expected {wanted}, found {unknown[0]!r}; it {found}"
             )
-        return scene, others
+        return scene, lambda: held_out_sequences(**keys)
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
@@ -56,7 +65,7 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
             "move otherwise than those of scene.path; learn from each alone"
         )
     check_distinct([scene, *others], ["scene.path", *(f"scene.{where}" for where, _ in entries)])
-    return scene, others
+    return scene, lambda: others
 
 
 def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:

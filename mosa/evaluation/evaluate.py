@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Ordered
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 from warnings import warn
 
 import numpy as np
@@ -33,6 +35,8 @@ from mosa.system.progress import tqdm
 from mosa.system.threads import threaded
 from mosa.types import Rollout, Scene
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
 NAMES = {"adapted": "the learned law", "prior": "the prior", "prior_eta": "the prior with eta"}
 
@@ -174,6 +178,22 @@ def true_motion(body: Body, scene: Scene) -> Tensor | None:
     return metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
 
 
+def apart(
+    body: Body, items: Ordered[Item], function: Callable[[Body, Item], Result]
+) -> Iterator[Result]:
+    """function(body, item) of each item, in their order, without gradients; on a CPU on as many threads as there are cores, each
+    item with a copy of the body, as simulators are not for two threads."""
+    inferring = torch.is_inference_mode_enabled()  # a thread has switches of its own
+
+    def of_copy(item: Item) -> Result:
+        with torch.inference_mode(inferring), torch.no_grad():
+            return function(copy.deepcopy(body), item)
+
+    if body.rest.is_cpu and len(items) > 1:
+        return threaded(of_copy, items)
+    return (function(body, item) for item in items)
+
+
 @torch.no_grad()
 def evaluate(
     body: Body, sequences: list[Sequence], world: World, settings: EvaluationSettings
@@ -182,36 +202,39 @@ def evaluate(
 
     Errors: SimulationDiverged where none of them could be."""
     figures: dict[str, float] = {}
-    kept: dict[str, dict[str, Rollout]] = {}
-    every = len(sequences) * len(VARIANTS)
-    bar = tqdm(total=every, desc="evaluate", unit="rollout", dynamic_ncols=True)
-    rates, measured, missing = [], set[str](), list[tuple[str, str]]()
-    for sequence in sequences:
-        kept[sequence.prefix] = {}
-        simulated, size, rate = rollouts(body, sequence, world)
-        rates.append(rate)
+    measured, missing = set[str](), list[tuple[str, str]]()
+    ran = list(apart(body, sequences, lambda own, each: rollouts(own, each, world)))
+    kept = {each.prefix: simulated for each, (simulated, _, _) in zip(sequences, ran)}
+    targets = {each.prefix: true_motion(body, each.scene) for each in sequences}
+
+    def compared(own: Body, of: tuple[Sequence, str]) -> dict[str, float]:
+        sequence, variant = of
+        rollout, target = kept[sequence.prefix][variant], targets[sequence.prefix]
+        return sequence_metrics(own, sequence, rollout, PREFIX[variant], settings, target)
+
+    every = [(sequence, variant) for sequence in sequences for variant in kept[sequence.prefix]]
+    found = apart(body, every, compared)
+    bar = tqdm(found, "evaluate", len(every), unit="rollout", dynamic_ncols=True)
+    of_each = {(each.prefix, variant): own for (each, variant), own in zip(every, bar)}
+    for sequence, (simulated, size, _) in zip(sequences, ran):
         if size is not None:
             figures[f"{sequence.prefix}/mean_abs_C"] = size
-        target = true_motion(body, sequence.scene)
         for variant in VARIANTS:
             model = PREFIX[variant]
             if variant in simulated:
-                kept[sequence.prefix][variant] = simulated[variant]
                 if world.forces and variant == "adapted":
                     scene, first = sequence.scene, sequence.prefix == "train"
                     curves = curves_of(world.forces, scene.sequence, first)
                     dt = float(scene.times[1] - scene.times[0])
                     figures |= force_figures(simulated[variant], curves, world, dt)
-                found = sequence_metrics(
-                    body, sequence, simulated[variant], model, settings, target
-                )
-                figures |= found
-                own = (key for key in figures if key.startswith(f"{model}{sequence.prefix}/"))
-                measured |= {key.rpartition("/")[2] for key in own}
+                figures |= of_each[sequence.prefix, variant]
+                measured |= {
+                    key.rpartition("/")[2]
+                    for key in figures
+                    if key.startswith(f"{model}{sequence.prefix}/")
+                }
             else:
                 missing += [(model, part) for part in parts_of(sequence)]
-            bar.update()
-    bar.close()
     if not measured:
         raise SimulationDiverged(
             "evaluation: neither the law nor its prior can be simulated on any of these sequences: "
@@ -222,6 +245,7 @@ def evaluate(
     figures |= {f"{model}{part}/{name}": worst(name) for model, part in missing
                 for name in (of_pictures if part == "camera" else measured - {"mean_abs_C"})}  # fmt: skip
     figures |= test_means(figures)
+    rates = [rate for _, _, rate in ran]
     figures["time/particle_substeps_per_s"] = max(rates)  # the first rollouts also load kernels
     return figures, kept
 
@@ -299,14 +323,16 @@ def floor_figures(
     """
     from mosa.evaluation.floor import floor_rollout
 
-    figures = {}
-    for sequence in evaluated:
+    figures, known = {}, [s for s in evaluated if s.scene.truth is not None]
+    found = apart(body, known, lambda own, each: floor_rollout(own, each.scene, world))
+    motions = {s.prefix: x for s, x in zip(known, found)}
+    for sequence in known:
         scene = sequence.scene
-        if scene.truth is None:
-            continue
-        x = floor_rollout(body, scene, world)
-        training = sequence.prefix.startswith("train")
-        frames = scene.training_frames if training else list(range(scene.frames))
+        x = motions[sequence.prefix]
+        if sequence.prefix.startswith("train"):
+            frames = scene.training_frames
+        else:
+            frames = list(range(scene.frames))
         result = motion_metrics(x, body, sequence, frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mosa.errors import MosaError
 from mosa.evaluation.analysis.stiffness import cone, stiffest
-from mosa.evaluation.evaluate import Sequence, true_motion
+from mosa.evaluation.evaluate import Sequence, apart, true_motion
 from mosa.modules.body.body import Body, World
 from mosa.modules.body.material import FORMS as RANGES
 from mosa.modules.body.material import RELATIVE, Form, Material
@@ -68,13 +68,24 @@ def predicted_spread(
         except MosaError:  # `evaluate` has said so
             continue
     sequences = [s for s in sequences if s.prefix in base]
-    drawn, others = [], []
-    if sequences:  # else of no draw would anything be simulated
-        predict = lambda: {s.prefix: _positions(body, s, world) for s in sequences}  # noqa: E731
-        drawn = drawn_motions(body, posterior.draws(draws, generator), predict)
-        others = rival_motions(body, posterior, predict)
-    figures = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others))}
-    figures["posterior/model_error_m"] = posterior.model_error
+    if not sequences:  # of no draw would anything be simulated
+        return {
+            "posterior/draws": 0.0,
+            "posterior/rivals": 0.0,
+            "posterior/model_error_m": posterior.model_error,
+        }, {}
+
+    def positions() -> dict[str, Tensor]:
+        found = apart(body, sequences, lambda own, s: _positions(own, s, world))
+        return {s.prefix: x for s, x in zip(sequences, found)}
+
+    drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
+    others = rival_motions(body, posterior, positions)
+    figures: dict[str, float] = {
+        "posterior/draws": float(len(drawn)),
+        "posterior/rivals": float(len(others)),
+        "posterior/model_error_m": posterior.model_error,
+    }
     spreads: dict[str, Tensor] = {}
     if len(drawn) < LEAST_DRAWS:
         return figures, spreads

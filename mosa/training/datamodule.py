@@ -11,7 +11,8 @@ It stands alone; `LitMosa` asks it for the particles that a body is made of."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ from mosa.config.composition import composed
 from mosa.config.record import BodyRecord
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule, on_device
 from mosa.data.observations import cropped, training_observations
-from mosa.data.sequences import load_sequences, taught_names
+from mosa.data.scene import held_out_of
+from mosa.data.sequences import load_first, load_sequences, taught_names
 from mosa.errors import ConfigError
 from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
 from mosa.evaluation.evaluate import sequences
@@ -47,7 +49,7 @@ from mosa.reconstruction.rest_shape import RestShape
 from mosa.system.caches import default_cache
 from mosa.system.progress import tqdm
 from mosa.training.run_folder import most_particles
-from mosa.types import Reconstruction, Scene
+from mosa.types import Appearance, Reconstruction, Scene
 
 
 def served(batches: Any) -> DataLoader[Any]:
@@ -81,6 +83,7 @@ class SceneDataModule(L.LightningDataModule):
         self.cfg = composed(scene, overrides)
         self.settings = DataSections.part(plain(self.cfg))
         self.device, self.held_out, self.predict = device, held_out, list(predict)
+        self._ahead: Future[list[Scene]] | None = None
 
     def __repr__(self) -> str:
         scene = dict(self.cfg.scene)
@@ -141,15 +144,30 @@ class SceneDataModule(L.LightningDataModule):
         return taught_names(plain(self.cfg.scene))
 
     @cached_property
-    def scenes(self) -> tuple[Scene, list[Scene]]:
-        """The training sequence and the others of the same object."""
-        training, others = load_sequences(plain(self.cfg.scene))
-        return training, [s for s in others if self.held_out or s.sequence in self.taught]
+    def _first(self) -> tuple[Scene, Callable[[], list[Scene]]]:
+        return load_first(plain(self.cfg.scene))
 
     @property
     def scene(self) -> Scene:
         """The training sequence."""
-        return self.scenes[0]
+        return self._first[0]
+
+    @property
+    def others(self) -> int:
+        """How many sequences there are beside the training one; films of a built-in scene need not be made for it."""
+        if self.scene.synthetic:
+            return len(held_out_of(plain(self.cfg.scene)))
+        return len(self.scenes[1])
+
+    def read_ahead(self) -> None:
+        """Makes the films of the other sequences in a thread beside what comes next; who asks for them waits."""
+        self._ahead = ThreadPoolExecutor(1).submit(self._first[1])
+
+    @cached_property
+    def scenes(self) -> tuple[Scene, list[Scene]]:
+        """The training sequence and the others of the same object."""
+        others = self._first[1]() if self._ahead is None else self._ahead.result()
+        return self.scene, [s for s in others if self.held_out or s.sequence in self.taught]
 
     def prefix(self, scene: Scene) -> str:
         """Of the figures of a sequence beside the training one: train/<name> where it is learned from, else test/<name>."""
@@ -221,17 +239,27 @@ class SceneDataModule(L.LightningDataModule):
 
     # ---------------------------------------------------------------- starts
     @cached_property
+    def start(self) -> Start:
+        """Initial state of the training sequence, from images alone: the rest pose, velocity of the frames before contact."""
+        return self._start_of(self.scene, register=False)
+
+    def _start_of(self, scene: Scene, register: bool = True) -> Start:
+        moving = self.reconstruction.moving
+        place = None if moving is None else moving.place
+        return sequence_start(self.shape, self._seen, scene, register=register, place=place)
+
+    @cached_property
+    def _seen(self) -> Appearance:
+        return appearance_of(self.shape)
+
+    @cached_property
     def starts(self) -> dict[str, Start]:
-        """Initial states by prefix, from images alone: pose of frame 0, velocity of the frames before contact.
+        """Initial states by prefix: `start`, of the others also the pose of their frame 0.
 
         Prefixes: train, then train/<name> for the sequences that are learned from, test/<name> for the rest, in their order."""
-        shape, (training, others) = self.shape, self.scenes
-        seen = appearance_of(shape)
-        place = None if self.reconstruction.moving is None else self.reconstruction.moving.place
-        found = {"train": sequence_start(shape, seen, training, register=False, place=place)}
-        for scene in tqdm(others, "poses of the other sequences", leave=False):
-            start = sequence_start(shape, seen, scene, register=True, place=place)
-            found[self.prefix(scene)] = start
+        found = {"train": self.start}
+        for scene in tqdm(self.scenes[1], "poses of the other sequences", leave=False):
+            found[self.prefix(scene)] = self._start_of(scene)
         return found
 
     @property

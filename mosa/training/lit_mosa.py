@@ -50,7 +50,6 @@ from mosa.evaluation import metrics
 from mosa.evaluation.evaluate import evaluate, run_sequences
 from mosa.modules.adapters.penalties import MISFIT
 from mosa.modules.body.body import Body, World
-from mosa.modules.body.material import material_states
 from mosa.modules.fitting import losses
 from mosa.modules.fitting.adam_steps import GradientSteps
 from mosa.modules.fitting.gauss_newton import Posterior
@@ -182,6 +181,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.compared, self.grounds, self.parts = {}, {}, {}
         self.law_gains, self.ground_gains = {}, {}
         self.posterior: Posterior | None = None
+        self.columns = None
         self._known: dict[str, Posterior] = {}  # by law
         begins_again = body is not None and (self.ground_is_sought or body.material.candidates)
         self.untouched = copy.deepcopy(body.state_dict()) if begins_again else None
@@ -368,7 +368,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.body.load_state_dict(self.untouched)
         self.takes, self.informed = list(self.first_takes), False
         self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
-        self.stage_over = False
+        self.stage_over, self.columns = False, None
 
     # ---------------------------------------------------------------- one step
     def configure_optimizers(self):
@@ -503,12 +503,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.settle_ground(self.world.ground)
         if stage.looks_again or not (stage.calibrates or self.informed):
             self.inform(response=stage.newton and not stage.calibrates)
-        adapter, material = self.body.adapter, self.body.material
-        if stage.learns_adapter and adapter is not None:
-            adapter.switch_on(material.reference_modulus(), material.poisson())
-            parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
-            states = material_states(material.law, parameters, self.body.law_options)
-            adapter.prepare(material.law, states)
+        if stage.learns_adapter and self.body.adapter is not None:
+            self.body.switch_on()
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
 

@@ -31,6 +31,7 @@ from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.system.limits import named_device
 from mosa.system.whole_files import write_whole
 from mosa.training.datamodule import SceneDataModule
+from mosa.training.first_picture import write_first_picture
 from mosa.training.fitting import build_trainer, fit
 from mosa.training.lit_mosa import LitMosa
 from mosa.training.loggers import log_outcome
@@ -98,13 +99,17 @@ def train(cfg: DictConfig) -> float | None:
     most = most_particles(device)
     check_before_data(settings.plain(), most)
     with timed(times, "data"):
-        scene, others = data.scenes
+        scene = data.scene
+        if scene.synthetic and device == "cpu":  # the other films are still to be made
+            data.read_ahead()
+        else:
+            _ = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
-        check_with_data(settings.plain(), scene, len(others), most)
+        check_with_data(settings.plain(), scene, data.others, most)
     else:
         log.info("tracked points only: no reconstruction from images, no figures of images")
     if scene.synthetic:
@@ -122,6 +127,8 @@ def train(cfg: DictConfig) -> float | None:
             stacklevel=1,
         )
     with timed(times, "starts"):
+        if filmed and cfg.evaluation.video:
+            write_first_picture(folder, data, trainer.loggers)
         starts = data.starts
     for prefix, start in starts.items():
         velocity = ", ".join(f"{v:.3f}" for v in start.velocity.tolist())

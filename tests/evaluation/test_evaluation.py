@@ -43,7 +43,8 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
     """A law that was learned from the first frames may turn an element inside out in the held-out ones."""
     scene = SimpleNamespace(truth=None, holdout_frames=held_frames, holdout_cameras=held_cameras)
     sequences = [Sequence("train", scene, None, 2), Sequence("test/a", scene, None, 2)]
-    body, lost = object(), {"train": {"adapted"}, "test/a": {"prior_eta"}}
+    body = SimpleNamespace(rest=torch.zeros(1, 3))
+    lost = {"train": {"adapted"}, "test/a": {"prior_eta"}}
 
     def rollouts(_, sequence, __):
         return dict.fromkeys({"adapted", "prior", "prior_eta"} - lost[sequence.prefix]), None, 1.0

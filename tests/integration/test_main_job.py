@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import forked
+import imageio.v3 as imageio
 import lightning as L
 import numpy as np
 import pytest
@@ -136,6 +137,17 @@ def test_the_log_has_the_lines_that_matter(run):
     ):
         assert line in log, line
     assert log.count("] stage ") == 6
+
+
+def test_the_first_picture_is_there_before_the_fit(run):
+    """The film, its reconstruction and the prior, in the run folder and in TensorBoard; the log says where."""
+    log = (run / "train.log").read_text()
+    said = f"first picture, the reconstruction beside the prior: {run / 'first.png'}"
+    assert 0 < log.index(said) < log.index("] start of train") < log.index("] fit: ")
+    picture = imageio.imread(run / "first.png")
+    assert picture.shape[0] > 3 * 60 and picture.std() > 5
+    (shown,) = events_of(run).Images("film_reconstruction_prior")
+    assert shown.step == 0 and shown.height > 3 * 60
 
 
 def test_progress_in_a_file_is_lines(run):

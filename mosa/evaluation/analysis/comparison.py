@@ -24,7 +24,7 @@ from mosa.evaluation.analysis.figures import (
 from mosa.evaluation.evaluate import Sequence, true_motion
 from mosa.modules.body.body import Body
 from mosa.physics.world import World
-from mosa.rendering.appearance.carried_splats import seen
+from mosa.rendering.appearance.carried_splats import Seen, seen
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
 from mosa.rendering.observer import deformed_covariances, observe
 from mosa.types import Cameras, Rollout, Scene
@@ -38,6 +38,46 @@ DARK = 0.45  # of the light that a shadow takes where it is deepest
 
 
 @dataclass(frozen=True)
+class View:
+    """The first camera of a scene, cut to where the object goes. real: (T, H, W, 3) what it sees; enlarged: how many times pictures
+    are; lines: of the ground."""
+
+    scene: Scene
+    cameras: Cameras
+    real: Tensor
+    enlarged: int
+    lines: list[np.ndarray]
+
+    @classmethod
+    def of(cls, scene: Scene, size: float, width: int = 320) -> View:
+        """size: of the object [m]; width: of pictures, about [px]."""
+        camera = (scene.training_cameras or [0])[0]
+        x0, y0, w, h = crop_boxes(scene.mattes[[camera]], margin=16)
+        cameras = crop_cameras(scene.cameras.select([camera]), x0, y0, w, h)
+        real = crop_images(scene.images[[camera]], x0, y0, w, h, axis=2)[0]
+        times = max(1, round(width / max(w, h)))
+        return cls(scene, cameras, real, times, ground_lines(scene, cameras, size))
+
+    @property
+    def moments(self) -> list[str]:
+        """The caption of each frame."""
+        times = self.scene.times.tolist()
+        return [f"frame {t}, {time - times[0]:.3f} s" for t, time in enumerate(times)]
+
+    def drawn(self, shown: Seen) -> Tensor:
+        """(T, H, W, 3) on the CPU."""
+        device = shown.means.device
+        given = self.cameras.to(device), self.scene.background.to(device)
+        return shown.images(*given)[0].clamp(0, 1).cpu()
+
+    def finished(self, images: Tensor) -> np.ndarray:
+        """(T, H', W', 3) uint8: images (T, H, W, 3), enlarged, on the ground."""
+        pictures = (enlarge(to_uint8(image), self.enlarged) for image in images)
+        given = self.lines, self.enlarged, self.scene.background
+        return np.stack([on_ground(picture, *given) for picture in pictures])
+
+
+@dataclass(frozen=True)
 class Comparison:
     """One camera's view of a sequence, cut to where the object goes and enlarged. images: by title, (T, H, W, 3) uint8: `real` and
     the models; errors: of the models, as colours; label: what of, from 0 to `high`; colors: of matplotlib; times: (T,) [s]."""
@@ -47,12 +87,7 @@ class Comparison:
     label: str
     high: str
     colors: str
-    times: list[float]
-
-    @property
-    def moments(self) -> list[str]:
-        """The caption of each frame."""
-        return [f"frame {t}, {time - self.times[0]:.3f} s" for t, time in enumerate(self.times)]
+    moments: list[str]
 
 
 @torch.no_grad()
@@ -67,37 +102,33 @@ def compare(
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
-    limit [m]: the distance that has the last colour (`error_limit` of this sequence)."""
-    scene = shown.scene
-    camera = (scene.training_cameras or [0])[0]
-    x0, y0, w, h = crop_boxes(scene.mattes[[camera]], margin=16)
-    cameras = crop_cameras(scene.cameras.select([camera]), x0, y0, w, h)
-    times = max(1, round(width / max(w, h)))
-    lines = ground_lines(scene, cameras, body.size)
-    real = crop_images(scene.images[[camera]], x0, y0, w, h, axis=2)[0]
-    seen = {v: drawn(body, variants[v], cameras, scene) for v in TITLES if v in variants}
-
-    def finished(images: Tensor) -> np.ndarray:
-        large = (enlarge(to_uint8(image), times) for image in images)
-        return np.stack([on_ground(each, lines, times, scene.background) for each in large])
-
+    limit [m]: the distance that has the last colour (`error_limit` of this sequence).
+    """
+    scene, view = shown.scene, View.of(shown.scene, body.size, width)
+    seen_of = {
+        v: view.drawn(seen(body, variants[v].x, variants[v].F_tot)) for v in TITLES if v in variants
+    }
     far = distances(body, scene, variants)
     if not far:
         label, high, colors = "difference of the images", f"{DIFFERENCE:g}", "Reds"
-        off = {v: (images - real).abs().mean(-1) / DIFFERENCE for v, images in seen.items()}
-        errors = {v: paint(share, colors) for v, share in off.items()}
+        errors = {
+            v: paint((images - view.real).abs().mean(-1) / DIFFERENCE, colors)
+            for v, images in seen_of.items()
+        }
     else:
         limit = limit or error_limit(far.values())
         label, high, colors = "distance to the true motion", f"{1e3 * limit:g} mm", "viridis"
-        painted = {v: paint(d / limit, colors) for v, d in far.items()}
-        errors = {v: drawn(body, variants[v], cameras, scene, p) for v, p in painted.items()}
+        errors = {
+            v: painted(body, variants[v], view, paint(d / limit, colors)) for v, d in far.items()
+        }
     return Comparison(
-        {"real": finished(real)} | {TITLES[v]: finished(images) for v, images in seen.items()},
-        {TITLES[v]: finished(images) for v, images in errors.items()},
+        {"real": view.finished(view.real)}
+        | {TITLES[v]: view.finished(images) for v, images in seen_of.items()},
+        {TITLES[v]: view.finished(images) for v, images in errors.items()},
         label,
         high,
         colors,
-        scene.times.tolist(),
+        view.moments,
     )
 
 
@@ -114,15 +145,10 @@ def error_limit(far: Iterable[Tensor]) -> float:
     return round_up(max(most, default=0.0))
 
 
-def drawn(
-    body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: Tensor | None = None
-) -> Tensor:
-    """(T, H, W, 3) images of a rollout from one camera, on the CPU. colors: (T, N, 3) of its particles in place of
-    the body's appearance."""
+def painted(body: Body, rollout: Rollout, view: View, colors: Tensor) -> Tensor:
+    """(T, H, W, 3) images of a rollout's particles with colours (T, N, 3), on the CPU."""
     device = body.rest.device
-    cameras, background = cameras.to(device), scene.background.to(device)
-    if colors is None:
-        return seen(body, rollout.x, rollout.F_tot).images(cameras, background)[0].clamp(0, 1).cpu()
+    cameras, background = view.cameras.to(device), view.scene.background.to(device)
     covariances = deformed_covariances(rollout.F_tot, body.covariances)
     parts = []
     for t in range(len(rollout.x)):
@@ -264,7 +290,7 @@ def legend(shown: Comparison) -> np.ndarray:
 def write_comparisons(folder: Path, shown: Mapping[str, Comparison]) -> None:
     """video.mp4 of the last sequence and strip.png of all. shown: by the prefix of the sequence."""
     prefix, last = list(shown.items())[-1]
-    below = {last.label: np.repeat(legend(last)[None], len(last.times), 0)}
+    below = {last.label: np.repeat(legend(last)[None], len(last.moments), 0)}
     below |= {f"{title}: {last.label}": images for title, images in last.errors.items()}
     footer = [f"{prefix}   {moment}" for moment in last.moments]
     write_video(folder / "video.mp4", side_by_side(last.images, below=below, footer=footer), fps=6)

@@ -10,10 +10,10 @@ import matplotlib
 import numpy as np
 import torch
 
-from mosa.evaluation.analysis.comparison import drawn
 from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_strip, write_video
 from mosa.modules.body.body import Body
 from mosa.reconstruction.marker_body import cues_of_markers
+from mosa.rendering.appearance.carried_splats import seen
 from mosa.rendering.cameras import look_at, project
 from mosa.system.npz import write_npz
 from mosa.types import Cameras, Rollout
@@ -107,7 +107,9 @@ def film(body: Body, scene, rollout: Rollout, measured: np.ndarray, predicted: n
     K = torch.tensor([[focal, 0, SIZE[0] / 2], [0, focal, SIZE[1] / 2], [0, 0, 1.0]])
     w2c = look_at((middle + far * side).float(), middle.float(), up.float())
     camera = Cameras(K[None], w2c[None], *SIZE, ("side",))
-    images = [to_uint8(image).copy() for image in drawn(body, rollout, camera, scene)]
+    of_body, device = seen(body, rollout.x, rollout.F_tot), body.rest.device
+    pictures = of_body.images(camera.to(device), scene.background.to(device))[0].cpu()
+    images = [to_uint8(image).copy() for image in pictures]
     kinds = ((measured, MEASURED, 3, -1), (predicted, PREDICTED, 6, 2))
     for points, color, radius, thickness in kinds:
         for image, places in zip(images, torch.from_numpy(points).float()):

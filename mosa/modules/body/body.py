@@ -17,7 +17,7 @@ from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.body.contact import ContactOffset
 from mosa.modules.body.heterogeneity import StiffnessField
-from mosa.modules.body.material import Material
+from mosa.modules.body.material import Material, material_states
 from mosa.modules.body.model import Model
 from mosa.modules.body.ready import Ready
 from mosa.modules.body.simulation_settings import SimulationSettings
@@ -131,6 +131,15 @@ class Body(nn.Module):
         """Settle on a candidate for the backbone, here and in what was kept of it."""
         for material in (self.material, *(kept["material"] for kept in self.frozen.values())):
             material.choose(law)
+
+    def switch_on(self) -> None:
+        """The adapter acts from now on, beginning at the prior as it stands."""
+        material = self.material
+        self.adapter.switch_on(material.reference_modulus(), material.poisson())
+        parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
+        self.adapter.prepare(
+            material.law, material_states(material.law, parameters, self.law_options)
+        )
 
     def freeze(self, variant: str) -> None:
         """Keep the live parameters as the calibrated backbone `variant` (prior | prior_eta)."""

@@ -34,9 +34,12 @@ class Ready:
     def simulate(
         self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
         progress: Callable[[int], None] | None = None, observed: Tensor | None = None, gain: float = 0.0,
-        unseen: Callable[[Tensor, int], Tensor] | None = None,
+        unseen: Callable[[Tensor, int], Tensor] | None = None, begun: Rollout | None = None,
     ) -> Rollout:  # fmt: skip
-        """As `Body.simulate`, from here on; of a stack, the worlds at once."""
+        """As `Body.simulate`, from here on; of a stack, the worlds at once.
+
+        begun: the first frames, simulated before from here with the same arguments (substeps that
+        do not vary, no colliders), which the rest then follow."""
         simulator, stacked = self.simulator, self.state.x.ndim == 3
         arguments, alone = self.arguments, not stacked and collect is None
         if observed is not None and alone and arguments["stride"] is None:
@@ -45,9 +48,13 @@ class Ready:
             simulator.rollout, **arguments, collect=collect, motions=self.motions(colliders)
         )
         lift = self.lift[:, None] if stacked else self.lift
+        first, state = (0, self.state) if begun is None else (len(begun.x) - 1, begun.final)
         if observed is None:
             timing = {} if self.timing is None else {"timing": self.timing}
-            rollout = roll(self.state, frames=frames, progress=progress, **timing)
+            rollout = roll(
+                state, frames=frames - first, started=first > 0,
+                start_time=first * simulator.frame_dt, progress=progress, **timing,
+            )  # fmt: skip
         else:
             if self.timing:
                 raise ConfigError("simulation.adaptive: expected false with criterion=corrected")
@@ -55,13 +62,16 @@ class Ready:
             hidden = (
                 None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)
             )
-            rollout = corrected_rollout(
-                roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt, hidden
-            )
+            seen = seen.to(state.x.dtype)
+            rollout = corrected_rollout(roll, state, seen, gain, simulator.frame_dt, hidden, first)
         fields = {
             name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")
         }
-        return replace(rollout, **{**fields, "x": fields["x"] - lift})
+        fields["x"] = fields["x"] - lift
+        if begun is not None:
+            parts = {name: (getattr(begun, name), field[1:]) for name, field in fields.items()}
+            fields = {name: torch.cat(both) for name, both in parts.items()}
+        return replace(rollout, **fields)
 
     def motions(self, colliders: Sequence[Collider]) -> list:
         """Of the colliders, where the simulator sees them: the offset is the ground's, they keep their place. Of a stack, a list
@@ -113,10 +123,10 @@ class Ready:
 
 def corrected_rollout(
     roll: Callable[..., Rollout], state, observed: Tensor, gain: float, frame_dt: float,
-    unseen: Callable[[Tensor, int], Tensor] | None = None,
+    unseen: Callable[[Tensor, int], Tensor] | None = None, first: int = 0,
 ) -> Rollout:  # fmt: skip
     """Frames predicted one by one: after each, v += gain (x_seen - x)/frame_dt. Its positions are
-    those before the correction.
+    those before the correction. first: the frame that `state` is of; the result begins with it.
 
     roll: a simulator's rollout with everything but state, frames and times given; observed:
     (T, N, 3) [m] with its frame 0; frame_dt [s]; unseen: of positions [m] in a frame, what would
@@ -127,15 +137,19 @@ def corrected_rollout(
     bent to undo them. A prediction error method (Ljung, System Identification, chapter 3) asks
     less: from what was seen up to a frame, predict the next. Here the observer is Luenberger's
     with a fixed gain on the velocities; positions and deformation gradients stay the simulation's."""
+
+    def corrected(there, frame: int):
+        away = observed[frame] - there.x
+        if unseen is not None:
+            away = away + unseen(there.x, frame)
+        return replace(there, v=there.v + ((gain / frame_dt) * away).to(there.v))
+
     parts: list[Rollout] = []
-    current = state
-    for frame in range(1, len(observed)):
+    current = state if first == 0 else corrected(state, first)
+    for frame in range(first + 1, len(observed)):
         part = roll(current, frames=2, started=frame > 1, start_time=(frame - 1) * frame_dt)
         parts.append(part)
-        away = observed[frame] - part.final.x
-        if unseen is not None:
-            away = away + unseen(part.final.x, frame)
-        current = replace(part.final, v=part.final.v + ((gain / frame_dt) * away).to(part.final.v))
+        current = corrected(part.final, frame)
     if not parts:
         return roll(state, frames=1)
     stacked = {
@@ -146,7 +160,7 @@ def corrected_rollout(
         None if parts[0].reactions is None else torch.cat([part.reactions for part in parts])
     )
     times = frame_dt * torch.arange(
-        len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device
+        first, len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device
     )
     return Rollout(
         **stacked, times=times, final=parts[-1].final, reactions=reactions,

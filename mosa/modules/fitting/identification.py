@@ -55,6 +55,8 @@ COARSER = 1.25
 MOST_THREADS = 8
 PARTICLES_TOGETHER = 400_000
 """Of all worlds in one launch: more no longer make a GPU's substep cheaper for each."""
+CLEAR = 2.0
+"""Cells above the ground from which on nothing of a body meets it: a particle's weights reach 1.5."""
 ROUNDED = 8
 """Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
 REMEMBERED = 8
@@ -116,6 +118,7 @@ class Identification:
         self.iteration, self.noise, self.substeps = 0, None, None
         self._remembered: OrderedDict[tuple, list[residuals.Fields]] = OrderedDict()
         self._lock = threading.Lock()
+        self._flown: dict[tuple[int, float], tuple[Tensor, Rollout]] = {}
         # of every pair, on the coarser grid from those on the body's own
         self.grid_difference: list[residuals.Fields] | None = None
         if self.two_grids:
@@ -130,6 +133,8 @@ class Identification:
         self.report: dict[str, float] = {}
         # at the numbers as they stand, between `prepare` and `iterate`
         self._residuals: Tensor | None = None
+        # (R, D) of the first pass, where another stage has made it (`NewtonSteps.share_columns`)
+        self.first: Tensor | None = None
 
     def threads(self, numbers: int) -> int:
         """Rollouts side by side, of as many numbers."""
@@ -145,7 +150,10 @@ class Identification:
         if self.two_grids:
             tensors.append(share)
         return Seat(
-            tensors, lambda: self._whitened(body, float(share)), lambda: self._possible(body)
+            tensors,
+            lambda: self._whitened(body, float(share)),
+            lambda: self._possible(body),
+            lambda: self._whitened(body, float(share), flown=True),
         )
 
     def _possible(self, body: Body) -> None:
@@ -189,11 +197,38 @@ class Identification:
     def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
         return self._simulated(self.ready(body, index, substeps), self.takes[index], gain)
 
-    def _simulated(self, ready: Ready, take, gain: float) -> Rollout:
-        seen, solids = take.cues.positions, self.world.solids
+    def _simulated(
+        self, ready: Ready, take, gain: float, frames: int | None = None, begun: Rollout | None = None
+    ) -> Rollout:  # fmt: skip
+        """frames: how many, None for all; begun: see `Ready.simulate`."""
+        seen, solids = take.cues.positions[:frames], self.world.solids
         unseen = None if take.response is None else take.response.unseen
         observed = seen if gain else None
-        return ready.simulate(len(seen), solids, observed=observed, gain=gain, unseen=unseen)
+        return ready.simulate(
+            len(seen), solids, observed=observed, gain=gain, unseen=unseen, begun=begun
+        )
+
+    @torch.no_grad()
+    def _flights(self) -> dict[tuple[int, float], tuple[Tensor, Rollout]]:
+        """By pair: the contact's offset (3,) [m], and the frames in which the body is seen more than
+        `CLEAR` cells above the ground. The law's numbers hardly change these, so rollouts for a
+        Jacobian begin after them. Empty where something else than the ground may be met, and where
+        columns are rolled out as so many worlds."""
+        world, flights = self.world, {}
+        alone = world.ground is not None and not (world.planes or world.solids or world.driven)
+        if not alone or self.newton.many is not None or self.body.settings.adaptive:
+            return flights
+        for i, gain in self.pairs:
+            take, clear = self.takes[i], CLEAR * self.body.settings.dx
+            if isinstance(take.cues, MarkerCues) or take.start.loads:
+                continue
+            high = (take.cues.positions @ world.up.to(take.cues.positions)).amin(1)
+            low = (high < world.ground.height + clear).nonzero()
+            frames = int(low[0]) if len(low) else len(high)
+            if frames > 1:
+                ready = self.ready(self.body, i, self.substeps[i])
+                flights[i, gain] = ready.lift, self._simulated(ready, take, gain, frames)
+        return flights
 
     @torch.no_grad()
     def _many(self, rows: Tensor) -> Tensor:
@@ -213,18 +248,22 @@ class Identification:
         shares = rows[:, -1].tolist() if self.two_grids else [0.0] * len(rows)
         return torch.stack([self._compared(own, share) for own, share in zip(found, shares)])
 
-    def _fields(self, body: Body) -> list[residuals.Fields]:
-        """Of every pair; those that were found last are remembered."""
+    def _fields(self, body: Body, flown: bool = False) -> list[residuals.Fields]:
+        """Of every pair; those that were found last are remembered. flown: from the end of the `_flights` on."""
         numbers = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
         place = torch.cat([t.detach().double().cpu().flatten() for t in numbers]).tolist()
         key = (body.material.law, body.settings.dx, *self.substeps, *place)
         with self._lock:
             found = self._remembered.get(key)
         if found is None:
-            rollouts = (
-                (i, self.rollout(body, i, gain, self.substeps[i])) for i, gain in self.pairs
-            )
-            found = [self._differences(rollout, i) for i, rollout in rollouts]
+            found = []
+            for i, gain in self.pairs:
+                ready, take = self.ready(body, i, self.substeps[i]), self.takes[i]
+                lift, begun = self._flown.get((i, gain), (None, None)) if flown else (None, None)
+                if lift is None or not torch.equal(lift, ready.lift):
+                    begun = None
+                rollout = self._simulated(ready, take, gain, begun=begun)
+                found.append(self._differences(rollout, i))
             with self._lock:
                 self._remembered[key] = found
                 while len(self._remembered) > REMEMBERED:
@@ -241,10 +280,10 @@ class Identification:
         force = force_residuals(rollout, curves, self.world, take.frame_dt)
         return replace(found, force=force)
 
-    def _whitened(self, body: Body, grid_share: float) -> Tensor:
+    def _whitened(self, body: Body, grid_share: float, flown: bool = False) -> Tensor:
         # torch's switch is a thread's own, and these may be other threads than the one that switched it
         with torch.no_grad():
-            return self._compared(self._fields(body), grid_share)
+            return self._compared(self._fields(body, flown), grid_share)
 
     def _share(self) -> float:
         """Independent data that a frame counts as, of each kind."""
@@ -306,27 +345,30 @@ class Identification:
         return search(self)
 
     @torch.no_grad()
-    def score(self, gains: Sequence[float] | None = None) -> float:
-        """Error of the predictions [m] with these gains, by default the stage's own: the geometric
+    def score(self, gains: Sequence[float] | None = None, body: Body | None = None) -> float:
+        """Error of the predictions [m] with these gains, by default the stage's own, of the body or a copy: the geometric
         mean over the frames after the first of the root mean square distance over particles, above
         the floor of the noise.
 
         This is the likelihood of the positions where each frame has an unknown noise of its own,
         so that frames which no law predicts do not decide. Of free rollouts it is `distance`."""
         gains = gains or self.gains
+        body = self.body if body is None else body
         if not any(gains):
-            return self.distance()
+            return self.distance(body)
         least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
         logarithms = []
         for i, gain in itertools.product(range(len(self.takes)), gains):
-            away = self.takes[i].cues.away(self.rollout(self.body, i, gain).x)
+            away = self.takes[i].cues.away(self.rollout(body, i, gain).x)
             square = away[1:].square().sum(-1).mean(-1).double() + least
             logarithms.append(0.5 * float(square.log().mean()))
         return math.exp(sum(logarithms) / len(logarithms))
 
-    def distance(self) -> float:
-        """Mean distance [m] of free rollouts from the cues after frame 0."""
-        found = [take.cues.away(self.rollout(self.body, i).x) for i, take in enumerate(self.takes)]
+    @torch.no_grad()
+    def distance(self, body: Body | None = None) -> float:
+        """Mean distance [m] of free rollouts from the cues after frame 0, of the body or a copy."""
+        body = self.body if body is None else body
+        found = [take.cues.away(self.rollout(body, i).x) for i, take in enumerate(self.takes)]
         return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
 
     def _hold_substeps(self) -> None:
@@ -346,16 +388,24 @@ class Identification:
             self._measure_noise()
         if self.calibrating and self.newton.known is not None:
             self.newton.borne = self.independent()
+        self._flown = self._flights()
         seat = self.newton.seats[0]
         self._residuals = seat.residuals()
         return self.newton.cost(seat.read(), self._residuals)
+
+    @torch.no_grad()
+    def columns(self) -> Tensor:
+        """(R, D) the Jacobian of the first pass."""
+        self.prepare()
+        return self.newton.jacobian(self.newton.seats[0].read(), self._residuals)
 
     @torch.no_grad()
     def iterate(self) -> dict[str, float]:
         """One iteration of Gauss-Newton: a pass, or, in the stage `prior_eta`, `SERVES` with one
         Jacobian, each under its own noise. Returns the last one's report (`GaussNewton.iterate`).
         `prepare` comes before it, or is done here."""
-        report = self._pass()
+        first, self.first = self.first, None
+        report = self._pass(first)
         for _ in range(SERVES - 1 if self.compares else 0):
             if self.converged or report["share"] == 0:
                 break

@@ -16,6 +16,7 @@ from mosa.errors import DataError, SimulationDiverged
 from mosa.modules.body.body import Body
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import EVIDENCE_ITERATIONS, Identification
+from mosa.modules.fitting.parameters import is_learned
 from mosa.modules.fitting.search.backbone import choose_law
 from mosa.modules.fitting.search.ground import (
     EXPLAINED,
@@ -39,6 +40,8 @@ class NewtonSteps:
     """The part of `LitMosa` that runs stages by Gauss-Newton."""
 
     known: Posterior | None
+    columns: Tensor | None
+    """(R, D) of the joint stage's first pass, where the stage before has made it."""
 
     def newton_loss(self, stage: Stage, iteration: int) -> Tensor:
         """Minus the logarithm of the posterior at the numbers as they stand; the optimiser goes on from there."""
@@ -75,7 +78,26 @@ class NewtonSteps:
             self.go_on(identification, saved)
         elif stage.calibrates and not searched and not stage.looks_again:
             identification.search()
+        elif not stage.calibrates:
+            self.share_columns(stage, identification)
         return identification
+
+    def share_columns(self, stage: Stage, identification: Identification) -> None:
+        """Where the stages `prior_eta` and `joint` begin at the same numbers, the first Jacobian of
+        the joint stage contains the other one's: it is made once, in `prior_eta`. A fit that is
+        resumed between them makes it again."""
+        if stage.learns_adapter:
+            identification.first, self.columns = self.columns, None
+            return
+        later, learned = self.stages[self.stage_index + 1 :][:1], is_learned(self.body.adapter)
+        if not (later and later[0].newton and later[0].start == "prior" and learned):
+            return
+        body = copy.deepcopy(self.body)
+        body.switch_on()
+        ahead = self.identifying(later[0], body=body)
+        self.columns, names = ahead.columns(), ahead.newton.names()
+        own = [names.index(name) for name in identification.newton.names()]
+        identification.first = self.columns[:, own + [-1] * identification.two_grids]
 
     def find_ground(self, stage: Stage) -> None:
         """How the body touches the ground, by a calibration on each that may be."""

@@ -160,12 +160,14 @@ class SecondLook:
 
         first_contact: index of the first frame after it: until then predictions do not differ."""
         seen, target, views = self._seen(seen), self._target(), self.settings.informed.response
-        found = self._found(predicted, seen, target)
+        told = bool(views) and first_contact < len(predicted)
+        both = (threaded if seen.is_cpu else map)(
+            lambda each: self._found(each, seen, target), [predicted, other][: 1 + told]
+        )
+        found, second = (*both, None)[:2]
         if found is None:
             return self.cues(seen), None
         positions, about = found
-        told = bool(views) and first_contact < len(positions)
-        second = self._found(other, seen, target) if told else None
         if second is None:
             return self.cues(positions), None
         with self._bar("how far images determine the motion", len(positions) - 1) as steps:

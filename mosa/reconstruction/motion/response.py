@@ -28,6 +28,7 @@ from mosa.reconstruction.motion.modes import Modes, coefficients_of
 from mosa.reconstruction.motion.observed import Windows
 from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
+from mosa.system.threads import threaded
 
 MODES = 60
 """Softest modes in which the response is known: 180 directions of a frame. What moves in others counts as seen."""
@@ -112,7 +113,8 @@ def image_matrices(
         # an odd step meets all four channels
         return values[:, :: 2 * (values.shape[1] // (2 * VALUES)) + 1]
 
-    for frame in range(1, len(target.offsets)):
+    @torch.no_grad()  # a thread has its own switch
+    def matrix(frame: int) -> Tensor:
         at = torch.tensor([frame], device=device)
         here = motion.coefficients(at)
         own = target.windows.of_frame(frame)
@@ -126,6 +128,9 @@ def image_matrices(
             moved = [images(here + STEP * d, at, window) for d in directions.split(TOGETHER)]
             J = (torch.cat(moved) - base) / STEP * weight
             H += (J @ J.T).double() / J.shape[1] / len(chosen)
+        return H
+
+    for H in (threaded if found.is_cpu else map)(matrix, range(1, len(target.offsets))):
         matrices.append(H)
         if progress is not None:
             progress(1)

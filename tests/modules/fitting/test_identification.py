@@ -26,6 +26,7 @@ from mosa.modules.fitting.parameters import as_rival, read_numbers, write_number
 from mosa.modules.fitting.search.backbone import compass
 from mosa.modules.fitting.stages import Stage
 from mosa.reconstruction.motion.response import Response
+from mosa.training.lit_mosa import LitMosa
 
 FRAMES = 12
 AXIS = torch.nn.functional.normalize(torch.tensor([1.0, 0.6, 0.3], dtype=torch.float64), dim=0)
@@ -105,6 +106,63 @@ def test_a_jacobian_that_serves_again_is_that_of_the_noise_in_use(monkeypatch):
     served = found._served().clone()
     fresh = found.newton.jacobian(found.newton.seats[0].read(), found._residuals)
     assert float((served - fresh).norm()) < 1e-6 * float(fresh.norm())
+
+
+def test_rollouts_for_a_jacobian_begin_where_the_body_comes_near_the_ground():
+    """Every frame of them until then is the flight's; their columns are those of whole rollouts but for the little that corrections
+    deform the body in flight, and the contact's own is made of whole ones."""
+    truth = small_body(numbers=fibres(0.3), contact=True)
+    body = small_body(contact=True)
+    take = take_of(truth, start(height=0.2, turn=0.5), 9)
+    found = identification(body, [take], seats=2)
+    found.prepare()
+    ((_, flight),) = found._flown.values()
+    assert 2 < len(flight.x) < take.first_contact + 1
+    seat = found.newton.seats[0]
+    numbers, r = seat.read(), seat.residuals()
+    flown = found.newton.jacobian(numbers, r)
+    found._flown = {}
+    whole = found.newton.jacobian(numbers, r)
+    contact = found.newton.names().index("contact")
+    assert torch.equal(flown[:, contact], whole[:, contact])
+    assert 0 < float((flown - whole).norm()) < 1e-2 * float(whole.norm())
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.5])
+def test_a_rollout_goes_on_from_its_first_frames_bit_for_bit(gain):
+    body, take = small_body(), take_and_turn(small_body(numbers=fibres(0.3)), 0.5, frames=SHORT)
+    ready = body.ready(take.start, WORLD, SHORT, FRAME_DT)
+    seen = take.cues.positions if gain else None
+    with torch.no_grad():
+        whole = ready.simulate(SHORT, observed=seen, gain=gain)
+        begun = ready.simulate(4, observed=None if seen is None else seen[:4], gain=gain)
+        again = ready.simulate(SHORT, observed=seen, gain=gain, begun=begun)
+    for name in ("x", "v", "F", "F_tot"):
+        assert torch.equal(getattr(again, name), getattr(whole, name)), name
+
+
+def test_the_comparison_and_the_joint_stage_share_their_first_jacobian():
+    """The comparison's columns are among those of the joint stage, which are what it would have made itself, to the bit."""
+    take = take_and_turn(small_body(numbers=fibres(0.3), modes=True), 0.5, frames=SHORT)
+    take.again = None
+    body = small_body(modes=True, on=False)
+    stages = [
+        Stage(name=name, iterations=1, lr=0.1, optimizer="gauss_newton", start=begins)
+        for name, begins in (("prior_eta", None), ("joint", "prior"))
+    ]
+    module = LitMosa.of_parts(
+        body, takes=[take], world=WORLD, background=torch.ones(3), stages=stages,
+        weights={"position": 1.0}, criterion=Criterion(name="corrected"),
+    )  # fmt: skip
+    compared = module.begun(stages[0])
+    own = module.identifying(stages[0]).columns()
+    assert compared.first.shape == own.shape
+    assert float((compared.first - own).norm()) < 1e-6 * float(own.norm())
+    module.end(stages[0])
+    module.begin(stages[1])
+    joint = module.begun(stages[1])
+    assert torch.equal(joint.first, module.identifying(stages[1]).columns())
+    assert module.columns is None
 
 
 def test_the_first_iterations_on_several_drops_count_a_part_of_the_data():
@@ -559,7 +617,7 @@ def test_columns_as_worlds_are_those_one_by_one(criterion):
     found.iterate()
     newton, seat = found.newton, found.newton.seats[0]
     numbers = seat.read()
-    r = seat.residuals()
+    r, found._flown = seat.residuals(), {}
     alone = newton.jacobian(numbers, r)
     newton.many = found._many
     for together in (10**6, 3 * len(body.rest)):

@@ -6,6 +6,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
@@ -93,6 +94,8 @@ class Starts:
         modulated = self.material.modulated
         self.modulated = [n for n in STIFFNESS if n in self.learned and n in modulated]
         self._scores: dict[tuple[float, ...], float] = {}
+        seats, body = len(calibration.newton.seats), calibration.body
+        self._bodies = [*(copy.deepcopy(body) for _ in range(seats - 1)), body]
 
     def row(self, multiple: float, nu: float | None, cells: float | None) -> dict[str, float]:
         """Of a multiple of the stiffness, a Poisson number and a contact offset [cells], None for those that stay."""
@@ -102,22 +105,33 @@ class Starts:
         return row if cells is None else row | {CONTACT: cells}
 
     @torch.no_grad()
-    def begin_at(self, row: dict[str, float]) -> None:
-        """Set the body's numbers."""
-        cells = self.calibration.body.contact.cells
+    def begin_at(self, row: dict[str, float], body: Body | None = None) -> None:
+        """Set the numbers of the calibration's body, or of another one."""
+        body = self.calibration.body if body is None else body
         for name, value in row.items():
-            (cells if name == CONTACT else self.material.raw[name]).fill_(value)
+            (body.contact.cells if name == CONTACT else body.material.raw[name]).fill_(value)
 
     def score(self, row: dict[str, float]) -> float:
         """[m], infinite where the body cannot be simulated there."""
-        key = tuple(row.values())
-        if key not in self._scores:
-            self.begin_at(row)
-            try:
-                self._scores[key] = self.calibration.score()
-            except (SimulationDiverged, ConfigError):
-                self._scores[key] = math.inf
-        return self._scores[key]
+        return self.scores([row])[0]
+
+    def scores(self, rows: Sequence[dict[str, float]]) -> list[float]:
+        """`score` of each, on as many threads as the calibration has seats."""
+        new = {key: row for row in rows if (key := tuple(row.values())) not in self._scores}
+        with ThreadPoolExecutor(len(self._bodies)) as pool:
+            found = pool.map(self._tried, new.values())
+            self._scores |= dict(zip(new, found))
+        return [self._scores[tuple(row.values())] for row in rows]
+
+    def _tried(self, row: dict[str, float]) -> float:
+        body = self._bodies.pop()
+        try:
+            self.begin_at(row, body)
+            return self.calibration.score(body=body)
+        except (SimulationDiverged, ConfigError):
+            return math.inf
+        finally:
+            self._bodies.append(body)
 
 
 def search(calibration: Calibration) -> float:
@@ -138,6 +152,7 @@ def search(calibration: Calibration) -> float:
         stiffnesses = [starts.row(m, None, row.get(CONTACT)) for m in multiples]
         moves = [(each, steps) for each in stiffnesses for steps in moved(learned)]
         wide = [each | {n: each[n] + step for n, step in steps.items()} for each, steps in moves]
+        starts.scores(wide)
         begun = [row, *sorted(wide, key=starts.score)[:BEGUN]]
         return nearest_end(calibration, starts.begin_at, begun)
     if len(rows) > 1 and not further:
@@ -156,15 +171,18 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
     multiples = dict(enumerate(STIFFNESS_STEPS)) if starts.modulated else {0: 1.0}
     grid: dict[tuple[int, int], float] = {}
 
-    def add(i: int) -> None:
-        for j, cells in enumerate(offsets):
-            grid[i, j] = starts.score(starts.row(multiples[i], middle, cells))
+    def add(*some: int) -> None:
+        places = {
+            (i, j): starts.row(multiples[i], middle, cells)
+            for i in some
+            for j, cells in enumerate(offsets)
+        }
+        grid.update(zip(places, starts.scores(list(places.values()))))
 
     def best() -> tuple[int, int]:
         return min(grid, key=grid.__getitem__)
 
-    for i in multiples:
-        add(i)
+    add(*multiples)
     for end, step in ((min, -1), (max, 1)):
         while (
             starts.modulated
@@ -180,11 +198,12 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
             "nearer to the body's, or raise simulation.max_substeps"
         )
     numbers: dict[tuple[int, int], float | None] = {place: middle for place in grid}
-    for i, j in sorted(grid, key=grid.__getitem__)[:NEAREST]:
-        for nu in others:
-            found = starts.score(starts.row(multiples[i], nu, offsets[j]))
-            if found < grid[i, j]:
-                grid[i, j], numbers[i, j] = found, nu
+    nearest = sorted(grid, key=grid.__getitem__)[:NEAREST]
+    tried = [(place, nu) for place in nearest for nu in others]
+    rows = [starts.row(multiples[i], nu, offsets[j]) for (i, j), nu in tried]
+    for (place, nu), found in zip(tried, starts.scores(rows)):
+        if found < grid[place]:
+            grid[place], numbers[place] = found, nu
     deepest = valleys(grid)[:ENTERED]
     return [starts.row(multiples[i], numbers[i, j], offsets[j]) for i, j in deepest]
 

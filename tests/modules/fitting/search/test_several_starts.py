@@ -10,7 +10,7 @@ from torch import nn
 from mosa.errors import SimulationDiverged
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.search import backbone as backbone_search
-from mosa.modules.fitting.search.backbone import FIRST, LAST, moved, nearest_end
+from mosa.modules.fitting.search.backbone import FIRST, LAST, Starts, moved, nearest_end
 from tests.modules.fitting.test_identification import identification
 
 
@@ -68,6 +68,19 @@ def test_starts_that_cannot_be_simulated_are_an_error_only_where_all_are():
     found = Valleys()
     with pytest.raises(SimulationDiverged, match="too far"):
         nearest_end(found, found.start_at, [{"x": 5.0}, {"x": 6.0}])
+
+
+def test_several_seats_score_starts_as_one_does():
+    """To the bit, each with a body of its own; a place that cannot be simulated is infinitely far."""
+    take = take_of(small_body(adapter=False), start(turn=0.5), 6)
+    rows = []
+    for seats in (1, 2):
+        found = identification(small_body(adapter=False), [take], "prior", seats=seats)
+        starts = Starts(found)
+        places = [starts.row(multiple, 0.3, None) for multiple in (0.5, 1.0, 2.0, 1e9)]
+        rows.append(starts.scores(places))
+        assert len(starts._bodies) == seats and starts.score(places[1]) == rows[0][1]
+    assert rows[0] == rows[1] and rows[0][3] == float("inf") and len(set(rows[0])) == 4
 
 
 def yielding(**numbers):
