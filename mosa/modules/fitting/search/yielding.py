@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mosa.modules.body.body import Body, World
 from mosa.physics.constitutive.laws import law_named
+from mosa.physics.contact.colliders import reach
 from mosa.reconstruction.motion.cues import polar
 from mosa.types import MarkerCues
 
@@ -32,7 +33,10 @@ LEAST = 0.01
 def lasting(body: Body, takes: Sequence, world: World) -> float:
     """Share of the largest change of shape that the later frames keep on the mean and that free
     rollouts of the backbone as it stands do not explain; the largest of several takes. 0 where it
-    is within the error of the cues, or the film ends before."""
+    is within the error of the cues, where the film ends before, and of a body that is held, driven
+    or pressed: it does not come to rest in a shape of its own."""
+    if world.driven or any(c.motion.max_speed(reach(c.shape)) for c in world.colliders):
+        return 0.0
     shares, model = [], body.model().only(heterogeneity=False, adapter=False)
     for take in takes:
         cues, frames = take.cues, len(take.cues.positions)

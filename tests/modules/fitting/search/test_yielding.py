@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,8 @@ from mosa.modules.fitting.search.backbone import choose_law
 from mosa.modules.fitting.search.parts import WORTH
 from mosa.modules.fitting.search.yielding import LASTS, lasting, warn_of_yielding
 from mosa.modules.fitting.stages import Stage
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.contact.motion import Motion
 from mosa.types import MarkerCues
 
 BEGINS = start(turn=0.5, speed=-3.0)
@@ -50,6 +53,13 @@ def test_a_body_that_yields_keeps_a_shape_that_no_elastic_law_has():
     # films that end as the body is squashed, and of a body that flows to the end
     assert lasting(body_of("corotated"), [film("stvk", frames=3)], WORLD) == 0.0
     assert lasting(body_of("stvk"), [film("von_mises", yield_stress=800.0)], WORLD) > LASTS
+
+
+@pytest.mark.parametrize("velocity, share", [(0.0, True), (0.1, False)])
+def test_a_body_that_is_pressed_does_not_tell(velocity, share):
+    far = Collider(Sphere(0.05), motion=Motion((0.0, 5.0, 0.0), velocity=(0.0, velocity, 0.0)))
+    world = replace(WORLD, colliders=(far,))
+    assert (lasting(body_of("stvk"), [film("von_mises")], world) > LASTS) == share
 
 
 def test_tracked_points_tell_it_too():
