@@ -25,9 +25,10 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-GOOD, SAME, SOFTEST = 0.95, 1.1, 10.0
+GOOD, SAME, SOFTEST, LONGEST = 0.95, 1.1, 1e3, 15.0
 """R2 below which a fit is warned of; ratio of errors above which exports differ from the fit; E [Pa]
-below which the unit is doubted: gels that keep their shape have more."""
+below which the unit is doubted: most gels and tissues have more; and the stretch above which strain is
+suspected: rubber breaks before."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -103,15 +104,20 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
 
 def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
     """What a user should look at: poor curves, an export that is another law."""
-    R2, poor, soft = float(figures(data, fit, {})["R2"]), "", ""
+    R2, poor, soft, long = float(figures(data, fit, {})["R2"]), "", "", ""
     if R2 < GOOD:
         poor = (
             f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), or the "
             "file holds true stress (expected: force over the undeformed area) or strain (expected: stretch, 1 at rest)"
         )
     if (E := float(law.material.physical()["E"].detach())) < SOFTEST:
-        soft = f"unit: E is {E:.3g} Pa, softer than gels: is the file in {unit}, not in kPa or MPa?"
-    return [each for each in (poor, soft, note(law, data, fit, unit)) if each]
+        others = " or ".join(each for each in UNITS if each != unit)
+        soft = (
+            f"unit: E is {E:.3g} Pa, softer than most gels: is the file in {unit}, not in {others}?"
+        )
+    if (most := float(np.abs(data.given).max())) > LONGEST:
+        long = f"tests: a stretch of {most:.4g}, which no rubber reaches: stretch is 1 at rest, strain in per cent is not"
+    return [each for each in (poor, soft, long, note(law, data, fit, unit)) if each]
 
 
 def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
@@ -120,10 +126,11 @@ def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
     if fit.simulated is None or float(totals["rms_simulated"]) < SAME * float(totals["rms"]):
         return ""
     nu = float(law.material.poisson().detach())
+    higher = f"prior.parameters.nu={NU_MAX:g}, or " if nu < 0.999 * NU_MAX else ""
     return (
         f"fitted as incompressible; the law that simulations and exports get has nu = {nu:.4g} (at most {NU_MAX:g}), and an rms in "
         f"the tests of {float(totals['rms_simulated']) / scale:.4g} {unit} in place of {float(totals['rms']) / scale:.4g} {unit}. "
-        f"Closest: prior.parameters.nu={NU_MAX:g}, or incompressible=false, which fits that law"
+        f"Nearer: {higher}incompressible=false, which fits that law"
     )
 
 

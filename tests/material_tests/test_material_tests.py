@@ -189,7 +189,8 @@ def test_slips_in_a_file_are_warned_of():
     assert [v for _, v, *_ in numbers] == pytest.approx([4e5, 1.2e6, 4e5 * 2 * 1.45], rel=1e-6)
     for slip in (l**4, l * (l - l**-2), l + 1 - (l + 1) ** -2):  # the last two: true stress, strain
         assert "true stress" in pulled(l, 0.4 * slip)[1]
-    assert "in MPa, not in kPa" in pulled(l, 2e-6 * (l - l**-2))[1] and "unit" not in right
+    assert "in MPa, not in Pa or kPa" in pulled(l, 2e-6 * (l - l**-2))[1] and "unit" not in right
+    assert "in per cent" in pulled(10 * l, P)[1] and "per cent" not in right
     l = np.linspace(0.8, 4.0, 12)  # strains, the first below 1
     with pytest.warns(UserWarning, match="1 of the stresses pull at a stretch below 1"):
         pulled(l, 0.4 * (1 + l - (1 + l) ** -2))

@@ -29,6 +29,7 @@ KINDS: dict[str, Any] = {"points": Places | None, "tracked": Annotated[Names, Mi
 FOUND = {AUTO: released, "swing": swung}  # how scene.start is found
 MOST_FRAMES = 100_000
 MISALIGNED = 0.1  # of the points' extent: a distance (rms) of aligned points that is refused
+LEAST_SPAN, MOST_SPAN = 0.01, 3.0  # distances of tracked points over the body's size
 WIDE = 3.0  # the world reaches so many sizes of the body beyond it
 
 
@@ -100,7 +101,13 @@ def load_markers(
     log.info("%s: let go at %.4f s; %d frames at %g Hz", Path(path).name, begin, frames, rate)
     solid = solid_of(body, Path(path).parent)
     low, high = corners(solid)
-    far = WIDE * (high - low).max()
+    far = WIDE * (across := float((high - low).max()))
+    span = float(np.ptp(rest, axis=0).max())
+    if len(rest) > 1 and not LEAST_SPAN < span / across < MOST_SPAN:
+        raise ConfigError(
+            f"scene.body: expected the body [m] on which the tracked points lie, found one of {across:.3g} m, and points that "
+            f"are {span:.3g} m apart: another unit?"
+        )
     for each in driven_from_config(loads, "scene.loads"):
         if each.held or not each.mass:
             raise ConfigError(

@@ -150,6 +150,7 @@ subroutine umat(stress, statev, ddsdde, sse, spd, scd, rpl, ddsddt, drplde, drpl
   double precision :: sigma(6), tangent(6, 6)
   integer :: a, b, n
   integer, parameter :: order(6) = (/1, 2, 3, 6, 5, 4/)  ! Abaqus: 11 22 33 12 13 23
+  if (ndi /= 3) error stop "MoSA UMAT: three direct stresses are needed (3D, plane strain, axisymmetric), not plane stress"
   call stress_and_tangent(dfgrd1, props, sse, sigma, tangent)
   n = min(ntens, 6)
   do a = 1, n

@@ -169,6 +169,7 @@ def test_points_in_line_align_nothing():
     "keys, said",
     [({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
      ({"body": BOX | {"motion": {"velocity": [1, 0, 0]}}}, "scene.body"),
+     ({"body": BOX | {"size": [400, 100, 200]}}, "scene.body: .*another unit"),
      ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads"),
      *(({key: wrong}, f"^scene.{key}: expected") for key, wrong in (
          ("start", [0.5]), ("duration", "a"), ("duration", math.nan), ("holdout_frames", 1.5), ("tracked", "a"),
