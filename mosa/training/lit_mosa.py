@@ -225,8 +225,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 "loader reads films in a format of your own (docs/extending.md, 'A data format')"
             )
         # what is saved at the end of an epoch belongs to the stage that comes next
-        kinds = Checkpoint, Stages
-        self.trainer.callbacks.sort(key=lambda each: [isinstance(each, kind) for kind in kinds])
+        order = lambda each: (isinstance(each, Checkpoint), not isinstance(each, Stages))  # noqa: E731
+        self.trainer.callbacks.sort(key=order)
 
     def configure_callbacks(self) -> list[L.Callback]:
         """Asked for first of all, before the data take their time."""

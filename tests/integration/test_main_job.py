@@ -334,8 +334,8 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["prior=jelly"], "prior: expected one of .*, found jelly"),
-        (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
+        (["prior=jelly"], ", found jelly"),
+        (["ckpt_path=nowhere.ckpt"], "ckpt_path: nowhere.ckpt: no such file"),
         (["losses.colour=1"], "colour"),
         (["trainer.devices=[1000]", "trainer.accelerator=gpu"], "trainer=cpu runs without one"),
         (["fit.clip=abc"], "fit.clip: expected a number above 0 and at most 1e+20, found 'abc'"),
@@ -393,17 +393,18 @@ def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(
 ):
     """The fit was lost with it, and all other figures. On the training drop too, which no stage has to simulate freely.
     lost: sequences by the law that cannot be simulated there."""
-    simulate, failing = Body.simulate, []
+    simulate = Body.simulate
 
     def diverges(self, start, world, frames, frame_dt, **more):
         asked = more.get("model") or self.model()
-        for wanted in map(self.model, failing):
+        for wanted in map(self.model, getattr(self, "failing", [])):
             if asked.material is wanted.material and asked.heterogeneity is wanted.heterogeneity:
                 raise SimulationDiverged("substep 7, particle 3: gone")
         return simulate(self, start, world, frames, frame_dt, **more)
 
     def rollouts(body, sequence, world):
-        failing[:] = [variant for variant, where in lost.items() if sequence.prefix in where]
+        # of this body, as each sequence has a thread and a copy of its own
+        body.failing = [variant for variant, where in lost.items() if sequence.prefix in where]
         return evaluation_rollouts(body, sequence, world)
 
     evaluation_rollouts = evaluation.rollouts

@@ -41,7 +41,7 @@ def test_a_fit_without_memory_keeps_its_checkpoint_and_names_it(outcomes):
         assert not kept[place][1] and "resume=auto" not in kept[place][0]
     for place in ("LitMosa.training_step", "LitMosa.on_load_checkpoint", "LitMosa.end", "rollouts"):
         said, there = kept[place]
-        assert there and "last.ckpt, and the same command with resume=auto goes on" in said, (
+        assert there and "last.ckpt: the same command with resume=auto goes on" in said, (
             place,
             said,
         )
