@@ -25,9 +25,9 @@ True motions of twelve elastic bodies keep at most 0.43 of it (a fish that toppl
 it), those of four bodies that yield at least 0.82; this is about the geometric mean of both."""
 NEAR = 0.9
 """Of the largest change of shape: the frames after the first that has so much tell what lasts."""
-LEAST, FEWEST = 0.01, 3
-"""Of the body's size: a smaller change of shape is within the error of the cues. And frames of which
-the mean tells something."""
+LEAST, FEWEST = 0.01, 8
+"""Of the body's size: a smaller change of shape is within the error of the cues. And frames of a film
+whose end tells something."""
 
 
 @torch.no_grad()
@@ -55,7 +55,7 @@ def lasting(body: Body, takes: Sequence, world: World) -> float:
         # predicted differs from the rollout: one that has yielded does both
         unexplained = change - changed(found)
         kept = min(c[late:].mean(0).square().sum(-1).mean().sqrt() for c in (change, unexplained))
-        if late + FEWEST <= frames and kept > LEAST * body.size:
+        if frames >= FEWEST and late < frames and kept > LEAST * body.size:
             shares.append(float(kept / sizes.max()))
     return max(shares, default=0.0)
 
