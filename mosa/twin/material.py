@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -25,6 +26,8 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import AS_USUAL
 from mosa.settings import Positive, check, typed
 from mosa.twin.presets import preset
+
+SAGS = 0.3  # E over the weight of a column as high as the body, below which its unit is doubted
 
 
 class TwinMaterial:
@@ -180,6 +183,15 @@ class TwinMaterial:
                 settings["adapter"] = {"name": None}
             if body.heterogeneity is None:
                 settings["heterogeneity"] = {"enabled": False}
+        E, weight = (
+            material.physical().get("E"),
+            density * float(twin.world.gravity.norm()) * body.size,
+        )
+        if E is not None and float(E.detach().max()) < SAGS * weight:
+            warnings.warn(
+                f"E: {float(E.detach().max()):.3g} Pa does not carry the body's weight ({weight:.3g} Pa at its foot): in Pa?",
+                stacklevel=3,
+            )
         changed = twin.record.but(settings=settings, law=None, density=density)
         twin._record, twin.posterior, body.density = changed, None, density
         body.material = material.to(body.rest)

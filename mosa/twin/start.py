@@ -44,13 +44,13 @@ UNDER = 0.25
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
 """Of a particle in a frame of a rollout: x, v, F, F_tot."""
 LARGE = 50.0
-"""A mesh's length, and a solid's distance, over the body's size, from which their unit is doubted."""
+"""A mesh's length, a solid's distance and a height, over the body's size, from which their unit is doubted."""
 CREEP = 5e-3
 """[m/s] of a held body from which the number of substeps is doubted."""
 
 
 Variant = Annotated[str, Expected(f"one of {', '.join(VARIANTS)}"), such(lambda v: v in VARIANTS)]
-Seconds = Annotated[float, Gt(0), Le(100)]
+Seconds = Annotated[float, Gt(0), Le(1)]
 
 
 class StartArguments(Settings):
@@ -156,6 +156,11 @@ def start_in(
             lift = body.contact.lift(world.ground, body.settings.dx).detach()
             low = low - 0.5 * body.volume.to(low) ** (1 / 3) + lift
         center = center + up * (ground + height - low.min() - center @ up)
+        if height > LARGE * body.size:
+            warnings.warn(
+                f"height: expected metres above the ground, found {height:g} m for a body of {body.size:.3g} m",
+                stacklevel=4,
+            )
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
     if colliders is not None:
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))

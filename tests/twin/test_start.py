@@ -90,6 +90,7 @@ def test_a_plane_that_faces_another_way_and_a_mesh_in_millimetres_are_named(tmp_
     [
         ({"rotation": (0, 1, 0, 1.57)}, r"found 1.57, which is 90 degrees in radians"),
         ({"colliders": [{**FLOOR, "rotation": (1, 0, 0, -3.1416)}]}, r"180 degrees in radians"),
+        ({"height": 200}, r"^height: expected metres above the ground, found 200 m for a body of"),
         (
             {"colliders": [{"type": "sphere", "radius": 0.1, "position": [-325, 100, 0]}]},
             r"^colliders\[0\]: expected a solid within reach .* found it 340 m away: .* metres",
@@ -98,7 +99,7 @@ def test_a_plane_that_faces_another_way_and_a_mesh_in_millimetres_are_named(tmp_
 )
 def test_radians_and_millimetres_are_asked_about(given, said):
     with pytest.warns(UserWarning, match=said):
-        twin().reset(**STILL, **given)
+        twin().reset(**STILL | given)
 
 
 def test_a_solid_in_millimetres_that_holds_the_body_is_named():

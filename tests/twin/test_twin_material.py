@@ -67,6 +67,9 @@ def test_a_value_out_of_range_is_named():
         material.density = -1
     with pytest.warns(UserWarning, match=r"^density: 1.1 kg/m\^3 is lighter .* in g/cm\^3"):
         material.density = 1.1
+    material.density = 1000.0
+    with pytest.warns(UserWarning, match="^E: 20 Pa does not carry the body's weight"):
+        material.E = 20.0
     with pytest.raises(ConfigError, match="preset: expected one of jelly, "):
         material.preset("steel")
     assert material.nu == pytest.approx(NU)
