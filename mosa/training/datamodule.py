@@ -12,7 +12,6 @@ It stands alone; `LitMosa` asks it for the particles that a body is made of."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -83,7 +82,6 @@ class SceneDataModule(L.LightningDataModule):
         self.cfg = composed(scene, overrides)
         self.settings = DataSections.part(plain(self.cfg))
         self.device, self.held_out, self.predict = device, held_out, list(predict)
-        self._ahead: Future[list[Scene]] | None = None
 
     def __repr__(self) -> str:
         scene = dict(self.cfg.scene)
@@ -159,15 +157,12 @@ class SceneDataModule(L.LightningDataModule):
             return len(held_out_of(plain(self.cfg.scene)))
         return len(self.scenes[1])
 
-    def read_ahead(self) -> None:
-        """Makes the films of the other sequences in a thread beside what comes next; who asks for them waits."""
-        self._ahead = ThreadPoolExecutor(1).submit(self._first[1])
-
     @cached_property
     def scenes(self) -> tuple[Scene, list[Scene]]:
         """The training sequence and the others of the same object."""
-        others = self._first[1]() if self._ahead is None else self._ahead.result()
-        return self.scene, [s for s in others if self.held_out or s.sequence in self.taught]
+        return self.scene, [
+            s for s in self._first[1]() if self.held_out or s.sequence in self.taught
+        ]
 
     def prefix(self, scene: Scene) -> str:
         """Of the figures of a sequence beside the training one: train/<name> where it is learned from, else test/<name>."""

@@ -99,11 +99,7 @@ def train(cfg: DictConfig) -> float | None:
     most = most_particles(device)
     check_before_data(settings.plain(), most)
     with timed(times, "data"):
-        scene = data.scene
-        if scene.synthetic and device == "cpu":  # the other films are still to be made
-            data.read_ahead()
-        else:
-            _ = data.scenes
+        scene, _ = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
     filmed = scene.markers is None

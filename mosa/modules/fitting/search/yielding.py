@@ -74,8 +74,8 @@ def warn_of_yielding(body: Body, takes: Sequence, world: World) -> None:
     if not law_named(law).plastic and (share := lasting(body, takes, world)) > LASTS:
         warnings.warn(
             f"prior: the body keeps {share:.0%} of its largest change of shape to the end of the "
-            f"film, which the elastic law {law} does not predict: it probably yields, and then all "
-            "numbers are wrong; take prior=auto, which compares a law that yields too, or "
-            "prior=von_mises",
+            f"film, which the elastic law {law} does not predict: it may yield, and then all numbers are "
+            "wrong, or it leans or topples otherwise than predicted; prior=auto compares a law that yields "
+            "too (prior=von_mises)",
             stacklevel=2,
         )
