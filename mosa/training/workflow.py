@@ -99,13 +99,13 @@ def train(cfg: DictConfig) -> float | None:
     most = most_particles(device)
     check_before_data(settings.plain(), most)
     with timed(times, "data"):
-        scene, _ = data.scenes
+        scene, others = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
-        check_with_data(settings.plain(), scene, data.others, most)
+        check_with_data(settings.plain(), scene, len(others), most)
     else:
         log.info("tracked points only: no reconstruction from images, no figures of images")
     if scene.synthetic:

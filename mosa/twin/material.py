@@ -183,13 +183,11 @@ class TwinMaterial:
                 settings["adapter"] = {"name": None}
             if body.heterogeneity is None:
                 settings["heterogeneity"] = {"enabled": False}
-        E, weight = (
-            material.physical().get("E"),
-            density * float(twin.world.gravity.norm()) * body.size,
-        )
-        if E is not None and float(E.detach().max()) < SAGS * weight:
+        weight = density * float(twin.world.gravity.norm()) * body.size
+        stiffest_E = float(material.physical().get("E", torch.tensor(torch.inf)).detach().max())
+        if stiffest_E < SAGS * weight:
             warnings.warn(
-                f"E: {float(E.detach().max()):.3g} Pa does not carry the body's weight ({weight:.3g} Pa at its foot): in Pa?",
+                f"E: {stiffest_E:.3g} Pa does not carry the body's weight ({weight:.3g} Pa at its foot): in Pa?",
                 stacklevel=3,
             )
         changed = twin.record.but(settings=settings, law=None, density=density)
