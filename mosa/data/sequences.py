@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,13 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
 
     keys: plain, of conf/scene. Errors: ConfigError naming the key, DataError naming the file.
     """
+    scene, others = load_first(keys)
+    return scene, others()
+
+
+def load_first(keys: Mapping[str, Any]) -> tuple[Scene, Callable[[], list[Scene]]]:
+    """The training sequence, and what gives the others: of a built-in scene it makes their films when it is called, which takes as
+    long; those of folders have been read and checked. Arguments and errors as of `load_sequences`."""
     keys = dict(keys)
     also_train, test = keys.pop("also_train", None) or [], keys.pop("test", None) or []
     if keys.get("format") == "builtin":
@@ -46,7 +53,7 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
             raise ConfigError(
                 f"scene.also_train: expected {wanted}, found {unknown[0]!r}; it {found}"
             )
-        return scene, held_out_sequences(**keys)
+        return scene, lambda: held_out_sequences(**keys)
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
@@ -58,7 +65,7 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
             "move otherwise than those of scene.path; learn from each alone"
         )
     check_distinct([scene, *others], ["scene.path", *(f"scene.{where}" for where, _ in entries)])
-    return scene, others
+    return scene, lambda: others
 
 
 def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ContextDecorator, contextmanager, nullcontext
 
 import torch
 import warp as wp
@@ -20,25 +20,30 @@ BLOCK = 64
 """Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
 
 
-class Turns:
+class Turns(ContextDecorator):
     """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches.
 
-    Itself the context of launches, which is entered for every one of them, within this thread's own capture too."""
+    Itself the context of launches, which is entered for every one of them, within this thread's own capture too, and a decorator of
+    functions that launch. A capture that waits goes first, so that threads that render without a pause cannot keep it out."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._launching = 0
+        self._launching = self._waiting = 0
         self._capturing: int | None = None
+        self._own = threading.local()
 
     def __enter__(self) -> None:
-        if self._capturing != threading.get_ident():
+        depth = getattr(self._own, "depth", 0)
+        if depth == 0 and self._capturing != threading.get_ident():
             with self._changed:
-                while self._capturing is not None:
+                while self._capturing is not None or self._waiting:
                     self._changed.wait()
                 self._launching += 1
+        self._own.depth = depth + 1
 
     def __exit__(self, *_) -> None:
-        if self._capturing != threading.get_ident():
+        self._own.depth -= 1
+        if self._own.depth == 0 and self._capturing != threading.get_ident():
             with self._changed:
                 self._launching -= 1
                 self._changed.notify_all()
@@ -47,8 +52,12 @@ class Turns:
     def capturing(self) -> Iterator[None]:
         """When no other thread launches, and until it ends none begins to."""
         with self._changed:
-            self._changed.wait_for(lambda: self._capturing is None and self._launching == 0)
-            self._capturing = threading.get_ident()
+            self._waiting += 1
+            try:
+                self._changed.wait_for(lambda: self._capturing is None and self._launching == 0)
+                self._capturing = threading.get_ident()
+            finally:
+                self._waiting -= 1
         try:
             yield
         finally:
@@ -60,6 +69,11 @@ class Turns:
 ON_CPU = Turns()
 """Of this process."""
 NOTHING = nullcontext()
+
+
+def turn(device: torch.device):
+    """Context of Warp's work outside of `launch` (meshes, sorts, arrays that are filled): where another thread may be capturing."""
+    return NOTHING if device.type == "cuda" else ON_CPU
 
 
 def filled(kind, *values):

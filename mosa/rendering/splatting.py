@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mosa.physics.exact_sums import COLUMNS, needed, sum_functions
-from mosa.physics.launching import SCALARS, warp_stream
+from mosa.physics.launching import SCALARS, turn, warp_stream
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
@@ -60,7 +60,7 @@ class Splat(torch.autograd.Function):
         means, covariances, opacities, features, K, w2c = (
             x.detach().contiguous() for x in (means, covariances, opacities, features, K, w2c)
         )
-        with warp_stream(means.device):
+        with warp_stream(means.device), turn(means.device):
             records, depths = project(means, covariances, opacities, K, w2c, geometry)
             lists = depth_lists(depths, records, geometry)
             image, transmittance, ends = composite(lists, records, features, geometry)
@@ -77,7 +77,7 @@ class Splat(torch.autograd.Function):
             ctx.saved_tensors
         )
         g = ctx.geometry
-        with warp_stream(features.device):
+        with warp_stream(features.device), turn(features.device):
             incoming = grad_image.contiguous(), grad_alpha.contiguous()
             moments, grad_features = composite_backward(
                 lists, records, features, ends, transmittance, *incoming, g

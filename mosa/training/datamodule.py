@@ -11,7 +11,8 @@ It stands alone; `LitMosa` asks it for the particles that a body is made of."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ from mosa.config.composition import composed
 from mosa.config.record import BodyRecord
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule, on_device
 from mosa.data.observations import cropped, training_observations
-from mosa.data.sequences import load_sequences, taught_names
+from mosa.data.scene import held_out_of
+from mosa.data.sequences import load_first, load_sequences, taught_names
 from mosa.errors import ConfigError
 from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
 from mosa.evaluation.evaluate import sequences
@@ -81,6 +83,7 @@ class SceneDataModule(L.LightningDataModule):
         self.cfg = composed(scene, overrides)
         self.settings = DataSections.part(plain(self.cfg))
         self.device, self.held_out, self.predict = device, held_out, list(predict)
+        self._ahead: Future[list[Scene]] | None = None
 
     def __repr__(self) -> str:
         scene = dict(self.cfg.scene)
@@ -141,15 +144,30 @@ class SceneDataModule(L.LightningDataModule):
         return taught_names(plain(self.cfg.scene))
 
     @cached_property
-    def scenes(self) -> tuple[Scene, list[Scene]]:
-        """The training sequence and the others of the same object."""
-        training, others = load_sequences(plain(self.cfg.scene))
-        return training, [s for s in others if self.held_out or s.sequence in self.taught]
+    def _first(self) -> tuple[Scene, Callable[[], list[Scene]]]:
+        return load_first(plain(self.cfg.scene))
 
     @property
     def scene(self) -> Scene:
         """The training sequence."""
-        return self.scenes[0]
+        return self._first[0]
+
+    @property
+    def others(self) -> int:
+        """How many sequences there are beside the training one; films of a built-in scene need not be made for it."""
+        if self.scene.synthetic:
+            return len(held_out_of(plain(self.cfg.scene)))
+        return len(self.scenes[1])
+
+    def read_ahead(self) -> None:
+        """Makes the films of the other sequences in a thread beside what comes next; who asks for them waits."""
+        self._ahead = ThreadPoolExecutor(1).submit(self._first[1])
+
+    @cached_property
+    def scenes(self) -> tuple[Scene, list[Scene]]:
+        """The training sequence and the others of the same object."""
+        others = self._first[1]() if self._ahead is None else self._ahead.result()
+        return self.scene, [s for s in others if self.held_out or s.sequence in self.taught]
 
     def prefix(self, scene: Scene) -> str:
         """Of the figures of a sequence beside the training one: train/<name> where it is learned from, else test/<name>."""

@@ -99,13 +99,17 @@ def train(cfg: DictConfig) -> float | None:
     most = most_particles(device)
     check_before_data(settings.plain(), most)
     with timed(times, "data"):
-        scene, others = data.scenes
+        scene = data.scene
+        if scene.synthetic and device == "cpu":  # the other films are still to be made
+            data.read_ahead()
+        else:
+            _ = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
-        check_with_data(settings.plain(), scene, len(others), most)
+        check_with_data(settings.plain(), scene, data.others, most)
     else:
         log.info("tracked points only: no reconstruction from images, no figures of images")
     if scene.synthetic:

@@ -11,7 +11,7 @@ from blocks_film import WORLD, assert_same_footage, clouds_of
 from written_scenes import export_pacnerf, export_particles, export_transforms
 
 from mosa.data import sequences
-from mosa.data.sequences import load_sequences, sequence_names, taught_names
+from mosa.data.sequences import load_first, load_sequences, sequence_names, taught_names
 from mosa.errors import ConfigError, DataError
 
 
@@ -172,18 +172,19 @@ def test_a_built_in_scene_has_its_own_held_out_sequences():
         load_sequences({"format": "builtin", "name": "tiny", "test": ["somewhere"]})
 
 
-def test_a_name_that_is_none_of_a_built_in_scene_is_refused_before_its_other_films_are_made(
-    monkeypatch,
-):
+def test_the_training_film_of_a_built_in_scene_is_there_before_the_others_are_made(monkeypatch):
+    """A name that is none of theirs is refused before."""
     made = []
     monkeypatch.setattr(sequences, "load_scene", lambda **keys: made.append("train") or "training")
     monkeypatch.setattr(
         sequences, "held_out_sequences", lambda **keys: made.append("others") or ["other"]
     )
     keys = {"format": "builtin", "name": "tiny"}
-    assert load_sequences(keys) == ("training", ["other"]) and made == ["train", "others"]
+    scene, others = load_first(keys)
+    assert scene == "training" and made == ["train"]
+    assert others() == ["other"] and made == ["train", "others"]
     with pytest.raises(ConfigError, match="expected other sequences of the scene, found 'test_9'"):
-        load_sequences(keys | {"also_train": ["test_60", "test_9"]})
+        load_first(keys | {"also_train": ["test_60", "test_9"]})
     assert made == ["train", "others", "train"]
 
 

@@ -8,6 +8,7 @@ import warp as wp
 
 from mosa.data.synthetic.raycast_kernels import cast
 from mosa.data.synthetic.surface import Surface, vertex_normals
+from mosa.physics.launching import ON_CPU
 from mosa.types import Cameras
 
 LIGHT = np.array([0.45, 0.80, 0.40]) / np.linalg.norm([0.45, 0.80, 0.40])
@@ -15,6 +16,7 @@ AMBIENT = 0.62
 SAMPLES = 2
 
 
+@ON_CPU
 def render_surface(surface: Surface, vertices: np.ndarray, cameras: Cameras) -> np.ndarray:
     """RGBA (V, H, W, 4) uint8, straight alpha, of the surface with its vertices at (M, 3) [m]; 2x2 rays per pixel."""
     normals = vertex_normals(vertices, surface.triangles)

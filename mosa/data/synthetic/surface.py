@@ -10,6 +10,7 @@ import warp.geometry
 from scipy.spatial import cKDTree
 
 from mosa.data.synthetic.bodies.parts import Shape
+from mosa.physics.launching import ON_CPU
 from mosa.system.warp_start import start_warp
 
 start_warp()
@@ -25,6 +26,7 @@ class Surface:
     colors: np.ndarray
 
 
+@ON_CPU
 def extract_surface(shape: Shape, pitch: float, rng: np.random.Generator) -> Surface:
     """Marching cubes on a grid of `pitch` [m], vertices moved onto the zero level by one Newton step."""
     low, high = shape.bounds[0] - 2 * pitch, shape.bounds[1] + 2 * pitch

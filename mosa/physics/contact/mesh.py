@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.physics.launching import ON_CPU
 from mosa.system.limits import counted
 
 MAX_LATTICE = 2**24
@@ -121,6 +122,7 @@ def field_of_triangles(
     return SignedDistanceField(values, tuple(low.tolist()), float(spacing), margin)
 
 
+@ON_CPU
 def _signed_distance(points: np.ndarray, index: np.ndarray, at: np.ndarray) -> np.ndarray:
     centre = points.mean(0)  # float32 queries are finest near the origin
     mesh = wp.Mesh(
