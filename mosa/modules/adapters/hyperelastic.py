@@ -113,6 +113,11 @@ class HyperelasticAdapter(Adapter):
         live = None if self._live is None else self._live.detach()
         return super().__getstate__() | {"_live": live}
 
+    def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
+        # checkpoints of before the yield was learned have none: it is the prior's there
+        state_dict.setdefault(f"{prefix}yields", torch.zeros_like(self.yields))
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
     @property
     def steady(self) -> bool:
         return True

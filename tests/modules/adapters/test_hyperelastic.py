@@ -419,3 +419,11 @@ def test_yields_are_hills_criterion():
 def test_without_numbers_a_law_yields_as_its_prior():
     answer = adapter_of(torch.zeros(NUMBERS))(MaterialState(*torch.rand(3, 5, 6).double()))
     assert not bool(answer.plastic_G.any()) and not bool(answer.plastic_h.any())
+
+
+def test_weights_of_before_the_yield_was_learned_are_read():
+    old = {k: v for k, v in HyperelasticAdapter().state_dict().items() if k != "yields"}
+    adapter = adapter_of(torch.zeros(NUMBERS))
+    adapter.yields.data.fill_(1.0)
+    adapter.load_state_dict(old)
+    assert not bool(adapter.yields.any())
