@@ -141,7 +141,7 @@ def test_actions_of_a_stepped_twin(data):
         one_message(error)
         assert torch.equal(stepped.state.x, before.x) and int(stepped.state.frames) == 0
         return
-    for found in (state.x, state.v, state.F, state.position, reactions):
+    for found in (state.x, state.v, state.F, state.collider_position, reactions):
         assert bool(torch.isfinite(found).all())
 
 

@@ -27,6 +27,11 @@ def main(words: list[str] | None = None) -> None:
         help="deformations at which every text is compared; 0: none",
     )
     parser.add_argument(
+        "--nu",
+        type=float,
+        help="in place of the law's own, with the same mu: 0.49999 of an incompressible material",
+    )
+    parser.add_argument(
         "--extensions",
         metavar="MODULE,MODULE",
         help="modules that register the law and its energy (docs/law_export.md)",
@@ -38,7 +43,7 @@ def main(words: list[str] | None = None) -> None:
     warnings.formatwarning = lambda *about: f"{one_line(*about)}\n"
     with one_message():
         load_extensions(given.extensions.split(",") if given.extensions else None)
-        differences = export(given.source, given.folder, given.check)
+        differences = export(given.source, given.folder, given.check, given.nu)
     for name, value in differences.items():
         print(f"{name:14s} {value:.1e} relative difference at {given.check} deformations")
     if "umat stress" not in differences and given.check:

@@ -284,6 +284,8 @@ class MaterialSettings(LawSections):
     """csv: test, mode, first, stress_1, ... (docs/material_tests.md)"""
     unit: Literal["Pa", "kPa", "MPa"]
     """unit of the file's stresses"""
+    stress: Literal["nominal", "cauchy"] = "nominal"
+    """of the file: force over the undeformed area, or true stress: over the area now"""
     incompressible: bool = True
     """true: the volume is constant; false: lateral stretches are solved for so that free faces
     carry no stress"""

@@ -180,7 +180,7 @@ class Arena:
     def _see(self, state: TwinState) -> None:
         self.view = look(state, self.weights)
         if self.states is not None:
-            places = torch.cat([state.rotation, state.position[..., None]], 3)
+            places = torch.cat([state.collider_rotation, state.collider_position[..., None]], 3)
             parts = (state.positions, state.F_tot, places)
             self.states.append(tuple(value.detach().cpu() for value in parts))
 

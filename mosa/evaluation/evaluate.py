@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from collections.abc import Sequence as Ordered
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -32,11 +30,9 @@ from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.rendering.cameras import crop_boxes
 from mosa.system.progress import tqdm
-from mosa.system.threads import threaded
+from mosa.system.threads import apart, threaded
 from mosa.types import Rollout, Scene
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
 NAMES = {"adapted": "the learned law", "prior": "the prior", "prior_eta": "the prior with eta"}
 
@@ -50,6 +46,12 @@ class Sequence:
     scene: Scene
     start: Start
     contact: int
+
+    @property
+    def frames(self) -> list[int]:
+        """That are learned from, of a held-out sequence all."""
+        learned = self.prefix.startswith("train")
+        return self.scene.training_frames if learned else list(range(self.scene.frames))
 
     def to(self, device: torch.device | str) -> Sequence:
         """Itself, where Lightning moves a batch: the parts that are needed move later."""
@@ -178,22 +180,6 @@ def true_motion(body: Body, scene: Scene) -> Tensor | None:
     return metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
 
 
-def apart(
-    body: Body, items: Ordered[Item], function: Callable[[Body, Item], Result]
-) -> Iterator[Result]:
-    """function(body, item) of each item, in their order, without gradients; on a CPU on as many threads as there are cores, each
-    item with a copy of the body, as simulators are not for two threads."""
-    inferring = torch.is_inference_mode_enabled()  # a thread has switches of its own
-
-    def of_copy(item: Item) -> Result:
-        with torch.inference_mode(inferring), torch.no_grad():
-            return function(copy.deepcopy(body), item)
-
-    if body.rest.is_cpu and len(items) > 1:
-        return threaded(of_copy, items)
-    return (function(body, item) for item in items)
-
-
 @torch.no_grad()
 def evaluate(
     body: Body, sequences: list[Sequence], world: World, settings: EvaluationSettings
@@ -276,9 +262,8 @@ def sequence_metrics(
     target: Tensor | None,
 ) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
-    scene, x, parts = sequence.scene, rollout.x.cpu(), parts_of(sequence)
+    scene, x, parts, frames = sequence.scene, rollout.x.cpu(), parts_of(sequence), sequence.frames
     training = sequence.prefix.startswith("train")
-    frames = scene.training_frames if training else list(range(scene.frames))
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
     # without a camera there is nothing to compare
     images = render(body, rollout, scene, cameras) if cameras else scene.images
@@ -324,23 +309,13 @@ def floor_figures(
     from mosa.evaluation.floor import floor_rollout
 
     figures, known = {}, [s for s in evaluated if s.scene.truth is not None]
-    found = apart(body, known, lambda own, each: floor_rollout(own, each.scene, world))
-    motions = {s.prefix: x for s, x in zip(known, found)}
-    for sequence in known:
-        scene = sequence.scene
-        x = motions[sequence.prefix]
-        if sequence.prefix.startswith("train"):
-            frames = scene.training_frames
-        else:
-            frames = list(range(scene.frames))
-        result = motion_metrics(x, body, sequence, frames, settings)
+    found = list(apart(body, known, lambda own, each: floor_rollout(own, each.scene, world)))
+    for sequence, x in zip(known, found):
+        result = motion_metrics(x, body, sequence, sequence.frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)
-    known = [
-        s.scene for s in evaluated if s.scene.truth is not None or s.scene.particles is not None
-    ]
-    clouds = [s.particles[0] if s.truth is None else s.truth.rest for s in known]
-    if clouds:
+    true = [s.scene.truth.rest for s in known]
+    if clouds := true or [s.scene.particles[0] for s in evaluated if s.scene.particles]:
         sizes = {"samples": settings.samples, "assignment": settings.assignment}
         floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), **sizes)
         figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}

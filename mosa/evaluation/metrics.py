@@ -18,6 +18,7 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from mosa.errors import ConfigError
+from mosa.types import MarkerCues, MotionCues
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
 NEIGHBOURS = 8  # true points that a motion is interpolated from
@@ -94,6 +95,20 @@ def rms(x: Tensor, target: Tensor) -> float:
 
 
 # --- shapes without identity ----------------------------------------------------------------------------------------
+
+
+STILL = 0.02  # of the body's size: motions that are smaller than this count as so large
+
+
+def unexplained(
+    x: Tensor, cues: MotionCues | MarkerCues, contact: int, size: float
+) -> dict[str, float]:
+    """How far a motion x (T, N, 3) [m] is from the one that was seen, from the frame `contact` on. off_m: rms distance; share: of
+    the rms distance of what was seen from where it was in the frame before. size: of the body [m]."""
+    seen = cues.positions[contact - 1 :]
+    moved = (seen[1:] - seen[0]).square().sum(-1).nanmean().sqrt()
+    off = float(cues.away(x[: len(cues.positions)])[contact:].square().sum(-1).mean().sqrt())
+    return {"off_m": off, "share": off / max(float(moved), STILL * size)}
 
 
 def subsample(points: Tensor, count: int, seed: int) -> np.ndarray:

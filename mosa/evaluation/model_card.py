@@ -25,11 +25,10 @@ def filmed(sequences: Ordered[Sequence]) -> list[str]:
         scene, dt = s.scene, float(s.scene.times[1] - s.scene.times[0])
         learned = s.prefix.startswith("train")
         cameras = scene.training_cameras if learned else scene.cameras
-        frames = len(scene.training_frames) if learned else scene.frames
         made = "simulated by this program, no capture" if scene.synthetic else "footage"
         lines.append(
             f"- `{s.prefix}`, {'learned from' if learned else 'held out'}: scene {scene.name}, "
-            f"sequence {scene.sequence}; {made}; {len(cameras)} cameras, {frames} frames at "
+            f"sequence {scene.sequence}; {made}; {len(cameras)} cameras, {len(s.frames)} frames at "
             f"{1 / dt:.4g} a second; speed at the start {float(s.start.velocity.norm()):.3g} m/s."
         )
     return lines
@@ -108,7 +107,8 @@ def model_card(
         f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."
     )
     unsure = "This fit keeps no posterior: how sure the law is, is not known."
-    errors = (tables.results_table(figures), tables.columns_text(figures, name))
+    doubt = tables.unexplained_text(figures, world)
+    errors = (doubt, tables.results_table(figures), tables.columns_text(figures, name))
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),
         "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law)}",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mosa.errors import MosaError
 from mosa.evaluation.analysis.stiffness import cone, stiffest
-from mosa.evaluation.evaluate import Sequence, apart, true_motion
+from mosa.evaluation.evaluate import Sequence, true_motion
 from mosa.modules.body.body import Body, World
 from mosa.modules.body.material import FORMS as RANGES
 from mosa.modules.body.material import RELATIVE, Form, Material
@@ -21,6 +21,7 @@ from mosa.modules.fitting.parameters import as_rival, each_law, limits_of
 from mosa.modules.fitting.search.parts import PARTS
 from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.system.progress import tqdm
+from mosa.system.threads import apart
 
 DRAWS = 12
 INFLATION = 1.75

@@ -14,11 +14,13 @@ LARGEST = {"stress": 1e-10, "energy": 1e-10, "tangent": 1e-6}
 
 
 @typed
-def export(path: str | Path, folder: str | Path, check: Whole) -> dict[str, float]:
-    """Write umat.f90, law_ufl.py, law_warp.py and law.json of a checkpoint or a material.json.
+def export(
+    path: str | Path, folder: str | Path, check: Whole, nu: float | None = None
+) -> dict[str, float]:
+    """Write umat.f90, law_ufl.py, law_warp.py and law.json of a checkpoint or a material.json. nu: in place of the law's own.
 
     Returns relative differences at `check` drawn deformations, none for 0. Errors: DataError, ConfigError."""
-    found = read_source(path)
+    found = read_source(path, nu)
     texts = {
         "umat.f90": umat(found),
         "law_ufl.py": ufl_text(found),

@@ -31,16 +31,17 @@ class Source:
     values: dict[str, float]
 
 
-def read_source(path: str | Path) -> Source:
-    """Of a checkpoint (.ckpt) or of material.json. Errors: DataError naming the file, ConfigError for a law without energy."""
+def read_source(path: str | Path, nu: float | None = None) -> Source:
+    """Of a checkpoint (.ckpt) or of material.json. nu: as `source`. Errors: DataError naming the file, ConfigError for a law
+    without energy."""
     path = Path(path)
     if path.suffix == ".json" and os.path.isfile(path):
-        found = source(*read_material(path))
-        if note := read_json(path).get("note"):
+        found = source(*read_material(path), nu)
+        if (note := read_json(path).get("note")) and nu is None:
             warn(f"{path}: {note}", stacklevel=1)
         return found
     body = Twin.load(path).body
-    return source(body.material, body.adapter)
+    return source(body.material, body.adapter, nu)
 
 
 def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
@@ -67,8 +68,22 @@ def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
     return material, adapter
 
 
-def source(material: Material, adapter: object) -> Source:
-    """Errors: ConfigError naming the law or the adapter that has no energy as text."""
+@torch.no_grad()
+def set_poisson(material: Material, adapter: object, nu: float) -> None:
+    """Give a law in float64 another Poisson number with the same mu, also one that no simulation takes. Errors: ConfigError."""
+    if not 0 <= nu < 0.5:
+        raise ConfigError(f"nu: expected a number of at least 0 and below 0.5, found {nu:g}")
+    if adapter is not None or "nu" not in material.names:
+        found = "a learned stiffness, which was fitted at its own" if adapter else material.law
+        raise ConfigError(f"nu: expected a law with E and nu alone, found {found}")
+    material.raw["E"] += torch.log((1 + nu) / (1 + material.physical()["nu"]))
+    material.held.append("nu")
+    material.held_nu = torch.tensor(nu, dtype=torch.float64)
+
+
+def source(material: Material, adapter: object, nu: float | None = None) -> Source:
+    """nu: in place of the law's own, whose mu stays. Errors: ConfigError naming the law or the adapter
+    that has no energy as text."""
     if material.law not in ENERGIES:
         raise ConfigError(
             f"export: expected a law of {', '.join(ENERGIES)}, found {material.law}: others yield, flow or "
@@ -76,23 +91,17 @@ def source(material: Material, adapter: object) -> Source:
             "mosa.export.energies.ENERGIES, by a module of --extensions"
         )
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
-        found = "found another adapter: its law has no energy"
-        raise ConfigError(f"export: expected a run with adapter=operator or none, {found}")
+        other = "found another adapter: its law has no energy"
+        raise ConfigError(f"export: expected a run with adapter=operator or none, {other}")
     material = in_double(material, configured=False)
+    if nu is not None:
+        set_poisson(material, adapter, nu)
     adapter = None if adapter is None else adapter.double()
     values: dict[str, float] = {}
-    for name, value in material.per_particle().items():
-        value = value.detach()
-        if value.numel() == 3:
-            values |= {f"{name}_{k + 1}": float(v) for k, v in enumerate(value.flatten())}
-        else:
-            values[name] = float(value)
-    law = law_named(material.law)
-    parts = {
-        k: [k] if size == 1 else [f"{k}_{i}" for i in (1, 2, 3)]
-        for k, size in law.parameters.items()
-    }
-    values = {name: values[name] for own in parts.values() for name in own}
+    found = material.per_particle()
+    for name, size in law_named(material.law).parameters.items():
+        names = [name] if size == 1 else [f"{name}_{k}" for k in (1, 2, 3)]
+        values |= dict(zip(names, found[name].detach().flatten().tolist(), strict=True))
     form = energy(material.law, tuple(values), adapter is not None)
     if adapter is not None:
         G, h = operator(material, adapter)

@@ -6,6 +6,9 @@ stiffness, each with a normal prior of one standard deviation that the evidence 
 
 from __future__ import annotations
 
+import copy
+import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +17,20 @@ from scipy.optimize import least_squares
 
 from mosa.errors import SimulationDiverged
 from mosa.evaluation.analysis.law_stress import in_double
-from mosa.material_tests.measurements import Measurements
+from mosa.material_tests.measurements import Measurements, strained
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.gauss_newton import Posterior
 
+log = logging.getLogger(__name__)
+
 ORTHOTROPIC = 7  # numbers of `anisotropic_basis` that keep the planes as mirrors
 SPREAD = 0.7  # of the starts, in unconstrained numbers
+LOOKED_AT, FAR = 64, 2.0  # further starts, of which only stresses are computed, and their spread
+RELATIVE, FLOOR, EXACT, ALIKE = 0.05, 0.003, 0.02, 0.02
+"""Where readings of stress are compared: standard deviation of a stress, relative to itself and to the largest; so many of them are
+no difference; and the largest logarithm of a stretch at which true and nominal stress are the same."""
 UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests do not determine
 HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
 UNSURE = 3.0  # sd of an unconstrained number above which it is not determined
@@ -34,7 +43,8 @@ SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 class Fit:
     """theta: (k,) numbers by `names`, unconstrained; covariance (k, k); noise: factor on the given standard deviations, or [Pa];
     sigma: of the stiffness' numbers; effective: how many numbers the tests determine; predicted: (m,) [Pa]; simulated: of a fit
-    with a pressure, (m,) [Pa] of the same numbers without it, as simulations and exports have them; NaN without an equilibrium."""
+    with a pressure, (m,) [Pa] of the same numbers without it, as simulations and exports have them; NaN without an equilibrium;
+    true: whether the stresses are Cauchy's; other: what `Fitting.other_reading` finds."""
 
     names: tuple[str, ...]
     theta: np.ndarray
@@ -44,6 +54,8 @@ class Fit:
     effective: float
     predicted: np.ndarray
     simulated: np.ndarray | None = None
+    true: bool = False
+    other: float | None = None
 
 
 class Law:
@@ -79,16 +91,16 @@ class Law:
 
 class Fitting:
     """`law` against `data`. seed: of the starts; known: what another experiment said of some of the
-    numbers (the stiffness' by the names operator[k]), which is their prior. Errors: SimulationDiverged
-    where no start can be evaluated."""
+    numbers (the stiffness' by the names operator[k]), which is their prior; true: the data are
+    Cauchy's stresses. Errors: SimulationDiverged where no start can be evaluated."""
 
     def __init__(
         self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int,
-        known: Posterior | None = None,
+        known: Posterior | None = None, true: bool = False,
     ) -> None:  # fmt: skip
         self.law, self.data, self.starts, self.seed = law, data, starts, seed
         self.begin = law.get()
-        self.specimens = Specimens(data, incompressible)
+        self.specimens = Specimens(data, incompressible, true)
         self.unit = float(np.sqrt(np.mean(data.value**2)))
         self.sd = np.where(np.isnan(data.sd), self.unit, data.sd)
         self.own = np.arange(len(law.names)) >= len(law.names) - law.count
@@ -126,6 +138,12 @@ class Fitting:
             return least_squares(residuals, theta, args=(noise, sigma), **ends)
 
         best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
+        near = best.cost
+        for theta in self.looked_at(rows) if rows.all() else ():
+            if (residuals(theta, noise, sigma) ** 2).sum() < 2 * best.cost:
+                best, self.begin = solve(theta, 60), theta
+        if best.cost < near:
+            log.info("prior.parameters: a start far from there leads nearer to the tests")
         if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:
             where = "in these tests at any start; start prior.parameters elsewhere"
             raise SimulationDiverged(f"the law has no stress {where}")
@@ -147,31 +165,61 @@ class Fitting:
         effective = float(shares[np.sqrt(np.diag(covariance)) < UNSURE].sum())
         scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
         told = self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
-        if not self.specimens.incompressible or not rows.all():
-            return Fit(*told)
+        own, free = self.specimens, None
+        if own.incompressible and rows.all():
+            try:
+                free = Specimens(self.data, False, own.true).predict(
+                    self.law.material, self.law.adapter
+                )
+            except SimulationDiverged:
+                free = np.full(len(self.data.value), np.nan)
+        return Fit(*told, free, own.true)
+
+    def scaled(self, theta: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """With its moduli scaled to the tests, where they then have the sign of the tests."""
+        moduli = ("E", "mu", "kappa", "fibre_stiffness")
+        names = enumerate(self.law.names)
+        stiff = [i for i, n in names if n in moduli[:3] or n.startswith(moduli[3])]
         try:
-            free = Specimens(self.data, False).predict(self.law.material, self.law.adapter)
+            found = self.predicted(theta)[rows] / self.sd[rows]
         except SimulationDiverged:
-            free = np.full(len(self.data.value), np.nan)
-        return Fit(*told, free)
+            return theta
+        with np.errstate(over="ignore", invalid="ignore"):  # of an exponential law far away
+            factor = found @ (self.data.value / self.sd)[rows] / (found @ found)
+        theta = theta.copy()
+        theta[stiff] += np.log(factor) if 0 < factor < math.inf else 0.0
+        return theta
 
     def drawn(self, rows: np.ndarray) -> list[np.ndarray]:
         """Starts: the configured one with its stiffness scaled to the tests, and others about it."""
-        theta = self.begin.copy()
-        moduli = ("E", "mu", "kappa", "fibre_stiffness")
-        stiff = [
-            i for i, n in enumerate(self.law.names) if n in moduli[:3] or n.startswith(moduli[3])
-        ]
-        try:
-            found = self.predicted(theta)[rows] / self.sd[rows]
-            seen = (self.data.value / self.sd)[rows]
-            theta[stiff] += np.log(max((found @ seen) / (found @ found), 1e-6))
-        except SimulationDiverged:
-            pass
+        theta = self.scaled(self.begin, rows)
         generator = np.random.default_rng(self.seed)
         spread = np.where(self.own, 0.1, SPREAD)
         drawn = (generator.standard_normal(len(theta)) for _ in range(self.starts - 1))
         return [theta, *(theta + spread * each for each in drawn)]
+
+    def looked_at(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Starts farther away, each scaled: a fit goes on from one only if that is better than all that the others led to."""
+        draws = np.random.default_rng(self.seed).standard_normal((LOOKED_AT, len(self.begin)))
+        theta = self.begin + np.where(self.own, 0.1, FAR) * draws
+        return [self.scaled(each, rows) for each in theta]
+
+    def other_reading(self) -> float | None:
+        """How many times as far from the tests the law ends where they are read as true stress in place of nominal, or the
+        reverse. Each stress counts relative to itself. None where both are nearly the same."""
+        data, own, errors = self.data, self.specimens, []
+        if strained(data) < ALIKE:
+            return None
+        again = copy.copy(self)
+        again.sd = np.hypot(RELATIVE * data.value, FLOOR * np.abs(data.value).max())
+        for true in (own.true, not own.true):
+            again.specimens = Specimens(data, own.incompressible, true)
+            try:
+                off = (again.fit().predicted - data.value) / again.sd
+                errors.append(float(np.sqrt(np.mean(off**2))) + EXACT)
+            except SimulationDiverged:
+                errors.append(math.inf)
+        return errors[1] / errors[0]
 
     def left_out(self) -> dict[str, np.ndarray]:
         """By test: its stresses (m_test,) [Pa] as predicted by a fit to all others."""

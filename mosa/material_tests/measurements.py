@@ -1,4 +1,4 @@
-"""Stress-strain tests as csv: one row for each measured state, homogeneous deformation, first Piola-Kirchhoff stress.
+"""Stress-strain tests as csv: one row for each measured state, homogeneous deformation, nominal or true stress.
 
     test,mode,angle,first,second,stress_1,stress_2,sd_1,sd_2
     tension,uniaxial x,0,1.05,,3.1,,,
@@ -7,10 +7,10 @@
 
 test: any name, rows of one name are one curve (or two) and are left out together. mode: `uniaxial a` (first: the stretch along axis
 a, the other two faces free), `biaxial ab` (first and second: the stretches along a and b, the third face free; planar tension is
-second = 1, equibiaxial second = first), `shear ab` (first: gamma; the face of normal a slides along b). stress_1, stress_2: force
-over the undeformed area, along the first and the second axis, of shear along b; an empty cell was not measured. sd_1, sd_2: their
-standard deviations, of all rows or of none. angle [degrees]: of the specimen's x axis from the material's, about z. The columns
-angle, second, stress_2, sd_1 and sd_2 may be left out."""
+second = 1, equibiaxial second = first), `shear ab` (first: gamma; the face of normal a slides along b). stress_1, stress_2:
+force over the undeformed area, or the area now, along the first and the second axis, of shear along b; an empty cell was not
+measured. sd_1, sd_2: their standard deviations, of all rows or of none. angle [degrees]: of the specimen's x axis from the
+material's, about z. The columns angle, second, stress_2, sd_1 and sd_2 may be left out."""
 
 from __future__ import annotations
 
@@ -55,6 +55,11 @@ class Measurements:
     def without(self, test: int) -> np.ndarray:
         """(m,) bool: the stresses of the other tests."""
         return self.test[self.row] != test
+
+
+def strained(data: Measurements) -> float:
+    """The largest logarithm of a stretch, 0 of shears alone."""
+    return float(np.abs(np.log(data.given[np.not_equal(data.kind, "shear")])).max(initial=0.0))
 
 
 def read_tests(path: str | Path, unit: str) -> Measurements:

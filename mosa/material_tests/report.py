@@ -17,7 +17,7 @@ from mosa.config.build import build_body, world_of
 from mosa.config.record import BodyRecord
 from mosa.evaluation.analysis.law_stress import described
 from mosa.material_tests.fitting import UNSURE, Fit, Law
-from mosa.material_tests.measurements import UNITS, Measurements
+from mosa.material_tests.measurements import UNITS, Measurements, strained
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.body import Start
 from mosa.modules.body.material import FORMS, NU_MAX, Form, unit_of
@@ -25,10 +25,11 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-GOOD, SAME, SOFTEST, LONGEST = 0.95, 1.1, 1e3, 15.0
-"""R2 below which a fit is warned of; ratio of errors above which exports differ from the fit; E [Pa]
-below which the unit is doubted: most gels and tissues have more; and the stretch above which strain is
-suspected: rubber breaks before."""
+GOOD, CLEAR, WIDE, SAME, SOFTEST, LONGEST = 0.95, 1.5, 0.4, 1.1, 1e3, 15.0
+"""R2 below which a fit is warned of; ratio of errors above which tests prefer one reading of stress, and
+logarithm of the stretch above which others are asked for it; ratio above which exports differ from the
+fit; E [Pa] below which the unit is doubted: most gels and tissues have more; and the stretch above which
+strain is suspected: rubber breaks before."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -55,7 +56,7 @@ def figures(
 ) -> dict[str, float | str]:
     """Of all stresses [Pa]: `rms`, `rms_curves` (mean over curves), R2 (mean over curves), `left_out` (mean over tests of the rms
     of a test that the fit did not see); `rms_simulated`: without the pressure of an incompressible fit; `rms_of_sd`: in units of
-    the given standard deviations; numbers, noise [Pa]."""
+    the given standard deviations; numbers, noise [Pa]; other_reading: as `Fitting.other_reading` finds it."""
     away = fit.predicted - data.value
     parts = curves(data).values()
     found: dict[str, float | str] = {
@@ -70,6 +71,8 @@ def figures(
         found["rms_simulated"] = rms(fit.simulated - data.value)
     if not np.isnan(data.sd).any():
         found["rms_of_sd"] = rms(away / data.sd)
+    if fit.other is not None:
+        found["other_reading"] = fit.other
     if left_out:
         seen = {name: data.value[~data.without(k)] for k, name in enumerate(data.names)}
         found["left_out"] = float(np.mean([rms(left_out[n] - seen[n]) for n in left_out]))
@@ -102,14 +105,29 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
     return rows
 
 
+READINGS = "nominal (force over the undeformed area)", "cauchy (true: over the area now)"
+
+
+def reading(fit: Fit) -> str:
+    """As what the stresses were read, and how much worse the other reading fits."""
+    own, other = READINGS[fit.true], READINGS[not fit.true].split()[0]
+    if fit.other is None:
+        return f"stress: read as {own}; stress={other} is nearly the same in these tests"
+    told = "" if fit.other >= CLEAR else ": look up which of the two the file holds"
+    far = f"this law ends {fit.other:.2g} times as far from the tests"
+    return f"stress: read as {own}; with stress={other} {far}{told}"
+
+
 def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
     """What a user should look at: poor curves, an export that is another law."""
     R2, poor, soft, long = float(figures(data, fit, {})["R2"]), "", "", ""
     if R2 < GOOD:
         poor = (
-            f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), or the "
-            "file holds true stress (expected: force over the undeformed area) or strain (expected: stretch, 1 at rest)"
+            f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), its start is "
+            "too far away (prior.parameters, starts), or the file holds strain (expected: stretch, 1 at rest) or another "
+            f"stress than {READINGS[fit.true]}"
         )
+    slip = reading(fit) if (fit.other or CLEAR) < CLEAR and strained(data) > WIDE else ""
     if (E := float(law.material.physical()["E"].detach())) < SOFTEST:
         others = " or ".join(each for each in UNITS if each != unit)
         soft = (
@@ -117,7 +135,7 @@ def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
         )
     if (most := float(np.abs(data.given).max())) > LONGEST:
         long = f"tests: a stretch of {most:.4g}, which no rubber reaches: stretch is 1 at rest, strain in per cent is not"
-    return [each for each in (poor, soft, long, note(law, data, fit, unit)) if each]
+    return [each for each in (poor, slip, soft, long, note(law, data, fit, unit)) if each]
 
 
 def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
@@ -130,7 +148,7 @@ def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
     return (
         f"fitted as incompressible; the law that simulations and exports get has nu = {nu:.4g} (at most {NU_MAX:g}), and an rms in "
         f"the tests of {float(totals['rms_simulated']) / scale:.4g} {unit} in place of {float(totals['rms']) / scale:.4g} {unit}. "
-        f"Nearer: {higher}incompressible=false, which fits that law"
+        f"Nearer: {higher}incompressible=false, which fits that law; an export, with --nu 0.49999"
     )
 
 
@@ -144,10 +162,11 @@ def table(
         "",
     ]
     for name, value in totals.items():
-        plain = name in ("R2", "numbers", "numbers_determined", "rms_of_sd")
+        plain = name in ("R2", "numbers", "numbers_determined", "rms_of_sd", "other_reading")
         said = f"{value:.4g}" if plain else f"{float(value) / scale:.4g} {unit}"
         lines.append(f"- {name}: {said}")
-    lines += ["", "| number | value | standard deviation | unit |", "|---|---|---|---|"]
+    lines += [f"- {reading(fit)}", ""]
+    lines += ["| number | value | standard deviation | unit |", "|---|---|---|---|"]
     for n, v, sd, u in uncertain(law, fit):
         lines.append(f"| {n} | {v:.4g} | {sd if isinstance(sd, str) else f'{sd:.2g}'} | {u} |")
     lines += ["", f"| test | stresses | rms [{unit}] | R2 | rms when left out [{unit}] |"]
@@ -188,7 +207,7 @@ def plot(
         panel.set_title(data.names[k], fontsize=9)
         kind = data.kind[data.row[chosen][0]]
         panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
-        panel.set_ylabel(f"P [{unit}]", fontsize=8)
+        panel.set_ylabel(f"{'true stress' if fit.true else 'P'} [{unit}]", fontsize=8)
         panel.tick_params(labelsize=7)
     panels.flat[len(data.names) - 1].legend(fontsize=7)
     figure.tight_layout()

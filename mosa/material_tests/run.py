@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from warnings import warn
 
 from omegaconf import DictConfig, OmegaConf
@@ -63,12 +64,13 @@ def fit_tests(cfg: DictConfig) -> float:
     if values["known"] is not None:
         known = known_numbers(values["known"], law.material, law.adapter, "known")
     options = {name: values[name] for name in ("incompressible", "starts", "seed")}
-    fitting = Fitting(law, data, known=known, **options)
+    fitting = Fitting(law, data, known=known, true=values["stress"] == "cauchy", **options)
     if not fitting.law.names:
         raise ConfigError("prior.frozen: expected a parameter that is learned, found none")
     fit = fitting.fit()
     several = values["leave_out"] and len(data.names) > 1
     left_out = fitting.left_out() if several else {}
+    fit = replace(fit, other=fitting.other_reading())
     law = fitting.law.set(fit.theta)
     write(folder, law, data, fit, left_out, values["unit"], values, values["density"])
     found = figures(data, fit, left_out)

@@ -20,10 +20,11 @@ ITERATIONS, STEP, LONGEST, PRECISE = 60, 1e-6, 0.3, 1e-11
 
 
 class Specimens:
-    """Predicted stresses of `data` under any law. incompressible: a pressure keeps volumes; else free faces are solved for."""
+    """Predicted stresses of `data` under any law. incompressible: a pressure keeps volumes; else free faces are solved for. true:
+    Cauchy's stresses, of the area now, in place of the first Piola-Kirchhoff ones."""
 
-    def __init__(self, data: Measurements, incompressible: bool) -> None:
-        self.data, self.incompressible = data, incompressible
+    def __init__(self, data: Measurements, incompressible: bool, true: bool = False) -> None:
+        self.data, self.incompressible, self.true = data, incompressible, true
         n = len(data.test)
         self.sheared: np.ndarray = np.equal(data.kind, "shear")
         self.logs = np.zeros((n, 3))
@@ -62,7 +63,7 @@ class Specimens:
         return F
 
     def predict(self, material: Material, adapter: HyperelasticAdapter | None) -> np.ndarray:
-        """(m,) first Piola-Kirchhoff stresses [Pa]. Errors: SimulationDiverged where no equilibrium is found."""
+        """(m,) stresses [Pa]. Errors: SimulationDiverged where no equilibrium is found."""
 
         def stress(rows: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             F = self.gradients(rows, moved)
@@ -77,7 +78,10 @@ class Specimens:
             held = self.incompressible & (self.free >= 0)
             pressure = np.where(held, tau[every, self.free, self.free], 0.0)
             tau = tau - pressure[:, None, None] * np.eye(3)
-            P = tau @ np.linalg.inv(F).swapaxes(1, 2)
+            if self.true:
+                P = tau / np.linalg.det(F)[:, None, None]
+            else:
+                P = tau @ np.linalg.inv(F).swapaxes(1, 2)
         i, axes = self.data.row, self.data.axes[self.data.row]
         along = np.where(self.data.component == 0, axes[:, 0], axes[:, 1])
         face = np.where(self.sheared[i], axes[:, 0], along)

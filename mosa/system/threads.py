@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -40,3 +41,21 @@ def threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> Itera
         return
     with ThreadPoolExecutor(workers) as pool:
         yield from pool.map(function, items)
+
+
+def apart(
+    body: Any, items: Sequence[Item], function: Callable[[Any, Item], Result]
+) -> Iterator[Result]:
+    """function(body, item) of each item, in their order, without gradients; on a CPU on as many threads as there are cores, each
+    item with a copy of the body, as simulators are not for two threads."""
+    import torch  # not before `settle_threads`
+
+    inferring = torch.is_inference_mode_enabled()  # a thread has switches of its own
+
+    def of_copy(item: Item) -> Result:
+        with torch.inference_mode(inferring), torch.no_grad():
+            return function(copy.deepcopy(body), item)
+
+    if body.rest.is_cpu and len(items) > 1:
+        return threaded(of_copy, items)
+    return (function(body, item) for item in items)

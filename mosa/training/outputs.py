@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from pathlib import Path
+from warnings import warn
 
 from omegaconf import DictConfig
 from torch import Tensor
@@ -27,6 +28,7 @@ from mosa.evaluation.analysis.tables import (
     geometry_lines,
     parameter_table,
     results_table,
+    unexplained_text,
 )
 from mosa.evaluation.evaluate import (
     Sequence,
@@ -128,7 +130,12 @@ def write_outputs(
             compared = {s.prefix: compare(body, s, kept[s.prefix], limit=limit) for s in shown}
             write_comparisons(folder, compared)
     law = body.material.law
-    parts = (note, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
+    if doubt := unexplained_text(figures, world):
+        warn(
+            "the learned law does not explain the motion: see the first lines of results.md",
+            stacklevel=1,
+        )
+    parts = (note, doubt, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
              determined_text(figures, law), force_lines(figures), geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:

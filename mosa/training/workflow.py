@@ -20,6 +20,7 @@ from mosa.config.extensions import load_extensions
 from mosa.data.sequences import load_sequences
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.evaluate import sequences
+from mosa.evaluation.metrics import unexplained
 from mosa.evaluation.same_body import warn_of_other_bodies
 from mosa.modules.body.body import Body, Start
 from mosa.modules.fitting.parameters import warn_of_ends
@@ -145,6 +146,10 @@ def train(cfg: DictConfig) -> float | None:
     with timed(times, "evaluation"):
         evaluated, posterior = data.sequences, module.posterior
         figures, kept = figures_of(settings.evaluation, body, evaluated, world, posterior, folder)
+        for prefix, take in zip(learned_from, module.takes):
+            if (own := kept[prefix].get("adapted")) is not None:
+                off = unexplained(own.x, take.cues, take.first_contact, body.size)
+                figures |= {f"unexplained/{prefix}/{name}": value for name, value in off.items()}
         figures |= start_figures(starts["train"]) | data.reconstruction.geometry | module.figures()
     sizes = {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures |= times | cost(device) | sizes

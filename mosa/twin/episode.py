@@ -45,7 +45,7 @@ class TwinState:
     """All that a motion goes on from, as plain tensors; of B worlds with a leading dimension.
 
     x, v: (N, 3) [m], [m/s]; C_affine: (N, 3, 3) [1/s]; F, F_tot: (N, 3, 3): particles, in the simulation's type; lift: (3,), the
-    contact's offset, by which x is above where the body is seen; position, rotation: (K, 3) [m], (K, 3, 3) of the colliders now;
+    contact's offset, by which x is above where the body is seen; collider_position, collider_rotation: (K, 3) [m], (K, 3, 3) now;
     driven: (K,) bool, whether an action has moved a collider yet; frames, substeps: () steps and substeps since the start; time: ()
     [s]; lag: () [s], length of the last substep."""
 
@@ -57,8 +57,8 @@ class TwinState:
     F: Tensor
     F_tot: Tensor
     lift: Tensor
-    position: Tensor
-    rotation: Tensor
+    collider_position: Tensor
+    collider_rotation: Tensor
     driven: Tensor
     frames: Tensor
     substeps: Tensor
@@ -106,7 +106,8 @@ def rollout_of(states: Sequence[TwinState]) -> Rollout:
 
 def placed_as(states: Sequence[TwinState], solids: Sequence[Collider]) -> tuple[Collider, ...]:
     """K solids where they are in the states."""
-    x, R = (torch.stack([getattr(s, n).detach() for s in states]) for n in ("position", "rotation"))
+    names = "collider_position", "collider_rotation"
+    x, R = (torch.stack([getattr(state, n).detach() for state in states]) for n in names)
     ways = (Trajectory(a, turned, 0 * a, 0 * a) for a, turned in zip(x.unbind(1), R.unbind(1)))
     return tuple(replace(solid, motion=way) for solid, way in zip(solids, ways))
 
@@ -202,7 +203,8 @@ class Episode:
         if self._stepper.prepared.numerics.check_J and float(torch.linalg.det(state.F).min()) <= 0:
             raise ConfigError("state.F: expected det F > 0, which the law needs, found less")
         if self.colliders:
-            rotation_matrices(state.rotation, state.rotation.ndim - 2)
+            turned = state.collider_rotation
+            rotation_matrices(turned, turned.ndim - 2)
         for name in ("frames", "substeps"):
             # as far as times have them exactly
             if not 0 <= int(found := getattr(state, name)) <= 2**53:
@@ -224,7 +226,8 @@ class Episode:
         # own motions go by time, and the other reset may have had other substeps
         done = int(state.substeps) if self.substeps is None else frames * self.substeps
         self._moment = Moment(particles, done, frames, float(state.lag))
-        self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
+        self._driven = state.driven.cpu()
+        self._poses = state.collider_position.cpu(), state.collider_rotation.cpu()
 
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
         """One step on. action: by the names of colliders, see `Twin.step`. Errors: ConfigError naming the collider, before anything

@@ -360,7 +360,8 @@ class Twin:
             rollout, world = motion, self.world
             met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         else:
-            rollout, world, met = rollout_of(motion), self.episode.world, len(motion[0].position)
+            rollout, world = rollout_of(motion), self.episode.world
+            met = len(motion[0].collider_position)
         if rollout.x.shape[1:] != self.body.rest.shape:
             raise ConfigError(
                 f"rollout: expected one of this body's {len(self.body.rest)} particles, found {rollout!r}"

@@ -182,13 +182,13 @@ class Live:
         """(3,) [m] of the ball now."""
         if self.state is None:
             return np.asarray(self.target, np.float64)
-        return self.state.position[self.column].numpy()
+        return self.state.collider_position[self.column].numpy()
 
     def poses(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """((3,) position [m], (3, 3) rotation) of the twin's own colliders now."""
         if self.state is None:
             return []
-        pairs = zip(self.state.position[: self.column], self.state.rotation)
+        pairs = zip(self.state.collider_position[: self.column], self.state.collider_rotation)
         return [(x.numpy(), R.numpy()) for x, R in pairs]
 
     @property

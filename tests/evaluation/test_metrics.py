@@ -2,12 +2,15 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from mosa.evaluation import metrics
+from mosa.evaluation.analysis.tables import unexplained_text
+from mosa.types import Ground, MarkerCues, MotionCues
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -33,6 +36,35 @@ def test_rms_by_hand():
     x = torch.zeros(2, 2, 3)
     target = torch.tensor([[[3.0, 4, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 1]]])
     assert metrics.rms(x, target) == pytest.approx(math.sqrt((25 + 1) / 4))
+
+
+@pytest.mark.parametrize("marked", [False, True])
+def test_the_unexplained_share_of_a_motion(marked):
+    """A body that swings by 1 cm after frame 2, and a law that stays: all of it. One that follows halfway leaves half; a
+    motion below 2 % of the body's size counts as so large."""
+    still, swing = ball(0.02, 0.0), torch.tensor([0, 0, 0, 0.01, -0.01], dtype=torch.float64)
+    seen = still + swing[:, None, None] * torch.tensor([0.0, 1, 0])
+    x = torch.cat([still + 0.5 * (seen - still), still[None]])  # a frame more than was seen
+    if marked:
+        every = torch.arange(len(still))[:, None]
+        seen[3, 0] = torch.nan  # a point that was not seen
+        cues = MarkerCues(seen, every, torch.ones_like(every).double())
+    else:
+        none = torch.zeros(0)
+        cues = MotionCues(seen, none, none, none, none)
+    found = metrics.unexplained(still.expand(6, -1, -1), cues, 3, 0.25)
+    assert found == pytest.approx({"off_m": 0.01, "share": 1.0})
+    found = metrics.unexplained(x, cues, 3, 1.0)
+    assert found == pytest.approx({"off_m": 0.005, "share": 0.25})
+
+
+def test_results_say_that_a_law_does_not_explain_the_motion():
+    world = SimpleNamespace(driven=(), colliders=(), planes=(), ground=Ground(0.0))
+    figures = {"unexplained/train/off_m": 0.088, "unexplained/train/share": 13.1}
+    said = unexplained_text(figures | {"unexplained/train/b/off_m": 1.0, "unexplained/train/b/share": 0.6}, world)  # fmt: skip
+    assert "`train`: 88 mm" in said and "train/b" not in said
+    assert "no driven sets (world.driven)" in said and "a ground" in said
+    assert not unexplained_text(figures | {"unexplained/train/share": 0.6}, world)
 
 
 def test_interpolation_is_exact_for_affine_motions():

@@ -23,6 +23,8 @@ from mosa.export.checking import (
 from mosa.export.energies import ENERGIES, ENTRIES, STRETCHES, energy
 from mosa.export.source import as_json, read_material, source
 from mosa.export.texts import ufl_text, umat, warp_text
+from mosa.material_tests.measurements import measurements
+from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
 
@@ -146,6 +148,31 @@ def test_the_command_writes_reads_and_checks(tmp_path, capsys):
         "umat.f90",
     ]
     assert json.loads((tmp_path / "law" / "law.json").read_text())["values"]["kept"] < 1
+
+
+def test_a_law_is_exported_as_nearly_incompressible():
+    """mu stays, lam is 2 mu nu/(1 - 2 nu). To a stretch of 5 the uniaxial stress is within 1 % of that
+    of a specimen whose volume a pressure keeps; at nu = 0.49 it is 7 % off."""
+    law = {"E": 1e5, "nu": 0.45}
+    found = source(Material("mooney_rivlin", law | LAWS["mooney_rivlin"]), None, 0.49999)
+    mu = 1e5 / 2 / 1.45
+    assert found.values["mu"] == pytest.approx(mu) and found.values["lam"] == pytest.approx(
+        2 * mu * 0.49999 / 2e-5
+    )
+    assert json.loads(as_json(found))["parameters"]["nu"] == 0.49999
+    F = deformations(50)
+    truth = expected(found, F)
+    assert check_ufl(ufl_text(found), F, truth)[0] < 1e-10
+    states = [{"test": "t", "mode": "uniaxial x", "first": l, "stress_1": 1.0} for l in (1.5, 5.0)]
+    data = measurements(states, "Pa", "here")
+    kept, free = (Specimens(data, s).predict(found.material, None) for s in (True, False))
+    usual = source(Material("mooney_rivlin", law | LAWS["mooney_rivlin"]), None, 0.49).material
+    assert free == pytest.approx(kept, rel=0.01)
+    assert Specimens(data, False).predict(usual, None) != pytest.approx(kept, rel=0.05)
+    with pytest.raises(ConfigError, match="nu: expected a number of at least 0 and below"):
+        source(Material("neo_hookean", law), None, 0.5)
+    with pytest.raises(ConfigError, match="found a learned stiffness"):
+        source(Material("neo_hookean", law), HyperelasticAdapter(), 0.499)
 
 
 def test_an_energy_of_another_package_is_exported(tmp_path, monkeypatch, capsys):

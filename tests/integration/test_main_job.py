@@ -119,6 +119,7 @@ def test_a_run_leaves_its_outputs(run):
     assert 0 < figures["id/growth_per_period"] <= 1  # it has an energy
     richest = figures["held_back/operator+stiffness_m"]
     assert richest < figures["held_back/isotropic_m"]  # something was learned
+    assert figures["unexplained/train/share"] < 0.3 and figures["unexplained/train/off_m"] > 0
     assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
 
 

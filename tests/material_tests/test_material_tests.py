@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from mosa.evaluation.analysis.law_stress import in_double, kirchhoff, tangent
 from mosa.export.source import read_source
 from mosa.material_tests.fitting import Fitting, Law
 from mosa.material_tests.measurements import measurements, read_tests
-from mosa.material_tests.report import doubts, figures, rms, uncertain, written
+from mosa.material_tests.report import doubts, figures, reading, rms, uncertain, written
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
@@ -180,6 +181,53 @@ def pulled(lengths, stresses, law="neo_hookean", **more):
     return uncertain(law, fit), "; ".join(doubts(law, data, fit, "MPa")), fit
 
 
+def test_the_tests_tell_nominal_from_true_stress():
+    """Neo-Hooke's uniaxial and equibiaxial curves with noise of 1 %: P = mu (l - l^-2), mu (l - l^-5),
+    and l P is the true stress. At a stretch of 1.02 both are the same, in shear as well."""
+    l = np.linspace(1.1, 2.5, 6)
+    states = [*rows("uniaxial x", l), *rows("biaxial xy", l)]
+    noise = 1 + 0.01 * np.random.default_rng(0).standard_normal(2 * len(l))
+    P = MU * np.concatenate([l - l**-2, l - l**-5]) * noise
+    law = Law(Material("neo_hookean", {"E": 1e5, "nu": NU}, ["nu"]), None, "full")
+    read = {}
+    for true in (False, True):
+        given = measurements([dict(r, stress_1=v * a) for r, v, a in zip(states, P, np.tile(l, 2))], "Pa", "here")  # fmt: skip
+        fitting = Fitting(law, given, True, starts=1, seed=0, true=true)
+        fit = fitting.fit()
+        read[true] = replace(fit, other=fitting.other_reading())
+        said = "; ".join(doubts(law.set(fit.theta), given, read[true], "Pa"))
+        assert ("stress: read as" in said) == (not true)
+    assert read[False].other < 0.3 and "with stress=cauchy this law ends 0." in reading(read[False])
+    assert read[True].other > 3 and "look up" not in reading(read[True])
+    assert np.exp(read[True].theta) == pytest.approx(2 * (1 + NU) * MU, rel=0.02)
+    assert "look up" in reading(replace(fit, other=1.1))
+    for same in (rows("uniaxial x", LENGTHS[1:2] + 0.01), rows("shear xy", LENGTHS, 0.0)):
+        data = measurements([dict(r, stress_1=1.0) for r in same], "Pa", "here")
+        assert Fitting(law, data, True, starts=1, seed=0).other_reading() is None
+
+
+def test_true_stress_of_a_compressible_specimen():
+    """tau/J beside P: on a free face's specimen J = l t^2, with the stretch across t."""
+    states = rows("uniaxial z", LENGTHS)
+    data = measurements(states, "Pa", "here")
+    material = in_double(Material("neo_hookean", {"E": E, "nu": 0.3}))
+    P, sigma = (Specimens(data, False, true).predict(material, None) for true in (False, True))
+    mu = E / 2.6
+    across = LENGTHS**2 - P * LENGTHS / mu  # t^2, from P = mu (l^2 - t^2)/l
+    assert sigma * across == pytest.approx(P, rel=1e-8, abs=1e-8 * mu)
+
+
+def test_a_start_far_from_the_law_is_left():
+    """Where the start has no finite stress at all: exp(3e3 (l^2 - 1)^2)."""
+    l = np.linspace(1.02, 1.5, 8)
+    truth = {"E": E, "nu": 0.45, "fibre_stiffness": 1e4, "fibre_exponent": 0.8, "dispersion": 0.0, "fibre": [1, 0, 0]}  # fmt: skip
+    P = predicted("hgo", truth, rows("uniaxial x", l))
+    start = Material("hgo", truth | {"fibre_exponent": 3e3}, ["nu", "fibre"])
+    data = measurements([dict(r, stress_1=v) for r, v in zip(rows("uniaxial x", l), P)], "Pa", "here")  # fmt: skip
+    fit = Fitting(Law(start, None, "full"), data, True, starts=1, seed=0).fit()
+    assert fit.predicted == pytest.approx(P, rel=1e-3)
+
+
 def test_slips_in_a_file_are_warned_of():
     l = np.linspace(1.1, 4.0, 12)
     P = 0.4 * (l - l**-2)
@@ -188,7 +236,7 @@ def test_slips_in_a_file_are_warned_of():
     assert [n for n, *_ in numbers] == ["mu", "3 mu (E at nu = 1/2)", "E (at the given nu = 0.45)"]
     assert [v for _, v, *_ in numbers] == pytest.approx([4e5, 1.2e6, 4e5 * 2 * 1.45], rel=1e-6)
     for slip in (l**4, l * (l - l**-2), l + 1 - (l + 1) ** -2):  # the last two: true stress, strain
-        assert "true stress" in pulled(l, 0.4 * slip)[1]
+        assert "another stress than nominal" in pulled(l, 0.4 * slip)[1]
     assert "in MPa, not in Pa or kPa" in pulled(l, 2e-6 * (l - l**-2))[1] and "unit" not in right
     assert "in per cent" in pulled(10 * l, P)[1] and "per cent" not in right
     l = np.linspace(0.8, 4.0, 12)  # strains, the first below 1

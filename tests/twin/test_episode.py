@@ -103,9 +103,9 @@ def test_steps_are_one_long_simulation_to_the_last_bit(precision, adaptive):
             torch.save(state.tensors(), file)
     assert (made.episode.substeps is None) == adaptive and int(state.substeps) == sum(long.counts)
     assert float(state.time) == pytest.approx(STEPS * FRAME_DT) and float(
-        state.position[0, 0]
+        state.collider_position[0, 0]
     ) == pytest.approx(-0.12 + 0.6 / 7.5)
-    assert float(state.position[1, 1]) == pytest.approx(0.15) and not state.driven.any()
+    assert float(state.collider_position[1, 1]) == pytest.approx(0.15) and not state.driven.any()
     file.seek(0)
     for saved in (TwinState.read(torch.load(file, weights_only=True)), branch):
         made.reset(**given)
@@ -128,8 +128,8 @@ def test_driven_colliders_are_the_trajectory_of_their_commands():
         command = {"velocity": v, "angular_velocity": w}
         if kind == 1:
             target = {
-                "position": before.position[0] + FRAME_DT * v,
-                "rotation": exponential(FRAME_DT * w) @ before.rotation[0],
+                "position": before.collider_position[0] + FRAME_DT * v,
+                "rotation": exponential(FRAME_DT * w) @ before.collider_rotation[0],
             }
             command = target
         elif kind == 2:
@@ -138,16 +138,24 @@ def test_driven_colliders_are_the_trajectory_of_their_commands():
         v, w = (0 * v, 0 * w) if kind == 3 else (v, w)
         state, reactions = made.step(action)
         if kind == 1:
-            assert torch.equal(state.position[0], target["position"]) and torch.equal(
-                state.rotation[0], target["rotation"]
+            assert torch.equal(state.collider_position[0], target["position"]) and torch.equal(
+                state.collider_rotation[0], target["rotation"]
             )
         torch.testing.assert_close(
-            state.position[0], before.position[0] + FRAME_DT * v, rtol=0, atol=1e-15
+            state.collider_position[0],
+            before.collider_position[0] + FRAME_DT * v,
+            rtol=0,
+            atol=1e-15,
         )
         times = dt * torch.arange(count).double()[:, None]
-        turned = exponential(times * w) @ before.rotation[0]
+        turned = exponential(times * w) @ before.collider_rotation[0]
         parts.append(
-            (before.position[0] + times * v, turned, v.expand(count, 3), w.expand(count, 3))
+            (
+                before.collider_position[0] + times * v,
+                turned,
+                v.expand(count, 3),
+                w.expand(count, 3),
+            )
         )
         states.append(state)
     assert reactions.abs().max() > 1e-3 and states[-1].driven.tolist() == [True, False]
@@ -349,7 +357,11 @@ def test_worlds_are_so_many_twins():
             state, reactions = worlds.step(
                 {"pusher": {"velocity": pushes}, "1": (0.0, -0.1 * k, 0.0)}
             )
-        assert reactions.shape == (12, count, 2, 6) and state.position.shape == (count, 2, 3)
+        assert reactions.shape == (12, count, 2, 6) and state.collider_position.shape == (
+            count,
+            2,
+            3,
+        )
         for b in range(count):
             single = twin()
             if numbers is not None:
@@ -360,7 +372,7 @@ def test_worlds_are_so_many_twins():
             assert torch.equal(own.positions, state.positions[b]) and torch.equal(
                 forces, reactions[:, b]
             )
-            assert torch.equal(own.position, state.position[b])
+            assert torch.equal(own.collider_position, state.collider_position[b])
     assert (state.positions[0] - state.positions[1]).abs().max() > 1e-3
     heavy = torch.tensor([[0.0, -9.8, 0.0], [0.0, -20.0, 0.0], [1.0, -9.8, 0.0]])
     worlds = made.worlds(count)
@@ -389,9 +401,9 @@ def test_some_worlds_begin_again():
     assert torch.equal(worlds.restart([2]).positions[2], kept.positions[2])
     state = worlds.restart([0], [new])
     assert torch.equal(state.x[1], before.x[1]) and not torch.equal(state.x[0], before.x[0])
-    assert torch.equal(state.position[[0, 2]], kept.position[[0, 2]]) and torch.equal(
-        state.position[1], before.position[1]
-    )
+    assert torch.equal(
+        state.collider_position[[0, 2]], kept.collider_position[[0, 2]]
+    ) and torch.equal(state.collider_position[1], before.collider_position[1])
     for _ in range(4):
         state, reactions = worlds.step(push)
     for b, begin, steps in ((0, new, 4), (1, begins[1], 7), (2, begins[2], 4)):
@@ -527,11 +539,11 @@ def test_errors_of_starts_and_states():
             made.state = replace(made.state, F=other)
     made.reset(colliders=[PUSHER])
     for name, value, message in (
-        ("position", math.nan, "finite numbers, found nan"),
+        ("collider_position", math.nan, "finite numbers, found nan"),
         ("F", math.inf, "finite"),
         ("lag", math.nan, "finite"),
-        ("rotation", 0.0, "rotation"),
-        ("rotation", 1e38, "rotation"),
+        ("collider_rotation", 0.0, "rotation"),
+        ("collider_rotation", 1e38, "rotation"),
     ):
         with pytest.raises(ConfigError, match=f"expected {message}"):
             made.state = replace(
@@ -556,13 +568,15 @@ def test_worlds_begin_again_outside_of_where_solids_are_by_then():
             match=r"colliders\[0\] \(own\): .* of world 1 inside of it now, where its .* \[-0.0, 0",
         ):
             made.restart([1], starts)
-    assert torch.equal(made.state.x, before.x) and torch.equal(made.state.position, before.position)
+    assert torch.equal(made.state.x, before.x) and torch.equal(
+        made.state.collider_position, before.collider_position
+    )
     free = made.restart(
         [1], [{"position": (-0.2, None, 0), "height": 0.01}]
     )  # where it was at t = 0
-    assert free.position[1, :, 2].tolist() == [0, 0.3] and free.position[0, 1, 2] == pytest.approx(
-        0, abs=1e-9
-    )
+    assert free.collider_position[1, :, 2].tolist() == [0, 0.3] and free.collider_position[
+        0, 1, 2
+    ] == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("ground", ["sticky", "separate", "slip", "touch"])
@@ -653,7 +667,7 @@ def test_any_turn_is_swept(angle):
     begun = made.reset(**options)
     state, reactions = made.step({"bar": {"rotation": target.tolist()}})
     assert float(reactions.abs().max()) > 0.1
-    torch.testing.assert_close(state.rotation[0], exponential(target), rtol=0, atol=1e-9)
+    torch.testing.assert_close(state.collider_rotation[0], exponential(target), rtol=0, atol=1e-9)
     made.state = begun
     again, same = made.step({"bar": {"rotation": target.tolist()}})
     assert torch.equal(same, reactions) and torch.equal(again.x, state.x)
@@ -668,19 +682,19 @@ def test_turns_go_on_beyond_half_a_turn():
     made = twin()
     made.reset(colliders=[PUSHER | {"position": [-2, 1, 0], "motion": {}}], frames=3, substeps=60)
     for n in (1, 2, 3, 4, 5, 6, 7, 8, 7, 6, 5):
-        before = made.state.rotation[0]
+        before = made.state.collider_rotation[0]
         state, _ = made.step({"pusher": {"rotation": (0, 0.3 * torch.pi * n, 0)}})
         torch.testing.assert_close(
-            state.rotation[0],
+            state.collider_rotation[0],
             exponential(torch.tensor([0, 0.3 * math.pi * n, 0], dtype=torch.float64)),
         )
-        turned = state.rotation[0] @ before.mT
+        turned = state.collider_rotation[0] @ before.mT
         assert float(turned.diagonal().sum()) == pytest.approx(
             1 + 2 * math.cos(0.3 * math.pi), abs=1e-6
         )
     held, _ = made.step({"pusher": {"rotation": (0, 1.5 * torch.pi, 0)}})
     torch.testing.assert_close(
-        held.rotation, state.rotation
+        held.rotation, state.collider_rotation
     )  # at a speed of 0: a whole turn would be refused as too fast
 
 
@@ -734,7 +748,7 @@ def test_a_state_of_another_clock_is_refused_and_of_other_substeps_goes_on():
     made.reset(colliders=[solid], substeps=40)
     made.state = kept
     after = made.step().state
-    moved = (after.position - kept.position).norm()
+    moved = (after.collider_position - kept.collider_position).norm()
     assert float(moved) == pytest.approx(0.2 * FRAME_DT) and float(after.time) == pytest.approx(
         4 * FRAME_DT
     )

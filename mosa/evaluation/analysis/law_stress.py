@@ -47,10 +47,10 @@ def in_double(material: Material, configured: bool = True) -> Material:
 
 
 def bound_at(name: str, value: float) -> float:
-    """The bound that a parameter is held at which has this value, rounded."""
+    """The bound that a parameter is held at which has this value, rounded; a value at no bound is itself."""
     form = FORMS[name]
     assert isinstance(form, Form)
-    return min(form.held, key=lambda bound: abs(bound - value))
+    return next((bound for bound in form.held if abs(bound - value) < 1e-6), value)
 
 
 @torch.no_grad()

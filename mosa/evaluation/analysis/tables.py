@@ -17,6 +17,7 @@ from mosa.modules.fitting.search.ground import (
 )
 from mosa.modules.fitting.search.parts import PARTS, WORTH, chosen, named
 from mosa.physics.constitutive.laws import law_named
+from mosa.physics.world import World
 from mosa.types import RUBBING
 
 ROWS = {
@@ -96,6 +97,10 @@ def with_unit(law: str, name: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
+UNEXPLAINED = 0.7
+"""Share of the observed displacement (`metrics.unexplained`) from which on a law does not explain the motion. README's rabbit has
+0.01, the beam 0.14 to 0.23, a fish that topples 0.30, an isotropic law on a disc that rolls as it is anisotropic 0.64. Without its
+clamp the beam has 13, a pressed cylinder without the plate that moves 0.73."""
 SURE_DEGREES = 30.0  # half angle of a direction's 95 % cone above which it counts as not determined
 NOTICEABLE = 1.1  # ratio of Young's moduli below which a law counts as isotropic
 LISTED = 3  # so many contacts the sentence lists; more are in a table
@@ -277,6 +282,26 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             f"{sd * 1e3:.1f} mm (rms){covered}."
         )
     return "\n".join(lines)
+
+
+def unexplained_text(figures: Mapping[str, float], world: World) -> str:
+    """What to look for where the learned law does not follow the motion that it was learned from; empty where it does."""
+    far = [
+        f"`{name}`: {1e3 * figures[f'unexplained/{name}/off_m']:.3g} mm (rms), {share:.0%} of how far the body moves"
+        for name, share in _part(figures, "unexplained/", "/share").items()
+        if share > UNEXPLAINED
+    ]
+    has = (
+        f"{len(world.driven) or 'no'} driven sets (world.driven), {len(world.colliders) or 'no'} "
+        f"colliders, {len(world.planes) or 'no'} walls, {'a' if world.ground else 'no'} ground"
+    )
+    return bool(far) * (
+        "**The learned law does not explain the motion: do not use the numbers below.** Distance from "
+        f"the observed motion after first contact: {'; '.join(far)}. Is everything there that holds, "
+        f"drives or touches the body (this run has {has}), and in the right place? Are lengths in metres, "
+        "times in seconds (scene.fps), and gravity along the right axis (scene.gravity)? If so, the law "
+        "cannot follow (prior), or the fit began too far away (prior.parameters)."
+    )
 
 
 def force_lines(figures: Mapping[str, float]) -> str:
