@@ -71,7 +71,7 @@ def changed(x: Tensor) -> Tensor:
 def warn_of_yielding(body: Body, takes: Sequence, world: World) -> None:
     """A warning where the backbone is elastic and the body stays deformed."""
     law = body.material.law
-    if not law_named(law).plastic and (share := lasting(body, takes, world)) > LASTS:
+    if law_named(law).elastic and (share := lasting(body, takes, world)) > LASTS:
         warnings.warn(
             f"prior: the body keeps {share:.0%} of its largest change of shape to the end of the "
             f"film, which the elastic law {law} does not predict: it may yield, and then all numbers are "

@@ -10,7 +10,7 @@ import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
 from mosa.errors import SimulationDiverged
-from mosa.modules.body.material import Material
+from mosa.modules.body.material import Material, taken
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.search import backbone
@@ -25,14 +25,13 @@ from mosa.types import MarkerCues
 BEGINS = start(turn=0.5, speed=-3.0)
 YIELDS = 2500.0
 LAWS = ("corotated", "stvk", "von_mises")
+GIVEN = {"E": E, "nu": NU, "mu": 15.0, "kappa": 2e4, "yield_stress": YIELDS, "friction_angle": 25.0, "cohesion": 0.0}  # fmt: skip
 
 
-def body_of(law, yield_stress=YIELDS, scale=1.0):
+def body_of(law, scale=1.0, **changes):
     body = small_body(adapter=False)
-    given = {"E": scale * E, "nu": NU} | (
-        {"yield_stress": yield_stress} if law == "von_mises" else {}
-    )
-    body.material = Material(law, given).double()
+    given = GIVEN | {"E": scale * E} | changes
+    body.material = Material(law, {name: given[name] for name in taken(law, given)}).double()
     return body
 
 
@@ -134,23 +133,27 @@ def test_a_law_that_yields_is_left_where_no_elastic_one_can_be_simulated():
     assert body.material.law == "von_mises" and tried == list(LAWS)
 
 
-@pytest.mark.parametrize(("truth", "yield_stress"), [("von_mises", YIELDS), ("stvk", 1e6)])
-def test_both_kinds_of_law_are_compared_by_one_prediction(monkeypatch, truth, yield_stress):
+FLOWING = ("von_mises", "drucker_prager", "newtonian")
+
+
+@pytest.mark.parametrize(("truth", "yield_stress"), [("stvk", 1e6), *((law, YIELDS) for law in FLOWING)])  # fmt: skip
+def test_all_kinds_of_law_are_compared_by_one_prediction(monkeypatch, truth, yield_stress):
     """With a yield stress that the motion does not reach von Mises is the elastic law."""
     monkeypatch.setattr(Identification, "search", lambda self: 0.0)
     monkeypatch.setattr(backbone, "TRIED", 1)
     take = film(truth)
     body = small_body(adapter=False)
-    given = {"E": 1.1 * E, "nu": NU, "yield_stress": 1.1 * yield_stress}
-    body.material = Material("auto", given, candidates=LAWS[1:]).double()
+    laws = ("stvk", *FLOWING)
+    given = {name: 1.1 * value for name, value in (GIVEN | {"yield_stress": yield_stress}).items()}
+    body.material = Material("auto", given, candidates=laws).double()
     stage = Stage(name="prior", iterations=3, lr=0.1, optimizer="gauss_newton")
     errors = choose_law(
-        body, LAWS[1:],
+        body, laws,
         lambda: Identification(body, [take], WORLD, stage, Criterion(name="corrected"), IdentificationSettings()),
         lambda: 1.0,
     )  # fmt: skip
     if truth == "stvk":
         assert errors["von_mises"] == pytest.approx(errors["stvk"], rel=0.1)
     else:
-        assert errors["von_mises"] < 0.5 * errors["stvk"]
+        assert errors[truth] < 0.5 * errors["stvk"]
     assert body.material.law == truth
