@@ -16,6 +16,7 @@ from mosa.modules.fitting.search.ground import (
     taken_of,
 )
 from mosa.modules.fitting.search.parts import PARTS, WORTH, chosen, named
+from mosa.physics.constitutive.damping import DAMPED
 from mosa.physics.constitutive.laws import law_named
 from mosa.types import RUBBING
 
@@ -198,9 +199,10 @@ def _backbones(law: str, compared: Mapping[str, float], gained: Mapping[str, flo
     others = [name for name in nearest if name not in elastic]
     if elastic and others:
         said += " The body stays deformed, which no elastic law predicts: laws that yield or flow were compared."
-    for name in others if law in others else ():
+    for name in others:
         if name != law and WORTH * compared[name] < compared[law]:
-            said += f" {name} predicts nearly as well: the body may be {KINDS.get(name, name)} (prior={name})."
+            plain = name.removesuffix(DAMPED)
+            said += f" {name} predicts about as well: the body may be {KINDS.get(plain, plain)} (prior={plain})."
     if gained:
         each = ", ".join(f"{name} {gain:+.1f}" for name, gain in gained.items())
         said += f" With what was learned about {elastic[0]}, the logarithm of the likelihood changes by: {each}."
