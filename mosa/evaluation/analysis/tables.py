@@ -199,10 +199,11 @@ def _backbones(law: str, compared: Mapping[str, float], gained: Mapping[str, flo
     others = [name for name in nearest if name not in elastic]
     if elastic and others:
         said += " The body stays deformed, which no elastic law predicts: laws that yield or flow were compared."
-    for name in others:
-        if name != law and WORTH * compared[name] < compared[law]:
-            plain = name.removesuffix(DAMPED)
-            said += f" {name} predicts about as well: the body may be {KINDS.get(plain, plain)} (prior={plain})."
+    near = [name for name in others if name != law and WORTH * compared[name] < compared[law]]
+    for name in (each.removesuffix(DAMPED) for each in near):
+        said += f" {name} predicts about as well: the body may be {KINDS.get(name, name)} (prior={name})."
+    if {"von_mises", "newtonian"} <= {law, *near}:
+        said += " Between both are pastes: prior=herschel_bulkley, which was not compared."
     if gained:
         each = ", ".join(f"{name} {gain:+.1f}" for name, gain in gained.items())
         said += f" With what was learned about {elastic[0]}, the logarithm of the likelihood changes by: {each}."

@@ -123,6 +123,6 @@ def test_a_report_says_which_backbones_were_compared_and_why():
                       {"newtonian": 4e-3, "von_mises": 4.9e-3, "drucker_prager": 5.1e-3}.items()}  # fmt: skip
     text = determined_text(flows, "newtonian")
     assert "the body may be a solid that yields (prior=von_mises)" in text and "sand" not in text
-    assert "may be" not in determined_text(
-        flows | {"id_prior/compared/newtonian_m": 3e-3}, "newtonian"
-    )
+    assert "prior=herschel_bulkley," in text
+    alone = determined_text(flows | {"id_prior/compared/newtonian_m": 3e-3}, "newtonian")
+    assert "may be" not in alone and "herschel" not in alone
