@@ -122,7 +122,9 @@ def build_body(record: BodyRecord, tensors: Mapping[str, Tensor]) -> Body:
     heterogeneity = build_heterogeneity(
         sections.heterogeneity, tensors["rest"].amin(0), tensors["rest"].amax(0)
     )
-    adapter = fitting(build_adapter(sections.adapter.plain()), material.law)
+    adapter = build_adapter(sections.adapter.plain())
+    if not material.candidates:  # else once the law is chosen
+        adapter = fitting(adapter, material.law)
     settings = sections.simulation.on_grid(record.dx)
     if record.ground is None and sections.world.walls is None:
         settings = settings.but(contact_offset=False)  # solids keep their place from the body

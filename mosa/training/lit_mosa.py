@@ -30,7 +30,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import build_body, build_stages, plain, rehearse, world_of
+from mosa.config.build import build_body, build_stages, fitting, plain, rehearse, world_of
 from mosa.config.checkpoints import (
     check_plain,
     check_same_data,
@@ -336,9 +336,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             )
 
     def choose(self, law: str) -> None:
-        """This candidate is the run's backbone from now on."""
+        """This candidate is the run's backbone from now on; without an adapter that it has no use for."""
         self.body.choose(law)
         self.record = self.record.but(law=law)
+        self.body.adapter = fitting(self.body.adapter, law)
 
     @property
     def known(self) -> Posterior | None:
@@ -365,7 +366,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.settle_ground(ground)
         if law is not None:
             self.choose(law)
-        self.body.load_state_dict(self.untouched)
+        self.body.load_state_dict(self.untouched, strict=self.body.adapter is not None)
         self.takes, self.informed = list(self.first_takes), False
         self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
         self.stage_over, self.columns = False, None
@@ -535,7 +536,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     def end(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next."""
-        compared = any(law_named(law).plastic for law in self.compared)
+        compared = not all(law_named(law).elastic for law in self.compared)
         if stage.calibrates and not stage.looks_again and not compared:
             warn_of_yielding(self.body, self.takes, self.world)
         for name in stage.keeps:

@@ -16,6 +16,7 @@ from mosa.modules.fitting.search.ground import (
     taken_of,
 )
 from mosa.modules.fitting.search.parts import PARTS, WORTH, chosen, named
+from mosa.physics.constitutive.damping import DAMPED
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import World
 from mosa.types import RUBBING
@@ -26,6 +27,9 @@ ROWS = {
     "prior + eta": "the prior with a stiffness that varies over the body",
     "adapted": "the learned law",
 }
+KINDS = {
+    "von_mises": "a solid that yields", "drucker_prager": "sand", "newtonian": "a liquid",
+}  # fmt: skip
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {
     "rms_m": ("rms [mm]", 1e3, 2),
@@ -190,20 +194,24 @@ def _words(name: str) -> str:
     return freely if mode in RUBBING else "sticks to it"
 
 
-def _backbones(compared: Mapping[str, float], gained: Mapping[str, float]) -> str:
-    """How the backbones compare. compared: error [m] after calibration; gained: how much better than the one that was nearest then
-    others explain the motion once the adapter is learned."""
+def _backbones(law: str, compared: Mapping[str, float], gained: Mapping[str, float]) -> str:
+    """How the backbones compare. law: the run's; compared: error [m] after calibration; gained: how much better than the one that
+    was nearest then others explain the motion once the adapter is learned."""
     nearest = sorted(compared, key=compared.get)
     listed = ", ".join(f"{name} {compared[name] * 1e3:.2f} mm" for name in nearest)
     said = f"Error of the isotropic laws after calibration: {listed}."
-    yielding = {name for name in compared if law_named(name).plastic}
-    if yielding and yielding != set(compared):
-        said += " The body stays deformed, which no elastic law predicts: laws that yield were compared."
+    elastic = [name for name in nearest if law_named(name).elastic]
+    others = [name for name in nearest if name not in elastic]
+    if elastic and others:
+        said += " The body stays deformed, which no elastic law predicts: laws that yield or flow were compared."
+    near = [name for name in others if name != law and WORTH * compared[name] < compared[law]]
+    for name in (each.removesuffix(DAMPED) for each in near):
+        said += f" {name} predicts about as well: the body may be {KINDS.get(name, name)} (prior={name})."
+    if {"von_mises", "newtonian"} <= {law, *near}:
+        said += " Between both are pastes: prior=herschel_bulkley, which was not compared."
     if gained:
         each = ", ".join(f"{name} {gain:+.1f}" for name, gain in gained.items())
-        alike = yielding if yielding & set(gained) else set(compared) - yielding
-        nearest = min(alike, key=compared.get)
-        said += f" With what was learned about {nearest}, the logarithm of the likelihood changes by: {each}."
+        said += f" With what was learned about {elastic[0]}, the logarithm of the likelihood changes by: {each}."
     return said
 
 
@@ -213,7 +221,7 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     lines = []
     if compared := _part(figures, "id_prior/compared/"):
         gained = _part(figures, "id_prior/gain/", "")
-        lines = [f"Backbone: {law}. {_backbones(compared, gained)}", ""]
+        lines = [f"Backbone: {law}. {_backbones(law, compared, gained)}", ""]
     if distances := _part(figures, "id_prior/ground/"):
         gains = _part(figures, "id_prior/ground/", "_gain")
         for part in filter(None, (ground_text(distances, gains), ground_table(distances, gains))):

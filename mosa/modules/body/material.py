@@ -138,9 +138,11 @@ def unit_of(law: str, name: str) -> str:
 
 
 def taken(law: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Those of the parameters `names` that a law has. Errors: ConfigError for an unknown law."""
+    """Those of the parameters `names` that a law has; its mu is that of E and nu where it has them.
+    Errors: ConfigError for an unknown law."""
     known = set(law_named(law).parameters)
-    return tuple(name for name in names if known.issuperset(GIVES.get(name, (name,))))
+    own = [name for name in names if known.issuperset(GIVES.get(name, (name,)))]
+    return tuple(name for name in own if name != ("mu" if "E" in own else "nu"))
 
 
 class Material(nn.Module):
@@ -169,6 +171,9 @@ class Material(nn.Module):
         if any(name in parameters for name in DAMPING):
             parameters = dict.fromkeys(DAMPING, 0.0) | dict(parameters)
             undamped = lambda name: name != AUTO and not name.endswith(DAMPED)  # noqa: E731
+            candidates = [
+                n for n in candidates if law_named(n).viscosity is None or not undamped(n)
+            ]
             law, *candidates = (n + DAMPED if undamped(n) else n for n in (law, *candidates))
         laws = tuple(candidates) or (law,)
         for each in laws:
@@ -184,7 +189,6 @@ class Material(nn.Module):
         parameters = {name: value for name, value in parameters.items() if name in used}
         self.candidates, self.friction_cone = tuple(candidates), friction_cone
         self.law, self.given = laws[0], tuple(parameters)
-        self.stiffness = "E" if "E" in parameters else "kappa"
         if modulated is None:
             modulated = [n for n in STIFFNESS if n in parameters]
         self.modulated = tuple(modulated)
@@ -342,7 +346,7 @@ class Material(nn.Module):
 
     def reference_modulus(self) -> Tensor:
         """E, or kappa where the law has no E [Pa], (), without gradient: the unit the adapter measures stress in."""
-        return self.physical()[self.stiffness].detach()
+        return self.physical()["E" if "E" in self.names else "kappa"].detach()
 
 
 def material_states(

@@ -51,8 +51,8 @@ class PriorSection(Settings):
     modulated: Names | None = None
     """parameters that the heterogeneity multiplies; null: the stiffness"""
     candidates: Names | None = None
-    """with law=auto: the laws that are calibrated and compared; those that yield only
-    where the body stays deformed"""
+    """with law=auto: the laws that are calibrated and compared; those that yield or
+    flow only where the body stays deformed"""
     options: Section | None = None
     """options of the law (below)"""
 

@@ -71,7 +71,7 @@ class NewtonSteps:
                 lambda: lasting(self.body, self.takes, self.world),
             )
             self.choose(self.body.material.law)
-            if again and law_named(self.body.material.law).plastic:
+            if again and not law_named(self.body.material.law).elastic:
                 self.find_ground(stage)  # what was found before was found with an elastic law
         identification = self.identifying(stage)
         if saved is not None:
@@ -136,7 +136,9 @@ class NewtonSteps:
             return None
         own = self.identification.cost()
         law = law_named(self.body.material.law)
-        others = [n for n in self.compared if n != law.name and law_named(n).plastic == law.plastic]
+        others = [
+            n for n in self.compared if n != law.name and law.elastic and law_named(n).elastic
+        ]
         gains = {law: own - self.fitted_on(self.world.ground, stage, law)[0] for law in others}
         self.law_gains = {law: gain for law, gain in gains.items() if math.isfinite(gain)}
         best = max(self.law_gains, key=self.law_gains.get, default=None)

@@ -85,6 +85,11 @@ class Law:
         """Whether the law has a return mapping, so that F and F_tot differ."""
         return self.return_map is not None
 
+    @property
+    def elastic(self) -> bool:
+        """Whether the body returns to its shape at rest: the law neither yields nor flows."""
+        return not self.plastic and (self.viscosity is None or self.damped)
+
     def wave_modulus(self, parameters: dict[str, Tensor]) -> Tensor:
         """P wave modulus M at rest [Pa], of the parameters' shape. Errors: ConfigError if it does not follow from them."""
         if self.modulus is not None:

@@ -11,7 +11,7 @@ from mosa.evaluation.analysis.tables import (
     parameter_table,
 )
 from mosa.modules.body import material
-from mosa.modules.body.material import LOG, register_form, unit_of
+from mosa.modules.body.material import LOG, register_form, taken, unit_of
 
 PRIORS = Path(__file__).parents[3] / "conf" / "prior"
 
@@ -37,13 +37,16 @@ def test_every_parameter_of_every_law_has_the_unit_that_its_configuration_says(f
     (line,) = [line for line in file.read_text().splitlines() if line.startswith("parameters:")]
     units = [unit.strip() for unit in line.partition("#")[2].split(":")[0].split(",")]
     prior = OmegaConf.load(file)
-    law, names = prior.get("candidates", [prior.law])[0], list(prior.parameters)
-    assert len(units) == len(names)
-    assert [unit_of(law, name) or "-" for name in names] == units
-    rows = cells_of(parameter_table({f"id_prior/{name}": 1.0 for name in names}, law))[2:]
-    assert [row[0] for row in rows] == [
-        name if unit == "-" else f"{name} [{unit}]" for name, unit in zip(names, units)
-    ]
+    said, named = dict(zip(prior.parameters, units, strict=True)), set()
+    for law in prior.get("candidates", [prior.law]):
+        names = taken(law, said)
+        named.update(names)
+        assert [unit_of(law, name) or "-" for name in names] == [said[name] for name in names]
+        rows = cells_of(parameter_table({f"id_prior/{name}": 1.0 for name in names}, law))[2:]
+        assert [row[0] for row in rows] == [
+            name if said[name] == "-" else f"{name} [{said[name]}]" for name in names
+        ]
+    assert named == set(said)
 
 
 def test_the_same_name_is_measured_as_the_law_of_a_mixture_has_it():
@@ -114,4 +117,12 @@ def test_a_report_says_which_backbones_were_compared_and_why():
     assert "corotated 12.00 mm, stvk 13.00 mm." in text and "about corotated" in text
     yields = found | {"id_prior/compared/von_mises_m": 11e-3}  # too little to be taken
     text = determined_text(yields | {"id_prior/gain/stvk": -3.0}, "corotated")
-    assert "laws that yield were compared" in text and "about corotated" in text
+    assert "laws that yield or flow were compared" in text and "about corotated" in text
+    assert "may be a solid that yields" in text
+    flows = yields | {f"id_prior/compared/{name}_m": error for name, error in
+                      {"newtonian": 4e-3, "von_mises": 4.9e-3, "drucker_prager": 5.1e-3}.items()}  # fmt: skip
+    text = determined_text(flows, "newtonian")
+    assert "the body may be a solid that yields (prior=von_mises)" in text and "sand" not in text
+    assert "prior=herschel_bulkley," in text
+    alone = determined_text(flows | {"id_prior/compared/newtonian_m": 3e-3}, "newtonian")
+    assert "may be" not in alone and "herschel" not in alone

@@ -70,6 +70,20 @@ def test_each_candidate_has_its_own_parameters():
         Material("auto", ELASTIC, candidates=laws)
 
 
+def test_a_liquid_among_the_candidates_has_its_viscosity_and_no_damping():
+    given = {**ELASTIC, "mu": 100.0, "kappa": 2e4}
+    laws = ("corotated", "newtonian")
+    material = Material("auto", given, candidates=laws)
+    assert material.names == ("E", "nu") and float(material.reference_modulus()) == pytest.approx(
+        1e5
+    )
+    material.choose("newtonian")
+    assert material.learned == ["mu", "kappa"] and set(material.per_particle()) == {"mu", "kappa"}
+    assert float(material.reference_modulus()) == pytest.approx(2e4)
+    damped = Material("auto", {**given, "damping": 5.0}, candidates=laws)
+    assert damped.candidates == ("corotated~damped",)
+
+
 def test_lame_parameters_and_friction_follow_from_the_physical_ones():
     values = {
         name: value.detach()

@@ -6,7 +6,7 @@ import warp as wp
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import neo_hookean
-from mosa.physics.constitutive.laws import LawParameters, register_law
+from mosa.physics.constitutive.laws import LawParameters, law_named, register_law
 from mosa.physics.engine.simulator import Simulator
 
 
@@ -67,6 +67,14 @@ def test_fibre_law_value_and_gradient(law, make_block):
         found = (gradients[name] * direction).sum()
         expected = (8 * (shifted(h) - shifted(-h)) - (shifted(2 * h) - shifted(-2 * h))) / (12 * h)
         assert abs(float(found - expected)) < 1e-6 * abs(float(expected)), name
+
+
+@pytest.mark.parametrize(("name", "elastic"), [
+    ("stvk", True), ("stvk~damped", True), ("von_mises", False), ("newtonian", False), ("drucker_prager", False),
+    ("herschel_bulkley", False),
+])  # fmt: skip
+def test_an_elastic_law_neither_yields_nor_flows(name, elastic):
+    assert law_named(name).elastic == elastic
 
 
 def test_registration(law):

@@ -281,17 +281,17 @@ def choose_law(
     """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction
     [m], all by the elastic laws' criterion; infinite where a law cannot be simulated.
 
-    The elastic law with the smallest error is chosen. Where it leaves a lasting change of shape
-    unexplained, or none can be simulated, laws that yield are calibrated too, and the best of them
-    is chosen if its error is below `WORTH` of the elastic one's: with a yield stress that the
-    motion does not reach it is an elastic law.
+    The elastic law with the smallest error is chosen. Where the body stays deformed, or none can be
+    simulated, laws that yield or flow are calibrated too, and the best of them is chosen if its
+    error is below `WORTH` of the elastic one's: with a yield stress that the motion does not reach
+    von Mises is an elastic law.
 
-    build: a calibration of `body`; lasts: the share that `body` leaves unexplained (`yielding`).
+    build: a calibration of `body`; lasts: the share of its change of shape that stays (`yielding`).
     Errors: SimulationDiverged where no law can be simulated."""
     errors: dict[str, float] = {}
     ends: dict[str, dict[str, dict]] = {}
     begun, gains = calibrated(body), None
-    yielding = [law for law in candidates if law_named(law).plastic]
+    yielding = [law for law in candidates if not law_named(law).elastic]
 
     def best_of(laws: Sequence[str]) -> str | None:
         """Calibrates these; the best one, which `body` then is."""

@@ -70,3 +70,40 @@ def test_the_fit_begins_again_about_the_backbone_that_explains_the_learned_law_b
                                record=record, weights={"position": 1.0}, stages=stages)  # fmt: skip
     resumed.on_load_checkpoint(checkpoint)  # which does not begin again once more
     assert resumed.body.material.law == truth and resumed.law_gains == module.law_gains
+
+
+def test_a_liquid_that_is_found_has_no_adapter_and_goes_on_from_its_checkpoint(monkeypatch):
+    def liquid(body, candidates, *asked):
+        body.choose("newtonian")
+        return dict.fromkeys(candidates, 1e-3)
+
+    monkeypatch.setattr(newton_steps, "choose_law", liquid)
+    given = {"E": E, "nu": NU, "mu": 15.0, "kappa": 2e4}
+
+    def start_body():
+        body = small_body(on=False, modes=True)
+        body.material = Material(AUTO, given, candidates=("corotated", "newtonian")).double()
+        for kept in body.frozen.values():
+            kept["material"] = copy.deepcopy(body.material)
+        return body
+
+    film = small_body(adapter=False)
+    film.material = Material("newtonian", {"mu": 18.0, "kappa": 2e4}).double()
+    take = take_of(film, start(turn=0.5, speed=-3.0), 6)
+    take.again = None
+    stages = [Stage(name=name, iterations=1, lr=0.1, optimizer="gauss_newton") for name in ("prior", "joint")]  # fmt: skip
+    body = start_body()
+    parts = dict(record=BodyRecord.of(body, WORLD, 0.02, take.start), weights={"position": 1.0},
+                 world=WORLD, background=torch.ones(3), stages=stages)  # fmt: skip
+    module = LitMosa.of_parts(body, takes=[take], **parts)
+    with pytest.warns(UserWarning, match="newtonian has no shear stiffness"):
+        identify(module)
+    assert module.body.adapter is None and module.stage is None and module.record.law == "newtonian"
+    assert module.body.material.learned == ["mu", "kappa"]
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    resumed = LitMosa.of_parts(start_body(), takes=[take], **parts)
+    with pytest.warns(UserWarning, match="newtonian has no shear stiffness"):
+        resumed.on_load_checkpoint(checkpoint)
+    resumed.load_state_dict(module.state_dict())
+    assert resumed.body.material.physical() == module.body.material.physical()
