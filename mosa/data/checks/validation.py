@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import InstanceOf
 
-from mosa.data.checks.cameras import check_agreement, holes_report
+from mosa.data.checks.cameras import check_agreement, check_hues, holes_report
 from mosa.data.checks.free_fall import check_fall
 from mosa.data.checks.silhouettes import check_outlines, check_particles
 from mosa.data.checks.tangents import check_copies, check_pictures
@@ -24,6 +24,7 @@ from mosa.types import FALLING, REST, Cameras, Ground, KnownBody, Markers, Scene
 
 FULL = 0.99  # share of an image from which on a matte says nothing
 CLEAR = 0.9  # coverage that a camera's matte has somewhere in a film
+GROWN = 1.25  # area of a matte at the border, over the largest of its camera that is not
 FLASH = 0.2  # jump of the mean colour (0 to 1) in one frame; built-in films stay below 0.04
 DRIFT = 0.15
 """By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
@@ -105,9 +106,9 @@ def validate(scene: Scene) -> Scene:
             )
     if not scene.synthetic:
         check_colors(scene, label)
-    holes = None if scene.synthetic else holes_report(scene)
-    if holes:
-        warnings.warn(f"{label}: {holes}", stacklevel=2)
+        check_hues(scene, label)
+        if holes := holes_report(scene):
+            warnings.warn(f"{label}: {holes}", stacklevel=2)
     return scene
 
 
@@ -246,6 +247,17 @@ def check_mattes(scene: Scene, label: str) -> None:
                 f"{every if float(covered[v].min()) > FULL else one}"
             )
     check_gaps(scene, covered > 0, label)
+    cut = at_border(scene.mattes) > 0.5
+    whole = (covered * ~cut).amax(1, keepdim=True)
+    grown = torch.where(cut & (whole > 0), covered / whole, 0.0)
+    v, t = divmod(int(grown.argmax()), scene.frames)
+    if float(grown[v, t]) > GROWN:
+        warnings.warn(
+            f"{label}: camera {scene.cameras.names[v]}, frame {t}: the matte reaches the image's border and is "
+            f"{float(grown[v, t]):.2g} times the largest that does not: expected the object alone, found a hand, or what "
+            "holds it?",
+            stacklevel=3,
+        )
     most = scene.mattes.amax((1, 2, 3))
     if float(most.min()) < CLEAR:
         v = int(most.argmin())
