@@ -249,7 +249,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     def attach(self, data: SceneDataModule, fitting: bool = True) -> None:
         """Makes the body of the particles of `data` where there is none yet; fitting: and takes what a fit reads. A caller may do
-        it where the body is wanted before there is a trainer. Errors: ConfigError where a body from a checkpoint has other particles."""
+        it where the body is wanted before there is a trainer. Errors: ConfigError for other particles than a checkpoint's."""
         if self.body is None:
             measured = data.measured
             own = {key: measured.settings[key] for key in OF_DATA if key in measured.settings}

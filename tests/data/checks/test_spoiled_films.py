@@ -15,7 +15,7 @@ from written_scenes import export_transforms
 
 from mosa.data.checks.free_fall import check_still, track_of
 from mosa.data.checks.tangents import check_copies, check_pictures
-from mosa.data.checks.validation import validate
+from mosa.data.checks.validation import check_colors, validate
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
 from mosa.rendering.cameras import look_at
@@ -219,6 +219,15 @@ SPOILED = {
     "all cameras begin again": (range(6), lambda x: x[[0, 1, 2, 0, 1]], "those of frame 0 in frame 3 of all cameras, after"),
     "all frames are doubled": (range(6), lambda x: x[[0, 0, 1, 1, 2]], r"in frames 0 to 1 of all cameras, .*\(2 such stretches\)"),
 }  # fmt: skip
+
+
+def test_an_exposure_of_one_camera_that_changes_is_said(scene):
+    scene = replace(scene, images=scene.images.clone())
+    scene.images[3] *= torch.linspace(1, 0.6, 5)[:, None, None, None]
+    with pytest.warns(
+        UserWarning, match="camera 3: the object's brightness, over .* factor of 1.[4-6]"
+    ):
+        check_colors(scene, "film")
 
 
 @pytest.fixture(scope="module")

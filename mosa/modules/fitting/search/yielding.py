@@ -45,6 +45,8 @@ def lasting(body: Body, takes: Sequence, world: World) -> float:
         seen = cues.positions
         if isinstance(cues, MarkerCues):
             whole = torch.isfinite(seen).all(-1).all(0)
+            if not whole.any():  # each point was lost somewhere
+                continue
             seen, found = seen[:, whole], cues.seen(found)[:, whole]
         change = changed(seen)
         sizes = change.square().sum(-1).mean(-1).sqrt()
