@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import mosa.config.composition  # noqa: F401  registers what conf/ refers to
+from mosa.config.checkpoints import known_numbers
 from mosa.config.command_settings import TrainSettings
 from mosa.config.record import BodyRecord
 from mosa.data.io.forces import columns_of, forces_from_config
@@ -188,6 +190,7 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
         with warnings.catch_warnings():  # said again where the body is built
             warnings.simplefilter("ignore")
             adapter = fitting(build_adapter(settings.adapter.plain()), material.law)
+        check_known(settings.identification.known, material, adapter)
     stages = build_stages(settings.fit, heterogeneity, adapter, bool(material.candidates))
     weights = settings.losses.weights()
     check_terms(weights, adapter)
@@ -209,6 +212,21 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
     return stages
 
 
+def check_known(path: str | None, material: Material, adapter: torch.nn.Module | None) -> None:
+    """Another experiment tells of the law, or of one of its candidates. Errors: DataError naming the file, ConfigError."""
+    refused = None
+    for law in () if path is None else material.candidates or (material.law,):
+        own = copy.deepcopy(material)
+        own.choose(law)
+        try:
+            known_numbers(path, own, adapter, "identification.known")
+            return
+        except ConfigError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
 def check_forces(world: Mapping[str, Any], recordings: Sequence[str] = ()) -> None:
     """Driven sets and measured forces, before anything takes long. recordings: names of those beside
     the first. Errors: ConfigError naming the key, DataError the file."""
@@ -216,6 +234,12 @@ def check_forces(world: Mapping[str, Any], recordings: Sequence[str] = ()) -> No
     sets = driven_from_config(world.get("driven") or ())
     curves = forces_from_config(world.get("forces"))
     columns_of(curves, solids_of(solids, sets))
+    names = [curve.name for curve in curves]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(
+            f"world.forces: expected one file for each solid in each recording, found two of {twice[0]!r}; columns of "
+            "one time axis go into one file"
+        )
     if unknown := [c.recording for c in curves if c.recording not in (None, *recordings)]:
         raise ConfigError(
             "world.forces: recording: expected the name of one of scene.also_train or scene.test "

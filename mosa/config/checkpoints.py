@@ -229,7 +229,10 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
             ) from error
         inflation = 1.0
     else:
-        run = record_of(read_checkpoint(path), path)
+        try:
+            run = record_of(read_checkpoint(path), path)
+        except DataError as error:
+            raise DataError(f"{where}{str(error).removeprefix('ckpt_path')}") from error
         law, record = run.law or run.sections.prior.law, run.posterior
         inflation = INFLATION
     if record is None:

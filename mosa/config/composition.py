@@ -75,6 +75,8 @@ def said_of(error: BaseException) -> str:
             f"{nearest(found[2], options, '')}; files of your own: hydra.searchpath=[file://<folder>], "
             f"which holds {found[1]}/{found[2]}.yaml"
         )
+    if "Config group override must be a string" in said:
+        said = "a group, as scene, prior or adapter: expected the name of an option, found null"
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
         known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
         said = said.replace(found[0], f"{nearest(found[1], known, '')}.")
@@ -89,7 +91,7 @@ def compose(*overrides: str, name: str = "train") -> DictConfig:
     try:
         with initialize_config_dir(configuration(), version_base="1.3"):
             cfg = hydra_compose(name, overrides=list(overrides))
-    except HydraException as error:
+    except (HydraException, ValueError) as error:  # the latter for `group=null`
         raise ConfigError(said_of(error)) from error
     load_extensions(OmegaConf.to_container(cfg).get("extensions"))  # type: ignore[union-attr]
     return cfg

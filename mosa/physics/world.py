@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.planes import Plane
@@ -70,6 +71,11 @@ class World:
     driven: tuple[Driven, ...] = ()
     forces: tuple[Any, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Errors: ConfigError."""
+        if not abs(float(self.up.norm()) - 1) < 1e-3:
+            raise ConfigError(f"up: expected a unit vector, found {self.up.tolist()}")
+
     @property
     def solids(self) -> tuple[Collider, ...]:
         """All that has a motion and takes a reaction, in the order of a rollout's reactions: the
@@ -79,7 +85,7 @@ class World:
     def fastest(self, start: Start, size: float, time: float) -> float:
         """Bound of the speeds [m/s] of a body of this size [m] within `time` [s] from `start`: as far as it can fall, and what
         colliders add."""
-        given = self.up / self.up.norm(), self.gravity, start.center
+        given = self.up, self.gravity, start.center
         up, gravity, center = (v.detach().double().cpu() for v in given)
         first, spin = (
             float(v.detach().norm()) for v in (start.velocity, start.angular_velocity * size)

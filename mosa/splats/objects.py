@@ -33,6 +33,7 @@ from mosa.reconstruction.geometry.shell import solid_of, together
 from mosa.reconstruction.pipeline import FEW, filling_spacing
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.rendering.appearance.carried_splats import CarriedSplats
+from mosa.settings import Number, Positive, typed
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
@@ -51,8 +52,9 @@ NEAR = 3.0  # spacings from the nearest particle beyond which a Gaussian does no
 HALF_CELL = 0.35  # sd of a particle's own Gaussian, in spacings (reconstruction)
 
 
+@typed
 def read_object(
-    path: str | Path, *, box=None, opacity: float = 0.1, size: float | None = None, up=None
+    path: str | Path, *, box=None, opacity: Number = 0.1, size: Positive | None = None, up=None
 ) -> Appearance:
     """The Gaussians of a 3DGS PLY that are the object.
 

@@ -99,16 +99,20 @@ class SceneDataModule(L.LightningDataModule):
 
     # ---------------------------------------------------------------- Lightning's hooks
     def prepare_data(self) -> None:
-        """Makes the films of a built-in scene where they are not in the cache, or reads those of a folder. Nothing is kept."""
-        load_sequences(plain(self.cfg.scene))
+        """Makes the films of a built-in scene where they are not in the cache, or reads those of a folder. Nothing is kept. Under
+        a trainer that is left to what asks for them: a fit first compares the checkpoint that it goes on from."""
+        if self.trainer is None:
+            load_sequences(plain(self.cfg.scene))
 
     def setup(self, stage: str) -> None:
-        """Loads the films, reconstructs and finds the starts, each once. stage: fit | validate | test | predict."""
+        """Loads the films, reconstructs and finds the starts, each once, under a trainer when they are asked for.
+        stage: fit | validate | test | predict."""
         if self.device is None:
             self.device = "cpu" if self.trainer is None else self.trainer.strategy.root_device
-        _ = self.starts
-        if stage in ("fit", "validate"):
-            _ = self.epochs
+        if self.trainer is None:
+            _ = self.starts
+            if stage in ("fit", "validate"):
+                _ = self.epochs
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Batches of one epoch each time it is iterated over (`Epochs`)."""

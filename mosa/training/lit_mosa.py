@@ -68,6 +68,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.observer import Views, deformed_covariances, observe
+from mosa.training.datamodule import SceneDataModule
 from mosa.types import Ground, Rollout
 
 log = logging.getLogger(__name__)
@@ -213,10 +214,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     # ---------------------------------------------------------------- data
     def setup(self, stage: str) -> None:
-        """Asks the trainer's data module for the body's particles, its world and, for a fit, what it learns from."""
+        """Asks the trainer's data module for the body's particles and its world; a fit's data wait
+        until the checkpoint that it goes on from is known to be of this scene."""
         data = self.trainer.datamodule
-        if hasattr(data, "takes") and hasattr(data, "shape"):
-            self.attach(data, fitting=stage in ("fit", "validate"))
+        if isinstance(data, SceneDataModule):
+            if stage != "fit":
+                self.attach(data, fitting=stage == "validate")
         elif self.body is None:
             raise ConfigError(
                 "LitMosa: expected a SceneDataModule, which knows the particles of the body "
@@ -237,10 +240,16 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         known = any(isinstance(each, Stages) for each in self.trainer.callbacks)
         return [] if known else [Stages()]
 
-    def attach(self, data, fitting: bool = True) -> None:
-        """Makes the body of the particles of `data`, a `SceneDataModule`, where there is none yet; fitting: and takes what a fit
-        reads. `setup` does it; a caller may before, where the body is wanted before there is a trainer. Errors: ConfigError where
-        a body from a checkpoint has other particles."""
+    def attach_trainer(self) -> None:
+        """`attach` the data of the trainer of a fit, if it has some, on its device."""
+        data = None if self._trainer is None else self.trainer.datamodule
+        if isinstance(data, SceneDataModule):
+            self.attach(data)
+            self.to(self.device)
+
+    def attach(self, data: SceneDataModule, fitting: bool = True) -> None:
+        """Makes the body of the particles of `data` where there is none yet; fitting: and takes what a fit reads. A caller may do
+        it where the body is wanted before there is a trainer. Errors: ConfigError for other particles than a checkpoint's."""
         if self.body is None:
             measured = data.measured
             own = {key: measured.settings[key] for key in OF_DATA if key in measured.settings}
@@ -303,11 +312,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             raise ConfigError("ckpt_path: the checkpoint was not written by this program")
         record = RunRecord.read(checkpoint["mosa"])
         saved = record.fit
+        here = plain(self.trainer.datamodule.cfg) if self.record is None else self.record.settings
+        check_same_scene(record, here, "the checkpoint")
+        self.attach_trainer()
         if saved is None or saved.particles != len(self.body.rest):
             raise self.of_another_body(None if saved is None else saved.particles)
-        if self.record is not None:
-            check_same_scene(record, self.record.settings, "the checkpoint")
-            check_same_data(record, self.record.data, "the checkpoint")
+        check_same_data(record, self.record.data, "the checkpoint")
         for name in KEPT:
             setattr(self, name, copy.copy(getattr(saved, name)))
         self.stage_index, self.losses = saved.stage, list(saved.losses)
@@ -374,6 +384,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     # ---------------------------------------------------------------- one step
     def configure_optimizers(self):
         """Of the running stage; `Stages` asks again for the next one."""
+        self.attach_trainer()
         stage = self.stage
         if stage is None:  # the fit has ended
             return None

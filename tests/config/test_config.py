@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 import mosa
 from mosa.config.build import build_adapter, build_stages, rehearse
 from mosa.config.command_settings import TrainSettings
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.modules.adapters.registry import ADAPTERS, adapter_class
 from mosa.modules.body.simulation_settings import SimulationSettings
 from mosa.settings import annotation_of, arguments_of, described, fits
@@ -59,6 +59,7 @@ def test_a_mistyped_option_is_refused(override):
     ("prior=neo_hokean", r"prior: expected .*, found neo_hokean; .*neo_hookean; .* hydra\.searchpath"),
     ("callbacks=[default,early_stoping]", "callbacks: expected one of default, early_st.*nearest is early_stopping"),
     ("hydra/launcher=rai", "hydra/launcher: expected one of .*basic"),
+    ("prior=null", "a group, as scene, prior or adapter: expected the name of an option, found null"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):
@@ -213,12 +214,21 @@ def test_forces_need_a_fit_that_compares_them(tmp_path):
     rehearse(composed(*of_another, "scene.also_train=[test_60]"))
     with pytest.raises(ConfigError, match=r"recording: .* \(there are none\).* found 'test_60'"):
         rehearse(composed(*of_another))
+    with pytest.raises(ConfigError, match=r"one file for each solid .* found two of 'grip'"):
+        rehearse(composed(world[0], world[1][:-1] + "," + world[1].partition("[")[2]))
     with pytest.raises(ConfigError, match=r"world\.forces: expected stages that run Gauss-Newton"):
         rehearse(composed(*world, "fit=adam"))
     with pytest.raises(
         ConfigError, match=r"name of one collider or driven set \(there are none\), found 'grip'"
     ):
         rehearse(composed(world[1]))
+
+
+def test_what_another_experiment_says_is_read_before_anything_is_computed(tmp_path):
+    known = f"identification.known={tmp_path / 'none.json'}"
+    for prior in ("auto", "neo_hookean"):
+        with pytest.raises(DataError, match=r"^identification\.known: .*none\.json: no such file"):
+            rehearse(composed(f"prior={prior}", known))
 
 
 def test_a_rehearsal_draws_no_random_number():

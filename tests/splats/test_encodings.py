@@ -193,3 +193,11 @@ def test_opacities_in_per_cent_and_an_object_of_no_extent_are_refused(tmp_path):
         load_ply(written(tmp_path / "a.ply", change))
     with pytest.raises(DataError, match=r"field scale_.*: expected logarithms .* an object of 0"):
         read_object(written(tmp_path / "a.ply", lambda d: d | {k: 0 * d[k] for k in "xyz"}))
+    with pytest.raises(ConfigError, match=r"^size: expected a number above 0"):
+        read_object(tmp_path / "a.ply", size=-1)
+
+
+def test_colours_as_bytes_are_refused(tmp_path):
+    change = lambda d: d | {f"f_dc_{i}": 0 * d["x"] + 90 + i for i in range(3)}  # noqa: E731
+    with pytest.raises(DataError, match=r"field f_dc_\*: .*found half of them beyond 91: .*bytes"):
+        load_ply(written(tmp_path / "a.ply", change))

@@ -4,12 +4,13 @@ from types import SimpleNamespace
 
 import lightning as L
 import pytest
+import torch
 from strangers import checkpoint, saved
 
 from mosa import SceneDataModule
 from mosa.errors import ConfigError
 from mosa.modules.fitting.identification_settings import IdentificationSettings
-from mosa.training import lit_mosa
+from mosa.training import datamodule, lit_mosa
 from mosa.training.lit_mosa import LitMosa
 
 
@@ -29,17 +30,22 @@ def test_another_experiment_is_read_once_for_a_law(monkeypatch):
 
 
 @pytest.mark.parametrize("other", ["scene=ring", "scene.sequence=test_60"])
-def test_a_fit_goes_on_with_its_own_scene_alone(tmp_path, other):
+def test_a_fit_goes_on_with_its_own_scene_alone(tmp_path, monkeypatch, other):
     """It trained silently on another scene's films, where those had as many particles."""
     module = LitMosa.load_from_checkpoint(checkpoint(tmp_path / "tiny.ckpt"))
     trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     data = SceneDataModule("debug=default", other)
-    data.prepare_data = lambda: pytest.fail("the films were made")
+    monkeypatch.setattr(datamodule, "load_sequences", lambda _: pytest.fail("the films were made"))
     for run in (trainer.fit, trainer.validate, trainer.test):
         with pytest.raises(
             ConfigError, match=r"a fit to this scene, found one to another.*scene\."
         ):
             run(module, datamodule=data)
+    stored = torch.load(tmp_path / "tiny.ckpt", weights_only=True)
+    lightning = {"epoch": 0, "global_step": 0, "pytorch-lightning_version": L.__version__}
+    torch.save(stored | lightning | {"loops": {}, "callbacks": {}}, tmp_path / "tiny.ckpt")
+    with pytest.raises(ConfigError, match=r"expected in the checkpoint a fit to this .*scene\."):
+        trainer.fit(LitMosa(data.cfg), datamodule=data, ckpt_path=tmp_path / "tiny.ckpt")
     with pytest.raises(ConfigError, match=r"found one to another.*scene\."):
         LitMosa.load_from_checkpoint(tmp_path / "tiny.ckpt").on_load_checkpoint(
             saved("debug=default", other)

@@ -74,7 +74,7 @@ GRID = {"dx": 0.05, "substeps": 40, "frame_dt": 1 / 30}
     ("law", (5, None, True, [], 1.0)), ("dx", (0, -1, math.nan, "a", True)), ("substeps", (0, 2.5, "a", True, 10**9)),
     ("frame_dt", (0, -1, math.inf, "a", None)), ("energetic", ("foo", 5, None, [], "")),
     ("gravity", ("abc", (0, 1), (0, math.nan, 0), 5, None, (0, 1e9, 0))),
-    ("up", ("abc", (0, 1), (0, math.nan, 0), 5, [[0, 1, 0]])), ("ground", (5, "sticky", {}, True, [0.0])),
+    ("up", ("abc", (0, 1), (0, math.nan, 0), 5, [[0, 1, 0]], (0, 0, 0))), ("ground", (5, "sticky", {}, True, [0.0])),
     (r"ground\.height", (Ground("a"), Ground(math.nan), Ground(True), Ground(10**400), Ground(None))),
     (r"ground\.friction", (Ground(0.0, "separate", "a"), Ground(0.0, "touch", -1), Ground(0.0, "touch", math.nan))),
     ("planes", (5, [5], "ab", {}, [None])), ("colliders", (5, [5], "ab", [{"type": "sphere"}], [None])),
@@ -114,6 +114,7 @@ def rolled(count=4, volume=1e-6, density=1000.0, mu=1e4, ground=0.0, **keys):
     ({"state": 5}, "state: "), ({"state": None}, "state: "), ({"state": ParticleState(*[[0.0]] * 5)}, "state: "),
     ({"timing": 5}, "timing: "), ({"motions": 5}, "motions: "), ({"held": 5}, "held: "), ({"adapter": 5}, "adapter: "),
     ({"progress": 5}, "progress: "), ({"collect": "a"}, "collect: "),
+    ({"collect": print, "adapter": print}, "collect: "), ({"collect": print, "adapter": [print]}, "collect: "),
     ({"ground": 2.0}, "x: expected a body above the ground"), ({"ground": 1.11}, "x: expected a body above"),
 ])  # fmt: skip
 def test_a_wrong_argument_of_a_rollout_is_named(keys, message):

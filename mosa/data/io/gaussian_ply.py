@@ -39,6 +39,7 @@ FAR = 100.0
 """Extents from the origin, from which on an object is read about its own middle: float32 would round its shape."""
 OPACITY_MARGIN = 1e-6
 """Opacities are kept this far from 0 and 1, where the logit has no number."""
+BRIGHT = 6.0  # of a constant harmonic: a colour from 0 to 1 is one from -1.8 to 1.8
 SMALLEST = 1e-9
 """Standard deviations [m] below are written as this: the logarithm of 0 has no number either."""
 
@@ -165,6 +166,11 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
     higher = read(tuple(f"f_rest_{i}" for i in range(len(rest))))
     higher = higher.view(len(means), 3, per_channel).transpose(1, 2)
     coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)
+    if (usual := float(coefficients[:, 0].abs().median())) > BRIGHT:
+        raise DataError(
+            f"{path}: field f_dc_*: expected harmonics, of which most are within 2, found half of them beyond {usual:.3g}: "
+            "colours as bytes?"
+        )
     colors = mean_colors(coefficients)
     said = " ".join(document.comments).lower().partition("vertical axis:")[2].split()[:1]
     splats = Splats(means, scales, rotations / length, opacities, colors)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from functools import cache
 from typing import Any
 from warnings import warn
@@ -19,7 +18,7 @@ from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import field_types, kernels_of
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.launching import launch
-from mosa.settings import typed
+from mosa.settings import Section, Text, typed
 
 KINDS = [field_types(wp.float64)[k] for k in (0, 0, 3, 2, 1, 0)]  # F, C_affine, p, G, h, tau
 
@@ -151,7 +150,8 @@ PROPERTIES = {
 
 
 @typed
-def check_law(law: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+@typed
+def check_law(law: Text, parameters: Section) -> dict[str, float]:
     """Relative errors of a registered law, at 100 drawn deformations: `symmetry`, `objectivity`, `gradient` (adjoint
     against differences), `loops` (d P/dF against its transpose; not of laws that yield or flow). Warns above `WRONG`.
 

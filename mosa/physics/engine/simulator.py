@@ -102,7 +102,8 @@ class Simulator:
     ) -> None:  # fmt: skip
         self.law = law_named(law)
         inputs.vector("gravity", gravity)
-        inputs.vector("up", gravity if up is None else up)
+        if up is not None and not inputs.vector("up", up).any():
+            raise ConfigError(f"up: expected a direction (x, y, z), found {up}")
         if energetic and not self.law.sheared:
             raise ConfigError(
                 f"energetic: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu"
@@ -269,6 +270,10 @@ class Simulator:
         if worlds is None and (gravity is not None or asked.together is not None):
             raise ConfigError(
                 "gravity and together: expected None without worlds; gravity is the simulator's"
+            )
+        if None not in (asked.collect, asked.adapter) and not hasattr(asked.adapter, "statistics"):
+            raise ConfigError(
+                f"collect: expected one adapter that has statistics(), found {shown(asked.adapter)}"
             )
         inputs.check_state(self.numerics, state, asked.volume)
         each = inputs.motions_of_worlds(asked.motions, self.colliders, worlds)

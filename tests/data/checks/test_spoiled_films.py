@@ -15,7 +15,7 @@ from written_scenes import export_transforms
 
 from mosa.data.checks.free_fall import check_still, track_of
 from mosa.data.checks.tangents import check_copies, check_pictures
-from mosa.data.checks.validation import validate
+from mosa.data.checks.validation import check_colors, validate
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
 from mosa.rendering.cameras import look_at
@@ -63,6 +63,18 @@ def halved(pixels):
 
 def speck(pixels):
     pixels[1:4, 1:4, 3] = 255
+
+
+def held(pixels):
+    pixels[: len(pixels) // 2, 24:40, 3] = 255
+
+
+def grey(pixels):
+    pixels[..., :3] = pixels[..., :3].mean(-1, keepdims=True)
+
+
+def exchanged(pixels):
+    pixels[..., :3] = pixels[..., 2::-1].copy()
 
 
 def empty(pixels):
@@ -122,6 +134,9 @@ def test_a_focal_length_that_is_off_is_no_other_moment():
     (black, {"camera": "2", "frame": 2}, "camera 2, frame 2: the object's mean colour is .* beside that of the frames before"),
     (faded, {"camera": "1"}, "camera 1: the matte is nowhere more than 0.7. in any frame"),
     (speck, {"frame": 0}, "frame 0, has 9 pixels apart from the object, .* cameras have such"),
+    (held, {"camera": "4", "frame": 3}, r"camera 4, frame 3: the matte reaches the image's border and is 1\.[3-9]"),
+    (grey, {"camera": "2"}, "camera 2: expected the object in the colours that the other cameras see, found .* a film in grey"),
+    (exchanged, {"camera": "5"}, "camera 5: expected the object in the colours .*, found [0-9]% of them there"),
     (empty, {"camera": "1", "frame": 1}, r"camera 1, frame 1: the matte is empty, where .* later frame \(1 such mattes\)"),
 ])  # fmt: skip
 def test_what_is_suspicious_is_said(film, tmp_path, change, where, message):
@@ -204,6 +219,15 @@ SPOILED = {
     "all cameras begin again": (range(6), lambda x: x[[0, 1, 2, 0, 1]], "those of frame 0 in frame 3 of all cameras, after"),
     "all frames are doubled": (range(6), lambda x: x[[0, 0, 1, 1, 2]], r"in frames 0 to 1 of all cameras, .*\(2 such stretches\)"),
 }  # fmt: skip
+
+
+def test_an_exposure_of_one_camera_that_changes_is_said(scene):
+    scene = replace(scene, images=scene.images.clone())
+    scene.images[3] *= torch.linspace(1, 0.6, 5)[:, None, None, None]
+    with pytest.warns(
+        UserWarning, match="camera 3: the object's brightness, over .* factor of 1.[4-6]"
+    ):
+        check_colors(scene, "film")
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 import mosa
+from mosa.errors import ConfigError
 from mosa.evaluation.analysis.law_stress import check_own
 from mosa.modules.body.material import Material
 from mosa.physics.constitutive.laws import LawParameters, register_law
@@ -64,6 +65,11 @@ def test_a_right_law_passes(law, more):
         found = mosa.check_law(law, SOLID | more)
         check_own(Material(law, SOLID | more))
     assert set(found) == {"symmetry", "objectivity", "gradient", "loops"}
+
+
+def test_parameters_are_a_section():
+    with pytest.raises(ConfigError, match=r"^parameters: expected a section of keys, found None"):
+        mosa.check_law("corotated", None)
 
 
 def test_laws_without_an_energy_are_not_asked_for_it():

@@ -30,6 +30,11 @@ def twin(world=WORLD):
     return Twin(body, build_world(world), 0.02, None, start)
 
 
+def test_up_is_a_unit_vector():
+    with pytest.raises(ConfigError, match=r"^up: expected a unit vector, found \[0.0, 2.0, 0.0\]"):
+        build_world(WORLD | {"up": [0, 2, 0]})
+
+
 def test_a_plate_presses_the_body_down():
     free = twin().simulate(frames=8)
     assert free.reactions is None

@@ -45,6 +45,8 @@ def lasting(body: Body, takes: Sequence, world: World, unexplained: bool = False
     for take in takes:
         cues, seen, frames = take.cues, take.cues.positions, len(take.cues.positions)
         whole = torch.isfinite(seen).all(-1).all(0)  # of tracked points
+        if not whole.any():  # each was lost somewhere
+            continue
         changes = [change := changed(seen[:, whole])]
         if unexplained:
             found = body.simulate(take.start, world, frames, take.frame_dt, model=model).x

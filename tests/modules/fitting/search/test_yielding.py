@@ -75,6 +75,8 @@ def test_tracked_points_tell_it_too():
     take.cues = MarkerCues(seen, few[:, None], torch.ones(len(few), 1).double())
     for unexplained in (False, True):
         assert lasting(body, [take], WORLD, unexplained) > LASTS
+    seen[torch.arange(len(few)) % len(seen), torch.arange(len(few))] = torch.nan
+    assert lasting(body, [take], WORLD) == 0.0  # each was lost once
 
 
 def test_an_elastic_prior_of_such_a_body_is_warned_of():
