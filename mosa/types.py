@@ -240,7 +240,8 @@ class MotionCues:
 
     positions: (T, N, 3) [m]; rotation: (T, N, 3, 3), stretch: (T, N, 3) descending singular values, both relative to frame 0;
     weight: (T, N) in [0, 1], 0 where rotation and stretch are not determined; covariances: (T, N, 3, 3) [m^2] of the dynamic
-    Gaussians, from which cue flow maps are rendered."""
+    Gaussians, from which cue flow maps are rendered; eye: (3,) [m] of the only camera, which sees the
+    direction of a particle but not its distance, None for several."""
 
     __repr__ = in_brief
 
@@ -249,17 +250,26 @@ class MotionCues:
     stretch: Tensor
     weight: Tensor
     covariances: Tensor
+    eye: Tensor | None = None
 
     def to(self, device: torch.device | str) -> MotionCues:
         return moved(self, device)
 
     def first(self, frames: int) -> MotionCues:
         """Of the first `frames` frames."""
-        return MotionCues(*(getattr(self, f.name)[:frames] for f in fields(self)))
+        cut = {f.name: getattr(self, f.name)[:frames] for f in fields(self) if f.name != "eye"}
+        return replace(self, **cut)
 
     def away(self, x: Tensor) -> Tensor:
-        """(T, N, 3) [m] of particles at x from where they were seen."""
-        return x - self.positions
+        """(T, N, 3) [m] of particles at x from where they were seen; from the lines of sight of a single camera."""
+        return self.across(x - self.positions, self.positions)
+
+    def across(self, away: Tensor, seen: Tensor) -> Tensor:
+        """(..., N, 3) [m] of distances `away` from positions `seen`, without what a single camera does not see of them."""
+        if self.eye is None:
+            return away
+        sight = torch.nn.functional.normalize(seen - self.eye, dim=-1).to(away)
+        return away - (away * sight).sum(-1, keepdim=True) * sight
 
 
 @dataclass(frozen=True)

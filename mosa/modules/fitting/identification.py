@@ -202,7 +202,7 @@ class Identification:
     ) -> Rollout:  # fmt: skip
         """frames: how many, None for all; begun: see `Ready.simulate`."""
         seen, solids = take.cues.positions[:frames], self.world.solids
-        unseen = None if take.response is None else take.response.unseen
+        unseen = residuals.unseen(take.cues, take.response)
         observed = seen if gain else None
         return ready.simulate(
             len(seen), solids, observed=observed, gain=gain, unseen=unseen, begun=begun

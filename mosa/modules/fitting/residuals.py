@@ -8,6 +8,7 @@ move alike, and so do frames: a frame counts as `count` independent data, not as
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -67,10 +68,26 @@ def fields(
     U, S, V = singular_value_decomposition(F[1:, chosen])
     relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
     weight = cues.weight[1:frames, chosen, None]
-    away = x[1:, chosen] - cues.positions[1:frames, chosen]
+    away = cues.first(frames).away(x)[1:, chosen]
     return Fields(
         away, 0.5 * axial(relative) * weight, (S - cues.stretch[1:frames, chosen]) * weight
     )
+
+
+def unseen(
+    cues: MotionCues | MarkerCues, response: Response | None
+) -> Callable[[Tensor, int], Tensor] | None:
+    """What would not have been found of positions (..., N, 3) [m] in a frame, (..., N, 3) [m]; None where all would."""
+    kept = None if response is None else response.unseen
+    if isinstance(cues, MarkerCues) or cues.eye is None:
+        return kept
+
+    def hidden(x: Tensor, frame: int) -> Tensor:
+        seen = cues.positions[frame].to(x)
+        away = x - seen
+        return away - cues.across(away if kept is None else away - kept(x, frame), seen)
+
+    return hidden
 
 
 def floors(dx: float, cells: float) -> tuple[float, float, float]:
