@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -280,6 +280,7 @@ class MarkerCues:
     positions: Tensor
     particles: Tensor
     weights: Tensor
+    eye: ClassVar[None] = None
 
     def to(self, device: torch.device | str) -> MarkerCues:
         return moved(self, device)

@@ -98,9 +98,12 @@ class Identification:
         )
         marked = any(take is not None and isinstance(take.cues, MarkerCues) for take in self.takes)
         free = self.calibrating and (law_named(body.material.law).plastic or body.settings.adaptive)
-        # a few points say neither where all the particles are nor how they are strained
+        # a few points say neither where all the particles are nor how they are strained, and a
+        # single camera does not see how they are along its lines of sight
         self.gains = (0.0,) if free or marked else criterion.gains
-        self.kinds = (True, False, False) if (self.calibrating or marked) and kinds[0] else kinds
+        single = any(take is not None and take.cues.eye is not None for take in self.takes)
+        alone = (self.calibrating or marked or single) and kinds[0]
+        self.kinds = (True, False, False) if alone else kinds
         if not any(self.kinds) and not world.forces:
             raise ConfigError(
                 "losses: identification compares motion cues, and the weights of position, rotation and stretch are "

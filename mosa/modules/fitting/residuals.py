@@ -79,7 +79,7 @@ def unseen(
 ) -> Callable[[Tensor, int], Tensor] | None:
     """What would not have been found of positions (..., N, 3) [m] in a frame, (..., N, 3) [m]; None where all would."""
     kept = None if response is None else response.unseen
-    if isinstance(cues, MarkerCues) or cues.eye is None:
+    if cues.eye is None:
         return kept
 
     def hidden(x: Tensor, frame: int) -> Tensor:

@@ -612,9 +612,11 @@ def test_how_far_a_single_camera_takes_a_body_to_be_is_not_taken_for_the_law(cri
         moved = eye + farther * (take.cues.positions - eye)
         take.cues = replace(take.cues, positions=moved, eye=eye if known else None)
         body = small_body(adapter=False, E=2e4, nu=0.3)
+        kinds = (True, known, known)  # of which one eye sees the first
         found = identification(
-            body, [take], criterion=Criterion(name=criterion), grid_error=0.0, kinds=(True, False, False)
+            body, [take], criterion=Criterion(name=criterion), grid_error=0.0, kinds=kinds
         )
+        assert found.kinds == (True, False, False)
         run(found)
         wrong[known] = abs(values(body)["E"] / E - 1) + abs(values(body)["nu"] - NU)
     assert wrong[True] < 1e-3 and wrong[False] > 0.01
