@@ -28,11 +28,6 @@ def centers(cameras: Cameras) -> Tensor:
     return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
 
 
-def only_eye(cameras: Cameras) -> Tensor | None:
-    """Where a camera is that films alone, (3,) [m]; None of several."""
-    return centers(cameras)[0] if len(cameras) == 1 else None
-
-
 def rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Origins (V, 3) [m] and unit directions (V, H, W, 3), in world axes, of the rays through all pixel centres."""
     x, y = (

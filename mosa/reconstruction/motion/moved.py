@@ -29,7 +29,7 @@ from mosa.reconstruction.motion.response import (
 from mosa.reconstruction.pose.known import known_centres
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.rendering.cameras import only_eye
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
 from mosa.system.progress import tqdm
@@ -85,9 +85,9 @@ class MovingParts:
         return Scaffold(seen, self.scaffold.modes.at(seen.means, self.splats.means), None, *lit)
 
     @property
-    def eye(self) -> Tensor | None:
-        """(3,) [m] of the only training camera, None of several."""
-        return only_eye(self.scene.cameras.select(self.scene.training_cameras))
+    def eyes(self) -> Tensor:
+        """(V, 3) [m] of the training cameras."""
+        return centers(self.scene.cameras.select(self.scene.training_cameras))
 
     @property
     def reach(self) -> float:
@@ -128,10 +128,10 @@ def first_motion(
 def cues_of(motion: dict[str, Tensor], splats: Splats, parts: MovingParts) -> MotionCues:
     """Cues of a reconstructed motion, relative to `splats`, where it starts."""
     if parts.settings.cue == "gaussian":
-        return replace(gaussian_cues(**motion, splats=splats), eye=parts.eye)
+        return replace(gaussian_cues(**motion, splats=splats), eyes=parts.eyes)
     around = neighbourhood(splats.means, neighbours=parts.settings.neighbours)
     found = neighbourhood_cues(motion["positions"], motion["covariances"], around)
-    return replace(found, eye=parts.eye)
+    return replace(found, eyes=parts.eyes)
 
 
 @dataclass(frozen=True)
@@ -256,4 +256,4 @@ class SecondLook:
         moved = around.deformation(positions)
         covariances = carried_covariance(moved, splats.scales, splats.rotations)
         found = neighbourhood_cues(positions, covariances, around)
-        return replace(found, eye=self.reconstruction.moving.eye).to(self.device)
+        return replace(found, eyes=self.reconstruction.moving.eyes).to(self.device)

@@ -610,7 +610,7 @@ def test_how_far_a_single_camera_takes_a_body_to_be_is_not_taken_for_the_law(cri
         take = take_and_turn(small_body(adapter=False), 0.5)
         farther = 1 + 0.1 * torch.linspace(0, 1, FRAMES).double()[:, None, None]
         moved = eye + farther * (take.cues.positions - eye)
-        take.cues = replace(take.cues, positions=moved, eye=eye if known else None)
+        take.cues = replace(take.cues, positions=moved, eyes=eye[None] if known else None)
         body = small_body(adapter=False, E=2e4, nu=0.3)
         kinds = (True, known, known)  # of which one eye sees the first
         found = identification(

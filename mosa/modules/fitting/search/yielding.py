@@ -42,7 +42,8 @@ def lasting(body: Body, takes: Sequence, world: World) -> float:
     for take in takes:
         cues, frames = take.cues, len(take.cues.positions)
         found = body.simulate(take.start, world, frames, take.frame_dt, model=model).x
-        seen = cues.positions
+        # a single camera's shapes grow with their unseen distance: those nearest to the rollout's
+        seen = found - cues.away(found) if cues.single else cues.positions
         if isinstance(cues, MarkerCues):
             whole = torch.isfinite(seen).all(-1).all(0)
             seen, found = seen[:, whole], cues.seen(found)[:, whole]
