@@ -271,7 +271,7 @@ class MotionCues:
 
     def across(self, away: Tensor, seen: Tensor) -> Tensor:
         """(..., N, 3) [m] of distances `away` from positions `seen`, without what a single camera does not see of them."""
-        if not self.single:
+        if self.eyes is None or not self.single:
             return away
         sight = torch.nn.functional.normalize(seen - self.eyes[0], dim=-1).to(away)
         return away - (away * sight).sum(-1, keepdim=True) * sight
