@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -240,7 +240,8 @@ class MotionCues:
 
     positions: (T, N, 3) [m]; rotation: (T, N, 3, 3), stretch: (T, N, 3) descending singular values, both relative to frame 0;
     weight: (T, N) in [0, 1], 0 where rotation and stretch are not determined; covariances: (T, N, 3, 3) [m^2] of the dynamic
-    Gaussians, from which cue flow maps are rendered."""
+    Gaussians, from which cue flow maps are rendered; eyes: (V, 3) [m] of the cameras that saw it, None for as
+    many as tell all. One sees the direction of a particle, not its distance."""
 
     __repr__ = in_brief
 
@@ -249,17 +250,31 @@ class MotionCues:
     stretch: Tensor
     weight: Tensor
     covariances: Tensor
+    eyes: Tensor | None = None
 
     def to(self, device: torch.device | str) -> MotionCues:
         return moved(self, device)
 
     def first(self, frames: int) -> MotionCues:
         """Of the first `frames` frames."""
-        return MotionCues(*(getattr(self, f.name)[:frames] for f in fields(self)))
+        cut = {f.name: getattr(self, f.name)[:frames] for f in fields(self) if f.name != "eyes"}
+        return replace(self, **cut)
+
+    @property
+    def single(self) -> bool:
+        """Whether one camera saw it."""
+        return self.eyes is not None and len(self.eyes) == 1
 
     def away(self, x: Tensor) -> Tensor:
-        """(T, N, 3) [m] of particles at x from where they were seen."""
-        return x - self.positions
+        """(T, N, 3) [m] of particles at x from where they were seen; from the lines of sight of a single camera."""
+        return self.across(x - self.positions, self.positions)
+
+    def across(self, away: Tensor, seen: Tensor) -> Tensor:
+        """(..., N, 3) [m] of distances `away` from positions `seen`, without what a single camera does not see of them."""
+        if self.eyes is None or not self.single:
+            return away
+        sight = torch.nn.functional.normalize(seen - self.eyes[0], dim=-1).to(away)
+        return away - (away * sight).sum(-1, keepdim=True) * sight
 
 
 @dataclass(frozen=True)
@@ -270,6 +285,8 @@ class MarkerCues:
     positions: Tensor
     particles: Tensor
     weights: Tensor
+    eyes: ClassVar[None] = None
+    single: ClassVar[bool] = False
 
     def to(self, device: torch.device | str) -> MarkerCues:
         return moved(self, device)

@@ -325,7 +325,7 @@ def reconstruct(
         found = apart.stage("carried", carried_stage)
         colored = {name: found.pop(name) for name in COLORED}
         appearance = Appearance(Splats(**found), **colored)
-    cues, figures = cues_of(motion, splats, settings), geometry.figures(spacing)
+    cues, figures = cues_of(motion, splats, parts), geometry.figures(spacing)
     return Reconstruction(splats, spacing, volume, cues, static, figures, appearance, parts)
 
 
@@ -392,7 +392,7 @@ def follow(
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
-    cues, volume = cues_of(motion, splats, settings), reconstruction.volume
+    cues, volume = cues_of(motion, splats, parts), reconstruction.volume
     return Reconstruction(splats, reconstruction.spacing, volume, cues, static, moving=parts)
 
 

@@ -97,9 +97,13 @@ class Identification:
         )
         marked = any(take is not None and isinstance(take.cues, MarkerCues) for take in self.takes)
         free = self.calibrating and (law_named(body.material.law).plastic or body.settings.adaptive)
-        # a few points say neither where all the particles are nor how they are strained
+        # a few points say neither where all the particles are nor how they are strained, and a
+        # single camera does not see how they are along its lines of sight
         self.gains = (0.0,) if free or marked else criterion.gains
-        self.kinds = (True, False, False) if (self.calibrating or marked) and kinds[0] else kinds
+        cues = [take.cues for take in self.takes if take is not None]
+        self.few = residuals.fewer(cues)
+        alone = (self.calibrating or marked or any(each.single for each in cues)) and kinds[0]
+        self.kinds = (True, False, False) if alone else kinds
         if not any(self.kinds) and not world.forces:
             raise ConfigError(
                 "losses: identification compares motion cues, and the weights of position, rotation and stretch are "
@@ -199,7 +203,7 @@ class Identification:
     ) -> Rollout:  # fmt: skip
         """frames: how many, None for all; begun: see `Ready.simulate`."""
         seen, solids = take.cues.positions[:frames], self.world.solids
-        unseen = None if take.response is None else take.response.unseen
+        unseen = residuals.unseen(take.cues, take.response)
         observed = seen if gain else None
         return ready.simulate(
             len(seen), solids, observed=observed, gain=gain, unseen=unseen, begun=begun
@@ -313,6 +317,9 @@ class Identification:
         except SimulationDiverged:
             return None
 
+    def _floors(self, cells: float) -> tuple[float, float, float]:
+        return residuals.floors(self.body.settings.dx, cells, self.few)
+
     @torch.no_grad()
     def _measure_noise(self) -> None:
         """Noise and what the grid gets wrong, at the numbers in use."""
@@ -320,7 +327,7 @@ class Identification:
         if self.two_grids and (coarser := self._coarser()) is not None:
             self.grid_difference = residuals.difference(found, coarser)
         model_error = 0.0 if self.calibrating else self.settings.model_error
-        least = residuals.floors(self.body.settings.dx, model_error)
+        least = self._floors(model_error)
         wrong = self.grid_difference and [
             residuals.Fields(*(self.settings.grid_error * field for field in each))
             for each in self.grid_difference
@@ -353,7 +360,7 @@ class Identification:
         body = self.body if body is None else body
         if not any(gains):
             return self.distance(body)
-        least = 3 * residuals.floors(self.body.settings.dx, self.settings.model_error)[0] ** 2
+        least = 3 * self._floors(self.settings.model_error)[0] ** 2
         logarithms = []
         for i, gain in itertools.product(range(len(self.takes)), gains):
             away = self.takes[i].cues.away(self.rollout(body, i, gain).x)
@@ -578,11 +585,12 @@ class Identification:
 
     def _between_grids(self, pair: int, kind: int) -> Tensor | None:
         """(frames,) root mean square distance over particles between the predictions on two grids,
-        `grid_error` times; None without a second grid."""
+        `grid_error` times, and how much farther off the cues of few cameras are; None without a second grid."""
         if self.grid_difference is None:
             return None
-        field = list(self.grid_difference[pair])[kind]
-        return self.settings.grid_error * field.square().sum(-1).mean(-1).sqrt()
+        field = self.settings.grid_error * list(self.grid_difference[pair])[kind]
+        cues = 3 * residuals.CUE_ERRORS[kind] ** 2 * (self.few**2 - 1)
+        return (field.square().sum(-1).mean(-1) + cues).sqrt()
 
     def cost(self) -> float:
         """Minus the logarithm of the posterior at the numbers in use, but for a constant, under the noise in use."""
@@ -596,7 +604,7 @@ class Identification:
         What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
         patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
         each = COUNTED_AT_FIRST * self.settings.count / len(self.gains)
-        cues = 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
+        cues = 3 * self._floors(0.0)[0] ** 2
         counted, wrong, late = 0.0, 0.0, []
         share = 1 / len(self.pairs)
         for (i, _), scales, found in zip(self.pairs, self.noise, there or self._fields(self.body)):

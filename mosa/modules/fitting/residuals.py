@@ -8,6 +8,7 @@ move alike, and so do frames: a frame counts as `count` independent data, not as
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +22,9 @@ from mosa.types import MarkerCues, MotionCues, Rollout
 CUE_ERRORS = (0.5e-3, 0.01, 0.015)
 """Per component: positions [m], rotations [rad], singular values. Cues that a simulation informed are 0.5 to 0.7 mm off after
 contact, 0.3 to 0.4 in a component (rabbit, chick1, mandarin, peanut); what they get wrong beyond is measured from the residuals."""
+CAMERAS = 12
+"""That saw the cues of `CUE_ERRORS`. Three leave cues that are 1.7 to 1.9 mm off (rabbit, chick1), one 2.6 mm across its lines of
+sight (rabbit)."""
 MODEL_ERRORS = (1.0, 0.3, 0.15)
 """Rotations and singular values that a grid gets wrong where it gets positions wrong by a cell."""
 SAMPLES = 2000
@@ -67,17 +71,39 @@ def fields(
     U, S, V = singular_value_decomposition(F[1:, chosen])
     relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
     weight = cues.weight[1:frames, chosen, None]
-    away = x[1:, chosen] - cues.positions[1:frames, chosen]
+    away = cues.first(frames).away(x)[1:, chosen]
     return Fields(
         away, 0.5 * axial(relative) * weight, (S - cues.stretch[1:frames, chosen]) * weight
     )
 
 
-def floors(dx: float, cells: float) -> tuple[float, float, float]:
-    """Noise per component that no frame gets below: that of the cues, and what a simulation on a grid of dx [m] gets wrong whatever
-    its law is, `cells` of it in positions."""
+def unseen(
+    cues: MotionCues | MarkerCues, response: Response | None
+) -> Callable[[Tensor, int], Tensor] | None:
+    """What would not have been found of positions (..., N, 3) [m] in a frame, (..., N, 3) [m]; None where all would."""
+    kept = None if response is None else response.unseen
+    if not cues.single:
+        return kept
+
+    def hidden(x: Tensor, frame: int) -> Tensor:
+        seen = cues.positions[frame].to(x)
+        away = x - seen
+        return away - cues.across(away if kept is None else away - kept(x, frame), seen)
+
+    return hidden
+
+
+def fewer(cues: Sequence[MotionCues | MarkerCues]) -> float:
+    """Factor of `CUE_ERRORS` with as many cameras as the cues have that fewest saw."""
+    counts = [len(each.eyes) for each in cues if each.eyes is not None]
+    return max(1.0, CAMERAS / min(counts, default=CAMERAS)) ** 0.5
+
+
+def floors(dx: float, cells: float, few: float = 1.0) -> tuple[float, float, float]:
+    """Noise per component that no frame gets below: that of the cues, `few` times as large, and what a simulation on a grid of
+    dx [m] gets wrong whatever its law is, `cells` of it in positions."""
     return tuple(
-        (cue**2 + (model * cells * (dx if i == 0 else 1.0)) ** 2) ** 0.5
+        ((few * cue) ** 2 + (model * cells * (dx if i == 0 else 1.0)) ** 2) ** 0.5
         for i, (cue, model) in enumerate(zip(CUE_ERRORS, MODEL_ERRORS))
     )
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from mosa.data.observations import Observations
 from mosa.errors import ConfigError, MosaError
 from mosa.modules.body.body import Body, Start, World
+from mosa.modules.fitting.residuals import unseen
 from mosa.reconstruction.motion.moved import SecondLook
 from mosa.reconstruction.motion.response import Response
 from mosa.types import MarkerCues, MotionCues
@@ -52,7 +53,8 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
     @torch.no_grad()
     def predicted(gain: float = 0.0) -> Tensor:
         return body.simulate(
-            take.start, world, len(seen), take.frame_dt, model=model, observed=seen if gain else None, gain=gain
+            take.start, world, len(seen), take.frame_dt, model=model, observed=seen if gain else None, gain=gain,
+            unseen=unseen(take.cues, None),
         ).x  # fmt: skip
 
     free, other, found, name = predicted(), None, None, take.again.scene.sequence

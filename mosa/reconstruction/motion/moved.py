@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -29,6 +29,7 @@ from mosa.reconstruction.motion.response import (
 from mosa.reconstruction.pose.known import known_centres
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
 from mosa.system.progress import tqdm
@@ -84,6 +85,11 @@ class MovingParts:
         return Scaffold(seen, self.scaffold.modes.at(seen.means, self.splats.means), None, *lit)
 
     @property
+    def eyes(self) -> Tensor:
+        """(V, 3) [m] of the training cameras."""
+        return centers(self.scene.cameras.select(self.scene.training_cameras))
+
+    @property
     def reach(self) -> float:
         """Radius of the body [m]."""
         means = self.splats.means
@@ -119,14 +125,13 @@ def first_motion(
     return {name: value.cpu() for name, value in result.items()}
 
 
-def cues_of(
-    motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings
-) -> MotionCues:
+def cues_of(motion: dict[str, Tensor], splats: Splats, parts: MovingParts) -> MotionCues:
     """Cues of a reconstructed motion, relative to `splats`, where it starts."""
-    if settings.cue == "gaussian":
-        return gaussian_cues(**motion, splats=splats)
-    around = neighbourhood(splats.means, neighbours=settings.neighbours)
-    return neighbourhood_cues(motion["positions"], motion["covariances"], around)
+    if parts.settings.cue == "gaussian":
+        return replace(gaussian_cues(**motion, splats=splats), eyes=parts.eyes)
+    around = neighbourhood(splats.means, neighbours=parts.settings.neighbours)
+    found = neighbourhood_cues(motion["positions"], motion["covariances"], around)
+    return replace(found, eyes=parts.eyes)
 
 
 @dataclass(frozen=True)
@@ -250,4 +255,5 @@ class SecondLook:
         positions = positions.to(splats.means)
         moved = around.deformation(positions)
         covariances = carried_covariance(moved, splats.scales, splats.rotations)
-        return neighbourhood_cues(positions, covariances, around)
+        found = neighbourhood_cues(positions, covariances, around)
+        return replace(found, eyes=self.reconstruction.moving.eyes).to(self.device)

@@ -602,6 +602,26 @@ def test_what_cues_keep_of_a_prediction_is_not_taken_for_the_law(criterion):
     assert wrong[True] < 1e-3 and wrong[False] > 0.01
 
 
+@pytest.mark.parametrize("criterion", ["free", "corrected"])
+def test_how_far_a_single_camera_takes_a_body_to_be_is_not_taken_for_the_law(criterion):
+    """Cues are moved along their lines of sight, by a tenth of their distance in the last frame."""
+    eye, wrong = torch.tensor([1.0, 0.6, 0.4]).double(), {}
+    for known in (True, False):
+        take = take_and_turn(small_body(adapter=False), 0.5)
+        farther = 1 + 0.1 * torch.linspace(0, 1, FRAMES).double()[:, None, None]
+        moved = eye + farther * (take.cues.positions - eye)
+        take.cues = replace(take.cues, positions=moved, eyes=eye[None] if known else None)
+        body = small_body(adapter=False, E=2e4, nu=0.3)
+        kinds = (True, known, known)  # of which one eye sees the first
+        found = identification(
+            body, [take], criterion=Criterion(name=criterion), grid_error=0.0, kinds=kinds
+        )
+        assert found.kinds == (True, False, False)
+        run(found)
+        wrong[known] = abs(values(body)["E"] / E - 1) + abs(values(body)["nu"] - NU)
+    assert wrong[True] < 1e-3 and wrong[False] > 0.01
+
+
 @pytest.mark.parametrize("criterion", ["free", "both"])
 def test_columns_as_worlds_are_those_one_by_one(criterion):
     """On a CPU every world has the bits of its own rollout. What corrects a prediction goes through torch, whose vectors round the

@@ -1,6 +1,7 @@
 """Distances between a rollout and cues: nothing for its own, known turns and stretches as they are, one unit for each datum."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -95,6 +96,43 @@ def test_noise_is_not_below_that_of_the_cues_and_the_grid():
             assert torch.allclose(
                 scale, torch.full((2,), 3**0.5 * floor, dtype=torch.float64), rtol=1e-12
             )
+
+
+def seen_by(cameras: int | None, x: torch.Tensor) -> MotionCues:
+    eyes = torch.randn(cameras, 3, generator=torch.Generator().manual_seed(3)) if cameras else None
+    return MotionCues(x, x, x, x, x, eyes)
+
+
+def test_cues_of_fewer_than_twelve_cameras_are_trusted_less():
+    """Errors of so many average out; with several recordings the one that fewest saw counts."""
+    x, none = torch.zeros(2, 4, 3), residuals.Fields(*(torch.zeros(2, 4, 3).double(),) * 3)
+    for counts, factor in (
+        ((None,), 1.0),
+        ((24, 12), 1.0),
+        ((3,), 2.0),
+        ((12, 3, None), 2.0),
+        ((1,), 12**0.5),
+    ):
+        few = residuals.fewer([seen_by(count, x) for count in counts])
+        assert few == pytest.approx(factor, rel=1e-15)
+        noise = residuals.spread([none], residuals.floors(0.02, 0.1, few))[0][0]
+        expected = (3 * ((factor * 0.5e-3) ** 2 + 0.002**2)) ** 0.5
+        assert torch.allclose(noise, torch.full_like(noise, expected), rtol=1e-12)
+
+
+def test_a_single_camera_sees_no_distance_along_its_lines_of_sight():
+    generator = torch.Generator().manual_seed(4)
+    seen, x = (torch.randn(2, 5, 3, generator=generator) for _ in range(2))
+    for cameras in (None, 2, 12):
+        assert torch.equal(seen_by(cameras, seen).away(x), x - seen)
+    cues = seen_by(1, seen)
+    sight = seen - cues.eyes[0]
+    expected = torch.linalg.cross(sight, x - seen).norm(dim=-1) / sight.norm(dim=-1)
+    assert torch.allclose(cues.away(x).norm(dim=-1), expected, rtol=1e-4)
+    farther = replace(cues, positions=cues.eyes[0] + 1.2 * sight)
+    assert torch.allclose(farther.away(x), cues.away(x), atol=1e-5)
+    hidden = residuals.unseen(cues, None)(x[1], 1)
+    assert torch.allclose(seen[1] - x[1] + hidden, -cues.away(x)[1], atol=1e-6)
 
 
 @pytest.mark.parametrize("particles", [1, 7, 2000, 2001, 12345])

@@ -44,12 +44,15 @@ def lasting(body: Body, takes: Sequence, world: World, unexplained: bool = False
     shares, model = [], body.model().only(heterogeneity=False, adapter=False)
     for take in takes:
         cues, seen, frames = take.cues, take.cues.positions, len(take.cues.positions)
+        if unexplained or cues.single:
+            found = body.simulate(take.start, world, frames, take.frame_dt, model=model).x
+            # a single camera's shapes grow with their unseen distance: those nearest to the rollout's
+            seen = found - cues.away(found) if cues.single else seen
         whole = torch.isfinite(seen).all(-1).all(0)  # of tracked points
         if not whole.any():  # each was lost somewhere
             continue
         changes = [change := changed(seen[:, whole])]
         if unexplained:
-            found = body.simulate(take.start, world, frames, take.frame_dt, model=model).x
             found = cues.seen(found) if isinstance(cues, MarkerCues) else found
             # a body that leans against the ground keeps some, and one that topples elsewhere than
             # predicted differs from the rollout: one that has yielded does both
