@@ -18,7 +18,6 @@ from mosa.modules.body.material import FORMS as RANGES
 from mosa.modules.body.material import RELATIVE, Form, Material
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import as_rival, each_law, limits_of
-from mosa.modules.fitting.search.parts import PARTS
 from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.system.progress import tqdm
 from mosa.system.threads import apart
@@ -221,7 +220,7 @@ def determined(
                 figures[f"posterior/{name}_relative_sd"] = sd / value
             else:
                 figures[f"posterior/{name}_sd"] = sd
-        elif name in PARTS:
+        elif name in ("operator", "stiffness"):
             figures[f"posterior/{name}_numbers"] = float(len(index))
             figures[f"posterior/{name}_determined"] = float(posterior.determined[index].sum())
     if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:

@@ -57,7 +57,7 @@ from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.newton_optimizer import GaussNewtonOptimizer
 from mosa.modules.fitting.newton_steps import NewtonSteps
-from mosa.modules.fitting.parameters import learned_parts, tensors_of
+from mosa.modules.fitting.parameters import is_learned, tensors_of
 from mosa.modules.fitting.retreat import Retreat
 from mosa.modules.fitting.search.yielding import warn_of_yielding
 from mosa.modules.fitting.stages import Stage
@@ -392,8 +392,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             found = self.adam(stage)
             self.running_optimizer = found["optimizer"]
             return found
-        learned = {"adapter": stage.learns_adapter, "heterogeneity": stage.learns_heterogeneity}
-        numbers = tensors_of(self.body, learned_parts(self.body, **learned))
+        body = self.body
+        adapter = stage.learns_adapter and is_learned(body.adapter)
+        varies = stage.learns_heterogeneity and is_learned(body.heterogeneity)
+        numbers = tensors_of(body, adapter=adapter, heterogeneity=varies)
         self.running_optimizer = GaussNewtonOptimizer(numbers, lambda: self.identification)
         return self.running_optimizer
 

@@ -42,9 +42,9 @@ def test_a_contact_offset_is_learned_where_something_lies_still_below(ground, wa
     """Solids and driven sets keep their place from the body, whatever the offset is."""
     record = RunRecord.read(saved(f"world.walls={walls}")["mosa"]).body
     body = build_body(record if ground else record.but(ground=None), cube())
-    blocks = blocks_of(body, [], IdentificationSettings())
+    blocks = blocks_of(body, adapter=False, heterogeneity=False, settings=IdentificationSettings())
     assert ("contact" in [block.name for block in blocks]) == learned
-    assert len(tensors_of(body, [])) == len(blocks)
+    assert len(tensors_of(body, adapter=False, heterogeneity=False)) == len(blocks)
     assert learned or float(body.contact.lift(None, 0.1).detach()) == 0.0
 
 

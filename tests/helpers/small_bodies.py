@@ -26,9 +26,8 @@ def lattice(counts=(6, 5, 4), spacing=DX / 2) -> torch.Tensor:
 
 
 def small_body(*, numbers=None, adapter=True, modes=False, law="corotated", E=E, nu=NU, contact=False,
-               counts=(6, 5, 4), precision=64, on=True, **parameters) -> Body:  # fmt: skip
-    """numbers: (19,) of the hyperelastic adapter, 0 where None; on: whether it is switched on, at E and nu; parameters: of the law
-    beside E and nu."""
+               counts=(6, 5, 4), precision=64, on=True) -> Body:  # fmt: skip
+    """numbers: (19,) of the hyperelastic adapter, 0 where None; on: whether it is switched on, at E and nu."""
     rest = lattice(counts)
     n = len(rest)
     module = HyperelasticAdapter() if adapter else None
@@ -41,7 +40,7 @@ def small_body(*, numbers=None, adapter=True, modes=False, law="corotated", E=E,
     )
     body = Body(
         rest=rest, volume=torch.full((n,), (DX / 2) ** 3).double(), colors=torch.ones(n, 3), opacities=torch.ones(n),
-        covariances=1e-4 * torch.eye(3).expand(n, 3, 3), density=1000.0, material=Material(law, {"E": E, "nu": nu, **parameters}),
+        covariances=1e-4 * torch.eye(3).expand(n, 3, 3), density=1000.0, material=Material(law, {"E": E, "nu": nu}),
         heterogeneity=field, adapter=module, settings=SimulationSettings(dx=DX, precision=precision, contact_offset=contact),
     )  # fmt: skip
     if precision == 64:

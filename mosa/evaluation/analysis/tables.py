@@ -15,7 +15,7 @@ from mosa.modules.fitting.search.ground import (
     learned_on,
     taken_of,
 )
-from mosa.modules.fitting.search.parts import PARTS, WORTH, chosen, named
+from mosa.modules.fitting.search.parts import WORTH, chosen, named
 from mosa.physics.constitutive.damping import DAMPED
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import World
@@ -163,12 +163,12 @@ def _asked(gains: Mapping[str, float]) -> str:
 def form_text(errors: Mapping[str, float]) -> str:
     """Which parts the learned law has, and why. errors: [m] of held-back frames, by `parts.named`."""
     words = {"isotropic": "isotropic and the same everywhere", "operator": "anisotropic",
-             "yield": "of an anisotropic yield", "stiffness": "of a stiffness that varies over the body"}  # fmt: skip
-    in_words = {name: ", ".join(words[part] for part in name.split("+")) for name in errors}
-    listed = "; ".join(f"{in_words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
+             "stiffness": "of a stiffness that varies over the body",
+             "operator+stiffness": "anisotropic, of a stiffness that varies over the body"}  # fmt: skip
+    listed = "; ".join(f"{words[name]}: {1e3 * error:.2f} mm" for name, error in errors.items())
     taken = chosen(errors)
     said = (
-        f"The learned law is {in_words[taken]}. Error of frames that were held back from the fit, "
+        f"The learned law is {words[taken]}. Error of frames that were held back from the fit, "
         f"plus the error of the grid: {listed}."
     )
     if taken == named(()) and len(errors) > 1:
@@ -247,8 +247,8 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}."
         )
     # a part that the choice of the law left out was not measured
-    taken = chosen(held_back) if held_back else named(PARTS)
-    left_out = set(PARTS) - set(taken.split("+"))
+    taken = chosen(held_back) if held_back else "operator+stiffness"
+    left_out = {"operator", "stiffness"} - set(taken.split("+"))
     if "posterior/stiffest_cone_deg" in figures and "operator" not in left_out:
         ratio, half = figures["id/stiffness_ratio"], figures["posterior/stiffest_cone_deg"]
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
@@ -270,7 +270,6 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         lines.append(f"- {said}")
     numbers = {
         "operator": "numbers of the anisotropic stiffness",
-        "yield": "numbers of the anisotropic yield",
         "stiffness": "modes of the stiffness over the body",
     }
     for name, what in numbers.items():

@@ -7,14 +7,10 @@ at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 
 
 which is positive definite whatever A is, isotropic only for A = 0, and leaves E and nu their meaning: they carry the isotropic
 part.
-
-Where the prior has a yield stress, the yield function takes |exp(Y) E'| for |E'|, E' the deviator of the Hencky strain and Y
-symmetric of trace 0: Hill's quadratic criterion (1948), whose mean the prior's yield stress stays. The flow is the prior's.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from functools import lru_cache
 from typing import Any
@@ -33,8 +29,7 @@ SHARPNESS = 60.0
 """Of the smoothed smallest eigenvalue: it is above the true one by at most log(6)/60."""
 NUMBERS = 19
 """Symmetric 6 x 6 matrices have 21 numbers, of which two are isotropic: the prior's own."""
-YIELD_NUMBERS = 14
-"""Symmetric maps of the five deviatoric strains have 15 numbers, of which one is the prior's yield stress."""
+
 
 CONTRASTS = (
     (math.sqrt(1 / 2), -math.sqrt(1 / 2), 0.0),
@@ -68,24 +63,6 @@ def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.stack([matrix(entries) for entries in (*parts, means, *others)]).to(device, dtype)
 
 
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)
-def yield_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(14, 6, 6) orthonormal symmetric matrices of trace 0 in Mandel scaling, from deviators to deviators; written out, as
-    `anisotropic_basis` is."""
-    five = torch.zeros(5, 6, dtype=torch.float64)  # what a deviator has, in orthonormal directions
-    five[:2, :3] = torch.tensor(CONTRASTS, dtype=torch.float64)
-    five[2:, 3:] = torch.eye(3)
-    numbers = torch.zeros(YIELD_NUMBERS, 5, 5, dtype=torch.float64)
-    for k, (i, j) in enumerate(itertools.combinations(range(5), 2)):
-        numbers[k, i, j] = numbers[k, j, i] = math.sqrt(1 / 2)
-    for k in range(1, 5):  # those on the diagonal, whose mean is the prior's
-        weights = torch.tensor([1.0] * k + [-k] + [0.0] * (4 - k), dtype=torch.float64)
-        numbers[9 + k] = torch.diag(weights / weights.norm())
-    basis = five.T @ numbers @ five
-    return (0.5 * (basis + basis.mT)).to(device, dtype)  # what rounding parts
-
-
 def root_stiffness(poisson: Tensor) -> Tensor:
     """(6, 6) C0^(1/2) in Mandel scaling and units of sqrt(2 mu); poisson: () below 1/2."""
     like: dict[str, Any] = {"dtype": poisson.dtype, "device": poisson.device}
@@ -95,8 +72,7 @@ def root_stiffness(poisson: Tensor) -> Tensor:
 
 
 class HyperelasticAdapter(Adapter):
-    """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior;
-    `yields`: (14,) of Y in `yield_basis`.
+    """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
 
     Fluids have no shear modulus that it could be a multiple of: it is left out there."""
 
@@ -106,17 +82,11 @@ class HyperelasticAdapter(Adapter):
     def __init__(self) -> None:
         super().__init__()
         self.numbers = nn.Parameter(torch.zeros(NUMBERS))
-        self.yields = nn.Parameter(torch.zeros(YIELD_NUMBERS))
         self._live: Tensor | None = None
 
     def __getstate__(self) -> dict:
         live = None if self._live is None else self._live.detach()
         return super().__getstate__() | {"_live": live}
-
-    def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
-        # checkpoints of before the yield was learned have none: it is the prior's there
-        state_dict.setdefault(f"{prefix}yields", torch.zeros_like(self.yields))
-        super()._load_from_state_dict(state_dict, prefix, *others)
 
     @property
     def steady(self) -> bool:
@@ -185,31 +155,19 @@ class HyperelasticAdapter(Adapter):
         scale = torch.tensor(MANDEL, dtype=torch.float64, device=C0.device)
         return (self.correction(poisson) @ torch.linalg.inv(C0)) * scale / scale[:, None]
 
-    def yielding(self) -> Tensor:
-        """(6, 6) float64 exp(Y) - I on vech components, with its graph."""
-        basis = yield_basis(torch.float64, self.yields.device)
-        Y = torch.einsum("k,kij->ij", self.yields.double(), basis)
-        change = torch.linalg.matrix_exp(Y) - torch.eye(6, dtype=torch.float64, device=Y.device)
-        scale = torch.tensor(MANDEL, dtype=torch.float64, device=Y.device)
-        return change * scale / scale[:, None]
-
     def increment(self, w: Tensor, s: Tensor) -> Tensor:
         return s.double() @ self.relative().T
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         """G: C0 + S - beta C0 for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: (beta - 1, 0, ...), see
-        `share`; views of one row. plastic_G: `yielding`, of a law that yields.
+        `share`; views of one row.
 
         Errors: ConfigError before `switch_on`."""
         self.check_on()
         n, less = len(state.w), self.share() - 1
         added = self.correction() - less * isotropic_stiffness(self._poisson().double())
         h = torch.cat([less.reshape(1), less.new_zeros(5)])
-        G, h = added.to(state.w).expand(n, 6, 6), h.to(state.w).expand(n, 6)
-        if state.plastic_strain is None:
-            return AdapterOperator(G, h)
-        yielding = self.yielding().to(state.w).expand(n, 6, 6)
-        return AdapterOperator(G, h, yielding, torch.zeros_like(h))
+        return AdapterOperator(added.to(state.w).expand(n, 6, 6), h.to(state.w).expand(n, 6))
 
     def statistics(self) -> OperatorStatistics:
         """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the

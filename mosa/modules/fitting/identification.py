@@ -25,7 +25,7 @@ from mosa.modules.body.material import RIVALS
 from mosa.modules.fitting import residuals
 from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
-from mosa.modules.fitting.parameters import blocks_of, learned_parts, tensors_of
+from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of
 from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
 from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
@@ -92,8 +92,9 @@ class Identification:
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
         self.calibrating, self.iterations = stage.calibrates, stage.iterations
         self.compares = not stage.calibrates and not stage.learns_adapter
-        self.parts = learned_parts(
-            body, adapter=stage.learns_adapter, heterogeneity=not self.calibrating, among=parts
+        self.adapter = stage.learns_adapter and is_learned(body.adapter) and "operator" in parts
+        self.heterogeneity = (
+            not self.calibrating and is_learned(body.heterogeneity) and "stiffness" in parts
         )
         marked = any(take is not None and isinstance(take.cues, MarkerCues) for take in self.takes)
         free = self.calibrating and (law_named(body.material.law).plastic or body.settings.adaptive)
@@ -113,7 +114,7 @@ class Identification:
         compared = self.takes[0].cues.positions.shape[1] if marked else len(body.rest)
         self.chosen = residuals.sampled(compared, body.rest.device)
         blocks = blocks_of(
-            body, self.parts, settings, ground=world.ground,
+            body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings, ground=world.ground,
             free=not any(self.gains), calibrating=self.calibrating,
         )  # fmt: skip
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
@@ -149,7 +150,7 @@ class Identification:
 
     def _seat(self, body: Body) -> Seat:
         share = torch.zeros(1, dtype=torch.float64)
-        tensors = tensors_of(body, self.parts)
+        tensors = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
         if self.two_grids:
             tensors.append(share)
         return Seat(
@@ -165,6 +166,11 @@ class Identification:
         if not body.settings.adaptive:
             for i in range(len(self.takes)):
                 self.ready(body, i)
+
+    @property
+    def parts(self) -> list[str]:
+        """Those of `search.parts` that are learned here."""
+        return [part for part, on in zip(PARTS, (self.adapter, self.heterogeneity)) if on]
 
     @property
     def two_grids(self) -> bool:
@@ -187,10 +193,7 @@ class Identification:
     def ready(self, body: Body, index: int, substeps: int | None = None) -> Ready:
         """The body at the start of a take, with what is learned here."""
         take = self.takes[index]
-        parts = set(self.parts)
-        model = body.model().only(
-            heterogeneity="stiffness" in parts, adapter=bool(parts - {"stiffness"})
-        )
+        model = body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter)
         frames, frame_dt = len(take.cues.positions), take.frame_dt
         return body.ready(take.start, self.world, frames, frame_dt, model=model, substeps=substeps)
 
@@ -251,7 +254,7 @@ class Identification:
 
     def _fields(self, body: Body, flown: bool = False) -> list[residuals.Fields]:
         """Of every pair; those that were found last are remembered. flown: from the end of the `_flights` on."""
-        numbers = tensors_of(body, self.parts)
+        numbers = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
         place = torch.cat([t.detach().double().cpu().flatten() for t in numbers]).tolist()
         key = (body.material.law, body.settings.dx, *self.substeps, *place)
         with self._lock:

@@ -16,7 +16,7 @@ from mosa.errors import DataError, SimulationDiverged
 from mosa.modules.body.body import Body
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.identification import EVIDENCE_ITERATIONS, Identification
-from mosa.modules.fitting.parameters import is_learned, tensor_of
+from mosa.modules.fitting.parameters import is_learned
 from mosa.modules.fitting.search.backbone import choose_law
 from mosa.modules.fitting.search.ground import (
     EXPLAINED,
@@ -200,8 +200,10 @@ class NewtonSteps:
             f"{name} {1e3 * error:.2f} mm" for name, error in self.parts.items()))  # fmt: skip
         kept = [part for part in PARTS if part in best.split("+")]
         with torch.no_grad():
-            for part in set(own.parts) - set(kept):
-                tensor_of(body, part).zero_()
+            if "operator" in own.parts and "operator" not in kept:
+                body.adapter.numbers.zero_()
+            if "stiffness" in own.parts and "stiffness" not in kept:
+                body.heterogeneity.coefficients.zero_()
         if not kept:
             body.thaw("prior")
         fewer = self.identifying(stage if kept else self.stages[0], parts=kept)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
@@ -17,8 +17,6 @@ from mosa.modules.body.body import Body, ContactOffset
 from mosa.modules.body.material import FORMS, NU_MAX, Form, Material, unit_of
 from mosa.modules.fitting.gauss_newton import Block, Seat
 from mosa.modules.fitting.identification_settings import IdentificationSettings
-from mosa.modules.fitting.search.parts import PARTS
-from mosa.physics.constitutive.laws import law_named
 from mosa.types import Ground
 
 FINER = 0.25
@@ -65,24 +63,12 @@ def warn_of_ends(material: Material) -> None:
         )
 
 
-def learned_parts(
-    body: Body, *, adapter: bool = True, heterogeneity: bool = True, among: Sequence[str] = PARTS
-) -> list[str]:
-    """Those of `search.parts` that Gauss-Newton learns of a body where its adapter and its heterogeneity are to be learned."""
-    adapter = adapter and is_learned(body.adapter)
-    directed = adapter and hasattr(body.adapter, "yields")
-    yields = directed and "yield_stress" in law_named(body.material.law).parameters
-    varies = heterogeneity and is_learned(body.heterogeneity)
-    learned = dict(zip(PARTS, (adapter, yields, varies), strict=True))
-    return [part for part in PARTS if learned[part] and part in among]
-
-
 def blocks_of(
-    body: Body, parts: Sequence[str], settings: IdentificationSettings, ground: Ground | None = None, free: bool = False,
-    calibrating: bool = False,
+    body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,
+    ground: Ground | None = None, free: bool = False, calibrating: bool = False,
 ) -> list[Block]:  # fmt: skip
-    """The numbers that are learned, in the order of `tensors_of`. parts: of `learned_parts`; ground: what the body falls on; free:
-    whether only free rollouts are compared."""
+    """The numbers that are learned, in the order of `tensors_of`. ground: what the body falls on; free: whether only free rollouts
+    are compared."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER
     for name in body.material.learned:
         start = body.material.begins[name]
@@ -93,32 +79,28 @@ def blocks_of(
         sd, bounds = body.contact.prior(ground, body.settings.dx, free)
         mean = torch.tensor([ContactOffset.START])
         blocks.append(Block("contact", mean, torch.tensor([sd]), step, bounds=bounds))
-    for name in [part for part in parts if part != "stiffness"]:
-        zero = torch.zeros(tensor_of(body, name).numel())
-        blocks.append(Block(name, zero, zero + settings.operator_sd, step, learned=True))
-    if "stiffness" in parts:
+    if adapter:
+        zero = torch.zeros(body.adapter.numbers.numel())
+        sd = zero + settings.operator_sd
+        blocks.append(Block("operator", zero, sd, step, learned=True))
+    if heterogeneity:
         falls = (1 + (body.heterogeneity.size / 2) ** 2) ** -0.5
         sd, step = settings.stiffness_sd * falls, step / body.heterogeneity.settings.amplitude
         blocks.append(Block("stiffness", 0 * falls, sd, step, learned=True))
     return blocks
 
 
-def tensors_of(body: Body, parts: Sequence[str]) -> list[Tensor]:
+def tensors_of(body: Body, *, adapter: bool, heterogeneity: bool) -> list[Tensor]:
     """The parameters of `blocks_of`."""
     tensors: list[Tensor] = [body.material.raw[name] for name in body.material.learned]
     tensors += [body.contact.cells] if body.contact.enabled else []
-    return tensors + [tensor_of(body, part) for part in parts]
-
-
-def tensor_of(body: Body, part: str) -> Tensor:
-    """The parameter that is a part of the law: zeros leave it out."""
-    if part == "stiffness":
-        return body.heterogeneity.coefficients
-    return body.adapter.numbers if part == "operator" else body.adapter.yields
+    tensors += [body.adapter.numbers] if adapter else []
+    return tensors + ([body.heterogeneity.coefficients] if heterogeneity else [])
 
 
 def _seat(body: Body) -> Seat:
-    return Seat(tensors_of(body, learned_parts(body)), torch.empty)
+    learned = {"adapter": is_learned(body.adapter), "heterogeneity": is_learned(body.heterogeneity)}
+    return Seat(tensors_of(body, **learned), torch.empty)
 
 
 def write_numbers(body: Body, numbers: Tensor) -> None:

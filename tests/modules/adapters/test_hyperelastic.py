@@ -14,11 +14,9 @@ from mosa.errors import ConfigError
 from mosa.evaluation.analysis.stiffness import directional_moduli
 from mosa.modules.adapters.hyperelastic import (
     NUMBERS,
-    YIELD_NUMBERS,
     HyperelasticAdapter,
     anisotropic_basis,
     root_stiffness,
-    yield_basis,
 )
 from mosa.modules.adapters.microplane import isotropic_stiffness
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
@@ -376,54 +374,3 @@ def test_what_it_refuses_and_what_a_copy_holds():
         not copied.requires_grad_(False).stiffness().requires_grad
         and adapter.stiffness().requires_grad
     )
-
-
-def hill(coefficients):
-    """(6, 6) M in Mandel scaling of Hill's quadratic criterion e:M:e, of (f, g, h, l, m, n); |dev e|^2 if all are 1."""
-    f, g, h, *shears = coefficients
-    normal = torch.tensor([[g + h, -h, -g], [-h, h + f, -f], [-g, -f, f + g]]).double() / 3
-    return torch.block_diag(normal, torch.diag(torch.tensor(shears).double()))
-
-
-def test_yield_basis_keeps_deviators_and_the_mean_yield():
-    basis, units = (
-        yield_basis(torch.float64, torch.device("cpu")),
-        torch.eye(YIELD_NUMBERS).double(),
-    )
-    assert torch.allclose(torch.einsum("kij,lij->kl", basis, basis), units, rtol=0, atol=1e-14)
-    volume = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
-    assert float((basis @ volume).abs().max()) < 1e-14 and torch.equal(basis, basis.mT)
-    assert float(basis.diagonal(dim1=1, dim2=2).sum(1).abs().max()) < 1e-14
-
-
-def test_yields_are_hills_criterion():
-    """Of the numbers that the criterion's own matrix has, to the factor that the yield stress carries."""
-    M = hill((0.5, 1.5, 1.2, 2.0, 0.7, 0.9))
-    values, vectors = torch.linalg.eigh(M)
-    assert float(values[0].abs()) < 1e-14  # of a change of volume
-    mean = values[1:].log().mean()
-    Y = 0.5 * (vectors[:, 1:] * (values[1:].log() - mean)) @ vectors[:, 1:].T
-    adapter = adapter_of(torch.zeros(NUMBERS))
-    with torch.no_grad():
-        adapter.yields.copy_(torch.einsum("kij,ij->k", yield_basis(M.dtype, M.device), Y))
-    e = reference.vech(torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(0)).double())
-    e[:, :3] -= e[:, :3].mean(1, keepdim=True)
-    state = MaterialState(e, e, e)
-    answer = adapter(state)
-    taken = (e + (answer.plastic_G @ e[..., None])[..., 0] + answer.plastic_h) * SCALE
-    wanted = torch.einsum("ni,ij,nj->n", e * SCALE, M, e * SCALE) / mean.exp()
-    assert torch.allclose(taken.square().sum(1), wanted, rtol=1e-12)
-    assert adapter(state._replace(plastic_strain=None)).plastic_G is None
-
-
-def test_without_numbers_a_law_yields_as_its_prior():
-    answer = adapter_of(torch.zeros(NUMBERS))(MaterialState(*torch.rand(3, 5, 6).double()))
-    assert not bool(answer.plastic_G.any()) and not bool(answer.plastic_h.any())
-
-
-def test_weights_of_before_the_yield_was_learned_are_read():
-    old = {k: v for k, v in HyperelasticAdapter().state_dict().items() if k != "yields"}
-    adapter = adapter_of(torch.zeros(NUMBERS))
-    adapter.yields.data.fill_(1.0)
-    adapter.load_state_dict(old)
-    assert not bool(adapter.yields.any())

@@ -1,4 +1,4 @@
-"""Parts of a learned law: anisotropy (`operator`), an anisotropic yield (`yield`), a stiffness that varies (`stiffness`), or none.
+"""Parts of a learned law: anisotropy (`operator`), a stiffness that varies (`stiffness`), or neither.
 
 A richer law always reproduces the film better, as it also explains errors of grid, contact and form.
 So each law predicts frames that were held back from it: the frames after first contact are divided
@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-PARTS = ("operator", "yield", "stiffness")
+PARTS = ("operator", "stiffness")
 """Blocks of numbers that a law may do without."""
 FOLDS = 4
 """Stretches of the frames after contact. Errors of neighbouring frames are alike, so single frames
@@ -34,7 +34,7 @@ have 0.83 to 1.0 of the isotropic law's error on isotropic bodies, at most 0.77 
 
 
 def named(parts: Sequence[str]) -> str:
-    """A law by its parts, as operator+stiffness; isotropic without any."""
+    """A law by its parts: isotropic, operator, stiffness or operator+stiffness."""
     return "+".join(parts) or "isotropic"
 
 

@@ -10,7 +10,6 @@ from without_trainer import identify
 from mosa.modules.fitting.gauss_newton import KNOWN, Posterior
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
-from mosa.modules.fitting.parameters import learned_parts
 from mosa.modules.fitting.search.backbone import valleys
 from mosa.modules.fitting.search.parts import UNKNOWN, WORTH, chosen, held_back
 from mosa.modules.fitting.stages import Stage
@@ -145,37 +144,3 @@ def test_an_operator_that_predicts_held_back_frames_is_kept(monkeypatch):
     module = fitted(monkeypatch, None)
     assert module.parts["operator"] < WORTH * module.parts["isotropic"]
     assert bool(module.body.adapter.numbers.any()) and len(module.posterior.names) == 21
-
-
-def yielding_body(yields=None):
-    """Of a von Mises law that is isotropic but for what these numbers (14,) make of its yield."""
-    body = small_body(law="von_mises", E=1e5, yield_stress=3e3, counts=(4, 4, 3))
-    if yields is not None:
-        body.adapter.yields.data.copy_(yields)
-    return body
-
-
-def test_laws_with_a_yield_stress_learn_its_anisotropy():
-    assert learned_parts(small_body()) == ["operator"]
-    assert learned_parts(yielding_body()) == ["operator", "yield"]
-    assert learned_parts(yielding_body(), adapter=False) == []
-    grains = small_body(law="drucker_prager", modes=True, friction_angle=30.0, cohesion=0.0)
-    assert learned_parts(grains) == ["operator", "stiffness"]
-
-
-def test_an_anisotropic_yield_is_found():
-    """From the motion of a body whose elasticity is isotropic: it, and not its stiffness, predicts held-back frames."""
-    generator = torch.Generator().manual_seed(0)
-    yields = 0.4 * torch.randn(14, generator=generator).double()
-    take = take_of(yielding_body(yields), start(turn=0.5, speed=-3.0), 7)
-    stage = Stage(name="joint", iterations=5, lr=0.1, optimizer="gauss_newton")
-    criterion, settings = Criterion(name="corrected"), IdentificationSettings(grid_error=0.0)
-    found = Identification(yielding_body(), [take], WORLD, stage, criterion, settings)
-    found.iterate_until_converged(stage.iterations)
-    errors = found.held_back()
-    assert errors["yield"] < WORTH * min(errors["isotropic"], errors["operator"])
-    away = [
-        found.rollout(body, 0).x - take.cues.positions for body in (found.body, yielding_body())
-    ]
-    assert float(away[0].norm()) < 0.1 * float(away[1].norm())
-    assert float(torch.cosine_similarity(found.body.adapter.yields.detach(), yields, 0)) > 0.7
