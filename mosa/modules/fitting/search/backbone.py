@@ -271,6 +271,12 @@ TRIED = 4
 """Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
 
 
+BETTER = 0.95
+"""With a yield stress that the motion does not reach von Mises is an elastic law, and both have the
+same error. Of a letter of a liquid and a trophy of sand, elastic laws soft enough to flow through
+the film have 1.2 times the true law's error."""
+
+
 def choose_law(
     body: Body,
     candidates: Sequence[str],
@@ -281,9 +287,8 @@ def choose_law(
     [m], all by the elastic laws' criterion; infinite where a law cannot be simulated.
 
     The elastic law with the smallest error is chosen. Where the body stays deformed, or none can be
-    simulated, laws that yield or flow are calibrated too, and the best of all is chosen: of a
-    letter of a liquid and a trophy of sand, elastic laws soft enough to flow through the film have
-    1.2 times the true law's error, so a margin would keep them.
+    simulated, laws that yield or flow are calibrated too, and the best of them is chosen if its
+    error is below `BETTER` of the elastic one's.
 
     build: a calibration of `body`; lasts: the share of its change of shape that stays (`yielding`).
     Errors: SimulationDiverged where no law can be simulated."""
@@ -317,7 +322,7 @@ def choose_law(
     best = best_of([law for law in candidates if law not in yielding])
     if yielding and (best is None or lasts() > LASTS):
         other = best_of(yielding)
-        if best is None or (other is not None and errors[other] < errors[best]):
+        if best is None or (other is not None and errors[other] < BETTER * errors[best]):
             best = other
     if best is None:
         raise SimulationDiverged(
