@@ -198,8 +198,9 @@ def imported_splats(path: str, scene: Scene) -> Appearance:
     if int(inside.sum()) < 8:
         low, high = (metres(x) for x in (splats.means.amin(0), splats.means.amax(0)))
         raise DataError(
-            f"{path}: expected Gaussians in the scene's box {metres(scene.box)} m, found {int(inside.sum())} of {len(inside)}: "
-            f"the file spans {low} to {high}; bring it into the scene's world and metres first"
+            f"{path}: expected Gaussians in the scene's box {metres(scene.box)} m, found "
+            f"{int(inside.sum())} of {len(inside)}: the file spans {low} to "
+            f"{high}; bring it into the scene's world and metres first"
         )
     kept = Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats)))
     check_place(path, kept, scene)

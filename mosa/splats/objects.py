@@ -190,8 +190,8 @@ def object_twin(
         above, far = float(middle @ direction) - ground, reach(solid.shape)
         if far > 0 and above < -0.99 * far:
             warnings.warn(
-                f"colliders[{k}]: its position {metres(middle)} is {-above:.3g} m below the ground, where "
-                f"nothing meets it: up is {metres(direction)}",
+                f"colliders[{k}]: its position {metres(middle)} is {-above:.3g} m below the ground, "
+                f"where nothing meets it: up is {metres(direction)}",
                 stacklevel=2,
             )
     return twin

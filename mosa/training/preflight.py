@@ -69,8 +69,8 @@ def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> Sp
     if settings.film.view is not None and any(settings.up):
         up = torch.tensor(settings.up).float()
         if float((viewed_from(settings.film.view, up, name="film.view") @ up).max()) < 0:
-            below = f"film.view: {settings.film.view} looks from below the object, as up is {settings.up}"
-            warnings.warn(below, stacklevel=2)
+            below = f"looks from below the object, as up is {settings.up}"
+            warnings.warn(f"film.view: {settings.film.view} {below}", stacklevel=2)
     if settings.preset is not None:
         preset(settings.preset)
         task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()

@@ -292,8 +292,8 @@ class Twin:
         shadow: bool = True,
     ) -> Tensor:
         """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and
-        among `colliders`, those that the rollout was simulated with (None: the world's). rollout: or
-        a list of the states of T steps, whose solids are drawn where they were then (None: those of
+        among `colliders`, those that the rollout was simulated with (None: the world's). rollout:
+        or a list of the states of T steps, whose solids are drawn where they were then (None: those of
         `reset`). Half spaces are not drawn. size [px]: of a square, or (width, height). view: (3,)
         from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None
         for the side and a little above. shadow: on the ground, of the body and of the solids, under
@@ -321,8 +321,8 @@ class Twin:
         side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
         width, height = (size, size) if isinstance(size, int) else size
         focal, frames = 1.6 * min(width, height), len(rollout.x)
-        # the ball around all places of the particles fills the shorter side
-        far = (3.2**2 + 1) ** 0.5 * (0.5 * float((high - low).norm()) + body.spacing)
+        # a ball around all places of the particles fills the shorter side, but for a margin
+        far = (3.2**2 + 1) ** 0.5 * (0.53 * float((high - low).norm()) + body.spacing)
         toward = viewed_from(side / side.norm() + 0.25 * up if view is None else view, up, frames)
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         w2c = look_at(target + far * toward, target.expand_as(toward), up).cpu()
@@ -393,8 +393,9 @@ class Twin:
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
         the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view and
-        shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px above and below. Errors, before
-        anything is written: ConfigError where they are not, or a format's or the video's program is missing."""
+        shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px
+        above and below. Errors, before anything is written: ConfigError where they are not, or a
+        format's or the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
         check_formats(formats)
         if video:

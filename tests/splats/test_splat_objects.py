@@ -209,7 +209,8 @@ def test_the_command_makes_all_of_it(tmp_path):
     arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply]",
                  "recentre=true", "colliders=[{type:sphere,radius:0.05,position:[0,0.05,0]}]",
                  "velocity=[60,0,0]",  # farther than any box around the object
-                 "preset=jelly", "film={size:[96,64],fps:30,view:[[1,0.3,0],[0,0.3,1]],shadow:false,caption:false}",
+                 "preset=jelly", "film={size:[96,64],fps:30,shadow:false,caption:false}",
+                 "film.view=[[1,0.3,0],[0,0.3,1]]",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
     done = forked.call("mosa/splats/__main__.py", *arguments)
     assert done.returncode == 0, done.stderr[-2000:]

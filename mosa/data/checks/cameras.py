@@ -95,8 +95,8 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
     if not bool(((point > low) & (point < high)).all()):
         raise DataError(
             f"{label}: scene.box: expected the object inside of {metres(scene.box)} m, found it at "
-            f"{metres(point)} m in frame {frame}, where the lines of sight meet; correct the box, or the "
-            "unit or axes of the poses"
+            f"{metres(point)} m in frame {frame}, where the lines of sight meet; correct the box, "
+            "or the unit or axes of the poses"
         )
 
 
