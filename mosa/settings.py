@@ -101,6 +101,12 @@ def folder(value: str) -> str:
     return value
 
 
+Side = Annotated[int, Ge(8), Le(8192)]
+Pixels = Annotated[
+    Side | Sequence[Side],
+    Expected("a whole number of at least 8 and at most 8192, or two such, [width, height]"),
+    such(lambda v: isinstance(v, int) or len(v) == 2),
+]
 Names = Annotated[
     list[str], Expected("a list of names like [a, b], each once"),
     such(lambda v: len(set(v)) == len(v)),

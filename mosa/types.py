@@ -52,6 +52,12 @@ def moved(held: Held, device: torch.device | str) -> Held:
     return replace(held, **{f.name: at(getattr(held, f.name)) for f in fields(held)})
 
 
+def metres(places: Tensor) -> list[Any]:
+    """Places [m] as numbers for a message, to 0.01 mm."""
+    rounded: list[Any] = (torch.round(places.detach().double(), decimals=5) + 0.0).tolist()
+    return rounded  # 0 added: -0.0 becomes 0.0
+
+
 @dataclass(frozen=True)
 class Cameras:
     """V pinhole cameras of one image size. `w2c` maps world metres to OpenCV camera axes (x right, y down, z forward).

@@ -25,6 +25,9 @@ def main() -> None:
         print(__doc__)
         return
     settle_threads()
-    from mosa.viewer.recorded import main as view
+    try:
+        from mosa.viewer.recorded import main as view
 
-    view(sys.argv[1:])
+        view(sys.argv[1:])
+    except KeyboardInterrupt:  # as it is read and opened
+        pass

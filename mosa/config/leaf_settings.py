@@ -16,6 +16,7 @@ from mosa.settings import (
     Folder,
     Four,
     Names,
+    Pixels,
     Positive,
     Seed,
     Settings,
@@ -34,6 +35,7 @@ Corners = Annotated[list[Three], Expected("two corners [[x, y, z], [x, y, z]]"),
 Direction = Annotated[
     list[float], Expected("a direction of three numbers, not zero"), Len(3, 3), such(any)
 ]
+Views = Annotated[list[Three], Expected("a list of such"), Len(1)]
 Rate = Annotated[float, Interval(ge=1, le=1e5)]
 Readout = Annotated[float, Interval(ge=0, le=0.1)]
 Seconds = Annotated[float, Interval(gt=0, le=60)]
@@ -57,16 +59,19 @@ class FilmSection(Settings):
 
     where: ClassVar[str] = "film"
 
-    size: int = Field(400, ge=8, le=8192)
-    """px, of its width and height"""
+    size: Pixels = 400
+    """px, [width, height]; one number: of a square. The caption's two bars add 26 px each to the
+    height: 160 gives 160 x 212"""
     fps: Positive | None = None
     """frames per second; null: 0.3 of real time; the value of `rate`: real time"""
-    view: Three | None = None
-    """direction from the object to the camera; null: from the side, a little above"""
+    view: Three | Views | None = None
+    """direction from the object to the camera in the file's axes, or a list of such, [[x, y, z],
+    ...], through which the camera turns about `up` while the film goes on; null: from the side, a
+    little above"""
     shadow: bool = True
     """shadows of the object and the obstacles on the ground, under light from above"""
     caption: bool = True
-    """title and times in the pictures"""
+    """title and times, above and below the picture"""
 
 
 class SplatsSettings(LawSections):

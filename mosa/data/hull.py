@@ -15,7 +15,7 @@ from torch import Tensor
 from mosa.errors import DataError
 from mosa.rendering.cameras import project, sample_images
 from mosa.system.limits import counted
-from mosa.types import Cameras
+from mosa.types import Cameras, metres
 
 voxel_counts = partial(
     counted, "voxels of the object", remedy="take fewer and larger ones", each=40, error=DataError
@@ -118,8 +118,8 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
         inside = points[occupancy(points, *_grown_views(mattes, cameras, radius)) > 0.5]
         if len(inside) == 0:
             raise DataError(
-                f"visual hull: no point of the box {bounds.tolist()} lies inside all {len(cameras)} mattes; check "
-                "scene.box, the cameras' axes and the mattes (the smallest matte covers "
+                f"visual hull: no point of the box {metres(bounds)} m lies inside all "
+                f"{len(cameras)} mattes; check scene.box, the cameras' axes and the mattes (the smallest matte covers "
                 f"{float(mattes.mean((1, 2)).min()):.2%} of its image)"
             )
         bounds = torch.stack([inside.amin(0) - pitch, inside.amax(0) + pitch])

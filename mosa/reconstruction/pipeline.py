@@ -38,7 +38,7 @@ from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import rasterize
 from mosa.system.progress import tqdm
-from mosa.types import Appearance, Reconstruction, Scene, Splats
+from mosa.types import Appearance, Reconstruction, Scene, Splats, metres
 
 CACHE_VERSION = 3
 """Raised when a stage computes something else from the same settings."""
@@ -196,10 +196,11 @@ def imported_splats(path: str, scene: Scene) -> Appearance:
     splats, harmonics = load_ply(path)
     inside = ((splats.means > scene.box[0]) & (splats.means < scene.box[1])).all(1)
     if int(inside.sum()) < 8:
-        low, high = (x.tolist() for x in (splats.means.amin(0), splats.means.amax(0)))
+        low, high = (metres(x) for x in (splats.means.amin(0), splats.means.amax(0)))
         raise DataError(
-            f"{path}: expected Gaussians in the scene's box {scene.box.tolist()} m, found {int(inside.sum())} of {len(inside)}: "
-            f"the file spans {low} to {high}; bring it into the scene's world and metres first"
+            f"{path}: expected Gaussians in the scene's box {metres(scene.box)} m, found "
+            f"{int(inside.sum())} of {len(inside)}: the file spans {low} to "
+            f"{high}; bring it into the scene's world and metres first"
         )
     kept = Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats)))
     check_place(path, kept, scene)

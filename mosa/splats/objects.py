@@ -40,7 +40,7 @@ from mosa.training.run_folder import most_particles, quiet, run_folder
 from mosa.twin.rollout_file import poses
 from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
-from mosa.types import Appearance, Splats
+from mosa.types import Appearance, Splats, metres
 
 log = logging.getLogger(__name__)
 
@@ -98,10 +98,14 @@ def read_object(
             f"size: {path} has no unit, and in metres its object would be {longest:.3g} m long; "
             f"expected the length of its longest side [m], as size=0.2 (size={longest:.3g} keeps it)"
         )
+    factor = 1.0 if size is None else size / longest
+    moved = f", {metres(offset)} units subtracted before" if bool(offset.any()) else ""
     if size is None:
-        log.info("no size given: 1 unit is 1 m; the object's longest side is %.3g m", longest)
+        log.info(
+            f"no size given: 1 unit is 1 m{moved}; the object's longest side is {longest:.3g} m"
+        )
     else:
-        factor = size / longest
+        log.info(f"size: 1 unit of the file is {factor:.6g} m{moved}")
         splats = replace(splats, means=factor * splats.means, scales=factor * splats.scales)
         if not usual:
             warnings.warn(
@@ -158,6 +162,7 @@ def object_twin(
         middle = 0.5 * (rest.amin(0) + rest.amax(0))
         above = float(middle @ direction) - float((rest @ direction).min()) + height
         origin = middle - above * direction
+        log.info(f"recentre: {metres(origin)} m subtracted from all places")
         tensors["rest"] = rest = rest - origin
         means = shown.splats.means - origin.to(shown.splats.means)
         shown = replace(shown, splats=replace(shown.splats, means=means))
@@ -167,7 +172,8 @@ def object_twin(
     given["heterogeneity"] = {**given.get("heterogeneity", {}), "enabled": False}
     given["world"] = {"colliders": [dict(each) for each in settings.colliders or ()]}
     room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height
-    met = {"height": float((rest @ direction).min()) - height, **settings.ground.plain()}
+    ground = 0.0 if settings.recentre else float((rest @ direction).min()) - height
+    met = {"height": ground, **settings.ground.plain()}
     world = {"gravity": (-settings.gravity * direction).tolist(), "up": direction.tolist(),
              "box": [(rest.amin(0) - room).tolist(), (rest.amax(0) + room).tolist()]}  # fmt: skip
     record = BodyRecord(settings=given, law=chosen, ground=met, world=world, density=density, dx=cell,
@@ -181,11 +187,11 @@ def object_twin(
     twin = Twin(body.eval(), world_of(record), record.frame_dt, record, start)
     for k, solid in enumerate(twin.world.colliders):
         middle = poses([solid], torch.zeros(1))[0][0, 0].to(direction)
-        above, far = float(middle @ direction) - met["height"], reach(solid.shape)
+        above, far = float(middle @ direction) - ground, reach(solid.shape)
         if far > 0 and above < -0.99 * far:
             warnings.warn(
-                f"colliders[{k}]: its position {middle.tolist()} is {-above:.3g} m below the ground, where "
-                f"nothing meets it: up is {direction.tolist()}",
+                f"colliders[{k}]: its position {metres(middle)} is {-above:.3g} m below the ground, "
+                f"where nothing meets it: up is {metres(direction)}",
                 stacklevel=2,
             )
     return twin
@@ -217,14 +223,14 @@ def drop(cfg: DictConfig) -> None:
     learned = None if settings.ckpt_path is None else Twin.load(settings.ckpt_path)
     twin = object_twin(found, settings, learned, most_particles(device))
     twin.body.to(device)
-    cm3, size, world = 1e6 * float(twin.body.volume.sum()), twin.body.size, twin.world
-    count = len(found.splats.means if twin.body.splats is None else twin.body.splats)
-    said = "object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long"
-    log.info(said, count, len(twin.body.rest), cm3, size)
-    up = ", ".join(f"{v:.3g}" for v in world.up.tolist())
-    middle = ", ".join(f"{v:.4g}" for v in twin.body.center.tolist())
-    said = "scene: up (%s), ground at %.4g m along it, the object's centre at (%s) m; %d obstacles"
-    log.info(said, up, world.ground.height, middle, len(world.colliders))
+    body, world, means = twin.body, twin.world, found.splats.means
+    long = float((means.amax(0) - means.amin(0)).max())
+    said = "object: %d Gaussians, %.3g m long; %d particles in it span %.3g m and have %.4g cm^3"
+    count = len(means if body.splats is None else body.splats)
+    log.info(said, count, long, len(body.rest), body.size, 1e6 * float(body.volume.sum()))
+    at = metres(torch.tensor(world.ground.height))
+    said = "scene: up %s, ground at %s m along it, the object's centre at %s m; %d obstacles"
+    log.info(said, metres(world.up), at, metres(body.center), len(world.colliders))
     if settings.preset is not None:
         twin.material.preset(settings.preset)
         if settings.density is not None:

@@ -67,7 +67,10 @@ def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> Sp
         ffmpeg("video")
     check_formats(settings.formats)
     if settings.film.view is not None and any(settings.up):
-        viewed_from(settings.film.view, torch.tensor(settings.up).float(), "film.view")
+        up = torch.tensor(settings.up).float()
+        if float((viewed_from(settings.film.view, up, name="film.view") @ up).max()) < 0:
+            below = f"looks from below the object, as up is {settings.up}"
+            warnings.warn(f"film.view: {settings.film.view} {below}", stacklevel=2)
     if settings.preset is not None:
         preset(settings.preset)
         task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()

@@ -38,6 +38,7 @@ from mosa.physics.engine.inputs import FASTEST, numbers, vector
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
 from mosa.twin.shown_solids import surface
+from mosa.types import metres
 
 UNDER = 0.25
 """Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
@@ -173,7 +174,7 @@ def start_in(
         if outside > 0:
             raise ConfigError(
                 f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
-                f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m"
+                f"{metres(world.box)} m; its centre is at {metres(center)} m"
             )
     field = "world.colliders" if colliders is None else "colliders"
     pressed = check_clear(world.colliders, center + arms, "the body", field, body.spacing)

@@ -49,7 +49,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
-from mosa.settings import Count, Expected, Number, Positive, Seed, such, typed
+from mosa.settings import Count, Expected, Number, Pixels, Positive, Seed, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
@@ -74,7 +74,7 @@ from mosa.twin.start import (
 from mosa.types import Cameras, Rollout
 
 Draws = Annotated[int, Ge(2), Le(10_000)]
-Pixels = Annotated[int, Ge(8), Le(8192)]
+Views = Sequence[float] | Sequence[Sequence[float]] | Tensor
 Motion = Annotated[
     InstanceOf[Rollout] | Sequence[InstanceOf[TwinState]],
     Expected("a Rollout, as simulate returns it, or a list of the states of steps, in their order"),
@@ -288,22 +288,24 @@ class Twin:
         rollout: Motion,
         size: Pixels = 400,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        view: Sequence[float] | None = None,
+        view: Views | None = None,
         shadow: bool = True,
     ) -> Tensor:
-        """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
-        rollout was simulated with (None: the world's). rollout: or a list of the states of T steps,
-        whose solids are drawn where they were then (None: those of `reset`). Half spaces are not
-        drawn. view: (3,) from the body to the camera, None for a view from the side and a little
-        above. shadow: on the ground, of the body and of the solids, under light from above."""
+        """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and
+        among `colliders`, those that the rollout was simulated with (None: the world's). rollout:
+        or a list of the states of T steps, whose solids are drawn where they were then (None: those of
+        `reset`). Half spaces are not drawn. size [px]: of a square, or (width, height). view: (3,)
+        from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None
+        for the side and a little above. shadow: on the ground, of the body and of the solids, under
+        light from above. Errors: ConfigError."""
         return self._pictures(*self._met(rollout, colliders), size, view, shadow)
 
     def _pictures(
         self,
         rollout: Rollout,
         solids: Sequence[Collider],
-        size: int,
-        view: Sequence[float] | None,
+        size: int | Sequence[int],
+        view: Views | None,
         shadow: bool,
     ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
@@ -317,37 +319,37 @@ class Twin:
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
         level = side - (side @ up) * up
         side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
-        focal = 1.6 * size
-        distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
-        toward = side / side.norm() + 0.25 * up
-        if view is not None:
-            given = viewed_from(view, up)
-            toward = float(toward.norm()) * given / given.norm()
-        eye = target + distance * toward
-        K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-        K, w2c = (t[None].to(body.rest) for t in (K, look_at(eye, target, up)))
-        camera = Cameras(K, w2c, size, size, ("view",))
+        width, height = (size, size) if isinstance(size, int) else size
+        focal, frames = 1.6 * min(width, height), len(rollout.x)
+        # a ball around all places of the particles fills the shorter side, but for a margin
+        far = (3.2**2 + 1) ** 0.5 * (0.53 * float((high - low).norm()) + body.spacing)
+        toward = viewed_from(side / side.norm() + 0.25 * up if view is None else view, up, frames)
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        w2c = look_at(target + far * toward, target.expand_as(toward), up).cpu()
+        names = tuple(f"frame {t}" for t in range(frames))
+        cameras = Cameras(K.to(w2c).expand(frames, 3, 3), w2c, width, height, names)
         shown = seen(body, rollout.x, rollout.F_tot)
         ends, convex = [len(shown.opacities)], [False]
         for k, solid in enumerate(solids):
             shown = with_solids(shown, solids[k : k + 1], rollout.times, up, body.size / 30)
             ends.append(len(shown.opacities))
             convex.append(not isinstance(solid.shape, SignedDistanceField))
-        white, lines = torch.ones(3), ground_lines(self.world, camera, body.size)
-        if not lines:
-            return shown.images(camera, white.to(body.rest))[0].clamp(0, 1).cpu()
-        floor = on_ground(np.full((size, size, 3), 255, np.uint8), lines, 1, white)
-        floors = np.repeat(floor[None] / np.float32(255), len(shown.means), 0)
-        for image, points in zip(floors if shadow else (), shown.means):
+        white, floors = np.full((height, width, 3), 255, np.uint8), []
+        for t, points in enumerate(shown.means):
+            camera = cameras.select([t])
+            lines = ground_lines(self.world, camera, body.size, target.cpu())
+            floors.append(on_ground(white, lines, 1, torch.ones(3)) / np.float32(255))
+            if not (lines and shadow):
+                continue
             dark = [
                 ground_shadow(part, self.world, camera, body.size, filled)
                 for part, filled in zip(points.tensor_split(ends[:-1]), convex)
             ]
             # none shines through between the body's splats
             free = 1 - outline(points[: ends[0]], camera, body.size)
-            image *= (1 - DARK * free * np.max(dark, 0))[..., None]
-        behind = torch.from_numpy(floors).to(body.rest)
-        return shown.images(camera, behind)[0].clamp(0, 1).cpu()
+            floors[t] *= (1 - DARK * free * np.max(dark, 0))[..., None]
+        behind = torch.from_numpy(np.stack(floors)).to(body.rest)
+        return shown.film(cameras, behind).clamp(0, 1).cpu()
 
     def _met(
         self,
@@ -384,15 +386,16 @@ class Twin:
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        size: Pixels = 400, fps: Positive | None = None, view: Sequence[float] | None = None,
+        size: Pixels = 400, fps: Positive | None = None, view: Views | None = None,
         shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
         the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view and
-        shadow, as there; fps, None for 0.3 of real time; caption: title and times. Errors, before
-        anything is written: ConfigError where they are not, or a format's or the video's program is missing."""
+        shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px
+        above and below. Errors, before anything is written: ConfigError where they are not, or a
+        format's or the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
         check_formats(formats)
         if video:
@@ -439,12 +442,28 @@ class Twin:
         return f"Twin({len(body.rest)} particles, {1e3 * body.size:.4g} mm, {self.material!r})"
 
 
-def viewed_from(view: Sequence[float], up: Tensor, name: str = "view") -> Tensor:
-    """(3,) the direction from a body to the camera. Errors: ConfigError naming `name`."""
-    given = numbers(name, view, "a direction (x, y, z)", (3,)).to(up)
-    if not float(torch.linalg.cross(given, up).norm()) > 1e-3 * float(given.norm() * up.norm()):
+def viewed_from(view: Views, up: Tensor, frames: int = 1, name: str = "view") -> Tensor:
+    """(frames, 3) unit directions from a body to the camera. view: (3,), the same in all frames, or
+    (K, 3), spread evenly over the frames: from one to the next the camera turns about `up` by the
+    shorter way, and rises evenly. Errors: ConfigError naming `name`."""
+    expected = "a direction (x, y, z), or a list of such"
+    given = numbers(name, view, expected).to(up)
+    if given.ndim not in (1, 2) or given.shape[-1] != 3 or not len(given):
+        raise ConfigError(f"{name}: expected {expected}, found shape {tuple(given.shape)}")
+    given, up = given.reshape(-1, 3), up / up.norm()
+    level = given - (given @ up)[:, None] * up
+    if not bool((level.norm(dim=1) > 1e-3 * given.norm(dim=1)).all()):
         raise ConfigError(f"{name}: expected a direction that is not up or down, found {view}")
-    return given
+    ahead = level[0] / level[0].norm()
+    aside = torch.linalg.cross(up, ahead)
+    turns = np.unwrap(torch.atan2(level @ aside, level @ ahead).cpu().numpy())
+    rises = torch.atan2(given @ up, level.norm(dim=1)).cpu().numpy()
+    at, places = np.linspace(0, len(given) - 1, frames), np.arange(len(given))
+    turn, rise = (
+        torch.from_numpy(np.interp(at, places, v)).to(up)[:, None] for v in (turns, rises)
+    )
+    toward: Tensor = rise.cos() * (turn.cos() * ahead + turn.sin() * aside) + rise.sin() * up
+    return toward
 
 
 def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """A 3DGS file becomes a body without any video: filled, given a law, dropped, exported, and read again."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -98,7 +99,8 @@ def test_what_encloses_nothing_is_named(tmp_path):
         read_object(path, box=[[1, 1, 1], [0, 2, 2]])
 
 
-def test_a_file_in_other_units_gets_its_size(tmp_path):
+def test_a_file_in_other_units_gets_its_size(tmp_path, caplog):
+    caplog.set_level("INFO")
     source = ball()
     path = save_ply(tmp_path / "a.ply", source.splats, source.harmonics)
     found = read_object(path, size=0.5)
@@ -106,6 +108,7 @@ def test_a_file_in_other_units_gets_its_size(tmp_path):
     assert float(extent) == pytest.approx(0.5) and torch.allclose(found.harmonics, source.harmonics)
     factor = 0.5 / float((source.splats.means.amax(0) - source.splats.means.amin(0)).max())
     assert torch.allclose(found.splats.scales, factor * source.splats.scales, rtol=1e-5)
+    assert f"1 unit of the file is {factor:.6g} m" in caplog.text
 
 
 def test_the_object_falls_and_can_be_read_again(tmp_path):
@@ -166,7 +169,9 @@ def test_particles_can_be_shown_in_place_of_splats(tmp_path):
 def test_an_obstacle_below_the_ground_is_said():
     made = {"up": [0, -1, 0], "resolution": 32, "recentre": True}
     ends = [{"type": "sphere", "radius": 0.05, "position": [0, y, 0]} for y in (-0.05, 0.05)]
-    with pytest.warns(UserWarning, match=r"colliders\[1\]: its position .* 0.05 m below") as said:
+    with pytest.warns(
+        UserWarning, match=r"\[1\]: its position \[0.0, 0.05, 0.0\] is 0.05 m below"
+    ) as said:
         object_twin(ball(600, 0.007), settings(100, colliders=ends, **made))
     assert len([each for each in said if "below the ground" in str(each.message)]) == 1
 
@@ -204,7 +209,8 @@ def test_the_command_makes_all_of_it(tmp_path):
     arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply]",
                  "recentre=true", "colliders=[{type:sphere,radius:0.05,position:[0,0.05,0]}]",
                  "velocity=[60,0,0]",  # farther than any box around the object
-                 "preset=jelly", "film={size:64,fps:30,view:[1,0.3,0],shadow:false,caption:false}",
+                 "preset=jelly", "film={size:[96,64],fps:30,shadow:false,caption:false}",
+                 "film.view=[[1,0.3,0],[0,0.3,1]]",
                  f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
     done = forked.call("mosa/splats/__main__.py", *arguments)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -218,9 +224,11 @@ def test_the_command_makes_all_of_it(tmp_path):
     dropped = Twin.load(tmp_path / "run" / "checkpoints" / "last.ckpt").material
     assert (dropped.E, dropped.density) == pytest.approx((4.3e3, 1010.0))
     film = cv2.VideoCapture(str(tmp_path / "run" / "simulation.mp4"))
-    assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 64 and film.get(cv2.CAP_PROP_FPS) == 30
+    assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 96 and film.get(cv2.CAP_PROP_FPS) == 30
     assert film.get(cv2.CAP_PROP_FRAME_HEIGHT) == 64  # no caption
-    assert "no size given: 1 unit is 1 m" in done.stdout + done.stderr
+    said = done.stdout + done.stderr
+    assert "no size given: 1 unit is 1 m;" in said and "600 Gaussians, 0.2 m long; " in said
+    assert "ground at 0.0 m along it" in said
 
 
 @pytest.mark.parametrize(
@@ -237,14 +245,29 @@ def test_the_command_makes_all_of_it(tmp_path):
         ("preset", "rubber", "preset: expected one of jelly, "),
         ("colliders", [{"type": "sphere"}], "colliders"),
         ("film", {"view": [0, 2, 0]}, r"^film\.view: expected a direction that is not up or down"),
+        (
+            "film",
+            {"view": [[1, 0, 0], [0, 2, 0]]},
+            r"^film\.view: expected a direction that is not",
+        ),
+        ("film", {"view": []}, r"^film\.view: expected three numbers, or a list of such, or null"),
+        ("film", {"size": [160, 90, 3]}, r"^film\.size: expected a whole number .*, or two such"),
     ],
 )
 def test_a_wrong_value_is_named(key, value, message):
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         values = OmegaConf.to_container(compose("splats", overrides=["ply=a.ply"]), resolve=True)
-    check_splats(values)
     with pytest.raises(ConfigError, match=message):
         check_splats(values | {key: value})
+
+
+def test_a_view_from_below_is_said():
+    values = {**LAW, "ply": "a.ply"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_splats(values | {"film": {"size": [160, 90], "view": [[1, 0.3, 1], [1, 0, 0]]}})
+    with pytest.warns(UserWarning, match=r"^film\.view: .* from below the object, as up is \[0"):
+        check_splats(values | {"up": [0, -1, 0], "film": {"view": [1, 0.3, 1]}})
 
 
 @pytest.mark.parametrize(

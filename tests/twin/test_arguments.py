@@ -24,6 +24,7 @@ def begun(made):
 
 @pytest.mark.parametrize("name, wrong, call", [
     ("size", (0, -1, 2.5, "a", True, 10**6, None), lambda v: TWIN().render(MOTION(), size=v)),
+    ("size", ((9, 7), [64], (64,) * 3, (64, 8.5)), lambda v: TWIN().render(MOTION(), size=v)),
     ("rollout", (5, None, "a", {}, [1]), lambda v: TWIN().render(v)),
     ("rollout", (5, None, "a", {}, [1]), lambda v: TWIN().export(v, "nowhere")),
     ("folder", (5, None, True, [], 1.5), lambda v: TWIN().export(MOTION(), v)),

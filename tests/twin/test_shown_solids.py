@@ -15,6 +15,7 @@ from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
 from mosa.twin.shown_solids import SOLID, surface, with_solids
+from mosa.twin.twin import viewed_from
 from mosa.types import Cameras
 from mosa.viewer.clips import read_run
 from tests.modules.body.test_world import PLATE, twin
@@ -183,6 +184,40 @@ def test_a_shadow_darkens_the_floor_and_not_the_body():
     assert 0.1 < body.float().mean() < 0.9
     assert (shaded - plain)[body].abs().max() < 0.01
     assert (plain - shaded)[~body].max() > 0.15
+
+
+def test_a_film_has_two_sides_and_shows_the_whole_of_a_long_fall():
+    one = twin()
+    one.body.colors.copy_(torch.tensor([0.8, 0.0, 0.0]).expand_as(one.body.colors))
+    rollout = one.simulate(frames=28, height=1.5, velocity=(0, 0, 0), box=[[-9] * 3, [9] * 3])
+    for size in ((96, 64), [64, 96], 64):
+        images = one.render(rollout, size=size, shadow=False)
+        width, height = (size, size) if size == 64 else size
+        assert images.shape == (28, height, width, 3)
+        red = images[..., 0] - images[..., 1] > 0.3
+        rows = red.any(2).nonzero()[:, 1]
+        assert red.flatten(1).any(1).all() and 0 < rows.min() and rows.max() < height - 1
+        assert rows.max() - rows.min() > 0.6 * min(width, height)
+
+
+def test_a_camera_goes_along_its_views():
+    one = twin()
+    one.body.colors.copy_(torch.linspace(0, 1, one.body.rest.numel()).view(-1, 3))
+    rollout = one.simulate(frames=4, height=0.1)
+    views = [[1.0, 0.3, 0.0], [0.2, 0.6, 1.0], [-1.0, -0.5, 0.1], [-1.0, 0.3, -0.8]]
+    images = one.render(rollout, size=(48, 32), view=views, shadow=False)
+    for t, view in enumerate(views):
+        fixed = one.render(rollout, size=(48, 32), view=view, shadow=False)
+        assert torch.allclose(images[t], fixed[t], atol=1e-5)
+    # 100 degrees to the left and 100 to the right: by the shorter way, through behind
+    angle = math.radians(100)
+    ends = [[math.cos(angle), 0.0, math.sin(angle)], [math.cos(angle), 1.0, -math.sin(angle)]]
+    toward = viewed_from(ends, UP, 3)
+    rise = math.radians(22.5)
+    assert toward[1].tolist() == pytest.approx([-math.cos(rise), math.sin(rise), 0], abs=1e-6)
+    for wrong in ([], [[1, 0]], [[[1, 0, 0]]], "abc", [[1, 0, 0], [0, 1, 0]], [0, 0, 0]):
+        with pytest.raises(ConfigError, match=r"^view: expected a direction"):
+            one.render(rollout, size=32, view=wrong)
 
 
 def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from mosa.cli.view import main as view
 from mosa.config.build import build_world
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, SimulationSettings, Start
@@ -486,6 +487,16 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
         DataError, match=r"run: expected the folder of a finished run .*, found no folder .*nowhere"
     ):
         read_run(run / "nowhere")
+
+
+def test_an_interrupt_before_the_page_is_open_ends_quietly(run, monkeypatch, capsys):
+    def interrupted(chosen):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer, "opened", interrupted)
+    monkeypatch.setattr(sys, "argv", ["mosa-view", str(run)])
+    view()
+    assert capsys.readouterr() == ("", "")
 
 
 def test_the_server_plays_and_ends(run):

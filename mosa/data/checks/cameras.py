@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from mosa.data.images.reading import enclosed_holes
 from mosa.errors import DataError
-from mosa.types import Scene
+from mosa.types import Scene, metres
 
 AGREEMENT = 0.4
 """Distance between a line of sight and the object's centre, over the object's radius, above which a camera does not fit. Largest
@@ -94,9 +94,9 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
     low, high = scene.box.double()
     if not bool(((point > low) & (point < high)).all()):
         raise DataError(
-            f"{label}: scene.box: expected the object inside of {scene.box.tolist()} m, found it at "
-            f"{[round(x, 3) for x in point.tolist()]} m in frame {frame}, where the lines of sight meet; correct the box, or the "
-            "unit or axes of the poses"
+            f"{label}: scene.box: expected the object inside of {metres(scene.box)} m, found it at "
+            f"{metres(point)} m in frame {frame}, where the lines of sight meet; correct the box, "
+            "or the unit or axes of the poses"
         )
 
 

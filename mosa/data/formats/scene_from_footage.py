@@ -21,7 +21,7 @@ from mosa.data.formats.footage import Footage
 from mosa.data.formats.particles import read_clouds
 from mosa.errors import ConfigError, DataError
 from mosa.settings import Positive, Settings, Text, Three, Whole, check
-from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth
+from mosa.types import FALLING, REST, Ground, KnownBody, Scene, Truth, metres
 
 DENSITIES = 0.1, 1e5  # [kg/m^3]: aerogel has 1, osmium 22,590
 LIGHT = 10.0  # [kg/m^3] below which a density is asked about: foams of polystyrene have 15
@@ -158,7 +158,7 @@ def check_ground(ground: Ground | None, up: Tensor, pull: Tensor, box: Tensor) -
     if not low <= ground.height < high:
         raise ConfigError(
             f"scene.box: expected one that the ground at scene.ground.height={ground.height:g} m lies in, found "
-            f"{box.tolist()}, which reaches from {low:.4g} to {high:.4g} m along scene.up"
+            f"{metres(box)}, which reaches from {low:.4g} to {high:.4g} m along scene.up"
         )
     if float(pull.norm()) > 0:
         cosine = float(-(pull.double() @ up.double()) / pull.double().norm())

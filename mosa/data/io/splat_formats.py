@@ -25,6 +25,7 @@ from mosa.rendering.appearance.carried_splats import Seen
 from mosa.rendering.appearance.spherical_harmonics import Y0, degree_of, mean_colors, rotated
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.settings import Expected, check, such
+from mosa.system.progress import tqdm
 from mosa.system.threads import threaded
 from mosa.system.whole_files import written_whole
 from mosa.types import Appearance, Splats
@@ -204,7 +205,8 @@ def save_frames(
             save_sog(folder / "sog" / f"{t:03d}.sog", frame)
 
     if set(formats) & set(FRAMES):
-        for _ in threaded(save, range(count)):
+        quick = "sog" not in formats
+        for _ in tqdm(threaded(save, range(count)), "splats", count, leave=False, disable=quick):
             pass
     for name, write in (("usdc", save_usd), ("rrd", save_rrd)):
         if name[:3] in formats:

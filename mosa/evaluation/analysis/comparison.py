@@ -169,9 +169,11 @@ def round_up(value: float) -> float:
     return float(next(step * scale for step in (1, 2, 5, 10) if step * scale >= value * (1 - 1e-9)))
 
 
-def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np.ndarray]:
+def ground_lines(
+    scene: Scene | World, cameras: Cameras, size: float, middle: Tensor | None = None
+) -> list[np.ndarray]:
     """Lines of a grid on the ground, half the object's size apart, as (n, 2) [px] in the images of one camera; none without
-    a ground. The grid lies under the middle of the image."""
+    a ground. The grid lies under `middle` (3,) [m], None: under the middle of the image."""
     if scene.ground is None:
         return []
     up, w2c, K = scene.up.double(), cameras.w2c[0].double(), cameras.K[0].double()
@@ -182,7 +184,9 @@ def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np
     # a camera below the ground, or looking up
     if fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height:
         return []
-    middle = eye + (scene.ground.height - float(eye @ up)) / fall * ray
+    if middle is None:
+        middle = eye + (scene.ground.height - float(eye @ up)) / fall * ray
+    middle = middle.to(up) + (scene.ground.height - float(middle.to(up) @ up)) * up
     across = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
     across = across / across.norm()
     along = torch.linalg.cross(up, across)

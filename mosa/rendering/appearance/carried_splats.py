@@ -83,24 +83,22 @@ class Seen:
     def images(self, cameras: Cameras, background: Tensor) -> Tensor:
         """(V, T, H, W, 3), in [0, 1] up to harmonics that are brighter than white. background: (3,), or (T, H, W, 3) pictures of
         what lies behind. One camera at a time, which bounds memory."""
-        frames = len(self.means)
-        index, found = torch.arange(frames, device=self.means.device), []
-        for v in range(len(cameras)):
-            camera = cameras.select([v])
-            if self.rotations is None:
-                colors = spherical_harmonics.colors_in(
-                    self.harmonics, torch.ones_like(self.means[:1])
-                )
-            else:
-                lines = self.means - centers(camera).to(self.means)
-                turned = lines[..., None, :] @ self.rotations  # R^T d
-                colors = spherical_harmonics.colors_in(self.harmonics, turned[..., 0, :])
-            if self.shades is not None:
-                colors = colors * self.shades[..., None]
-            views = repeat_cameras(camera, frames)
-            given = self.means, self.covariances, self.opacities, colors, views, index
-            found.append(rasterize(*given, background)[0])
-        return torch.stack(found)
+        each = (repeat_cameras(cameras.select([v]), len(self.means)) for v in range(len(cameras)))
+        return torch.stack([self.film(views, background) for views in each])
+
+    def film(self, cameras: Cameras, background: Tensor) -> Tensor:
+        """(T, H, W, 3) as `images`, each frame from its own one of T cameras."""
+        if self.rotations is None:
+            colors = spherical_harmonics.colors_in(self.harmonics, torch.ones_like(self.means[:1]))
+        else:
+            lines = self.means - centers(cameras).to(self.means)[:, None]
+            turned = lines[..., None, :] @ self.rotations  # R^T d
+            colors = spherical_harmonics.colors_in(self.harmonics, turned[..., 0, :])
+        if self.shades is not None:
+            colors = colors * self.shades[..., None]
+        index = torch.arange(len(self.means), device=self.means.device)
+        given = self.means, self.covariances, self.opacities, colors, cameras, index
+        return rasterize(*given, background)[0]
 
     def colors(self) -> Tensor:
         """(T, M, 3) in [0, 1], averaged over all directions, in each frame's light."""

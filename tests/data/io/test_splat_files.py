@@ -6,6 +6,7 @@ import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
+from mosa.data.io import splat_formats
 from mosa.data.io.splat_formats import save_frames, splats_at, upright
 from mosa.errors import ConfigError
 from mosa.rendering.appearance.carried_splats import Seen
@@ -137,6 +138,18 @@ def test_a_glb_has_the_gaussians_upright(tmp_path, up):
         t
     ][:, None]
     assert np.allclose(found, wanted.numpy(), atol=1e-5)
+
+
+def test_sog_that_takes_long_says_how_far_it_is(tmp_path, monkeypatch, capsys):
+    program = tmp_path / "bin" / splat_formats.CONVERTER
+    program.parent.mkdir()
+    program.write_text('#!/bin/sh\ncp "$6" "$7"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=":")
+    save_frames(drawn(0), tmp_path, ("ply",))
+    assert capsys.readouterr().err == ""
+    save_frames(drawn(0), tmp_path, ("sog",))
+    assert "splats: 100%" in capsys.readouterr().err and (tmp_path / "sog" / "000.sog").is_file()
 
 
 def test_sog_is_what_the_converter_reads_back(tmp_path):
