@@ -169,6 +169,8 @@ def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tm
     data.predict = [{"height": 0.2, "velocity": (0.0, -1.0, 0.0), "frames": 3}]
     (rollout,) = trainer.predict(loaded, datamodule=data)
     assert rollout.x.shape == (3, len(loaded.body.rest), 3)
+    with pytest.raises(ConfigError, match=r"predict: expected starts.*'height'.*data\.predict ="):
+        L.Trainer(**QUIET).predict(loaded, dataloaders=[{"height": 0.2}])
 
 
 def test_the_last_validation_is_of_the_law_that_is_kept(cache, tmp_path, monkeypatch):
