@@ -65,7 +65,7 @@ def keys_of(values: Any, where: str = "") -> Iterator[str]:
 
 
 def options_of(group: str) -> dict[str, list[str]]:
-    """The options of a group of conf/, each with the keys that its file has; none where there is no such group."""
+    """The options of a group of conf/, each with the keys of its file; empty for any other name."""
     files = {f.stem: OmegaConf.load(f) for f in sorted(Path(configuration(), group).glob("*.yaml"))}
     return {
         name: list(keys_of(OmegaConf.to_container(f), f"{group}.")) for name, f in files.items()
@@ -73,15 +73,16 @@ def options_of(group: str) -> dict[str, list[str]]:
 
 
 def way_out(key: str) -> str:
-    """The end of a message on a key that the composed configuration lacks: which other options of its group have it, or the nearest
-    known key, with + where it is an argument of a Trainer that no file has."""
+    """The end of a message on a key that the configuration lacks: other options of its group that
+    have it, or the nearest known key, with + where no file has that argument of a Trainer."""
     group, _, name = key.partition(".")
     having = [option for option, keys in options_of(group).items() if key in keys] if name else []
     if having:
         having = [each for each in having if not any(each.startswith(f"{o}_") for o in having)]
-        way = f"; {group}={', '.join(having)} {'have' if having[1:] else 'has'} it, the chosen {group} has not"
-        own = key == "scene.test" and "; a built-in scene always brings its own held-out drops"
-        return f"{way}{own or ''}"
+        have = f"{', '.join(having)} {'have' if having[1:] else 'has'}"
+        own = "; a built-in scene always brings its own held-out drops"
+        rest = own if key == "scene.test" else ""
+        return f"; {group}={have} it, the chosen {group} has not{rest}"
     known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
     if group == "trainer":
         from lightning import Trainer
@@ -94,8 +95,8 @@ def way_out(key: str) -> str:
 
 
 def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
-    """What Hydra says of an override that it cannot take, and the options or the nearest key, where it does not name those. given:
-    the overrides."""
+    """What Hydra says of an override that it cannot take, and the options or the nearest key, where
+    it does not name those. given: the overrides."""
     said = "\n".join(dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error)))
     if found := re.search(r"Could not (?:load|find) '([\w/]+)/([^/']+)'", said):
         options = list(options_of(found[1]))

@@ -343,8 +343,8 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
 
 def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> dict[str, float]:
     """What was learned beside the hidden material of a built-in scene: `id/fibre_angle_deg` between the stiffest direction found
-    (of `law_figures`) and the fibres, where both laws are anisotropic, and `id/stiffness_correlation` of the stiffness over the
-    particles, where the truth has it."""
+    (of `law_figures`) and the fibres, where both laws are anisotropic, and
+    `id/stiffness_correlation` of the stiffness over the particles, where the truth has it."""
     if scene.truth is None or not scene.synthetic:
         return {}
     from mosa.evaluation.floor import hidden_of

@@ -71,10 +71,11 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
                 f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found {target} ({why})"
             ) from error
         if found := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
-            target = get_object(str(entry.get("_target_")))
-            near = nearest(found[1], list(inspect.signature(target).parameters), where)
+            key, target = found[1], str(entry.get("_target_"))
+            known = list(inspect.signature(get_object(target)).parameters)
             raise ConfigError(
-                f"{where}.{found[1]}: unknown key; expected an argument of {entry.get('_target_')}{near}"
+                f"{where}.{key}: unknown key; expected an argument of {target}"
+                f"{nearest(key, known, where)}"
             ) from error
         lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
         lacks = isinstance(cause, ModuleNotFoundError) and cause.name

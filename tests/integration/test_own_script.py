@@ -174,7 +174,7 @@ def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tm
 
 
 def test_the_last_validation_is_of_the_law_that_is_kept(cache, tmp_path, monkeypatch):
-    """A sweep was given `val/loss` of a law with parts that the end of the joint stage then drops."""
+    """A sweep was given `val/loss` of a law with parts that the joint stage's end then drops."""
     once = [f"fit.{stage}.newton_iterations=1" for stage in ("prior", "joint")]
     cfg = compose("debug=default", f"scene.cache={cache}", "adapter=operator", *HELD, *once,
                   "reconstruction.informed.iterations=0")  # fmt: skip

@@ -135,8 +135,8 @@ class Adapter(nn.Module):
 
     @property
     def corrects(self) -> bool:
-        """Whether the law is another than the prior's: not before `switch_on`, nor with `few_numbers`
-        that are all 0, as a fit leaves them that drops this part."""
+        """Whether the law is another than the prior's: not before `switch_on`, nor where its
+        `few_numbers` are all 0, as a fit leaves them that drops this part."""
         return self.is_on and not (self.few_numbers and not any(map(torch.any, self.parameters())))
 
     def check_on(self) -> None:

@@ -17,8 +17,8 @@ class Stages(Checkpoint):
     `LitMosa` brings it along (`configure_callbacks`). A stage has an optimiser and a schedule of its own. Callbacks that stop a
     training (`EarlyStopping`) end the running stage; the next one begins with their counters at zero.
 
-    A stage may leave another law than its last epoch validated: with fewer parts, of the step before,
-    or not fitted where all begins again. So validation runs once more at its end.
+    A stage may leave another law than its last epoch validated: with fewer parts, of the step
+    before, or not fitted where all begins again. So validation runs once more at its end.
 
     It is a `Checkpoint` only because Lightning calls these after the callbacks that stop a training; it saves nothing."""
 
