@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,42 @@ def keys_of(values: Any, where: str = "") -> Iterator[str]:
         yield from keys_of(value, f"{where}{key}.")
 
 
-def said_of(error: BaseException) -> str:
-    """What Hydra says of an override that it cannot take, and the options or the nearest key, where it does not name those."""
+def options_of(group: str) -> dict[str, list[str]]:
+    """The options of a group of conf/, each with the keys of its file; empty for any other name."""
+    files = {f.stem: OmegaConf.load(f) for f in sorted(Path(configuration(), group).glob("*.yaml"))}
+    return {
+        name: list(keys_of(OmegaConf.to_container(f), f"{group}.")) for name, f in files.items()
+    }
+
+
+def way_out(key: str) -> str:
+    """The end of a message on a key that the configuration lacks: other options of its group that
+    have it, or the nearest known key, with + where no file has that argument of a Trainer."""
+    group, _, name = key.partition(".")
+    having = [option for option, keys in options_of(group).items() if key in keys] if name else []
+    if having:
+        having = [each for each in having if not any(each.startswith(f"{o}_") for o in having)]
+        have = f"{', '.join(having)} {'have' if having[1:] else 'has'}"
+        own = "; a built-in scene always brings its own held-out drops"
+        rest = own if key == "scene.test" else ""
+        return f"; {group}={have} it, the chosen {group} has not{rest}"
+    known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
+    if group == "trainer":
+        from lightning import Trainer
+
+        filed = options_of(group)["cpu"]
+        whole = (f"{group}.{argument}" for argument in inspect.signature(Trainer).parameters)
+        known += [argument if argument in filed else f"+{argument}" for argument in whole]
+    near = nearest(key, known, "")
+    return f"{near}=<value>" if "+" in near else near
+
+
+def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
+    """What Hydra says of an override that it cannot take, and the options or the nearest key, where
+    it does not name those. given: the overrides."""
     said = "\n".join(dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error)))
     if found := re.search(r"Could not (?:load|find) '([\w/]+)/([^/']+)'", said):
-        options = sorted(f.stem for f in Path(configuration(), found[1]).glob("*.yaml"))
+        options = list(options_of(found[1]))
         if listed := re.search(r"Available options in '.*':((?:\s+\w+$)+)", said, re.MULTILINE):
             options = listed[1].split()
         said = (
@@ -77,9 +109,14 @@ def said_of(error: BaseException) -> str:
         )
     if "Config group override must be a string" in said:
         said = "a group, as scene, prior or adapter: expected the name of an option, found null"
+        words = (word.lstrip("+").partition("=") for word in given)
+        empty = [key for key, _, value in words if "null" in value.split(",") and options_of(key)]
+        for key in empty[:1]:
+            options = list(options_of(key))
+            way = f"{key}=none" if "none" in options else f"without {key}= it has its default"
+            said = f"{key}: expected one of {', '.join(options)}, found null; {way}"
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
-        known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
-        said = said.replace(found[0], f"{nearest(found[1], known, '')}.")
+        said = said.replace(found[0], f"{way_out(found[1])}.")
     return said[:2000]
 
 
@@ -92,7 +129,7 @@ def compose(*overrides: str, name: str = "train") -> DictConfig:
         with initialize_config_dir(configuration(), version_base="1.3"):
             cfg = hydra_compose(name, overrides=list(overrides))
     except (HydraException, ValueError) as error:  # the latter for `group=null`
-        raise ConfigError(said_of(error)) from error
+        raise ConfigError(said_of(error, overrides)) from error
     load_extensions(OmegaConf.to_container(cfg).get("extensions"))  # type: ignore[union-attr]
     return cfg
 

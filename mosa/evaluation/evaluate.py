@@ -33,6 +33,8 @@ from mosa.system.progress import tqdm
 from mosa.system.threads import apart, threaded
 from mosa.types import Rollout, Scene
 
+SAME = 1e-6  # relative difference of stiffnesses that counts as none
+
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
 NAMES = {"adapted": "the learned law", "prior": "the prior", "prior_eta": "the prior with eta"}
 
@@ -341,8 +343,8 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
 
 def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> dict[str, float]:
     """What was learned beside the hidden material of a built-in scene: `id/fibre_angle_deg` between the stiffest direction found
-    (of `law_figures`) and the fibres, `id/stiffness_correlation` of the stiffness over the particles, each where the truth has
-    it."""
+    (of `law_figures`) and the fibres, where both laws are anisotropic, and
+    `id/stiffness_correlation` of the stiffness over the particles, where the truth has it."""
     if scene.truth is None or not scene.synthetic:
         return {}
     from mosa.evaluation.floor import hidden_of
@@ -350,7 +352,8 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
     hidden, found = hidden_of(scene), {}
     fibre = getattr(hidden, "fibre", None)
     axis = [figures.get(f"id/stiffest_{name}") for name in "xyz"]
-    if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
+    ratios = getattr(hidden, "ratio", 1), figures.get("id/stiffness_ratio", 1)
+    if fibre is not None and min(ratios) > 1 + SAME and None not in axis:
         found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
     learned = body.factor(body.model().heterogeneity).detach().cpu()
     true = hidden.factor(body.rest.cpu().float())

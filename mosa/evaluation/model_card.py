@@ -8,13 +8,12 @@ from collections.abc import Sequence as Ordered
 import torch
 
 from mosa.evaluation.analysis import tables
-from mosa.evaluation.evaluate import Sequence
+from mosa.evaluation.evaluate import SAME, Sequence
 from mosa.modules.body.body import Body
 from mosa.physics.world import World
 from mosa.types import Rollout
 
 FILE = "model_card.md"
-SAME = 1e-6  # relative difference of stiffnesses that counts as none
 SHARE = 0.001  # of particles and frames at each end that the range of stretches leaves out
 
 
@@ -97,8 +96,8 @@ def model_card(
     variant; version: of mosa."""
     law, name = body.material.law, sequences[0].scene.name
     # a fit may leave out parts that the body has: their numbers are then 0
-    unlearned = body.adapter is None or figures.get("id/stiffness_ratio", 2.0) < 1 + SAME
-    correction = "none" if unlearned else type(body.adapter).__name__
+    learns = body.adapter is not None and body.adapter.corrects
+    correction = type(body.adapter).__name__ if learns else "none"
     with torch.no_grad():
         spread = float(torch.std(body.factor(body.heterogeneity), correction=0))
     field = "is the same everywhere" if spread < SAME else "varies over the body"

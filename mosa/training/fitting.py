@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Any
 import lightning as L
 import torch
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import LightningEnvironment
@@ -67,6 +69,13 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
                 why = f"the module {module} has no {name}{nearest(name, dir(there), '')}"
             raise ConfigError(
                 f"{where}: expected a class that can be imported (installed, or in PYTHONPATH), found {target} ({why})"
+            ) from error
+        if found := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
+            key, target = found[1], str(entry.get("_target_"))
+            known = list(inspect.signature(get_object(target)).parameters)
+            raise ConfigError(
+                f"{where}.{key}: unknown key; expected an argument of {target}"
+                f"{nearest(key, known, where)}"
             ) from error
         lines = [each for each in str(cause).splitlines() if each and "full_key" not in each]
         lacks = isinstance(cause, ModuleNotFoundError) and cause.name

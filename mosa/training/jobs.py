@@ -114,9 +114,11 @@ def run_command(run: Callable[[], None]) -> None:
             if (message := explained(error)) is None:
                 if begun and not isinstance(error, HydraException):
                     raise
+                given = sys.argv[1:]
                 message = (
-                    f"ConfigError: {said_of(error)}\n(in: {' '.join(sys.argv[1:])[:300]})\n`+` adds keys that no file of "
-                    "conf/ has, as a law's parameters; all keys: python -m mosa.config.reference <command> [KEY]"
+                    f"ConfigError: {said_of(error, given)}\n(in: {' '.join(given)[:300]})\n"
+                    "`+` adds keys that no file of conf/ has, as a law's parameters; all keys: "
+                    "python -m mosa.config.reference <command> [KEY]"
                 )
             print(f"\n{message}", file=sys.stderr)
             sys.exit(2)

@@ -475,7 +475,14 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.log_dict(figures, batch_size=1)  # `test/<metric>` of several sequences is averaged
 
     def predict_step(self, batch: Mapping[str, Any], batch_idx: int) -> Rollout:
-        """The law's rollout from a new start. batch: keyword arguments of `Twin.simulate`."""
+        """The law's rollout from a new start. batch: keyword arguments of `Twin.simulate`. Errors:
+        ConfigError."""
+        if not isinstance(batch, Mapping):  # to Lightning a mapping in a list is a loader of keys
+            raise ConfigError(
+                f"predict: expected starts as mappings like {{'height': 0.2}}, found "
+                f"{batch!r:.80}; data.predict = [{{'height': 0.2}}] and "
+                "trainer.predict(module, datamodule=data)"
+            )
         return self.twin().simulate(**batch)
 
     def twin(self):

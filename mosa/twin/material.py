@@ -229,7 +229,7 @@ def summary(twin: Any) -> str:
         spread = spread if own is None else f" +- {own:.2g}"
         lines.append(f"          {said(body.material.law, name, value)}{spread}")
     adapter = body.adapter
-    if adapter is None or not adapter.is_on:
+    if adapter is None or not adapter.corrects:
         lines.append("learned   no correction of the law")
     else:
         lines.append(f"learned   {type(adapter).__name__}, a correction of the law")

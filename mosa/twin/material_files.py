@@ -46,7 +46,7 @@ def described(twin: Any) -> dict[str, Any]:
     hold."""
     material, lost = twin.material, []
     adapter = twin.body.adapter
-    if adapter is not None and adapter.is_on:
+    if adapter is not None and adapter.corrects:
         lost.append("the learned correction of the law (its anisotropy is in `stiffness`)")
     if material.law not in ("neo_hookean", "corotated", "stvk", "linear"):
         lost.append(f"the law {material.law} beyond its E and nu")

@@ -59,7 +59,13 @@ def test_a_mistyped_option_is_refused(override):
     ("prior=neo_hokean", r"prior: expected .*, found neo_hokean; .*neo_hookean; .* hydra\.searchpath"),
     ("callbacks=[default,early_stoping]", "callbacks: expected one of default, early_st.*nearest is early_stopping"),
     ("hydra/launcher=rai", "hydra/launcher: expected one of .*basic"),
-    ("prior=null", "a group, as scene, prior or adapter: expected the name of an option, found null"),
+    ("prior=null", r"prior: expected one of auto, .*, found null; without prior= "),
+    ("logger=null", "logger: expected one of csv, none, .*, found null; logger=none"),
+    ("hydra/sweeper=null", "a group, as scene, .*: expected the name of an option, found null"),
+    ("trainer.max_time=60", r"'trainer\.max_time'; the nearest is \+trainer\.max_time=<value>"),
+    ("trainer.max_epoch=1", r"'trainer\.max_epoch'; the nearest is trainer\.max_epochs"),
+    ("callbacks.early_stopping.patience=3", "callbacks=early_stopping has it, the chosen callb"),
+    ("scene.test=[]", "scene=markers, pacnerf, .* have it, .* brings its own held-out"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):

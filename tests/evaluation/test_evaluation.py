@@ -4,11 +4,18 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from small_bodies import small_body
 
 from mosa.errors import SimulationDiverged
 from mosa.evaluation import evaluate as evaluation
 from mosa.evaluation import floor, metrics
-from mosa.evaluation.evaluate import Sequence, evaluate, floor_figures, motion_metrics
+from mosa.evaluation.evaluate import (
+    Sequence,
+    evaluate,
+    floor_figures,
+    hidden_figures,
+    motion_metrics,
+)
 from mosa.evaluation.settings import EvaluationSettings
 from mosa.types import Truth
 
@@ -76,3 +83,14 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
     lost |= {prefix: {"adapted", "prior", "prior_eta"} for prefix in lost}
     with pytest.raises(SimulationDiverged, match="train, test/a"):
         evaluate(body, sequences, SimpleNamespace(forces=()), EvaluationSettings())
+
+
+def test_a_law_without_a_stiffest_direction_has_no_angle_to_the_fibres(monkeypatch):
+    """Of an isotropic law the direction is that of rounding."""
+    hidden = SimpleNamespace(fibre=[0.0, 0.0, 1.0], ratio=3.0, factor=lambda x: torch.ones(len(x)))
+    monkeypatch.setattr(floor, "hidden_of", lambda scene: hidden)
+    body, scene = small_body(), SimpleNamespace(truth=object(), synthetic=True)
+    law = {"id/stiffest_x": 1.0, "id/stiffest_y": 0.0, "id/stiffest_z": 0.0}
+    assert hidden_figures(body, scene, law | {"id/stiffness_ratio": 1 + 1e-12}) == {}
+    found = hidden_figures(body, scene, law | {"id/stiffness_ratio": 1.3})
+    assert found == {"id/fibre_angle_deg": pytest.approx(90.0)}

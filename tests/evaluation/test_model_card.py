@@ -40,10 +40,11 @@ def test_the_card_says_what_was_filmed_what_is_known_and_where_it_holds():
 def test_parts_that_a_fit_left_out_are_not_said_to_be_learned():
     """The body has an adapter and a field, of which all numbers are 0."""
     body, evaluated = small_body(modes=True), [sequence("train", "a")]
+    body.switch_on()
     said = model_card({"id/stiffness_ratio": 1.0}, body, evaluated, {}, STICKY, "1")
     assert "correction none; the stiffness is the same everywhere" in said
     with torch.no_grad():
-        body.heterogeneity.coefficients[0] = 0.3
+        body.heterogeneity.coefficients[0] = body.adapter.numbers[3] = 0.3
     said = model_card({"id/stiffness_ratio": 1.4}, body, evaluated, {}, STICKY, "1")
     assert "correction HyperelasticAdapter; the stiffness varies over the body" in said
 

@@ -15,6 +15,7 @@ from run_page import written
 
 from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
+from mosa.modules.fitting import newton_steps
 
 ROOT = Path(__file__).parents[2]
 HELD = [
@@ -168,6 +169,35 @@ def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tm
     data.predict = [{"height": 0.2, "velocity": (0.0, -1.0, 0.0), "frames": 3}]
     (rollout,) = trainer.predict(loaded, datamodule=data)
     assert rollout.x.shape == (3, len(loaded.body.rest), 3)
+    with pytest.raises(ConfigError, match=r"predict: expected starts.*'height'.*data\.predict ="):
+        L.Trainer(**QUIET).predict(loaded, dataloaders=[{"height": 0.2}])
+
+
+def test_the_last_validation_is_of_the_law_that_is_kept(cache, tmp_path, monkeypatch):
+    """A sweep was given `val/loss` of a law with parts that the joint stage's end then drops."""
+    once = [f"fit.{stage}.newton_iterations=1" for stage in ("prior", "joint")]
+    cfg = compose("debug=default", f"scene.cache={cache}", "adapter=operator", *HELD, *once,
+                  "reconstruction.informed.iterations=0")  # fmt: skip
+    monkeypatch.setattr(newton_steps, "chosen", lambda errors: "isotropic")
+    seen = []
+
+    class Seen(L.Callback):
+        def on_validation_end(self, trainer, module):
+            seen.append(float(trainer.callback_metrics["val/loss"]))
+
+    every = ModelCheckpoint(tmp_path, monitor="val/loss", save_top_k=-1, save_last=True)
+    data, module = SceneDataModule(cfg, held_out=False), LitMosa(cfg)
+    trainer = L.Trainer(**QUIET, max_epochs=-1, callbacks=[Seen(), every])
+    trainer.fit(module, datamodule=data)
+    assert module.parts and not module.body.adapter.numbers.any()
+    found = float(trainer.callback_metrics["val/loss"])
+    assert found == seen[-1] == float(every.current_score) and found != seen[-2]
+    again = L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False)
+    kept = LitMosa.load_from_checkpoint(tmp_path / "last.ckpt")
+    (figures,) = again.validate(kept, datamodule=data, verbose=False)[:1]
+    assert figures["val/loss"] == pytest.approx(found, rel=1e-6)
+    again.fit(kept, datamodule=data)  # complete: a sweep that goes on is given the same figure
+    assert float(again.callback_metrics["val/loss"]) == pytest.approx(found, rel=1e-6)
 
 
 def test_what_cannot_be_done_is_named(cfg):

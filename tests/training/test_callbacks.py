@@ -100,6 +100,7 @@ def test_a_state_that_a_checkpoint_could_not_be_read_with_is_named(value):
     ("+trainer.precision=16-mixed", r"trainer\.precision: .*found '16-mixed'"),
     ("trainer.max_epochs=many", r"trainer\.max_epochs: expected a whole number, or null, found 'many'"),
     ("+trainer.accumulate_grad_batches=2", r"trainer\.accumulate_grad_batches: expected 1, found 2"),
+    ("+trainer.maxtime=1", r"trainer\.maxtime: unknown key; .*nearest is trainer\.max_time"),
 ])  # fmt: skip
 def test_a_trainer_that_no_fit_can_do_with_is_refused_before_the_data(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message):

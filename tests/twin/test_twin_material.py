@@ -8,6 +8,7 @@ from mosa.errors import ConfigError
 from mosa.modules.adapters.microplane import isotropic_stiffness
 from mosa.modules.adapters.stress import StressAdapter
 from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.twin.material_files import described
 from mosa.twin.presets import PRESETS
 from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
@@ -82,6 +83,16 @@ def test_presets_can_be_simulated(name):
     assert made.body.adapter is None and made.material.density == PRESETS[name].density
     assert made.body.material.law == PRESETS[name].law and len(PRESETS[name].source) > 40
     assert bool(made.simulate(frames=2).x.isfinite().all())
+
+
+def test_a_correction_that_a_fit_left_out_is_not_said_to_be_learned():
+    made = twin()
+    assert "no correction of the law" in made.summary() and "Adapter" not in made.summary()
+    assert not described(made)["not_in_E_and_nu"]
+    with torch.no_grad():
+        made.body.adapter.numbers[3] = 0.3
+    assert "HyperelasticAdapter, a correction" in made.summary()
+    assert "correction" in described(made)["not_in_E_and_nu"][0]
 
 
 def test_summary_and_reprs_are_short_and_have_units():

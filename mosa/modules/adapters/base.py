@@ -133,6 +133,12 @@ class Adapter(nn.Module):
         """Whether `switch_on` was called, here or in the run that the weights come from."""
         return not bool(torch.isnan(self.E_ref))
 
+    @property
+    def corrects(self) -> bool:
+        """Whether the law is another than the prior's: not before `switch_on`, nor where its
+        `few_numbers` are all 0, as a fit leaves them that drops this part."""
+        return self.is_on and not (self.few_numbers and not any(map(torch.any, self.parameters())))
+
     def check_on(self) -> None:
         if self.E_ref.is_cuda and torch.cuda.is_current_stream_capturing():
             return  # a capture may not look; the pass ran before it was captured

@@ -17,10 +17,14 @@ class Stages(Checkpoint):
     `LitMosa` brings it along (`configure_callbacks`). A stage has an optimiser and a schedule of its own. Callbacks that stop a
     training (`EarlyStopping`) end the running stage; the next one begins with their counters at zero.
 
+    A stage may leave another law than its last epoch validated: with fewer parts, of the step
+    before, or not fitted where all begins again. So validation runs once more at its end.
+
     It is a `Checkpoint` only because Lightning calls these after the callbacks that stop a training; it saves nothing."""
 
     def __init__(self) -> None:
         self.begun = -1  # number of the stage that has begun in this process
+        self.unseen = False  # whether a stage has ended whose law was not validated
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         self.begun = -1
@@ -29,6 +33,7 @@ class Stages(Checkpoint):
     def on_train_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         if pl_module.stage is None:  # a run that was stopped after its fit
             trainer.should_stop = True
+            self.validate(trainer)
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         self.announce(trainer, pl_module)
@@ -53,25 +58,37 @@ class Stages(Checkpoint):
         stoppers = [each for each in callbacks if isinstance(each, EarlyStopping)]
         if trainer.should_stop and any(each.wait_count >= each.patience for each in stoppers):
             pl_module.stage_over = True
-        if pl_module.stage_over:
+        over = pl_module.stage_over
+        if over:
             self.advance(trainer, pl_module)
-            if pl_module.stage is not None:
-                trainer.should_stop = False
-                for each in stoppers:
-                    each.wait_count, each.stopped_epoch = 0, 0
-                    each.best_score = torch.tensor(
-                        torch.inf if each.monitor_op == torch.lt else -torch.inf
-                    )
+        if self.unseen:
+            self.validate(trainer)
+        if over and pl_module.stage is not None:
+            trainer.should_stop = False
+            for each in stoppers:
+                each.wait_count, each.stopped_epoch = 0, 0
+                each.best_score = torch.tensor(
+                    torch.inf if each.monitor_op == torch.lt else -torch.inf
+                )
+        if over:
             self.announce(trainer, pl_module)
 
     def advance(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Ends the running stage; the next one gets its optimiser."""
         pl_module.finish()
-        self.begun = -1
+        self.begun, self.unseen = -1, True
         if pl_module.stage is None:
             trainer.should_stop = True
         else:
             trainer.strategy.setup_optimizers(trainer)
+
+    def validate(self, trainer: L.Trainer) -> None:
+        """Validation of the law as it stands, as Lightning runs it at the end of an epoch."""
+        self.unseen = False
+        if trainer.enable_validation:
+            trainer.validating = True
+            trainer.fit_loop.epoch_loop.val_loop.run()
+            trainer.training = True
 
     @staticmethod
     def announce(trainer: L.Trainer, pl_module: Any) -> None:
