@@ -107,7 +107,7 @@ def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
             f"{nearest(found[2], options, '')}; files of your own: hydra.searchpath=[file://<folder>], "
             f"which holds {found[1]}/{found[2]}.yaml"
         )
-    if "Config group override must be a string" in said:
+    if "Config group override must be a string" in said and "NoneType" in said:
         said = "a group, as scene, prior or adapter: expected the name of an option, found null"
         words = (word.lstrip("+").partition("=") for word in given)
         empty = [key for key, _, value in words if "null" in value.split(",") and options_of(key)]

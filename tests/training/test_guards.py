@@ -292,7 +292,7 @@ def test_a_ply_has_a_byte_for_each_property_of_its_elements(tmp_path):
 
 
 @pytest.mark.parametrize("overrides, message", [
-    (["+prior.parameters.mu=5"], r"prior\.parameters: expected each of lam, mu once, found mu twice"),
+    (["prior=neo_hookean", "+prior.parameters.mu=5"], r"prior\.parameters: expected each of lam, mu once, found mu twice"),
     (["simulation.stride=1000"], r"simulation\.stride: expected at most simulation\.max_substeps=400"),
     ([f"losses.{name}=0" for name in ("image", "mask", "flow", "rotation", "stretch", "position")], "losses: expected a weight"),
     (["world.colliders=[{type: box, size: [1, 1]}]"], r"world\.colliders\[0\]\.size: expected three lengths"),

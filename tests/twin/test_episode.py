@@ -694,7 +694,7 @@ def test_turns_go_on_beyond_half_a_turn():
         )
     held, _ = made.step({"pusher": {"rotation": (0, 1.5 * torch.pi, 0)}})
     torch.testing.assert_close(
-        held.rotation, state.collider_rotation
+        held.collider_rotation, state.collider_rotation
     )  # at a speed of 0: a whole turn would be refused as too fast
 
 

@@ -31,6 +31,7 @@ def varied():
 
 def test_numbers_of_every_particle_and_what_they_leave_out(tmp_path):
     made = varied()
+    made.body.adapter.numbers.data[0] = 0.1
     made.material.damping = 4.0
     made.export_material(tmp_path)
     known = json.loads((tmp_path / "material.json").read_text())
