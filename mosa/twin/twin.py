@@ -336,9 +336,11 @@ class Twin:
             convex.append(not isinstance(solid.shape, SignedDistanceField))
         white, floors = np.full((height, width, 3), 255, np.uint8), []
         for t, points in enumerate(shown.means):
-            camera = cameras.select([t])
-            lines = ground_lines(self.world, camera, body.size, target.cpu())
-            floors.append(on_ground(white, lines, 1, torch.ones(3)) / np.float32(255))
+            if t == 0 or not torch.equal(w2c[t], w2c[t - 1]):  # the camera has moved
+                camera = cameras.select([t])
+                lines = ground_lines(self.world, camera, body.size, target.cpu())
+                floor = on_ground(white, lines, 1, torch.ones(3)) / np.float32(255)
+            floors.append(floor.copy())
             if not (lines and shadow):
                 continue
             dark = [
