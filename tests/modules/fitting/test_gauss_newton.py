@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import pytest
 import torch
+from scipy.optimize import minimize_scalar
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.fitting.gauss_newton import (
@@ -226,6 +227,30 @@ def test_evidence_stops_at_the_upper_limit():
     for _ in range(5):
         newton.iterate()
     assert blocks[0].factor == blocks[0].limits[1] == 5.0
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("true_size", [0.02, 0.3])
+def test_the_size_is_where_the_evidence_times_its_own_prior_is_largest(true_size, spread):
+    """Of a linear model, whose evidence is a Gaussian in closed form: a search over its logarithm and the program's fixed point
+    end at the same size, in between 1 and what the evidence alone would give."""
+    A, noise = 6 * torch.linalg.qr(drawn(80, 30, seed=3)).Q, drawn(80, seed=5)
+    b = A @ (true_size * drawn(30, seed=4)) + noise
+    blocks = [
+        Block("sized", torch.zeros(30), 0.1 * torch.ones(30), 0.02, learned=True, spread=spread)
+    ]
+    newton = linear(blocks, A, b)
+    for _ in range(3):
+        newton.iterate()
+
+    def minus(logarithm):
+        covariance = (0.1 * math.exp(logarithm)) ** 2 * A @ A.T + torch.eye(80).double()
+        fit = b @ torch.linalg.solve(covariance, b) + torch.linalg.slogdet(covariance).logabsdet
+        return float(0.5 * fit) + 0.5 * (logarithm / spread) ** 2
+
+    low, high = blocks[0].limits
+    best = minimize_scalar(minus, bounds=(math.log(low), math.log(high)), method="bounded").x
+    assert math.log(blocks[0].factor) == pytest.approx(best, abs=0.02)
 
 
 @pytest.mark.parametrize("seats", [2, 3, 7])
