@@ -68,7 +68,8 @@ def read_checkpoint(path: str | Path) -> dict:
     with reading(path):
         try:
             if not Path(path).is_file():
-                raise DataError("no such file; a run writes <run folder>/checkpoints/last.ckpt")
+                found = "a folder" if Path(path).is_dir() else "no such file"
+                raise DataError(f"{found}; a run writes <run folder>/checkpoints/last.ckpt")
             check_archive(Path(path))
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         except DataError:

@@ -74,7 +74,8 @@ def options_of(group: str) -> dict[str, list[str]]:
 
 def way_out(key: str) -> str:
     """The end of a message on a key that the configuration lacks: other options of its group that
-    have it, or the nearest known key, with + where no file has that argument of a Trainer."""
+    have it, keys of that name in its sections, or the nearest known key, with + where no file has
+    that argument of a Trainer."""
     group, _, name = key.partition(".")
     having = [option for option, keys in options_of(group).items() if key in keys] if name else []
     if having:
@@ -83,7 +84,10 @@ def way_out(key: str) -> str:
         own = "; a built-in scene always brings its own held-out drops"
         rest = own if key == "scene.test" else ""
         return f"; {group}={have} it, the chosen {group} has not{rest}"
-    known = [key for model in COMMANDS.values() for key in keys_of(node_of(model))]
+    known = [each for model in COMMANDS.values() for each in keys_of(node_of(model))]
+    known = sorted({each for each in known if each != key})  # which another command may have
+    if deeper := [each for each in known if each.endswith(f".{key}")]:
+        return f"; expected {' or '.join(deeper[:3])}"
     if group == "trainer":
         from lightning import Trainer
 

@@ -68,6 +68,8 @@ class FilmSection(Settings):
     """direction from the object to the camera in the file's axes, or a list of such, [[x, y, z],
     ...], through which the camera turns about `up` while the film goes on; null: from the side, a
     little above"""
+    zoom: Positive = 1.0
+    """the picture shows so much less around the middle of the motion"""
     shadow: bool = True
     """shadows of the object and the obstacles on the ground, under light from above"""
     caption: bool = True

@@ -73,6 +73,8 @@ from mosa.twin.start import (
 )
 from mosa.types import Cameras, Rollout
 
+LENS = 1.6
+"""Of a video's camera: its focal length over the picture's shorter side."""
 Draws = Annotated[int, Ge(2), Le(10_000)]
 Views = Sequence[float] | Sequence[Sequence[float]] | Tensor
 Motion = Annotated[
@@ -289,6 +291,7 @@ class Twin:
         size: Pixels = 400,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         view: Views | None = None,
+        zoom: Positive = 1.0,
         shadow: bool = True,
     ) -> Tensor:
         """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and
@@ -296,9 +299,10 @@ class Twin:
         or a list of the states of T steps, whose solids are drawn where they were then (None: those of
         `reset`). Half spaces are not drawn. size [px]: of a square, or (width, height). view: (3,)
         from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None
-        for the side and a little above. shadow: on the ground, of the body and of the solids, under
-        light from above. Errors: ConfigError."""
-        return self._pictures(*self._met(rollout, colliders), size, view, shadow)
+        for the side and a little above. zoom: the picture shows so much less around the middle of the
+        motion. shadow: on the ground, of the body and of the solids, under light from above.
+        Errors: ConfigError."""
+        return self._pictures(*self._met(rollout, colliders), size, view, zoom, shadow)
 
     def _pictures(
         self,
@@ -306,6 +310,7 @@ class Twin:
         solids: Sequence[Collider],
         size: int | Sequence[int],
         view: Views | None,
+        zoom: float,
         shadow: bool,
     ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
@@ -320,9 +325,9 @@ class Twin:
         level = side - (side @ up) * up
         side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
         width, height = (size, size) if isinstance(size, int) else size
-        focal, frames = 1.6 * min(width, height), len(rollout.x)
-        # a ball around all places of the particles fills the shorter side, but for a margin
-        far = (3.2**2 + 1) ** 0.5 * (0.53 * float((high - low).norm()) + body.spacing)
+        focal, frames = zoom * LENS * min(width, height), len(rollout.x)
+        # without zoom a ball around all places of the particles fills the shorter side, but for a margin
+        far = (4 * LENS**2 + 1) ** 0.5 * (0.53 * float((high - low).norm()) + body.spacing)
         toward = viewed_from(side / side.norm() + 0.25 * up if view is None else view, up, frames)
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         w2c = look_at(target + far * toward, target.expand_as(toward), up).cpu()
@@ -388,14 +393,14 @@ class Twin:
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        size: Pixels = 400, fps: Positive | None = None, view: Views | None = None,
+        size: Pixels = 400, fps: Positive | None = None, view: Views | None = None, zoom: Positive = 1.0,
         shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
         images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
-        the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view and
-        shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px
+        the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view, zoom
+        and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px
         above and below. Errors, before anything is written: ConfigError where they are not, or a
         format's or the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
@@ -413,7 +418,7 @@ class Twin:
         save_frames(splats, folder / "splats", formats, rate=1 / apart, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            images = self._pictures(rollout, solids, size, view, shadow)
+            images = self._pictures(rollout, solids, size, view, zoom, shadow)
             plain = map(to_uint8, images)
             frames = side_by_side({title: images}, footer=moments) if caption else list(plain)
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))

@@ -66,6 +66,8 @@ def test_a_mistyped_option_is_refused(override):
     ("trainer.max_epoch=1", r"'trainer\.max_epoch'; the nearest is trainer\.max_epochs"),
     ("callbacks.early_stopping.patience=3", "callbacks=early_stopping has it, the chosen callb"),
     ("scene.test=[]", "scene=markers, pacnerf, .* have it, .* brings its own held-out"),
+    ("particles=200", r"'particles'; expected .*simulation\.particles"),
+    ("fps=24", r"'fps'; expected .*film\.fps"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):

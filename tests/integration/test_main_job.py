@@ -337,6 +337,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
     [
         (["prior=jelly"], ", found jelly"),
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: nowhere.ckpt: no such file"),
+        (["ckpt_path=conf"], "ckpt_path: conf: a folder; a run writes"),
         (["losses.colour=1"], "colour"),
         (["trainer.devices=[1000]", "trainer.accelerator=gpu"], "trainer=cpu runs without one"),
         (["fit.clip=abc"], "fit.clip: expected a number above 0 and at most 1e+20, found 'abc'"),

@@ -200,6 +200,15 @@ def test_a_film_has_two_sides_and_shows_the_whole_of_a_long_fall():
         assert rows.max() - rows.min() > 0.6 * min(width, height)
 
 
+def test_zoom_shows_so_much_less():
+    one = twin()
+    rollout = one.simulate(frames=2, height=0.1)
+    one.body.colors.copy_(torch.tensor([1.0, 0.0, 0.0]))
+    far, near = (one.render(rollout, size=64, zoom=zoom, shadow=False) for zoom in (0.5, 1.0))
+    whole, part = ((each[..., 0] - each[..., 1] > 0.3)[0].sum() for each in (near, far))
+    assert 3 < whole / part < 5
+
+
 def test_a_camera_goes_along_its_views():
     one = twin()
     one.body.colors.copy_(torch.linspace(0, 1, one.body.rest.numel()).view(-1, 3))
