@@ -365,16 +365,22 @@ def check_same_run(record: RunRecord, values: Mapping[str, Any], folder: str | P
 def check_same_scene(record: BodyRecord, values: Mapping[str, Any], path: str | Path) -> None:
     """The checkpoint that ckpt_path names was fitted to the data that the fit is to go on with: a body of as many particles would
     take another's law for its own. Other keys may differ. Errors: ConfigError naming those that must not."""
-    without = (*BESIDE, "scene.test")
-    scenes = (each.get("scene") or {} for each in (record.settings, values))
-    found = list(differing(*scenes, without, "scene"))
-    sizes = [{k: v for k, v in (each.get("simulation") or {}).items() if k in ("particles", "dx")}
-             for each in (record.settings, values)]  # fmt: skip
-    if found := [*found, *differing(*sizes, where="simulation")]:
+    if found := other_scene(record.settings, values):
         raise ConfigError(
             f"ckpt_path: expected in {path} a fit to this scene, found one to another or of other particles "
             f"({listed(found)}); a law is taken to another object with python eval.py or python -m mosa.splats"
         )
+
+
+def other_scene(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """The keys of the scene and of the particles that differ, as `differing` has them."""
+    scenes = (each.get("scene") or {} for each in (one, other))
+    sizes = [{k: v for k, v in (each.get("simulation") or {}).items() if k in ("particles", "dx")}
+             for each in (one, other)]  # fmt: skip
+    return [
+        *differing(*scenes, (*BESIDE, "scene.test"), "scene"),
+        *differing(*sizes, where="simulation"),
+    ]
 
 
 def check_same_data(record: RunRecord, here: Mapping[str, str], path: str | Path) -> None:

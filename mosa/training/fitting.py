@@ -7,6 +7,7 @@ import logging
 import re
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from mosa.system.refused import short_of_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa, check_trainer
-from mosa.training.run_folder import VALIDATION
+from mosa.training.run_folder import VALIDATED, VALIDATION
 
 log = logging.getLogger(__name__)
 
@@ -102,14 +103,18 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
 
 
 def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
-    """Errors: ConfigError where a callback or a sweep's objective is of validation and nothing is held out."""
-    if cfg.scene.get("holdout_cameras") or cfg.scene.get("holdout_frames"):
-        return
+    """Errors: ConfigError where a callback or a sweep's objective is of validation and nothing is held out, or is a slip of the
+    pen."""
+    held_out = cfg.scene.get("holdout_cameras") or cfg.scene.get("holdout_frames")
     monitors = [
         (f"callbacks: {type(c).__name__}.monitor", getattr(c, "monitor", None)) for c in callbacks
     ]
     for where, figure in [*monitors, ("optimized_metric", cfg.optimized_metric)]:
-        if str(figure).startswith(VALIDATION):
+        # a callback of a user's own may log others, which are less like these
+        slip = get_close_matches(str(figure), VALIDATED, 1, 0.9)
+        if slip and str(figure) not in VALIDATED:
+            raise ConfigError(f"{where}: expected one of {', '.join(VALIDATED)}, found {figure}")
+        if str(figure).startswith(VALIDATION) and not held_out:
             raise ConfigError(
                 f"{where} is {figure}: expected something that is held out of the training sequence, found nothing; "
                 "scene.holdout_cameras=[0] or scene.holdout_frames=2"

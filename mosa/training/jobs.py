@@ -65,6 +65,30 @@ def own_groups(command: str, conf: Path | None = None) -> str:
 OmegaConf.register_new_resolver("own_groups", own_groups, replace=True)
 
 
+WITH_VALUE = {
+    "--config-dir",
+    "-cd",
+    "--config-path",
+    "-cp",
+    "--config-name",
+    "-cn",
+    "--package",
+    "-p",
+}
+"""Options of Hydra whose next word is no override."""
+
+
+def options_first(words: Sequence[str]) -> list[str]:
+    """A command line whose overrides stand together at its end: argparse, by which Hydra reads it, refuses those after an option
+    where others stand before."""
+
+    def is_override(place: int) -> bool:
+        word, before = words[place], words[place - 1] if place else ""
+        return word[0] != "-" and ("=" in word or word[0] == "~") and before not in WITH_VALUE
+
+    return [words[k] for k in sorted(range(len(words)), key=is_override)]
+
+
 def quoted(argument: str) -> str:
     """An override as Hydra's grammar reads it: a value with letters beyond ASCII, or ~, &, = and the like, as paths have them, gets
     quotes. As it is where it can be read, and where it has a list, quotes or an escape, unless it begins as a path does."""
@@ -105,7 +129,7 @@ def run_command(run: Callable[[], None]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function
     with tolerant_output():
         try:
-            sys.argv[1:] = map(quoted, sys.argv[1:])
+            sys.argv[1:] = map(quoted, options_first(sys.argv[1:]))
             check_folders(sys.argv[1:])
             run()
         except KeyboardInterrupt:  # between jobs, or before the first

@@ -36,6 +36,8 @@ from mosa.config.checkpoints import (
     check_same_data,
     check_same_scene,
     known_numbers,
+    listed,
+    other_scene,
     read_checkpoint,
 )
 from mosa.config.command_settings import TrainSettings
@@ -237,6 +239,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         data = getattr(self.trainer, "datamodule", None)
         if self.record is not None and hasattr(data, "cfg"):
             check_same_scene(self.record, plain(data.cfg), "the module")
+        elif (
+            self.cfg and hasattr(data, "cfg") and (found := other_scene(self.cfg, plain(data.cfg)))
+        ):
+            raise ConfigError(
+                f"LitMosa, {type(data).__name__}: expected one configuration for both, found {listed(found)}"
+            )
         known = any(isinstance(each, Stages) for each in self.trainer.callbacks)
         return [] if known else [Stages()]
 

@@ -32,6 +32,7 @@ from mosa.training.jobs import (
     attempt,
     folder_name,
     held,
+    options_first,
     quoted,
 )
 
@@ -246,6 +247,21 @@ def test_values_that_hydra_cannot_read_are_quoted(argument, found):
     if argument.startswith("scene.path="):
         (read,) = OverridesParser.create().parse_overrides([found])
         assert str(read.value()) == argument.partition("=")[2]
+
+
+def test_overrides_may_stand_before_an_option_and_after_it():
+    words = [
+        "debug=default",
+        "--config-dir",
+        "a=b/conf",
+        "experiment=team",
+        "-m",
+        "~logger",
+        "--info",
+    ]
+    assert options_first(words) == [
+        "--config-dir", "a=b/conf", "-m", "--info", "debug=default", "experiment=team", "~logger",
+    ]  # fmt: skip
 
 
 @pytest.fixture

@@ -50,3 +50,13 @@ def test_a_fit_goes_on_with_its_own_scene_alone(tmp_path, monkeypatch, other):
         LitMosa.load_from_checkpoint(tmp_path / "tiny.ckpt").on_load_checkpoint(
             saved("debug=default", other)
         )
+
+
+@pytest.mark.parametrize("other", ["scene.holdout_cameras=[1]", "simulation.particles=150"])
+def test_module_and_data_have_one_configuration(monkeypatch, other):
+    """A camera that the module held out was learned from, and its settings named another body than its own."""
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    data = SceneDataModule("debug=default")
+    monkeypatch.setattr(datamodule, "load_sequences", lambda _: pytest.fail("the films were made"))
+    with pytest.raises(ConfigError, match=f"one configuration for both.*{other.split('=')[0]}"):
+        trainer.fit(LitMosa("debug=default", other), datamodule=data)

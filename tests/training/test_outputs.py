@@ -38,4 +38,10 @@ def test_what_is_chosen_by_validation_needs_something_held_out():
     ):
         check_monitors(usual, [EarlyStopping("val/loss")])
     for held_out in {"holdout_frames": 1}, {"holdout_cameras": [0]}:
-        check_monitors(OmegaConf.merge(chosen, {"scene": held_out}), [EarlyStopping("val/loss")])
+        whole = OmegaConf.merge(chosen, {"scene": held_out})
+        for own in "val/loss", "val/frames/psnr", "val/own_loss", "fit/loss":
+            check_monitors(whole, [EarlyStopping(own)])
+        with pytest.raises(
+            ConfigError, match=r"EarlyStopping\.monitor: .*val/loss, .*found val/los$"
+        ):
+            check_monitors(whole, [EarlyStopping("val/los")])
