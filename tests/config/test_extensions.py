@@ -120,5 +120,9 @@ def test_an_adapter_brings_its_penalties(monkeypatch):
         "cost": 2.5,
     }
     assert terms.evaluate_terms({"cost": 1.0}, SimpleNamespace(operator=None)) == {}
+    for wrong in 3.0, torch.ones(2):
+        monkeypatch.setitem(Costly.penalties, "cost", lambda *_: wrong)  # noqa: B023
+        with pytest.raises(ConfigError, match=r"losses\.cost: expected a tensor of shape"):
+            terms.evaluate_terms({"cost": 1.0}, step)
     with pytest.raises(ConfigError, match="another"):
         register_term("operator", lambda step: None)

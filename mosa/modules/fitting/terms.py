@@ -18,7 +18,7 @@ from mosa.modules.adapters.penalties import PENALTIES, OperatorStatistics
 from mosa.modules.body.body import Body, Start
 from mosa.modules.fitting import losses
 from mosa.rendering.observer import Views, deformed_covariances, observe
-from mosa.settings import nearest
+from mosa.settings import nearest, shown
 from mosa.types import MotionCues, Rollout
 
 
@@ -135,10 +135,16 @@ def check_terms(weights: Mapping[str, float], adapter: Adapter | None) -> None:
 
 
 def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor]:
-    """Every term that has a weight, raw, in the order in which they are known; then the penalties of an adapter that is learned."""
+    """Every term that has a weight, raw, in the order in which they are known; then the penalties of an adapter that is learned.
+    Errors: ConfigError naming a term that is no number."""
     found = {name: term(step) for name, term in TERMS.items() if weights.get(name, 0.0) != 0}
     if step.operator is not None:
         known = step.body.adapter.penalties
         counted = [name for name in known if weights.get(name, 0.0) != 0]
         found |= {name: known[name](step.operator, step.misfit) for name in counted}
+    for name, value in found.items():
+        if value is not None and getattr(value, "shape", None) != ():
+            raise ConfigError(
+                f"losses.{name}: expected a tensor of shape () of its term, found {shown(value)}"
+            )
     return {name: value for name, value in found.items() if value is not None}
