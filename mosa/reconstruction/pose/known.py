@@ -277,14 +277,27 @@ def followed(
     return own, fitted(solid, start, own, 15, sized=False)[0]
 
 
+def alike(solid: Solid, scene: Scene, place: Similarities) -> Similarities:
+    """Of the poses that the outlines of frame 0 leave, the one that is turned least from `place`, which colours say: a side that no
+    training camera has seen has none of its own."""
+    views = scene.training_cameras
+    rays = outline_rays(scene.mattes[views, 0], scene.cameras.select(views))
+    found, _ = searched(solid, scene, rays, float(place.size[0]), sized=False)
+    nearest = (found.rotation * place.rotation).sum((1, 2)).argmax()
+    return found.take(nearest[None])
+
+
 def known_start(
-    scene: Scene, place: Similarities, rest: Similarities, rest_center: Tensor
+    scene: Scene, place: Similarities, rest: Similarities, rest_center: Tensor, *, register: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rotation (3, 3) from the rest shape, centre (3,) [m], velocity and spin (3,) that the outlines of
-    free flight show. place: of frame 0, nearly; rest: of the rest shape, whose centre of mass is
-    `rest_center` (3,). Errors: DataError where there is no second frame of free flight."""
+    free flight show. place: of frame 0, nearly, or, where a pose is to be registered, what colours
+    say of it; rest: of the rest shape, whose centre of mass is `rest_center` (3,). Errors:
+    DataError where there is no second frame of free flight."""
     assert scene.body is not None
-    found = flown(known_solid(scene.body), scene, place, float(place.size[0]))
+    solid = known_solid(scene.body)
+    place = alike(solid, scene, place) if register else place
+    found = flown(solid, scene, place, float(place.size[0]))
     if len(found.places.size) < 2:
         raise DataError(
             f"{scene.name}/{scene.sequence}: expected two frames of free flight at least in which "

@@ -105,7 +105,9 @@ def sequence_start(
     if place is not None and scene.body is not None:
         rest_center = body.center.cpu()
         near = place.turned(rotation.cpu(), center.cpu(), rest_center)
-        turn, middle, velocity, spin = known_start(scene, near, place, rest_center)
+        turn, middle, velocity, spin = known_start(
+            scene, near, place, rest_center, register=register
+        )
         if register:
             rotation, center = turn, middle
         return Start(*(x.to(body.rest) for x in (rotation, center, velocity, spin)))

@@ -13,7 +13,7 @@ from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.errors import DataError
 from mosa.reconstruction.geometry.known import Solid
 from mosa.reconstruction.pose import outlines
-from mosa.reconstruction.pose.known import known_centres, register_known
+from mosa.reconstruction.pose.known import known_centres, known_start, register_known
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.types import REST, Ground, KnownBody, Scene
 
@@ -151,6 +151,21 @@ def test_one_camera_finds_the_scale_by_the_fall(tmp_path):
     centres = known_centres(scene, found.place)
     fallen = torch.tensor(GRAVITY) / 2 * (3 * DT) ** 2 + 3 * DT * torch.tensor(VELOCITY)
     assert float((centres[3] - centres[0] - fallen).norm()) < 0.01
+
+
+def test_outlines_find_a_start_that_colours_miss(tmp_path):
+    """The duck's colours, learned by one camera, put its held-out start half a turn off."""
+    scene = scene_of(written(tmp_path / "bracket.obj"), 3, 3, last_free_frame=2)
+    rest = register_known(scene).place
+    turn = torch.from_numpy(Rotation.from_euler("y", 150, degrees=True).as_matrix()).float()
+    wrong = rest.turned(turn, rest.center[0] + 0.01, rest.center[0])
+    rotation, center, velocity, spin = known_start(
+        scene, wrong, rest, rest.center[0], register=True
+    )
+    assert float((rotation - torch.eye(3)).norm()) < 0.05
+    assert float((center - rest.center[0]).norm()) < 0.005
+    assert torch.allclose(velocity, torch.tensor(VELOCITY), atol=0.1)
+    assert torch.allclose(spin, torch.tensor(SPIN), atol=0.6)
 
 
 def test_one_camera_and_no_fall_is_refused_without_a_scale(tmp_path):
