@@ -180,7 +180,7 @@ def test_a_body_that_rolled_within_its_shape_is_not_turned_back(scaffold):
         true = truth(EVERY, ball.splats, ball.modes).positions
     windows = object_windows(scene, list(range(6)), list(range(3)))
     predicted = torch.stack([splats.means, *[splats.means * flat] * 2]) + place
-    weak = {"lr": 0.02, "elastic": 0.03, "bending": 0.1}
+    weak = {"iterations": 40, "lr": 0.02, "elastic": 0.03, "bending": 0.1}
     found = fitted((windows, ball, true), predicted, true, **weak)
     assert away(laid_onto(predicted, true), true) > 6 and away(found, true) < 3
 
