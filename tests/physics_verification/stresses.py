@@ -32,7 +32,7 @@ def stress(
     kernel, _ = kernels_of(law_named(law), SCALARS[dtype], operator is not None, False)
     arrays = [wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in
               zip((F, C, packed, G, h, tau), (mat33, mat33, vecp, mat66, vec6, mat33))]  # fmt: skip
-    wp.launch(kernel, n, inputs=arrays, device="cpu")
+    wp.launch(kernel, n, inputs=[*arrays, None], device="cpu")
     return tau
 
 

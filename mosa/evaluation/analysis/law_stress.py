@@ -102,7 +102,7 @@ def evaluated(
 
 
 def wrapped(parts: list[Tensor]) -> list:
-    return [wp.from_torch(part, dtype=kind) for part, kind in zip(parts, KINDS)]
+    return [*(wp.from_torch(part, dtype=kind) for part, kind in zip(parts, KINDS)), None]
 
 
 def kirchhoff(material: Material, adapter: HyperelasticAdapter | None, F: Tensor) -> Tensor:

@@ -16,9 +16,9 @@ from mosa.physics.constitutive.kinematics import (
     rotation,
     rotation_of,
     svd,
-)
+)  # fmt: skip
 from mosa.physics.constitutive.laws import SLOTS, Law
-from mosa.physics.constitutive.particle_access import particle_access
+from mosa.physics.constitutive.particle_access import LANES, particle_access
 
 vec6 = wp.types.vector(length=6, dtype=wp.float64)
 MOST = 168
@@ -85,7 +85,8 @@ def stress_kernel(
 
     energetic: the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is added is the stress of the energy
     mu E : G : E, E Green's strain, to 1 + h[0] times the prior's. shear: place of mu among the law's parameters.
-    G and h of one row are those of all particles, each of which adds to a row of its own of their gradients."""
+    G and h of one row are those of all particles, each of which adds to a row of its own of their gradients. block: (LANES,) room
+    for the rotations of a few particles, None to find each by itself."""
     field33, field6, field66, fieldp = field_types(scalar)
     energetic = adapted and energetic
     own = particle_access(scalar, SLOTS)
@@ -95,13 +96,18 @@ def stress_kernel(
     def stress_of_particles(
         F: wp.array(dtype=field33), C_affine: wp.array(dtype=field33), parameters: wp.array(dtype=fieldp),
         G: wp.array(dtype=field66), h: wp.array(dtype=field6), tau: wp.array(dtype=field33),
+        block: wp.array(dtype=wp.mat33d),
     ):  # fmt: skip
         i = wp.tid()
         place = wp.min(i, G.shape[0] - 1)
         Fi = own.matrix33(F, i)
         R = Fi
         if wp.static(needs_rotation):
-            R = rotation(Fi, rotation_of(Fi))
+            if own.turned(F, i, block):
+                R = block[i % LANES]
+            else:
+                R = rotation_of(Fi)
+            R = rotation(Fi, R)
         p = own.parameters(parameters, i)
         T = stress(Fi, R, own.matrix33(C_affine, i), p)
         if wp.static(energetic):

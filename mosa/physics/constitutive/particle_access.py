@@ -136,6 +136,51 @@ ADD_PRODUCT = f"""
 #endif
 """
 
+# rotations of LANES particles by `polar_value`'s iteration, bit for bit, in one register each number: a CPU's launch is one thread,
+# which comes to one particle after the other. Whether that of particle i is there: that iteration may take another way
+LANES = 8
+TURNED = f"""
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
+#define ALL(k, n) _Pragma("unroll") for (int k = 0; k < n; ++k)
+    if (!block.data) return false;
+    typedef decltype(field.data[0].data[0][0] + 0) S;
+    typedef S W __attribute__((ext_vector_type({LANES})));
+    typedef double V __attribute__((ext_vector_type({LANES})));
+    if (i % {LANES} == 0) {{
+        V a[9], b[9], size = 0;
+        ALL(k, 9) {{
+            W w;
+            ALL(l, {LANES}) w[l] = field.data[i + l < field.shape[0] ? i + l : i].data[k / 3][k % 3];
+            a[k] = __builtin_convertvector(w, V);
+            size += a[k] * a[k];
+        }}
+        auto turning = size < 100.0, found = size < 0.0;
+        for (int step = 0; step < 20 && __builtin_reduce_or(turning); ++step) {{
+            ALL(k, 9) {{
+                const int r = (k / 3 + 1) % 3 * 3, s = (k / 3 + 2) % 3 * 3, l = (k + 1) % 3, m = (k + 2) % 3;
+                b[k] = a[r + l] * a[s + m] - a[r + m] * a[s + l];
+            }}
+            const V d = a[0] * b[0] + a[1] * b[1] + a[2] * b[2], f = 0.5 / d;
+            turning &= d > 0.02;
+            ALL(k, 9) {{
+                const V half = 0.5 * a[k], other = f * b[k], next = half + other;
+                b[k] = next - a[k];
+                a[k] = turning ? next : a[k];
+            }}
+            const V x = b[0] * b[0] + b[1] * b[1] + b[2] * b[2], y = b[3] * b[3] + b[4] * b[4] + b[5] * b[5];
+            const V z = b[6] * b[6] + b[7] * b[7] + b[8] * b[8];
+            found |= turning & (x + y + z < 1.0e-18);
+            turning &= ~found;
+        }}
+        ALL(k, 9 * {LANES}) block.data[k / 9].data[k % 9 / 3][k % 3] = found[k / 9] ? a[k % 9][k / 9] : 0;
+    }}
+    const double* own = block.data[i % {LANES}].data[0];
+    return own[0] != 0 || own[1] != 0 || own[2] != 0;
+#endif
+"""
+
 
 @cache
 def particle_access(scalar, slots: int) -> SimpleNamespace:
@@ -172,6 +217,9 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     @wp.func_native(*snippets(slots, f"wp::vec_t<{slots}, double>"))
     def parameters(field: fields, i: int) -> vector: ...
 
+    @wp.func_native(TURNED)
+    def turned(field: field33, i: int, block: wp.array(dtype=wp.mat33d)) -> bool: ...
+
     return SimpleNamespace(
-        matrix33=matrix33, vector6=vector6, times66=times66, parameters=parameters
-    )
+        matrix33=matrix33, vector6=vector6, times66=times66, parameters=parameters, turned=turned,
+    )  # fmt: skip

@@ -47,7 +47,7 @@ def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) 
             [F, C_affine, parameters, blank, blank[0, :1], tau],
             [mat33, mat33, vecp, mat66, vec6, mat33],
         )
-        launch(kernel, len(F), arrays, arrays[0].device)
+        launch(kernel, len(F), [*arrays, None], arrays[0].device)
     return tau
 
 
@@ -86,12 +86,9 @@ class _OfParticles(torch.autograd.Function):
 
 
 def material_state(
-    law: Law,
-    F: Tensor,
-    C_affine: Tensor,
-    parameters: Tensor,
+    law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor,
     into: tuple[Tensor, Tensor, Tensor] | None = None,
-) -> tuple[Tensor, Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
     """(w, s, e) that an adapter reads, differentiable.
 
     w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.

@@ -16,6 +16,7 @@ from torch import Tensor
 from mosa.errors import SimulationDiverged
 from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
+from mosa.physics.constitutive.particle_access import LANES
 from mosa.physics.contact.collider_buffers import ColliderBuffers
 from mosa.physics.contact.driven import Held
 from mosa.physics.contact.driven_buffers import DrivenBuffers
@@ -68,6 +69,7 @@ class Workspace:
             numerics.law, self.scalar, adapted, plastic_adapted, numerics.energetic
         )
         self.plastic = numerics.law.plastic
+        _, self.block_wp = self.array((LANES, 3, 3), wp.mat33d, torch.float64)
         n = particles
         states = substeps + 1 if with_adjoint else 2
         self._large = states * n * torch.finfo(numerics.dtype).bits // 8 >= LARGE
@@ -426,6 +428,7 @@ class Workspace:
         held = self.held_wp
         return [
             self._averaged(state), self.states_wp[state].C, held["parameters"], held["G"], held["h"], self.tau_wp[slot],
+            self.block_wp,
         ]  # fmt: skip
 
     def _mapping_arguments(self, state: int, new: int) -> list:
@@ -521,7 +524,7 @@ class Workspace:
                 adj_F = self.adj_F_bar_wp
                 adj_F.zero_()
             self.run(self.stress, n, self._stress_arguments(step, step), [
-                adj_F, adj.C, held["parameters"], held["G"], held["h"], self.adj_tau_wp,
+                adj_F, adj.C, held["parameters"], held["G"], held["h"], self.adj_tau_wp, None,
             ])  # fmt: skip
             if numerics.moduli is not None:
                 self._adj_averaged(step, adj)

@@ -107,6 +107,43 @@ PLAIN = """
     for (int n = 0; n < 3; ++n)
         for (int k = 0; k < NUMBERS; ++k) field.data[i + n].c[k] += values[n].c[k];"""
 
+# a CPU's compiler makes no vectors of Warp's own: a node is one of four numbers, in the order of operations of the loops that a GPU
+# goes through, so that all bits are theirs
+VECTORS = """
+#define ALL(k, n) _Pragma("unroll") for (int k = 0; k < n; ++k)
+    typedef decltype(wx.c[0] + wx.c[0]) S;
+    typedef S V __attribute__((ext_vector_type(4), aligned(sizeof(S))));
+    V* nodes = reinterpret_cast<V*>(field.data + i);"""
+SCATTER = f"""{VECTORS}
+    const V Q = {{q.c[0], q.c[1], q.c[2], m}};
+    const V X = {{bx.c[0], bx.c[1], bx.c[2], 0}}, Y = {{by.c[0], by.c[1], by.c[2], 0}}, Z = {{bz.c[0], bz.c[1], bz.c[2], 0}};
+    ALL(j, 3) ALL(k, 3) {{
+        const V x = S(j) * X, y = S(k) * Y, along = Q + x, here = along + y;
+        const S across = wx.c[j] * wy.c[k];
+        ALL(l, 3) {{
+            const V z = S(l) * Z, momentum = here + z, part = (across * wz.c[l]) * momentum;
+            nodes[(j * dims.c[1] + k) * dims.c[2] + l] += part;
+        }}
+    }}"""
+GATHER = f"""{VECTORS}
+    V v = 0, x = 0, y = 0, z = 0;
+    ALL(j, 3) {{
+        V layer = 0;
+        ALL(k, 3) {{
+            const V* row = nodes + (j * dims.c[1] + k) * dims.c[2];
+            const V a = wz.c[0] * row[0], b = wz.c[1] * row[1], c = wz.c[2] * row[2];
+            const V line = wy.c[k] * (a + b + c), twice = S(2) * c;
+            const V along = (wx.c[j] * S(k)) * line, up = (wx.c[j] * wy.c[k]) * (b + twice);
+            layer = layer + line, y = y + along, z = z + up;
+        }}
+        layer = wx.c[j] * layer, v = v + layer;
+        const V across = S(j) * layer;
+        x = x + across;
+    }}
+    wp::mat_t<4, 3, S> found;
+    ALL(k, 3) found.data[0][k] = v[k], found.data[1][k] = x[k], found.data[2][k] = y[k], found.data[3][k] = z[k];
+    return found;"""
+
 # of a particle's COUNT float32, an odd number: all but one in pairs, which begin with the first of an even particle
 TAKE = """
     const float* source = reinterpret_cast<const float*>(field.data + i);
@@ -154,6 +191,7 @@ def node_access(scalar) -> SimpleNamespace:
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=scalar)
     field3, field4, field33 = (wp.array(dtype=kind) for kind in (vec3, vec4, mat33))
     three, four = PARTS.format("decltype(x)(0)"), PARTS.format("value.c[3]")
 
@@ -218,6 +256,18 @@ def node_access(scalar) -> SimpleNamespace:
         meeting: wp.vec3i, together: wp.vec3i,
     ): ...  # fmt: skip
 
+    @wp.func_native(_either("return false;", "return true;"))
+    def on_cpu() -> bool: ...
+
+    @wp.func_native(_either("", SCATTER))
+    def scatter(
+        field: field4, i: int, dims: wp.vec3i, wx: vec3, wy: vec3, wz: vec3, q: vec3, bx: vec3, by: vec3, bz: vec3,
+        m: scalar,
+    ): ...  # fmt: skip
+
+    @wp.func_native(_either("return {};", GATHER))
+    def gather(field: field4, i: int, dims: wp.vec3i, wx: vec3, wy: vec3, wz: vec3) -> mat43: ...
+
     @wp.func
     def clear(field: field4, i: int):
         z = scalar(0.0)
@@ -226,6 +276,7 @@ def node_access(scalar) -> SimpleNamespace:
     return SimpleNamespace(
         load4=load4, load3=load3, store4=store4, store3=store3, run=run, meeting=meeting, add4=add4, add3=add3,
         add4_of_two=add4_of_two, clear=clear, take3=take3, take33=take33, put3=put3, put33=put33,
+        on_cpu=on_cpu, scatter=scatter, gather=gather,
     )  # fmt: skip
 
 

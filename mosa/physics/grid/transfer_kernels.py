@@ -42,6 +42,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
     run, add3, add4 = adding.run, adding.add3, adding.add4
     take3, take33, put3, put33 = memory.take3, memory.take33, memory.put3, memory.put33
     meeting, add4_of_two, twice = memory.meeting, memory.add4_of_two, each == 2
+    on_cpu, scatter, gather = memory.on_cpu, memory.scatter, memory.gather
     settle_node = exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
     Grids, located, nodes_of = stencil.Grids, stencil.located, stencil.nodes_of
@@ -197,6 +198,9 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
             s = sent(own, p, now, grids, dt, check_J, substep, flags)
             if s.n < 0:
                 return
+            if wp.static(not exact) and on_cpu():
+                scatter(grid, s.n, s.dims, s.wx, s.wy, s.wz, s.q0, s.bx, s.by, s.bz, s.m)
+                return
             together = run(s.n, True)
             for i in range(3):
                 for j in range(3):
@@ -227,20 +231,27 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
         cx = zero
         cy = zero
         cz = zero
-        for i in range(3):
-            layer = zero
-            for j in range(3):
-                row = n + (i * dims[1] + j) * dims[2]
-                a = wz[0] * load3(velocity, row)
-                b = wz[1] * load3(velocity, row + 1)
-                c = wz[2] * load3(velocity, row + 2)
-                line = wy[j] * (a + b + c)
-                layer = layer + line
-                cy = cy + (wx[i] * steps[j]) * line
-                cz = cz + (wx[i] * wy[j]) * (b + scalar(2.0) * c)
-            layer = wx[i] * layer
-            v = v + layer
-            cx = cx + steps[i] * layer
+        if on_cpu():
+            found = gather(velocity, n, dims, wx, wy, wz)
+            v = found[0]
+            cx = found[1]
+            cy = found[2]
+            cz = found[3]
+        else:
+            for i in range(3):
+                layer = zero
+                for j in range(3):
+                    row = n + (i * dims[1] + j) * dims[2]
+                    a = wz[0] * load3(velocity, row)
+                    b = wz[1] * load3(velocity, row + 1)
+                    c = wz[2] * load3(velocity, row + 2)
+                    line = wy[j] * (a + b + c)
+                    layer = layer + line
+                    cy = cy + (wx[i] * steps[j]) * line
+                    cz = cz + (wx[i] * wy[j]) * (b + scalar(2.0) * c)
+                layer = wx[i] * layer
+                v = v + layer
+                cx = cx + steps[i] * layer
         # sum w v (x_I - x)^T = dx (sum w v index^T - v f^T)
         s = scalar(4.0) * grids.inv_dx
         cx = s * (cx - f[0] * v)
@@ -267,7 +278,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
         ):
             wp.atomic_min(flags, _OUT, key)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=f"{module}_adjoint", enable_backward=False)
     def adj_g2p(
         now: Particles, velocity: wp.array(dtype=vec4), grids: Grids, dt: scalar, then: Particles,
         adj_then: Particles, adj: Particles, adj_velocity: added_to,
@@ -331,7 +342,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
                 gy = gy + wx[i] * sy[j] * flat
         put3(adj.x, p, ax + grids.inv_dx * (vec3(gx, gy, gz) - wp.transpose(ac) * v))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=f"{module}_adjoint", enable_backward=False)
     def adj_p2g(
         now: Particles, v: wp.array(dtype=vec3), tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar),
         volume: wp.array(dtype=scalar), grids: Grids, dt: scalar, adj_grid: wp.array(dtype=vec4),

@@ -186,7 +186,7 @@ def stress(F, mu, lam, S):
         wp.from_torch(t.contiguous(), dtype=k)
         for t, k in zip(tensors, (mat33, mat33, vecp, mat66, vec6, mat33))
     ]
-    wp.launch(kernel, n, inputs=arrays, device="cpu")
+    wp.launch(kernel, n, inputs=[*arrays, None], device="cpu")
     return wp.to_torch(arrays[-1])
 
 

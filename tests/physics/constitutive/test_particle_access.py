@@ -7,8 +7,8 @@ import torch
 import warp as wp
 
 from mosa.physics.constitutive.laws import SLOTS, law_named
-from mosa.physics.constitutive.material_kernels import state_kernel, stress_kernel
-from mosa.physics.constitutive.particle_access import particle_access
+from mosa.physics.constitutive.material_kernels import field_types, state_kernel, stress_kernel
+from mosa.physics.constitutive.particle_access import LANES, particle_access
 from mosa.physics.launching import aligned, warp_stream
 
 GPU = pytest.param("cuda", marks=pytest.mark.gpu)
@@ -142,6 +142,32 @@ def test_what_the_kernels_read_is_aligned():
     assert view.data_ptr() % 16 and aligned(view).data_ptr() % 16 == 0
     assert torch.equal(aligned(view), view)
     assert aligned(flat) is flat
+
+
+@pytest.mark.parametrize("dtype", SCALARS)
+def test_rotations_of_several_particles_at_once_are_those_of_each(dtype):
+    """Bit for bit, also where the iteration goes another way, and of a last block that is not full."""
+    generator = torch.Generator().manual_seed(0)
+    size = 10 ** torch.linspace(1, -6, 77, dtype=torch.float64)[:, None, None]
+    F = torch.randn(77, 3, 3, generator=generator, dtype=torch.float64)
+    F = (torch.eye(3) + size * F).to(dtype)
+    law, (mat33, vec6, mat66, vecp) = law_named("corotated"), field_types(SCALARS[dtype])
+    kernel = stress_kernel(law.stress, law.uses_rotation, SCALARS[dtype], False)
+    fields = [
+        F,
+        torch.zeros_like(F),
+        F.new_ones(77, SLOTS),
+        F.new_zeros(1, 6, 6),
+        F.new_zeros(1, 6),
+    ]
+    kinds, block = (mat33, mat33, vecp, mat66, vec6, mat33), torch.zeros(LANES, 3, 3).double()
+    found = []
+    for room in (None, wp.from_torch(block, dtype=wp.mat33d)):
+        tau = torch.empty_like(F)
+        arrays = [wp.from_torch(t, dtype=kind) for t, kind in zip([*fields, tau], kinds)]
+        wp.launch(kernel, 77, inputs=[*arrays, room], device="cpu")
+        found.append(tau)
+    assert torch.equal(*found) and (torch.linalg.det(F) < 0).any() and block.any()
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp has no compiler for GPUs")

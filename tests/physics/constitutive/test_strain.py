@@ -31,11 +31,11 @@ def launch(F, parameters, G, energetic=True, seed=None):
     tensors = [F, torch.zeros_like(F), parameters, G, F.new_zeros(len(F), 6), torch.empty_like(F)]
     arrays = [wp.from_torch(t.contiguous(), dtype=kinds[k]) for t, k in zip(tensors, KINDS)]
     if seed is None:
-        wp.launch(kernel, len(F), inputs=arrays, device="cpu")
+        wp.launch(kernel, len(F), inputs=[*arrays, None], device="cpu")
         return wp.to_torch(arrays[-1])
     adjoints = [torch.zeros_like(t) for t in tensors[:-1]] + [seed]
-    wp.launch(kernel, len(F), inputs=arrays, device="cpu", adjoint=True,
-              adj_inputs=[wp.from_torch(t.contiguous(), dtype=kinds[k]) for t, k in zip(adjoints, KINDS)])  # fmt: skip
+    seeds = [wp.from_torch(t.contiguous(), dtype=kinds[k]) for t, k in zip(adjoints, KINDS)]
+    wp.launch(kernel, len(F), inputs=[*arrays, None], device="cpu", adjoint=True, adj_inputs=[*seeds, None])  # fmt: skip
     return adjoints[0], adjoints[2], adjoints[3]
 
 
