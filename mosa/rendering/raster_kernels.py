@@ -29,20 +29,20 @@ def raster_kernels(dtype: type, channels: int):
     load, _, _, center_of, conic_of, pixels = record_functions(dtype)
 
     @wp.func
-    def row_span(center: vec2, conic: vec3, reach: dtype, y: int, rect: wp.vec4i):
-        """First and last + 1 pixel of row y where q can be below `reach`, a pixel of slack on both sides."""
+    def row_span(center: vec2, conic: vec3, across: dtype, reach: dtype, y: int, rect: wp.vec4i):
+        """First and last + 1 pixel of row y where q can be below `reach`, an eighth of a pixel of slack on both sides. across:
+        1 / conic[0]."""
         dy = dtype(y) + dtype(0.5) - center[1]
         first = 0
         last = 0
         disc = (conic[1] * dy) * (conic[1] * dy) - conic[0] * (conic[2] * dy * dy - reach)
         if disc > dtype(0.0):
-            root = wp.sqrt(disc)
-            a = (-conic[1] * dy - root) / conic[0] + center[0]
-            b = (-conic[1] * dy + root) / conic[0] + center[0]
+            half = wp.sqrt(disc) * across
+            middle = center[0] - conic[1] * dy * across
             left = dtype(rect[0])
             right = dtype(rect[1])
-            first = int(wp.clamp(wp.floor(a - dtype(1.0)), left, right))
-            last = int(wp.clamp(wp.ceil(b + dtype(1.0)), left, right))
+            first = int(wp.clamp(wp.ceil(middle - half - dtype(0.625)), left, right))
+            last = int(wp.clamp(wp.floor(middle + half + dtype(0.625)), left, right))
         return wp.vec2i(first, last)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -67,8 +67,9 @@ def raster_kernels(dtype: type, channels: int):
                 o = r[2]
                 color = features[b * feature_stride + n]
                 reach = dtype(2.0) * wp.log(o / dtype(ALPHA_MIN))
+                across = dtype(1.0) / conic[0]
                 for y in range(rect[2], rect[3]):
-                    span = row_span(center, conic, reach, y, rect)
+                    span = row_span(center, conic, across, reach, y, rect)
                     dy = dtype(y) + dtype(0.5) - center[1]
                     qyy = conic[2] * dy * dy
                     row = base + y * width
@@ -111,6 +112,7 @@ def raster_kernels(dtype: type, channels: int):
                 o = r[2]
                 color = features[b * feature_stride + n]
                 reach = dtype(2.0) * wp.log(o / dtype(ALPHA_MIN))
+                across = dtype(1.0) / conic[0]
                 gq_sum = dtype(0.0)
                 gx = dtype(0.0)
                 gy = dtype(0.0)
@@ -119,7 +121,7 @@ def raster_kernels(dtype: type, channels: int):
                 gyy = dtype(0.0)
                 gf = vecc()
                 for y in range(rect[2], rect[3]):
-                    span = row_span(center, conic, reach, y, rect)
+                    span = row_span(center, conic, across, reach, y, rect)
                     dy = dtype(y) + dtype(0.5) - center[1]
                     qyy = conic[2] * dy * dy
                     row = base + y * width
