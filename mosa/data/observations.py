@@ -27,8 +27,10 @@ class Observations:
     def select(self, views: Sequence[int], frames: int | None = None) -> Observations:
         """The given views and the first `frames` frames, all of them where None."""
         views, last = list(views), None if frames is None else frames - 1
-        flow = None if self.flow is None else self.flow[views, :last]
-        images, mattes = self.images[views, :frames], self.mattes[views, :frames]
+        # all of them are the same memory
+        chosen = slice(None) if views == list(range(len(self.cameras))) else views
+        flow = None if self.flow is None else self.flow[chosen, :last]
+        images, mattes = self.images[chosen, :frames], self.mattes[chosen, :frames]
         return Observations(images, mattes, flow, self.cameras.select(views), self.image_width)
 
     def to(self, device: torch.device | str) -> Observations:
@@ -49,12 +51,9 @@ def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: i
 
 @torch.no_grad()
 def training_observations(
-    scene: Scene,
-    reconstruction: Reconstruction,
-    *,
-    margin: int = 6,
+    scene: Scene, reconstruction: Reconstruction, *, margin: int = 6,
     device: torch.device | str = "cpu",
-) -> Observations:
+) -> Observations:  # fmt: skip
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
     if scene.markers is not None:

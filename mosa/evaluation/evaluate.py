@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 from warnings import warn
 
@@ -106,20 +106,29 @@ def rollouts(
     return result, float(np.mean(sizes)) if sizes else None, rate
 
 
-@torch.no_grad()
-def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Tensor:
-    """(V, T, H, W, 3) images of a rollout from the given cameras, on the body's device: of its splats where it has some."""
+def render(
+    body: Body, rollout: Rollout, scene: Scene, kept: int | None = 1
+) -> Callable[[int], Tensor]:
+    """Images (T, H, W, 3) of a rollout by camera, on the body's device: of its splats where it has some. kept: of how many cameras
+    they stay in memory, None for all."""
     device = body.rest.device
-    shown, views = seen(body, rollout.x, rollout.F_tot), scene.cameras.select(cameras).to(device)
-    return shown.images(views, scene.background.to(device)).clamp_(0, 1)
+    shown, background = seen(body, rollout.x, rollout.F_tot), scene.background.to(device)
+
+    @lru_cache(kept)
+    @torch.no_grad()
+    def images(camera: int) -> Tensor:
+        views = scene.cameras.select([camera]).to(device)
+        return shown.images(views, background)[0].clamp_(0, 1)
+
+    return images
 
 
 def image_metrics(
-    images: Tensor, scene: Scene, cameras: list[int], frames: list[int]
+    images: Callable[[int], Tensor], scene: Scene, cameras: list[int], frames: list[int]
 ) -> dict[str, float]:
     """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
 
-    images: (V, T, H, W, 3), all frames; where they lie is where they are compared."""
+    images: (T, H, W, 3) by camera, all frames; where they lie is where they are compared."""
     if not cameras or not frames:
         return {}
     x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
@@ -128,8 +137,9 @@ def image_metrics(
     found: dict[str, list[float]] = {
         f"{kind}_{name}": [] for name in ("crop", "full") for kind in kinds
     }
-    for v, (camera, x, y) in enumerate(zip(cameras, x0.tolist(), y0.tolist())):
-        seen, real = images[v][frames], scene.images[camera][frames].to(images.device)
+    for camera, x, y in zip(cameras, x0.tolist(), y0.tolist()):
+        seen = images(camera)[frames]
+        real = scene.images[camera][frames].to(seen.device)
         crop = (slice(None), slice(y, y + height), slice(x, x + width))
         for name, pair in (("crop", (seen[crop], real[crop])), ("full", (seen, real))):
             for kind, function in kinds.items():
@@ -138,13 +148,9 @@ def image_metrics(
 
 
 def motion_metrics(
-    x: Tensor,
-    body: Body,
-    sequence: Sequence,
-    frames: list[int],
-    settings: EvaluationSettings,
+    x: Tensor, body: Body, sequence: Sequence, frames: list[int], settings: EvaluationSettings,
     target: Tensor | None = None,
-) -> dict[str, float]:
+) -> dict[str, float]:  # fmt: skip
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
     target: `true_motion`, where it is at hand: it is the same for all models."""
@@ -256,19 +262,14 @@ def worst(name: str) -> float:
 
 
 def sequence_metrics(
-    body,
-    sequence: Sequence,
-    rollout: Rollout,
-    model: str,
-    settings: EvaluationSettings,
+    body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings,
     target: Tensor | None,
-) -> dict[str, float]:
+) -> dict[str, float]:  # fmt: skip
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x, parts, frames = sequence.scene, rollout.x.cpu(), parts_of(sequence), sequence.frames
     training = sequence.prefix.startswith("train")
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
-    # without a camera there is nothing to compare
-    images = render(body, rollout, scene, cameras) if cameras else scene.images
+    images = render(body, rollout, scene, None if "frames" in parts else 1)
 
     def measured(part: str, frames: list[int]) -> dict[str, float]:
         figures = motion_metrics(x, body, sequence, frames, settings, target)
@@ -280,7 +281,7 @@ def sequence_metrics(
         result |= measured("frames", list(scene.holdout_frames))
     if "camera" in parts:
         held = list(scene.holdout_cameras)
-        seen_there = render(body, rollout, scene, held)
+        seen_there = render(body, rollout, scene, None)
         figures = image_metrics(seen_there, scene, held, frames)
         result |= {f"{model}camera/{k}": v for k, v in figures.items()}
         for t in frames:

@@ -39,7 +39,7 @@ from mosa.config.checkpoints import (
     listed,
     other_scene,
     read_checkpoint,
-)
+)  # fmt: skip
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
@@ -70,6 +70,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.observer import Views, deformed_covariances, observe
+from mosa.system.limits import return_memory
 from mosa.training.datamodule import SceneDataModule
 from mosa.types import Ground, Rollout
 
@@ -119,12 +120,9 @@ def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
         stages = [stage for stage in stages if not stage.looks_again]
     return {
         "world": replace(world_of(record), forces=forces_from_config(settings.world.forces)),
-        "stages": stages,
-        "weights": settings.losses.weights(),
-        "clip": settings.fit.clip,
-        "criterion": settings.criterion,
-        "settings": settings.identification,
-    }
+        "stages": stages, "weights": settings.losses.weights(), "clip": settings.fit.clip,
+        "criterion": settings.criterion, "settings": settings.identification,
+    }  # fmt: skip
 
 
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
@@ -306,12 +304,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         )  # fmt: skip
         posterior, splats = self.posterior, self.body.splats
         record = RunRecord(
-            **dict(self.record),
-            start=self.start,
-            fit=fit,
+            **dict(self.record), start=self.start, fit=fit,
             posterior=posterior and posterior.written(),
             splats=None if splats is None else splats.written(),
-        )
+        )  # fmt: skip
         check_plain("", checkpoint)  # with what callbacks and data modules of anyone's added
         checkpoint["mosa"] = record.plain()
 
@@ -530,6 +526,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.settle_ground(self.world.ground)
         if stage.looks_again or not (stage.calibrates or self.informed):
             self.inform(response=stage.newton and not stage.calibrates)
+        return_memory()
         if stage.learns_adapter and self.body.adapter is not None:
             self.body.switch_on()
             if self.weights.get("operator", 0.0) != 0:

@@ -29,7 +29,7 @@ from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.driven import driven_from_config
 from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
-from mosa.system.limits import named_device
+from mosa.system.limits import named_device, return_memory
 from mosa.system.whole_files import write_whole
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.first_picture import write_first_picture
@@ -76,6 +76,7 @@ def timed(times: dict[str, float], stage: str):
     began = time.perf_counter()
     yield
     times[f"time/{stage}_s"] = took = time.perf_counter() - began
+    return_memory()
     log.info("%s took %.1f s, at most %.1f GB so far", stage, took, peak_memory())
 
 

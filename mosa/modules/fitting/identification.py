@@ -154,11 +154,9 @@ class Identification:
         if self.two_grids:
             tensors.append(share)
         return Seat(
-            tensors,
-            lambda: self._whitened(body, float(share)),
-            lambda: self._possible(body),
+            tensors, lambda: self._whitened(body, float(share)), lambda: self._possible(body),
             lambda: self._whitened(body, float(share), flown=True),
-        )
+        )  # fmt: skip
 
     def _possible(self, body: Body) -> None:
         """Errors: ConfigError where the numbers ask for more substeps than `max_substeps`. An iteration holds those of its
@@ -548,7 +546,7 @@ class Identification:
         newton, seat = self.newton, self.newton.seats[0]
         if newton.columns is None or self.noise is None or not any(self.kinds):
             return {}
-        table = torch.cat([newton.columns, seat.residuals()[:, None].to(newton.columns)], 1)
+        columns, r = newton.columns, seat.residuals()[:, None].to(newton.columns)
         squares: list[Tensor] = []
         positions: list[tuple[Tensor, float, float | None]] = []
         stretches: list[list[int]] = [[] for _ in range(FOLDS * len(self.takes))]
@@ -556,19 +554,23 @@ class Identification:
         width, first = 3 * len(self.chosen), 0
         felt = [each.force for each in self._fields(self.body)]
         forces: list[Tensor] = []
+
+        def gram(first: int, count: int) -> Tensor:
+            rows = slice(first, first + count)
+            table = torch.cat([columns[rows], r[rows]], 1).double()
+            return (table.mT @ table).cpu()
+
         for k, ((i, _), scales) in enumerate(zip(self.pairs, self.noise)):
             frames = len(scales[0])
             wrong = self._between_grids(k, kind)
-            own = table[first : first + 3 * frames * width].double().view(3, frames, width, -1)
+            # the rows of a field's frame after each other; those of the forces follow, as in `whitened`
+            every = [gram(first + width * n, width) for n in range(3 * frames)]
             first += 3 * frames * width
-            if (
-                force := felt[k]
-            ) is not None:  # its rows follow those of the fields, as in `whitened`
-                rows = table[first : first + len(force)].double()
-                forces.append((rows.mT @ rows).cpu())
+            if (force := felt[k]) is not None:
+                forces.append(gram(first, len(force)))
                 first += len(force)
             for frame in range(frames):
-                grams = [(part[frame].mT @ part[frame]).cpu() for part in own]
+                grams = every[frame::frames]
                 after = frame - (self.takes[i].first_contact - 1)
                 if after >= 0:
                     late = frames - self.takes[i].first_contact + 1

@@ -97,8 +97,11 @@ def coarse_poses(body: RigidBody, level: Level, center: Tensor, rotations: int, 
     seen = body.render(poses, level.cameras, level.background)
     centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras, SILHOUETTE * body.radius)
     poses = Poses(R, center + center - centres)
-    seen = level.weighed(body.render(poses, level.cameras, level.background))
-    return poses.take(rigid.huber(seen - level.target)[0].flatten(1).mean(-1).argsort()[:keep])
+    some = body.render(poses, level.cameras, level.background).split(50)  # for memory
+    costs = [
+        rigid.huber(level.weighed(each) - level.target)[0].flatten(1).mean(-1) for each in some
+    ]
+    return poses.take(torch.cat(costs).argsort()[:keep])
 
 
 class Registered(NamedTuple):

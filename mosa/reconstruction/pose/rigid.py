@@ -28,8 +28,8 @@ HUBER = 0.15
 STEP_PX = 0.3
 """Differences for the Jacobian move the body by this many pixels of the level's images."""
 
-PIXELS_AT_ONCE = 3_000_000
-"""Images are rendered in batches of at most this many pixels."""
+PIXELS_AT_ONCE = 1_500_000
+"""Images are rendered, and poses compared, in batches of at most this many pixels where one is not more."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,10 @@ def normal_equations(
     body: RigidBody, level: Level, poses: Poses, frame: Tensor, *, central: bool = True
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`equations` of K poses against the frames (K,) of the level, in the numbers of `pose_columns`."""
-    seen, columns = pose_columns(body, level, poses, central=central)
+    count = max(1, PIXELS_AT_ONCE // ((13 if central else 7) * level.target[0, ..., 0].numel()))
+    found = (pose_columns(body, level, poses.take(some), central=central)
+             for some in torch.arange(len(frame)).split(count))  # fmt: skip
+    seen, columns = map(torch.cat, zip(*found))
     return equations(seen - level.target[frame].flatten(1), columns)
 
 
