@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import warp as wp
 
 from mosa.data.formats.footage import WHITE
 from mosa.data.images.reading import composite, resize
+from mosa.data.synthetic import raycast_kernels
 from mosa.data.synthetic import surface as surfaces
 from mosa.data.synthetic.bodies import objects
 from mosa.data.synthetic.bodies.objects import BuiltinObject, drop_named, object_named
@@ -71,14 +73,9 @@ def film_file(name: str, sequence: str, material: str, seed: int, cache=None) ->
 
 
 def make(
-    name: str,
-    sequence: str,
-    *,
-    material: str = "anisotropic",
-    seed: int = 0,
-    cache: str | Path | None = None,
-    progress: bool = True,
-) -> Film:
+    name: str, sequence: str, *, material: str = "anisotropic", seed: int = 0,
+    cache: str | Path | None = None, progress: bool = True,
+) -> Film:  # fmt: skip
     """The take of a sequence, from the cache folder where it lies there. Equal arguments give equal bytes.
 
     Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
@@ -128,6 +125,7 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
         found = flowing_surface(x, paint, body.spacing, body.pitch)
         return render_surface(found, found.vertices, cameras)
 
+    wp.load_module(raycast_kernels, device="cpu")  # which each of the threads would compile
     films = threaded(film_at, fall.positions)
     pictures = list(tqdm(films, total=film.frames, desc=f"{label}: film", **how))
     chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])

@@ -76,7 +76,12 @@ def ask(
 ) -> dict[str, Tensor | None]:  # fmt: skip
     """The adapter's answer by name, checked. into: as `material_state`."""
     n = len(F)
-    found = answer(adapter, material_state(law, F, C, packed, into))
+    if getattr(adapter, "steady", False):  # whatever the state, which need not be found
+        zeros = F.new_zeros(n, 6)
+        state = zeros, zeros, zeros if law.plastic else None
+    else:
+        state = material_state(law, F, C, packed, into)
+    found = answer(adapter, state)
     plastic = (found.plastic_G, found.plastic_h) if law.plastic else (None, None)
     result = dict(zip(ANSWER, (found.G, found.h, *plastic)))
     for name, value in result.items():
