@@ -94,8 +94,9 @@ def coarse_poses(body: RigidBody, level: Level, center: Tensor, rotations: int, 
     """The `keep` best of many rotations, each placed so that its rendered mattes' centre meets that of the real ones."""
     R = spread_rotations(rotations).to(center)
     poses = Poses(R, center.expand(rotations, 3))
-    seen = body.render(poses, level.cameras, level.background)
-    centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras, SILHOUETTE * body.radius)
+    mattes = body.render(poses, level.cameras, level.background)[..., 3].transpose(0, 1)
+    centres = matte_centres(mattes, level.cameras, SILHOUETTE * body.radius)
+    del mattes  # with the colours
     poses = Poses(R, center + center - centres)
     some = body.render(poses, level.cameras, level.background).split(50)  # for memory
     costs = [

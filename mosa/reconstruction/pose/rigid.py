@@ -20,6 +20,7 @@ from mosa.rendering.appearance.lighting import LIGHT, shading
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images, project
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
+from mosa.system.threads import threaded
 from mosa.types import Cameras, Splats
 
 HUBER = 0.15
@@ -28,7 +29,7 @@ HUBER = 0.15
 STEP_PX = 0.3
 """Differences for the Jacobian move the body by this many pixels of the level's images."""
 
-PIXELS_AT_ONCE = 1_500_000
+PIXELS_AT_ONCE = 800_000
 """Images are rendered, and poses compared, in batches of at most this many pixels where one is not more."""
 
 
@@ -110,11 +111,13 @@ class RigidBody:
     ) -> Tensor:
         """Colour and alpha of every pose in every view, (K, V, H, W, 4). light: (8,) that stays while
         the body turns (`lighting.py`), None where the colours go along."""
-        views, colors = len(cameras), self.colors[None]
-        chunk = max(1, PIXELS_AT_ONCE // (views * cameras.width * cameras.height))
-        parts = []
-        for k in range(0, len(poses.center), chunk):
-            R, c = poses.rotation[k : k + chunk], poses.center[k : k + chunk]
+        views, pixels = len(cameras), len(cameras) * cameras.width * cameras.height
+        count = max(1, PIXELS_AT_ONCE // pixels)
+
+        @torch.no_grad()  # a thread has its own switch
+        def part(k: int) -> Tensor:
+            R, c = (t[k : k + count] for t in vars(poses).values())
+            colors = self.colors[None]
             means = self.arm @ R.transpose(1, 2) + c[:, None]
             covariances = R[:, None] @ self.covariances @ R[:, None].transpose(-1, -2)
             batch = cameras.select(list(range(views)) * len(R))
@@ -125,8 +128,10 @@ class RigidBody:
             image, alpha = rasterize(
                 means, covariances, self.opacities, colors, batch, index, background
             )
-            parts.append(torch.cat((image, alpha[..., None]), -1).unflatten(0, (len(R), views)))
-        return torch.cat(parts)
+            return torch.cat((image, alpha[..., None]), -1).unflatten(0, (len(R), views))
+
+        each = threaded if self.arm.is_cpu else map
+        return torch.cat(list(each(part, range(0, len(poses.center), count))))
 
 
 def rotation_exp(vectors: Tensor) -> Tensor:
@@ -202,9 +207,10 @@ def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor
     """Cost (K,), gradient (K, D) and Gauss-Newton matrix (K, D, D) of residuals (K, P) with derivatives (K, D, P), each residual
     weighted by Huber's rule."""
     cost, weight = huber(residual)
+    cost = cost.sum(-1)  # before there is more in memory
     weighted = columns * weight[:, None]
     gradient = (weighted @ residual[..., None])[..., 0]
-    return cost.sum(-1), gradient, weighted @ columns.transpose(1, 2)
+    return cost, gradient, weighted @ columns.transpose(1, 2)
 
 
 def normal_equations(
@@ -212,9 +218,10 @@ def normal_equations(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`equations` of K poses against the frames (K,) of the level, in the numbers of `pose_columns`."""
     count = max(1, PIXELS_AT_ONCE // ((13 if central else 7) * level.target[0, ..., 0].numel()))
-    found = (pose_columns(body, level, poses.take(some), central=central)
-             for some in torch.arange(len(frame)).split(count))  # fmt: skip
-    seen, columns = map(torch.cat, zip(*found))
+    seen = level.target.new_empty(len(frame), level.target[0].numel())
+    columns = seen.new_empty(len(frame), 6, seen.shape[1])
+    for some in torch.arange(len(frame)).split(count):
+        seen[some], columns[some] = pose_columns(body, level, poses.take(some), central=central)
     return equations(seen - level.target[frame].flatten(1), columns)
 
 
