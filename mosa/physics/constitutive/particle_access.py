@@ -185,7 +185,8 @@ TURNED = f"""
 @cache
 def particle_access(scalar, slots: int) -> SimpleNamespace:
     """matrix33 and parameters (vectors of `slots` numbers): f(field, i) -> the same in float64; vector6(field, i, place) -> that at
-    `place`; times66(field, i, place, x) -> the matrix at `place` times x.
+    `place`; times66(field, i, place, x) -> the matrix at `place` times x; turned(field, i, block) -> whether block[i % LANES] is
+    the polar rotation of matrix i, on a CPU alone.
 
     scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i, to whose gradients is added."""
     name, size = {wp.float32: ("float", 4), wp.float64: ("double", 8)}[scalar]

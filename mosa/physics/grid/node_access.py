@@ -187,7 +187,9 @@ def node_access(scalar) -> SimpleNamespace:
     fourth number out; a store sets it to 0. take(field, i) as load; put(field, i, value) stores for the thread's own number i, in
     blocks of whole warps.
     Of two particles a thread, on a GPU, where no thread may leave before: add4_of_two(field, first, i, a, b, c, d, e, f,
-    meeting(x, y), run(y, x == y)), a, b and c to `first` and the two after it, d, e and f to `i`."""
+    meeting(x, y), run(y, x == y)), a, b and c to `first` and the two after it, d, e and f to `i`.
+    Where `on_cpu()`: scatter adds what a particle sends (`Sent`) to its 27 nodes, of which `i` is the lowest; gather gives the rows
+    v, cx, cy, cz of `g2p`, of theirs."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
