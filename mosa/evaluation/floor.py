@@ -53,10 +53,18 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         viscosity=hidden.viscosity(),
     )
     simulator = Simulator(
-        hidden.law, dx=settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity,
-        up=world.up, ground=body.contact.at_nodes(world.ground, settings.dx), planes=world.planes,
-        colliders=world.solids, device=device, options=hidden.options,
-    )  # fmt: skip
+        hidden.law,
+        dx=settings.dx,
+        substeps=substeps,
+        frame_dt=frame_dt,
+        gravity=world.gravity,
+        up=world.up,
+        ground=body.contact.at_nodes(world.ground, settings.dx),
+        planes=world.planes,
+        colliders=world.solids,
+        device=device,
+        options=hidden.options,
+    )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact.lift(world.ground, settings.dx).detach().float().cpu() * up
     F = Q.expand(n, 3, 3).contiguous()

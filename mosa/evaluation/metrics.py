@@ -158,9 +158,14 @@ def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
 
 
 def sampling_floors(
-    cloud: Tensor, first: int, second: int, *, samples: int = CHAMFER_SAMPLES,
-    assignment: int = ASSIGNMENT_SAMPLES, seed: int = 0,
-) -> dict[str, float]:  # fmt: skip
+    cloud: Tensor,
+    first: int,
+    second: int,
+    *,
+    samples: int = CHAMFER_SAMPLES,
+    assignment: int = ASSIGNMENT_SAMPLES,
+    seed: int = 0,
+) -> dict[str, float]:
     """`cd_sq_m2`, `cd_m`, `emd_m` between two random samplings of one shape, of `first` and `second` points.
 
     cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.

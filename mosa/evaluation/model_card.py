@@ -85,9 +85,13 @@ rollout = twin.simulate(height=0.2, velocity=(0, 0, 0), angular_velocity=(0, 0, 
 
 
 def model_card(
-    figures: Mapping[str, float], body: Body, sequences: Ordered[Sequence], kept: Kept,
-    world: World, version: str,
-) -> str:  # fmt: skip
+    figures: Mapping[str, float],
+    body: Body,
+    sequences: Ordered[Sequence],
+    kept: Kept,
+    world: World,
+    version: str,
+) -> str:
     """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and
     variant; version: of mosa."""
     law, name = body.material.law, sequences[0].scene.name
@@ -109,8 +113,9 @@ def model_card(
         "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law)}",
         "What is determined, and what is not": tables.determined_text(figures, law) or unsure,
         "Errors": "\n\n".join(filter(None, errors)),
-        "Where it is valid": "\n".join(valid(sequences, kept, body, world)), "Licence": LICENCE,
+        "Where it is valid": "\n".join(valid(sequences, kept, body, world)),
+        "Licence": LICENCE,
         "How to load": LOADING,
-    }  # fmt: skip
+    }
     text = "\n\n".join(f"## {title}\n{part}" for title, part in parts.items())
     return f"# Model card: {name}\n\nA learned body, by mosa {version}.\n\n{text}\n"

@@ -40,9 +40,15 @@ QUANTILES = 400  # of a normal distribution, where its image under a bounded map
 
 @torch.no_grad()
 def predicted_spread(
-    body: Body, posterior: Posterior, sequences: Ordered[Sequence], world: World, *,
-    draws: int = DRAWS, seed: int = 0, known: Mapping[str, Tensor] | None = None,
-) -> tuple[dict[str, float], dict[str, Tensor]]:  # fmt: skip
+    body: Body,
+    posterior: Posterior,
+    sequences: Ordered[Sequence],
+    world: World,
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
+    known: Mapping[str, Tensor] | None = None,
+) -> tuple[dict[str, float], dict[str, Tensor]]:
     """(figures, standard deviation (T, N) [m] of every particle's position by the sequence's prefix).
 
     The variance of a position, summed over its three components, is that of the draws (times `DRAWN`^2), that among the forms of
@@ -77,9 +83,10 @@ def predicted_spread(
     drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
     others = rival_motions(body, posterior, positions)
     figures: dict[str, float] = {
-        "posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others)),
+        "posterior/draws": float(len(drawn)),
+        "posterior/rivals": float(len(others)),
         "posterior/model_error_m": posterior.model_error,
-    }  # fmt: skip
+    }
     spreads: dict[str, Tensor] = {}
     if len(drawn) < LEAST_DRAWS:
         return figures, spreads

@@ -22,9 +22,12 @@ def _red(kind: str, letter: str, names: Sequence[str], address: str, adds: str) 
 
 
 def added(
-    scalar, names: Sequence[str], address: str = "address", adds: str = "adds",
+    scalar,
+    names: Sequence[str],
+    address: str = "address",
+    adds: str = "adds",
     filler: str | None = None,
-) -> str:  # fmt: skip
+) -> str:
     """CUDA that adds names, C++ expressions of one to four wp.float32 or wp.float64, to as many numbers in a row.
 
     address: expression of a global address, aligned to all of them; adds: of an int, 0 where nothing is to be added; filler: of a

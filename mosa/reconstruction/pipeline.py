@@ -59,9 +59,12 @@ def object_hull(scene: Scene, settings: ReconstructionSettings) -> Volume:
 
 
 def object_geometry(
-    scene: Scene, settings: ReconstructionSettings, *, cache_dir: str | Path | None = None,
+    scene: Scene,
+    settings: ReconstructionSettings,
+    *,
+    cache_dir: str | Path | None = None,
     device: torch.device | str = "cpu",
-) -> Geometry:  # fmt: skip
+) -> Geometry:
     """The body of `scene.body`, or the one inside the visual hull, by settings.geometry; cached apart from the stages that depend
     on the particles' spacing.
 
@@ -161,10 +164,15 @@ def _open_cache(
 ) -> StageCache:
     """The cache of what is computed from the training views and frames of `scene`; more: whatever else the results depend on."""
     key = {
-        "version": CACHE_VERSION, "scene": f"{scene.name}-{scene.sequence}",
-        "data": scene.fingerprint, "views": scene.training_cameras, "frames": scene.training_frames,
-        "seed": seed, "settings": settings, "box": scene.box.tolist(),
-    }  # fmt: skip
+        "version": CACHE_VERSION,
+        "scene": f"{scene.name}-{scene.sequence}",
+        "data": scene.fingerprint,
+        "views": scene.training_cameras,
+        "frames": scene.training_frames,
+        "seed": seed,
+        "settings": settings,
+        "box": scene.box.tolist(),
+    }
     if scene.body is not None:
         key["body"] = [scene.body.fingerprint, scene.body.scale]
     return StageCache(Path(cache_dir) if cache_dir is not None else None, key | more)

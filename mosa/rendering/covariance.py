@@ -112,9 +112,11 @@ def matrix_to_quaternion(R: Tensor) -> Tensor:
     wx, wy, wz = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     rows = (
-        (squares[..., 0], wx, wy, wz), (wx, squares[..., 1], xy, xz), (wy, xy, squares[..., 2], yz),
+        (squares[..., 0], wx, wy, wz),
+        (wx, squares[..., 1], xy, xz),
+        (wy, xy, squares[..., 2], yz),
         (wz, xz, yz, squares[..., 3]),
-    )  # fmt: skip
+    )
     products = torch.stack([torch.stack(row, -1) for row in rows], -2)  # 4 q q^T
     largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
     q = products.gather(-2, largest)[..., 0, :]

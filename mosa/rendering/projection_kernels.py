@@ -57,9 +57,11 @@ def projection_kernels(dtype: type):
         half_x = dtype(0.5) * w / K[0, 0]
         half_y = dtype(0.5) * h / K[1, 1]
         return vec4(
-            -K[0, 2] / K[0, 0] - margin * half_x, (w - K[0, 2]) / K[0, 0] + margin * half_x,
-            -K[1, 2] / K[1, 1] - margin * half_y, (h - K[1, 2]) / K[1, 1] + margin * half_y,
-        )  # fmt: skip
+            -K[0, 2] / K[0, 0] - margin * half_x,
+            (w - K[0, 2]) / K[0, 0] + margin * half_x,
+            -K[1, 2] / K[1, 1] - margin * half_y,
+            (h - K[1, 2]) / K[1, 1] + margin * half_y,
+        )
 
     @wp.func
     def jacobian(K: mat33, p: vec3, limits: vec4):

@@ -30,10 +30,12 @@ def _check(
     images, channels = len(cameras), features.shape[-1]
     numbers = {"means": means, "covariances": covariances, "opacities": opacities, "features": features}  # fmt: skip
     wanted = {
-        "means": [(states, count, 3)], "covariances": [(states, count, 3, 3)],
+        "means": [(states, count, 3)],
+        "covariances": [(states, count, 3, 3)],
         "opacities": [(count,), (states, count)],
-        "features": [(images, count, channels), (1, count, channels)], "state_index": [(images,)],
-    }  # fmt: skip
+        "features": [(images, count, channels), (1, count, channels)],
+        "state_index": [(images,)],
+    }
     for name, shapes in wanted.items():
         value = numbers.get(name, state_index)
         if tuple(value.shape) not in shapes or 0 in value.shape:

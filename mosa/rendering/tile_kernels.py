@@ -20,7 +20,7 @@ from mosa.rendering.lanes import (
     lane_count,
     lane_of,
     lowest,
-)  # fmt: skip
+)
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.raster_kernels import STOP
 from mosa.rendering.records import record_functions, record_type

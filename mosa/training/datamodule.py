@@ -67,10 +67,13 @@ class SceneDataModule(L.LightningDataModule):
     """
 
     def __init__(
-        self, scene: str | Mapping[str, Any] | DictConfig = "rabbit", *overrides: str,
-        device: torch.device | str | None = None, held_out: bool = True,
+        self,
+        scene: str | Mapping[str, Any] | DictConfig = "rabbit",
+        *overrides: str,
+        device: torch.device | str | None = None,
+        held_out: bool = True,
         predict: Sequence[Mapping[str, Any]] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         """scene: a name of conf/scene, or a whole configuration (`mosa.compose`); overrides: as on the command line, beside a name.
 
         device: where reconstruction and targets are; None: the trainer's. held_out: whether to load sequences that nothing is

@@ -54,9 +54,13 @@ log = logging.getLogger(__name__)
 
 
 def figures_of(
-    settings: EvaluationSettings, body: Body, evaluated: list[Sequence], world: World,
-    posterior: Posterior | None, folder: Path,
-) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:  # fmt: skip
+    settings: EvaluationSettings,
+    body: Body,
+    evaluated: list[Sequence],
+    world: World,
+    posterior: Posterior | None,
+    folder: Path,
+) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
     """All that is measured on a fitted body, and the rollouts by sequence and variant.
 
     Writes uncertainty.npz into `folder` where there is a posterior."""
@@ -94,9 +98,15 @@ def start_figures(start: Start) -> dict[str, float]:
 
 
 def write_outputs(
-    folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict,
-    world: World, note: str = "",
-) -> None:  # fmt: skip
+    folder: Path,
+    cfg: DictConfig,
+    body: Body,
+    evaluated: list[Sequence],
+    figures: dict,
+    kept: dict,
+    world: World,
+    note: str = "",
+) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
     all; tables in results.md, below the note; a model card beside the checkpoint; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):

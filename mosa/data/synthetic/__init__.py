@@ -31,10 +31,18 @@ def held_out_names(name: str) -> tuple[str, ...]:
 
 
 def load_builtin(
-    *, name: str, sequence: str = "train", material: str = "anisotropic", seed: int = 0,
-    scale: float = 0.5, frames=None, last_free_frame: int | None = None, holdout_cameras=(),
-    holdout_frames=(), cache: str | Path | None = None,
-) -> Scene:  # fmt: skip
+    *,
+    name: str,
+    sequence: str = "train",
+    material: str = "anisotropic",
+    seed: int = 0,
+    scale: float = 0.5,
+    frames=None,
+    last_free_frame: int | None = None,
+    holdout_cameras=(),
+    holdout_frames=(),
+    cache: str | Path | None = None,
+) -> Scene:
     """Scene of a built-in sequence, made and cached on first use. material: anisotropic | isotropic (its twin).
 
     Errors: ConfigError naming the key."""

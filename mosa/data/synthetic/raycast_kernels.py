@@ -5,10 +5,20 @@ import warp as wp
 
 @wp.kernel(enable_backward=False)
 def cast(
-    mesh: wp.uint64, colors: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3),
-    camera_to_world: wp.mat44, focal: wp.vec2, center: wp.vec2, column: int, row: int, width: int,
-    samples: int, light: wp.vec3, ambient: float, image: wp.array2d(dtype=wp.vec4),
-):  # fmt: skip
+    mesh: wp.uint64,
+    colors: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    camera_to_world: wp.mat44,
+    focal: wp.vec2,
+    center: wp.vec2,
+    column: int,
+    row: int,
+    width: int,
+    samples: int,
+    light: wp.vec3,
+    ambient: float,
+    image: wp.array2d(dtype=wp.vec4),
+):
     """One thread per pixel of a window at (column, row), `samples` squared rays each. image: straight RGB and coverage."""
     i, j = wp.tid()
     color = wp.vec3(0.0, 0.0, 0.0)

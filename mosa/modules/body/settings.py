@@ -14,9 +14,10 @@ class HeterogeneitySettings(Settings):
 
     where: ClassVar[str] = "heterogeneity"
     needs: ClassVar[dict[str, str]] = {
-        "amplitude kind": "enabled=true", "wavelength most": "enabled=true, kind=modes",
+        "amplitude kind": "enabled=true",
+        "wavelength most": "enabled=true, kind=modes",
         "hidden frequencies": "enabled=true, kind=network",
-    }  # fmt: skip
+    }
 
     enabled: bool = True
     """learn how the stiffness varies over the body"""

@@ -226,8 +226,9 @@ class GradientSteps:
         values = {
             "loss/total": loss,
             "fit/frames": float(self.active_frames(stage, iteration, self.takes[-1])),
-            "fit/stage": float(self.stage_index), "fit/inverted": terms.pop("inverted"),
-        }  # fmt: skip
+            "fit/stage": float(self.stage_index),
+            "fit/inverted": terms.pop("inverted"),
+        }
         if "mean_abs_C" in terms:
             values["adapter/mean_abs_C"] = terms.pop("mean_abs_C")
         for name, value in terms.items():

@@ -65,9 +65,11 @@ class NewtonSteps:
         if self.body.material.candidates:
             again, searched = searched, True
             self.compared = choose_law(
-                self.body, self.body.material.candidates, lambda: self.identifying(stage),
+                self.body,
+                self.body.material.candidates,
+                lambda: self.identifying(stage),
                 lambda: lasting(self.body, self.takes, self.world),
-            )  # fmt: skip
+            )
             self.choose(self.body.material.law)
             if again and not law_named(self.body.material.law).elastic:
                 self.find_ground(stage)  # what was found before was found with an elastic law
@@ -245,9 +247,11 @@ class NewtonSteps:
     def report_newton(self, found: dict[str, float]) -> None:
         """Scalars of one iteration: cost, step, what the evidence found, parameters."""
         values = {
-            "loss/total": found["after"], "fit/stage": float(self.stage_index),
-            "newton/share": found["share"], "newton/length": found["length"],
-        }  # fmt: skip
+            "loss/total": found["after"],
+            "fit/stage": float(self.stage_index),
+            "newton/share": found["share"],
+            "newton/length": found["length"],
+        }
         values |= {
             f"newton/{name}": value for name, value in found.items() if name.startswith("sd/")
         }

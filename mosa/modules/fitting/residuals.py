@@ -53,9 +53,12 @@ def sampled(particles: int, device: torch.device) -> Tensor:
 
 @torch.no_grad()
 def fields(
-    rollout: Rollout, cues: MotionCues | MarkerCues, start_rotation: Tensor, chosen: Tensor,
+    rollout: Rollout,
+    cues: MotionCues | MarkerCues,
+    start_rotation: Tensor,
+    chosen: Tensor,
     response: Response | None = None,
-) -> Fields:  # fmt: skip
+) -> Fields:
     """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence;
     response: what the cues keep of the prediction that they were found about. Of tracked points,
     `chosen` of which are compared, positions alone: the others are 0."""
@@ -155,9 +158,11 @@ def spread(
 
 
 def whitened(
-    found: list[Fields], noise: list[tuple[Tensor, Tensor, Tensor]],
-    counts: list[tuple[float, float, float]], forces: float = 1.0,
-) -> Tensor:  # fmt: skip
+    found: list[Fields],
+    noise: list[tuple[Tensor, Tensor, Tensor]],
+    counts: list[tuple[float, float, float]],
+    forces: float = 1.0,
+) -> Tensor:
     """One vector whose squared length is minus twice the log likelihood, up to a constant.
     forces: how often a measured force counts."""
     parts = []

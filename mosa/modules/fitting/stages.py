@@ -145,9 +145,13 @@ class FitSection(Settings):
     )
     """second stage: with the stiffness over the body"""
     joint: StageSettings = StageSettings(
-        newton_iterations=8, iterations=40, lr=0.01, lr_networks=2e-3, lr_adapter=5e-3,
+        newton_iterations=8,
+        iterations=40,
+        lr=0.01,
+        lr_networks=2e-3,
+        lr_adapter=5e-3,
         start="prior",
-    )  # fmt: skip
+    )
     """last stage: with the adapter"""
 
     def stage(self, name: str) -> Stage:

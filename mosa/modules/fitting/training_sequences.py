@@ -77,9 +77,10 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
 
 
 def with_positions(
-    takes: Sequence[Take], positions: Sequence[Tensor],
+    takes: Sequence[Take],
+    positions: Sequence[Tensor],
     responses: Sequence[dict[str, Tensor] | None] | None = None,
-) -> list[Take]:  # fmt: skip
+) -> list[Take]:
     """With the cues that `seen_again` found, of which a checkpoint keeps the positions (T, N, 3) [m] of each take, and the
     responses as they were written.
 

@@ -131,8 +131,11 @@ class Chain:
         into = (work.adj_F[slot], work.adj_C_affine[slot], work.adj_held["parameters"])
         with torch.enable_grad(), at_hand():
             inputs = (
-                work.F[step], work.C_affine[step], work.held["parameters"], *self.learned.weights,
-            )  # fmt: skip
+                work.F[step],
+                work.C_affine[step],
+                work.held["parameters"],
+                *self.learned.weights,
+            )
             # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
             leaves = [t.detach().requires_grad_() for t in inputs]
             return leaves, *self._ask(*leaves[:3], collects, leaves[3:], into)

@@ -21,7 +21,7 @@ from mosa.physics.constitutive.laws import (
     LawParameters,
     register_composition,
     register_law,
-)  # fmt: skip
+)
 
 INDEX = "law"
 """Name of the parameter that says which law a particle follows."""

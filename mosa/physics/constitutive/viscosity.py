@@ -22,7 +22,7 @@ from mosa.physics.constitutive.kinematics import (
     rotation,
     rotation_of,
     svd,
-)  # fmt: skip
+)
 from mosa.physics.constitutive.laws import LawParameters, register_law
 from mosa.physics.constitutive.material_kernels import deviator
 

@@ -93,9 +93,12 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         if inside > scalar(0.0):
             V = poses.linear[substep, c] + wp.cross(poses.angular[substep, c], R)
             out = v + pushed(
-                v - V, Q * wp.normalize(g), kick * solids.shapes[k, 8] * inside,
-                solids.shapes[k, 3], solids.shapes[k, 9],
-            )  # fmt: skip
+                v - V,
+                Q * wp.normalize(g),
+                kick * solids.shapes[k, 8] * inside,
+                solids.shapes[k, 3],
+                solids.shapes[k, 9],
+            )
         return out
 
     @wp.kernel(module=module, enable_backward=False)

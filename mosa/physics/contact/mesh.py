@@ -67,9 +67,11 @@ def triangle_distance(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def field_of_triangles(
-    vertices: Tensor | np.ndarray, triangles: Tensor | np.ndarray, spacing: float | None = None,
+    vertices: Tensor | np.ndarray,
+    triangles: Tensor | np.ndarray,
+    spacing: float | None = None,
     margin: float | None = None,
-) -> SignedDistanceField:  # fmt: skip
+) -> SignedDistanceField:
     """Signed distances to a closed, consistently oriented mesh. vertices: (P, 3) [m]; triangles: (T, 3) indices.
 
     spacing [m] of the lattice (None: the longest extent over 48); margin [m] beyond the mesh, at least two

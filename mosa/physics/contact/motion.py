@@ -136,9 +136,11 @@ class Motion:
 
     @classmethod
     def waypoints(
-        cls, times: Sequence[float] | Tensor, positions: Tensor | Sequence,
+        cls,
+        times: Sequence[float] | Tensor,
+        positions: Tensor | Sequence,
         rotations: Tensor | Sequence | None = None,
-    ):  # fmt: skip
+    ):
         """Through poses at `times` (K,) [s], K >= 2, at constant twist between; at rest before the first and after the last.
 
         positions: (K, 3) [m]; rotations: (K, 3) or (K, 3, 3), turned by less than half a turn from one to the next, or by more

@@ -88,9 +88,12 @@ class Graphs:
     none at all; most: graphs, and passes that wait to become one."""
 
     def __init__(
-        self, strategy: WarpCapture | TorchCapture, failing: str, attempts: int = ATTEMPTS,
+        self,
+        strategy: WarpCapture | TorchCapture,
+        failing: str,
+        attempts: int = ATTEMPTS,
         most: int = MAX_GRAPHS,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.strategy, self.failing, self.attempts, self.most = strategy, failing, attempts, most
         self._replays: dict[Hashable, Body] = {}
         self._warm: dict[Hashable, None] = {}  # in the order in which they ran

@@ -149,9 +149,12 @@ class Simulator:
 
     @typed
     def pack(
-        self, parameters: Values, particles: Count, rotation: Tensor | None = None,
+        self,
+        parameters: Values,
+        particles: Count,
+        rotation: Tensor | None = None,
         worlds: Count | None = None,
-    ) -> Tensor:  # fmt: skip
+    ) -> Tensor:
         """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
 
         rotation: (N, 3, 3), fills the law's reference rotation. worlds: (W N, SLOTS), one world's after the other's; values may

@@ -251,9 +251,11 @@ class Stepper:
     solids: Sequence[Collider]
 
     def step(
-        self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None,
+        self,
+        moment: Moment,
+        poses: Poses | Callable[[int, float], Poses] | None = None,
         speed: float | None = None,
-    ) -> Step:  # fmt: skip
+    ) -> Step:
         """One step on from `moment`, which is left as it is; differentiable in it, in poses, and in what `Simulator.stepper` got.
 
         poses: of K colliders at the step's S substeps, (S, K, ...) or, of B worlds, (S, B, K, ...), or a function of S and their

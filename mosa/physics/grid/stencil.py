@@ -52,9 +52,10 @@ def stencil_functions(scalar) -> SimpleNamespace:
         is NaN; that node; row of the window)."""
         h = scalar(0.5)
         base = vec3(
-            wp.floor(x[0] * grids.inv_dx - h), wp.floor(x[1] * grids.inv_dx - h),
+            wp.floor(x[0] * grids.inv_dx - h),
+            wp.floor(x[1] * grids.inv_dx - h),
             wp.floor(x[2] * grids.inv_dx - h),
-        )  # fmt: skip
+        )
         row = window_row(p, grids.size)
         origin = grids.windows[row]
         dims = grids.windows[row + 1]

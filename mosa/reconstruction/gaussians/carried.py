@@ -96,10 +96,12 @@ class RestGaussians:
         """The splats as they are."""
         harmonics = self.harmonics.detach()
         splats = Splats(
-            self.start.means + self.shift.detach(), self.log_scale.detach().exp(),
-            normalize(self.quaternion.detach(), dim=-1), torch.sigmoid(self.logit.detach()),
+            self.start.means + self.shift.detach(),
+            self.log_scale.detach().exp(),
+            normalize(self.quaternion.detach(), dim=-1),
+            torch.sigmoid(self.logit.detach()),
             spherical_harmonics.mean_colors(harmonics),
-        )  # fmt: skip
+        )
         return Appearance(splats, harmonics, self.normals, self.light.detach())
 
 

@@ -33,10 +33,11 @@ class FreeGaussians:
         rates = {"means": settings.lr_positions * float(scale.mean()), "log_scale": settings.lr_scales,
                  "opacity": OPACITY_RATE, "color": COLOR_RATE, "rotation": ROTATION_RATE}  # fmt: skip
         self.parameters = {
-            "means": splats.means.clone(), "log_scale": scale.log(),
+            "means": splats.means.clone(),
+            "log_scale": scale.log(),
             "opacity": torch.logit(splats.opacities.clamp(0.01, 0.99)),
             "color": torch.logit(splats.colors.clamp(0.01, 0.99)),
-        }  # fmt: skip
+        }
         if anisotropic:
             self.parameters["log_scale"] = scale.log()[:, None].repeat(1, 3)
             self.parameters["rotation"] = splats.rotations.clone()

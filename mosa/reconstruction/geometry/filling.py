@@ -95,5 +95,6 @@ def fill(volume: Volume, *, spacing: float) -> Particles:
     device = volume.values.device
     return Particles(
         torch.as_tensor(positions, dtype=torch.float32, device=device),
-        torch.as_tensor(held * volume.pitch**3, dtype=torch.float32, device=device), spacing,
-    )  # fmt: skip
+        torch.as_tensor(held * volume.pitch**3, dtype=torch.float32, device=device),
+        spacing,
+    )

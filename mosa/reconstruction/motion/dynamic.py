@@ -118,9 +118,12 @@ class Objective:
     predicted: a motion in which neither energy is stored; None: the body at rest."""
 
     def __init__(
-        self, motion: Motion, target: Target, settings: DynamicSettings,
+        self,
+        motion: Motion,
+        target: Target,
+        settings: DynamicSettings,
         predicted: Predicted | None = None,
-    ):  # fmt: skip
+    ):
         self.motion, self.target, self.settings = motion, target, settings
         self.predicted, self.refining = predicted, False
 
@@ -182,9 +185,12 @@ class Objective:
 
 
 def fit_motion(
-    target: Target, settings: DynamicSettings, *, seed: int,
+    target: Target,
+    settings: DynamicSettings,
+    *,
+    seed: int,
     progress: Callable[[int], None] | None = None,
-) -> Motion:  # fmt: skip
+) -> Motion:
     """Motion through all frames of the target's windows."""
     draws = torch.Generator().manual_seed(seed), progress
     moving = list(range(1, len(target.offsets)))

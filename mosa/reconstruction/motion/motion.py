@@ -157,9 +157,12 @@ class MotionBasisNetwork(nn.Module):
         return (factors * basis[:, None]).mean(-2)
 
     def forward(
-        self, frames: Tensor, splats: Splats, modes: Modes | None,
+        self,
+        frames: Tensor,
+        splats: Splats,
+        modes: Modes | None,
         around: Neighbourhood | None = None,
-    ) -> MotionSample:  # fmt: skip
+    ) -> MotionSample:
         time = frames[:, None].to(self.centre) / max(1, len(self.offsets) - 1)
         points = (splats.means - self.centre) / self.reach
         raw = self._raw(torch.cat([torch.zeros_like(time[:1]), time]), points)

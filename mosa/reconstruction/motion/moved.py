@@ -25,7 +25,7 @@ from mosa.reconstruction.motion.response import (
     Response,
     image_matrices,
     response_of,
-)  # fmt: skip
+)
 from mosa.reconstruction.pose.known import known_centres
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.reconstruction.settings import ReconstructionSettings

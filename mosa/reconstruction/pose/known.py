@@ -26,7 +26,7 @@ from mosa.reconstruction.pose.outlines import (
     fitted,
     outline_rays,
     overlaps,
-)  # fmt: skip
+)
 from mosa.reconstruction.pose.rigid import Poses, descend
 from mosa.rendering.cameras import centers
 from mosa.types import REST, Cameras, Scene
@@ -79,8 +79,9 @@ class Registered:
             "geometry/registered_off_px": self.off,
             "geometry/registered_scale": float(self.place.size[0]) / self.solid.unit,
             "geometry/registered_scale_deviation": self.deviation,
-            "geometry/registered_rival": self.rival, "geometry/free_frames": float(self.frames),
-        }  # fmt: skip
+            "geometry/registered_rival": self.rival,
+            "geometry/free_frames": float(self.frames),
+        }
 
     def body(self, resolution: int) -> Volume:
         """The solid in the world (values 0 or 1), `resolution` voxels along its longest side."""

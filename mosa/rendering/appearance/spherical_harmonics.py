@@ -39,16 +39,24 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     if degree >= 2:
         a, b = math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi))
         values += [
-            a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, 0.5 * a * (x * x - y * y),
-        ]  # fmt: skip
+            a * x * y,
+            -a * y * z,
+            b * (3 * z * z - 1),
+            -a * x * z,
+            0.5 * a * (x * x - y * y),
+        ]
     if degree >= 3:
         a, b = math.sqrt(35 / (32 * math.pi)), math.sqrt(105 / (4 * math.pi))
         c, d = math.sqrt(21 / (32 * math.pi)), math.sqrt(7 / (16 * math.pi))
         values += [
-            -a * y * (3 * x * x - y * y), b * x * y * z, -c * y * (5 * z * z - 1),
-            d * z * (5 * z * z - 3), -c * x * (5 * z * z - 1), 0.5 * b * z * (x * x - y * y),
+            -a * y * (3 * x * x - y * y),
+            b * x * y * z,
+            -c * y * (5 * z * z - 1),
+            d * z * (5 * z * z - 3),
+            -c * x * (5 * z * z - 1),
+            0.5 * b * z * (x * x - y * y),
             -a * x * (x * x - 3 * y * y),
-        ]  # fmt: skip
+        ]
     return torch.stack(values, -1)
 
 

@@ -207,9 +207,16 @@ def stand_in(shape: str, height: float, law: str, *, spacing: float = 0.0125, re
     )
     film = Footage(11, frames, size=400, fps=24.0, field=0.52, target=0.38, distance=3.0)
     return BuiltinObject(
-        shape, height, material, PACNERF, film, spacing=spacing, pitch=0.006, remesh=remesh,
+        shape,
+        height,
+        material,
+        PACNERF,
+        film,
+        spacing=spacing,
+        pitch=0.006,
+        remesh=remesh,
         reach=1.6,
-    )  # fmt: skip
+    )
 
 
 OBJECTS |= {

@@ -97,8 +97,11 @@ def cream_distance(points: np.ndarray) -> np.ndarray:
 def toothpaste_distance(points: np.ndarray) -> np.ndarray:
     """A short piece of paste, bent, 0.05 m high."""
     joints = (
-        (-0.016, 0.008, 0.0), (0.006, 0.010, 0.006), (0.012, 0.026, 0.002), (0.000, 0.041, -0.004),
-    )  # fmt: skip
+        (-0.016, 0.008, 0.0),
+        (0.006, 0.010, 0.006),
+        (0.012, 0.026, 0.002),
+        (0.000, 0.041, -0.004),
+    )
     return np.min([capsule(points, a, b, 0.009) for a, b in pairwise(joints)], 0)
 
 
@@ -135,10 +138,16 @@ BOUNDS = {
 }
 """Corners of the boxes that hold them [m]."""
 DISTANCES = {
-    "torus": torus_distance, "bird": bird_distance, "cat": cat_distance,
-    "playdoh": playdoh_distance, "droplet": droplet_distance, "letter": letter_distance,
-    "cream": cream_distance, "toothpaste": toothpaste_distance, "trophy": trophy_distance,
-}  # fmt: skip
+    "torus": torus_distance,
+    "bird": bird_distance,
+    "cat": cat_distance,
+    "playdoh": playdoh_distance,
+    "droplet": droplet_distance,
+    "letter": letter_distance,
+    "cream": cream_distance,
+    "toothpaste": toothpaste_distance,
+    "trophy": trophy_distance,
+}
 
 STANDIN_SHAPES = {
     name: shape(distance, painted(LOOKS[name], 0.1 if name == "toothpaste" else 1.0), *BOUNDS[name])

@@ -208,9 +208,11 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
 
 
 def nearest_end(
-    calibration: Calibration, start_at: Callable[[dict[str, float]], None],
-    rows: Sequence[dict[str, float]], kept: int = KEPT,
-) -> float:  # fmt: skip
+    calibration: Calibration,
+    start_at: Callable[[dict[str, float]], None],
+    rows: Sequence[dict[str, float]],
+    kept: int = KEPT,
+) -> float:
     """Gauss-Newton from several starts, the nearest `kept` of which after a few iterations go on.
 
     The calibration is left at the nearest end, as if it had not begun, and its score [m] is
@@ -276,9 +278,11 @@ the film have 1.2 times the true law's error."""
 
 
 def choose_law(
-    body: Body, candidates: Sequence[str], build: Callable[[], Calibration],
+    body: Body,
+    candidates: Sequence[str],
+    build: Callable[[], Calibration],
     lasts: Callable[[], float],
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction
     [m], all by the elastic laws' criterion; infinite where a law cannot be simulated.
 
