@@ -375,8 +375,10 @@ def check_same_scene(record: BodyRecord, values: Mapping[str, Any], path: str | 
 def other_scene(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """The keys of the scene and of the particles that differ, as `differing` has them."""
     scenes = (each.get("scene") or {} for each in (one, other))
-    sizes = [{k: v for k, v in (each.get("simulation") or {}).items() if k in ("particles", "dx")}
-             for each in (one, other)]  # fmt: skip
+    sizes = [
+        {k: v for k, v in (each.get("simulation") or {}).items() if k in ("particles", "dx")}
+        for each in (one, other)
+    ]
     return [
         *differing(*scenes, (*BESIDE, "scene.test"), "scene"),
         *differing(*sizes, where="simulation"),

@@ -51,9 +51,12 @@ def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: i
 
 @torch.no_grad()
 def training_observations(
-    scene: Scene, reconstruction: Reconstruction, *, margin: int = 6,
+    scene: Scene,
+    reconstruction: Reconstruction,
+    *,
+    margin: int = 6,
     device: torch.device | str = "cpu",
-) -> Observations:  # fmt: skip
+) -> Observations:
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
     if scene.markers is not None:

@@ -148,9 +148,13 @@ def image_metrics(
 
 
 def motion_metrics(
-    x: Tensor, body: Body, sequence: Sequence, frames: list[int], settings: EvaluationSettings,
+    x: Tensor,
+    body: Body,
+    sequence: Sequence,
+    frames: list[int],
+    settings: EvaluationSettings,
     target: Tensor | None = None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
     target: `true_motion`, where it is at hand: it is the same for all models."""
@@ -262,9 +266,13 @@ def worst(name: str) -> float:
 
 
 def sequence_metrics(
-    body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings,
+    body,
+    sequence: Sequence,
+    rollout: Rollout,
+    model: str,
+    settings: EvaluationSettings,
     target: Tensor | None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x, parts, frames = sequence.scene, rollout.x.cpu(), parts_of(sequence), sequence.frames
     training = sequence.prefix.startswith("train")

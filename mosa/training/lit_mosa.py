@@ -39,7 +39,7 @@ from mosa.config.checkpoints import (
     listed,
     other_scene,
     read_checkpoint,
-)  # fmt: skip
+)
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
@@ -120,9 +120,12 @@ def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
         stages = [stage for stage in stages if not stage.looks_again]
     return {
         "world": replace(world_of(record), forces=forces_from_config(settings.world.forces)),
-        "stages": stages, "weights": settings.losses.weights(), "clip": settings.fit.clip,
-        "criterion": settings.criterion, "settings": settings.identification,
-    }  # fmt: skip
+        "stages": stages,
+        "weights": settings.losses.weights(),
+        "clip": settings.fit.clip,
+        "criterion": settings.criterion,
+        "settings": settings.identification,
+    }
 
 
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
@@ -304,10 +307,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         )  # fmt: skip
         posterior, splats = self.posterior, self.body.splats
         record = RunRecord(
-            **dict(self.record), start=self.start, fit=fit,
+            **dict(self.record),
+            start=self.start,
+            fit=fit,
             posterior=posterior and posterior.written(),
             splats=None if splats is None else splats.written(),
-        )  # fmt: skip
+        )
         check_plain("", checkpoint)  # with what callbacks and data modules of anyone's added
         checkpoint["mosa"] = record.plain()
 

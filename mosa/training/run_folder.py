@@ -23,8 +23,13 @@ from mosa.system.whole_files import written_whole
 log = logging.getLogger(__name__)
 
 VALIDATED = (
-    "val/loss", "val/psnr", "val/cameras/loss", "val/cameras/psnr", "val/frames/loss", "val/frames/psnr",
-)  # fmt: skip
+    "val/loss",
+    "val/psnr",
+    "val/cameras/loss",
+    "val/cameras/psnr",
+    "val/frames/loss",
+    "val/frames/psnr",
+)
 VALIDATION = "val/"  # begins the names of figures of what is held out of the training sequence
 MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 """Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""

@@ -260,8 +260,14 @@ def test_overrides_may_stand_before_an_option_and_after_it():
         "--info",
     ]
     assert options_first(words) == [
-        "--config-dir", "a=b/conf", "-m", "--info", "debug=default", "experiment=team", "~logger",
-    ]  # fmt: skip
+        "--config-dir",
+        "a=b/conf",
+        "-m",
+        "--info",
+        "debug=default",
+        "experiment=team",
+        "~logger",
+    ]
 
 
 @pytest.fixture

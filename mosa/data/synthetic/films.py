@@ -73,9 +73,14 @@ def film_file(name: str, sequence: str, material: str, seed: int, cache=None) ->
 
 
 def make(
-    name: str, sequence: str, *, material: str = "anisotropic", seed: int = 0,
-    cache: str | Path | None = None, progress: bool = True,
-) -> Film:  # fmt: skip
+    name: str,
+    sequence: str,
+    *,
+    material: str = "anisotropic",
+    seed: int = 0,
+    cache: str | Path | None = None,
+    progress: bool = True,
+) -> Film:
     """The take of a sequence, from the cache folder where it lies there. Equal arguments give equal bytes.
 
     Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.

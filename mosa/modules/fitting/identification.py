@@ -154,9 +154,11 @@ class Identification:
         if self.two_grids:
             tensors.append(share)
         return Seat(
-            tensors, lambda: self._whitened(body, float(share)), lambda: self._possible(body),
+            tensors,
+            lambda: self._whitened(body, float(share)),
+            lambda: self._possible(body),
             lambda: self._whitened(body, float(share), flown=True),
-        )  # fmt: skip
+        )
 
     def _possible(self, body: Body) -> None:
         """Errors: ConfigError where the numbers ask for more substeps than `max_substeps`. An iteration holds those of its

@@ -16,7 +16,7 @@ from mosa.physics.constitutive.kinematics import (
     rotation,
     rotation_of,
     svd,
-)  # fmt: skip
+)
 from mosa.physics.constitutive.laws import SLOTS, Law
 from mosa.physics.constitutive.particle_access import LANES, particle_access
 

@@ -222,5 +222,9 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     def turned(field: field33, i: int, block: wp.array(dtype=wp.mat33d)) -> bool: ...
 
     return SimpleNamespace(
-        matrix33=matrix33, vector6=vector6, times66=times66, parameters=parameters, turned=turned,
-    )  # fmt: skip
+        matrix33=matrix33,
+        vector6=vector6,
+        times66=times66,
+        parameters=parameters,
+        turned=turned,
+    )

@@ -86,9 +86,12 @@ class _OfParticles(torch.autograd.Function):
 
 
 def material_state(
-    law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor,
+    law: Law,
+    F: Tensor,
+    C_affine: Tensor,
+    parameters: Tensor,
     into: tuple[Tensor, Tensor, Tensor] | None = None,
-) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """(w, s, e) that an adapter reads, differentiable.
 
     w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.

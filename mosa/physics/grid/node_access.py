@@ -263,9 +263,18 @@ def node_access(scalar) -> SimpleNamespace:
 
     @wp.func_native(_either("", SCATTER))
     def scatter(
-        field: field4, i: int, dims: wp.vec3i, wx: vec3, wy: vec3, wz: vec3, q: vec3, bx: vec3, by: vec3, bz: vec3,
+        field: field4,
+        i: int,
+        dims: wp.vec3i,
+        wx: vec3,
+        wy: vec3,
+        wz: vec3,
+        q: vec3,
+        bx: vec3,
+        by: vec3,
+        bz: vec3,
         m: scalar,
-    ): ...  # fmt: skip
+    ): ...
 
     @wp.func_native(_either("return {};", GATHER))
     def gather(field: field4, i: int, dims: wp.vec3i, wx: vec3, wy: vec3, wz: vec3) -> mat43: ...

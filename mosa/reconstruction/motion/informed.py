@@ -94,9 +94,13 @@ def informed_motion(
             deformation = motion.displacement(every, scaffold.modes)[1]
             about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
         Objective(motion, target, weights, about).minimise(
-            UniformAdam(motion.parameters(), lr=settings.lr), frames.tolist(), settings.iterations, settings.views,
-            torch.Generator().manual_seed(seed), progress,
-        )  # fmt: skip
+            UniformAdam(motion.parameters(), lr=settings.lr),
+            frames.tolist(),
+            settings.iterations,
+            settings.views,
+            torch.Generator().manual_seed(seed),
+            progress,
+        )
         return motion
 
     single = len(windows.view.unique()) == 1
