@@ -8,6 +8,7 @@ import gc
 import math
 import os
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -30,9 +31,17 @@ def machine_memory() -> int:
     return min(total, int(limit)) if limit.isdigit() else total
 
 
+SELDOM = 20.0
+"""Seconds between two returns of memory: each takes a quarter of one, short runs would pay it in every stage."""
+returned = [-math.inf]  # when it was last
+
+
 def return_memory() -> None:
     """What nothing refers to goes back to the system. glibc keeps it, in pieces that are too small for what comes next."""
+    if time.monotonic() < returned[0] + SELDOM:
+        return
     gc.collect()
+    returned[0] = time.monotonic()
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "malloc_trim"):
         library.malloc_trim(0)
 

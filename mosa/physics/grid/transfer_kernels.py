@@ -198,9 +198,10 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
             s = sent(own, p, now, grids, dt, check_J, substep, flags)
             if s.n < 0:
                 return
-            if wp.static(not exact) and on_cpu():
-                scatter(grid, s.n, s.dims, s.wx, s.wy, s.wz, s.q0, s.bx, s.by, s.bz, s.m)
-                return
+            if wp.static(not exact):
+                if on_cpu():
+                    scatter(grid, s.n, s.dims, s.wx, s.wy, s.wz, s.q0, s.bx, s.by, s.bz, s.m)
+                    return
             together = run(s.n, True)
             for i in range(3):
                 for j in range(3):
