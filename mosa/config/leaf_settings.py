@@ -69,7 +69,7 @@ class FilmSection(Settings):
     ...], through which the camera turns about `up` while the film goes on; null: from the side, a
     little above"""
     zoom: Positive = 1.0
-    """the picture shows so much less around the middle of the motion"""
+    """magnification about the middle of the motion; 1: all of it is in the picture"""
     shadow: bool = True
     """shadows of the object and the obstacles on the ground, under light from above"""
     caption: bool = True

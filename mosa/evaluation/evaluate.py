@@ -277,7 +277,8 @@ def sequence_metrics(
     scene, x, parts, frames = sequence.scene, rollout.x.cpu(), parts_of(sequence), sequence.frames
     training = sequence.prefix.startswith("train")
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
-    images = render(body, rollout, scene, None if "frames" in parts else 1)
+    held = list(scene.holdout_cameras) if "camera" in parts else []
+    images = render(body, rollout, scene, None if "frames" in parts else max(1, len(held)))
 
     def measured(part: str, frames: list[int]) -> dict[str, float]:
         figures = motion_metrics(x, body, sequence, frames, settings, target)
@@ -287,13 +288,11 @@ def sequence_metrics(
     result = measured(sequence.prefix, frames)
     if "frames" in parts:
         result |= measured("frames", list(scene.holdout_frames))
-    if "camera" in parts:
-        held = list(scene.holdout_cameras)
-        seen_there = render(body, rollout, scene, None)
-        figures = image_metrics(seen_there, scene, held, frames)
+    if held:
+        figures = image_metrics(images, scene, held, frames)
         result |= {f"{model}camera/{k}": v for k, v in figures.items()}
         for t in frames:
-            figures = image_metrics(seen_there, scene, held, [t])
+            figures = image_metrics(images, scene, held, [t])
             where = f"{model}camera/frame_{t:02d}"
             result |= {f"{where}/{k}": figures[k] for k in ("psnr_crop", "ssim_crop")}
     return result

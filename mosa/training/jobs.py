@@ -65,16 +65,7 @@ def own_groups(command: str, conf: Path | None = None) -> str:
 OmegaConf.register_new_resolver("own_groups", own_groups, replace=True)
 
 
-WITH_VALUE = {
-    "--config-dir",
-    "-cd",
-    "--config-path",
-    "-cp",
-    "--config-name",
-    "-cn",
-    "--package",
-    "-p",
-}
+WITH_VALUE = "--config-dir -cd --config-path -cp --config-name -cn --package -p".split()
 """Options of Hydra whose next word is no override."""
 
 
@@ -84,7 +75,8 @@ def options_first(words: Sequence[str]) -> list[str]:
 
     def is_override(place: int) -> bool:
         word, before = words[place], words[place - 1] if place else ""
-        return word[0] != "-" and ("=" in word or word[0] == "~") and before not in WITH_VALUE
+        looks = "=" in word or word[:1] in ("", "~")  # "": a script's empty variable
+        return looks and not word.startswith("-") and before not in WITH_VALUE
 
     return [words[k] for k in sorted(range(len(words)), key=is_override)]
 

@@ -238,11 +238,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """Asked for first of all, before the data take their time."""
         check_trainer(self.trainer)
         data = getattr(self.trainer, "datamodule", None)
-        if self.record is not None and hasattr(data, "cfg"):
-            check_same_scene(self.record, plain(data.cfg), "the module")
-        elif (
-            self.cfg and hasattr(data, "cfg") and (found := other_scene(self.cfg, plain(data.cfg)))
-        ):
+        here = plain(data.cfg) if hasattr(data, "cfg") else {}
+        if self.record is not None and here:
+            check_same_scene(self.record, here, "the module")
+        elif found := other_scene(self.cfg, here):
             raise ConfigError(
                 f"LitMosa, {type(data).__name__}: expected one configuration for both, found {listed(found)}"
             )

@@ -22,15 +22,10 @@ from mosa.system.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
-VALIDATED = (
-    "val/loss",
-    "val/psnr",
-    "val/cameras/loss",
-    "val/cameras/psnr",
-    "val/frames/loss",
-    "val/frames/psnr",
-)
 VALIDATION = "val/"  # begins the names of figures of what is held out of the training sequence
+VALIDATED = [
+    VALIDATION + part + k for part in ("", "cameras/", "frames/") for k in ("loss", "psnr")
+]
 MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 """Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}

@@ -299,8 +299,8 @@ class Twin:
         or a list of the states of T steps, whose solids are drawn where they were then (None: those of
         `reset`). Half spaces are not drawn. size [px]: of a square, or (width, height). view: (3,)
         from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None
-        for the side and a little above. zoom: the picture shows so much less around the middle of the
-        motion. shadow: on the ground, of the body and of the solids, under light from above.
+        for the side and a little above. zoom: magnification about the middle of the motion. shadow: on
+        the ground, of the body and of the solids, under light from above.
         Errors: ConfigError."""
         return self._pictures(*self._met(rollout, colliders), size, view, zoom, shadow)
 

@@ -259,6 +259,7 @@ def test_overrides_may_stand_before_an_option_and_after_it():
         "~logger",
         "--info",
     ]
+    assert options_first(["", "seed=1", "--cfg", "job"]) == ["--cfg", "job", "", "seed=1"]
     assert options_first(words) == [
         "--config-dir",
         "a=b/conf",

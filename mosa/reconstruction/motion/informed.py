@@ -87,7 +87,9 @@ def informed_motion(
             found.append(objective(t[None], own, torch.zeros_like(own.frame)))
         return torch.stack(found)
 
-    def followed(begun: Tensor, frames: Tensor) -> ModalMotion:
+    def followed(
+        begun: Tensor, frames: Tensor, progress: Callable[[int], None] | None = None
+    ) -> ModalMotion:
         """From these shapes (T, N, 3) [m], the images of these frames."""
         motion = at(begun)
         with torch.no_grad():
@@ -106,7 +108,7 @@ def informed_motion(
     single = len(windows.view.unique()) == 1
     laid = laid_onto(predicted, seen, centers(windows.cameras)[0] if single else None)
     stays = losses(at(predicted)) < AS_IT_IS * losses(at(laid))
-    motion = followed(torch.where(stays[:, None, None], predicted, laid), every[1:])
+    motion = followed(torch.where(stays[:, None, None], predicted, laid), every[1:], progress)
     if bool(stays.any()):  # what begins nearer to the images may end farther from them
         other = followed(laid, every[stays])
         nearer = stays & (losses(other) < losses(motion))
