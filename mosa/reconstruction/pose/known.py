@@ -278,11 +278,15 @@ def followed(
 
 
 def alike(solid: Solid, scene: Scene, place: Similarities) -> Similarities:
-    """Of the poses that the outlines of frame 0 leave, the one that is turned least from `place`, which colours say: a side that no
-    training camera has seen has none of its own."""
+    """`place`, which colours say, fitted to the outlines of frame 0, where these leave it; else the pose they leave that is turned
+    least from it: a side that no training camera has seen has no colours of its own. How far a round body has turned about its
+    axis is in its colours alone."""
     views = scene.training_cameras
     rays = outline_rays(scene.mattes[views, 0], scene.cameras.select(views))
-    found, _ = searched(solid, scene, rays, float(place.size[0]), sized=False)
+    found, costs = searched(solid, scene, rays, float(place.size[0]), sized=False)
+    own, cost = fitted(solid, place, rays.some(400), 12, sized=False)
+    if float(cost) <= AMBIGUOUS**2 * max(float(costs.min()), NOISE**2):
+        return own
     nearest = (found.rotation * place.rotation).sum((1, 2)).argmax()
     return found.take(nearest[None])
 

@@ -12,7 +12,7 @@ from mosa.data.hull import Volume
 from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.errors import DataError
 from mosa.reconstruction.geometry.known import Solid
-from mosa.reconstruction.pose import outlines
+from mosa.reconstruction.pose import known, outlines
 from mosa.reconstruction.pose.known import known_centres, known_start, register_known
 from mosa.reconstruction.pose.outlines import Similarities
 from mosa.types import REST, Ground, KnownBody, Scene
@@ -166,6 +166,21 @@ def test_outlines_find_a_start_that_colours_miss(tmp_path):
     assert float((center - rest.center[0]).norm()) < 0.005
     assert torch.allclose(velocity, torch.tensor(VELOCITY), atol=0.1)
     assert torch.allclose(spin, torch.tensor(SPIN), atol=0.6)
+
+
+def test_a_pose_that_outlines_leave_is_the_colours(tmp_path, monkeypatch):
+    """As of a torus: the search keeps one pose of those about its axis, whichever."""
+    scene = scene_of(written(tmp_path / "bracket.obj"), 3, 3, last_free_frame=2)
+    found = register_known(scene)
+    searched, turn = known.searched, torch.tensor(POSE).float()
+
+    def turned(*given, **named):
+        poses, costs = searched(*given, **named)
+        return Similarities(turn @ poses.rotation, poses.center, poses.size), costs
+
+    monkeypatch.setattr(known, "searched", turned)
+    rotation = known.alike(found.solid, scene, found.place).rotation
+    assert float((rotation - found.place.rotation).norm()) < 0.05
 
 
 def test_one_camera_and_no_fall_is_refused_without_a_scale(tmp_path):
