@@ -27,8 +27,11 @@ POISSON_STEPS = (0.32, 0.2, 0.42)
 numbers, the middle one first."""
 NEAREST, ENTERED = 6, 3
 """Places of that grid at which all Poisson numbers are tried; its valleys in which Gauss-Newton begins."""
-CONTACT = "contact"
-"""Name of the contact offset among the numbers of a start."""
+CONTACT, YIELD = "contact", "yield_stress"
+"""Names among the numbers of a start: of the contact offset; of what takes its place in that grid where a law has it. Beside a
+yield stress far from the truth, the best stiffness is a wrong one."""
+YIELD_STEPS = (-2.2, -1.1, 0.0, 1.1, 2.2)
+"""Steps of its logarithm: a factor of 3."""
 FURTHER, FURTHEST = 1.5, 100.0
 """Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
 STRIDES = {
@@ -96,12 +99,20 @@ class Starts:
         seats, body = len(calibration.newton.seats), calibration.body
         self._bodies = [*(copy.deepcopy(body) for _ in range(seats - 1)), body]
 
-    def row(self, multiple: float, nu: float | None, cells: float | None) -> dict[str, float]:
-        """Of a multiple of the stiffness, a Poisson number and a contact offset [cells], None for those that stay."""
+    def row(
+        self, multiple: float, nu: float | None, further: Mapping[str, float]
+    ) -> dict[str, float]:
+        """Of a multiple of the stiffness, a Poisson number, None where it stays, and `further` numbers."""
         shift = math.log(multiple)
         row = {n: self._begins[n] + shift * (n in self.modulated) for n in self.learned}
-        row |= {} if nu is None else {"nu": FORMS["nu"].inverse(nu)}
-        return row if cells is None else row | {CONTACT: cells}
+        return row | ({} if nu is None else {"nu": FORMS["nu"].inverse(nu)}) | further
+
+    def columns(self) -> list[dict[str, float]]:
+        """Of the grid, beside the stiffness: yield stresses, or contact offsets."""
+        if YIELD in self.learned and len(self.learned) < MANY:
+            return [{YIELD: self._begins[YIELD] + step} for step in YIELD_STEPS]
+        cells = self.calibration.offsets
+        return [{} if each is None else {CONTACT: each} for each in cells]
 
     @torch.no_grad()
     def begin_at(self, row: dict[str, float], body: Body | None = None) -> None:
@@ -138,17 +149,19 @@ def search(calibration: Calibration) -> float:
 
     The deepest valleys of a coarse grid (`rows_of_grid`) come first; where there are several,
     Gauss-Newton begins in each, and the deepest after a few iterations is entered. Laws with
-    further parameters go on by a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review
-    45, 2003), laws of `MANY` numbers by Gauss-Newton from its end and from other starts
+    parameters that the grid has not go on by a compass search in all of them (Kolda, Lewis, Torczon,
+    SIAM Review 45, 2003), laws of `MANY` numbers by Gauss-Newton from its end and from other starts
     (`nearest_end`). Errors: those of `rows_of_grid` and `nearest_end`."""
     starts = Starts(calibration)
-    rows, learned = rows_of_grid(starts, calibration.offsets), starts.learned
-    row, further = rows[0], set(learned) - {"E", "nu"}
+    columns, learned = starts.columns(), starts.learned
+    rows = rows_of_grid(starts, columns)
+    row, further = rows[0], set(learned) - {"E", "nu", *columns[0]}
     if further:
         row = compass(starts.score, row, {n: STRIDES.get(n, 1.0) for n in row})
     if len(learned) >= MANY:
         multiples = WIDE if starts.modulated else (1.0,)
-        stiffnesses = [starts.row(m, None, row.get(CONTACT)) for m in multiples]
+        contact = {name: row[name] for name in (CONTACT,) if name in row}
+        stiffnesses = [starts.row(m, None, contact) for m in multiples]
         moves = [(each, steps) for each in stiffnesses for steps in moved(learned)]
         wide = [each | {n: each[n] + step for n, step in steps.items()} for each, steps in moves]
         starts.scores(wide)
@@ -160,8 +173,8 @@ def search(calibration: Calibration) -> float:
     return starts.score(row)
 
 
-def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[str, float]]:
-    """The deepest valleys, at most `ENTERED`, the lowest first, of a grid of stiffness and contact `offsets`.
+def rows_of_grid(starts: Starts, columns: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    """The deepest valleys, at most `ENTERED`, the lowest first, of a grid of stiffness and `columns`.
 
     It is searched at a middle Poisson number, further where its best is at an end of the stiffness;
     the other Poisson numbers at the `NEAREST` best places. Errors: SimulationDiverged where none
@@ -172,9 +185,9 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
 
     def add(*some: int) -> None:
         places = {
-            (i, j): starts.row(multiples[i], middle, cells)
+            (i, j): starts.row(multiples[i], middle, further)
             for i in some
-            for j, cells in enumerate(offsets)
+            for j, further in enumerate(columns)
         }
         grid.update(zip(places, starts.scores(list(places.values()))))
 
@@ -199,12 +212,12 @@ def rows_of_grid(starts: Starts, offsets: Sequence[float | None]) -> list[dict[s
     numbers: dict[tuple[int, int], float | None] = {place: middle for place in grid}
     nearest = sorted(grid, key=grid.__getitem__)[:NEAREST]
     tried = [(place, nu) for place in nearest for nu in others]
-    rows = [starts.row(multiples[i], nu, offsets[j]) for (i, j), nu in tried]
+    rows = [starts.row(multiples[i], nu, columns[j]) for (i, j), nu in tried]
     for (place, nu), found in zip(tried, starts.scores(rows)):
         if found < grid[place]:
             grid[place], numbers[place] = found, nu
     deepest = valleys(grid)[:ENTERED]
-    return [starts.row(multiples[i], numbers[i, j], offsets[j]) for i, j in deepest]
+    return [starts.row(multiples[i], numbers[i, j], columns[j]) for i, j in deepest]
 
 
 def nearest_end(

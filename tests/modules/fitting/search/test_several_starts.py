@@ -1,5 +1,6 @@
 """Calibrations of laws with several valleys: Gauss-Newton from several starts, of which the nearest go on."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -77,15 +78,15 @@ def test_several_seats_score_starts_as_one_does():
     for seats in (1, 2):
         found = identification(small_body(adapter=False), [take], "prior", seats=seats)
         starts = Starts(found)
-        places = [starts.row(multiple, 0.3, None) for multiple in (0.5, 1.0, 2.0, 1e9)]
+        places = [starts.row(multiple, 0.3, {}) for multiple in (0.5, 1.0, 2.0, 1e9)]
         rows.append(starts.scores(places))
         assert len(starts._bodies) == seats and starts.score(places[1]) == rows[0][1]
     assert rows[0] == rows[1] and rows[0][3] == float("inf") and len(set(rows[0])) == 4
 
 
-def yielding(**numbers):
+def yielding(law="herschel_bulkley_hencky", **numbers):
     made = small_body(adapter=False)
-    made.material = Material("herschel_bulkley_hencky", numbers).double()
+    made.material = Material(law, numbers).double()
     return made
 
 
@@ -119,3 +120,18 @@ def test_a_law_of_four_numbers_is_calibrated_nearer_than_by_a_search_in_one_afte
         assert found.iteration == 0 and not found.converged
         ends[several] = found.distance()
     assert ends[True] < 0.5 * ends[False]
+
+
+def test_a_yield_stress_far_from_the_truth_leads_to_no_wrong_stiffness(monkeypatch):
+    """von Mises' law begun at a twelfth of the yield stress: beside it, the best stiffness is a wrong one."""
+    truth = yielding("von_mises", E=1e5, nu=0.3, yield_stress=2500.0)
+    take, ends = take_of(truth, start(height=0.09, speed=-1.5), 8), {}
+    for steps in (backbone_search.YIELD_STEPS, (0.0,)):
+        monkeypatch.setattr(backbone_search, "YIELD_STEPS", steps)
+        body = yielding("von_mises", E=3e4, nu=0.4, yield_stress=200.0)
+        found = identification(body, [take], "prior")
+        found.search()
+        for _ in range(4):
+            found.iterate()
+        ends[len(steps)] = abs(math.log(float(body.material.physical()["E"].detach()) / 1e5))
+    assert ends[5] < 0.1 < 1 < ends[1]
