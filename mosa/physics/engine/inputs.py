@@ -155,7 +155,9 @@ def checked_density(
         density = density.detach().to(volume)
         ends = (*torch.aminmax(volume), *torch.aminmax(density))
     names = [name for name in law.offsets if name in MODULI]
-    moduli = packed.detach()[:, [law.offsets[name] for name in names]]
+    # columns one by one: a list of them is copied to a CUDA device, which waits for it
+    columns = [packed.detach()[:, law.offsets[name]] for name in names]
+    moduli = torch.stack(columns, 1) if columns else packed.detach()[:, :0]
     least = moduli.nan_to_num().amin(0)  # NaN: of another law of a mixture
     masses = density * volume
     told = torch.cat([torch.stack([*ends, masses.mean()]).to(least), least]).tolist()
