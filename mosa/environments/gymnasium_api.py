@@ -45,8 +45,7 @@ class _Worlds:
     ) -> tuple[spaces.Box, spaces.Box]:
         """(observations: ranges of a start, wider by rounding; actions). Errors: ConfigError, DataError."""
         made = simulator_named(simulator, **of)
-        if not isinstance(task, Task):
-            task = task_named(task, made.twin.body.rest, **(options or {}))
+        task = task_named(task, made.twin.body.rest, **(options or {}))
         self.arena, self.task = Arena(made, task, worlds), task
         low, high = np.array([(q.low, q.high) for q in task.observations], np.float32).T
         seen = spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)

@@ -74,11 +74,11 @@ class Task(ABC):
     """A hand lets go: it chooses the tilt, and where the body's centre shall be when it arrives. What follows is the body's law.
 
     The hand holds the body without deforming it, its lowest particle `low` to `high` [m] above what it falls on. extents: (3,) of
-    the body at rest [m], from which sizes follow; steps: control steps of an episode of `control_dt` [s]; tilt [rad], aim [m]: the
-    most that an action may ask for; unsteady_tilt, unsteady_aim: by how much the hand is off at most.
+    the body at rest [m], from which sizes follow, set by `task_named`; steps: control steps of an episode of `control_dt` [s];
+    tilt [rad], aim [m]: the most that an action may ask for; unsteady_tilt, unsteady_aim: by how much the hand is off at most.
     """
 
-    extents: tuple[float, float, float]
+    extents: tuple[float, float, float] = (0.0, 0.0, 0.0)
     steps: Steps = 50
     control_dt: Annotated[float, Interval(ge=1e-4, le=1)] = 0.02
     tilt: Angle = 0.4

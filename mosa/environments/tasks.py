@@ -28,7 +28,7 @@ from mosa.environments.task import (
     View,
 )
 from mosa.physics.contact.motion import exponential
-from mosa.settings import call, check
+from mosa.settings import Expected, call, check
 
 FRICTION = 0.6
 
@@ -88,13 +88,12 @@ class Placement(Task):
 class Hanging(Task):
     """Hang the body on a tower: thrown to the ground before it, the body bounces up, and the tower's two jaws close about it.
 
-    The body is held leaning by `leaning` [rad] about z, its lowest particle `low` to `high` above the ground, `close` to `far` in
-    front of where it lands and up to `aside` beside it. The hand turns it, throws it down at up to `hardest` [m/s], and gives the
-    horizontal velocity that brings it to the aim, about `before` in front of the jaws. A light barrier 4 cm above the ground starts
-    a clock; after `shut` control steps the jaws close within `closing`, to a gap that is narrower than the body by the share
-    `squeeze`. What is between them hangs.
-    Success: at the end the centre is within `near` of the jaws' middle, along x and in height, no particle is lower than `free`,
-    and the speed is below `still`."""
+    The body is held leaning by `leaning` [rad] about z, its lowest particle `low` to `high` above the ground, `close` to `far`
+    in front of where it lands and up to `aside` beside it. The hand turns it, throws it down at up to `hardest` [m/s], and
+    gives the horizontal velocity that brings it to the aim, about `before` in front of the jaws. A light barrier 4 cm above the
+    ground starts a clock; after `shut` control steps the jaws close within `closing`, to a gap that is narrower than the body
+    by the share `squeeze`. What is between them hangs. Success: at the end the centre is within `near` of the jaws' middle,
+    along x and in height, no particle is lower than `free`, and the speed is below `still`."""
 
     steps: Steps = 32
     tilt: Angle = 0.25
@@ -187,10 +186,12 @@ SIDES = (("left", -1.0), ("right", 1.0))  # of the jaws, and the sign of their z
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging)}
 
 
-def task_named(name: str, rest: Tensor, **options: Any) -> Task:
-    """The task for a body with rest positions (N, 3) [m]: its sizes follow from the body's. options: of the task.
-
-    Errors: ConfigError naming what is unknown."""
-    check("task", name, Literal[tuple(TASKS)])
+def task_named(name: str | Task, rest: Tensor, **options: Any) -> Task:
+    """The task of a name, or another one, for a body with rest positions (N, 3) [m]: its sizes follow from the body's. options: of
+    the task. Errors: ConfigError naming what is unknown."""
     extents = tuple(round(float(e), 2) for e in (rest.amax(0) - rest.amin(0)))
+    if isinstance(name, Task):
+        return replace(name, extents=extents, **options)
+    said = Expected(f"{' or '.join(TASKS)}, or a Task")
+    check("task", name, Annotated[Literal[tuple(TASKS)], said])
     return call("options", TASKS[name], options, extents=extents)

@@ -16,12 +16,14 @@ from mosa.data.synthetic.drop import COURANT, GRAVITY, place
 from mosa.data.synthetic.films import built
 from mosa.data.synthetic.materials.hidden import Hidden
 from mosa.data.synthetic.materials.published import PublishedMaterial
+from mosa.errors import ConfigError
 from mosa.modules.body.body import Body
 from mosa.modules.body.model import Model
 from mosa.modules.body.simulation_settings import SimulationSettings
 from mosa.physics.world import Start, World
 from mosa.settings import Expected, Seed, check
 from mosa.system.limits import named_device
+from mosa.twin.material import TwinMaterial
 from mosa.twin.twin import Twin
 from mosa.types import Ground
 
@@ -51,6 +53,18 @@ class TrueMaterial(nn.Module):
     def max_viscosity(self, factor: Tensor | float = 1.0) -> float:
         """[Pa s]."""
         return self.hidden.viscosity()
+
+
+class TrueTwin(Twin):
+    """A twin of the truth, whose law nobody may read: nothing is known of it but its motion."""
+
+    @property
+    def material(self) -> TwinMaterial:
+        """Errors: ConfigError."""
+        raise ConfigError("material: expected a learned twin, found the truth, whose law is hidden")
+
+    def __repr__(self) -> str:
+        return f"TrueTwin({self.body!r})"
 
 
 class TrueBody(Body):
@@ -103,4 +117,4 @@ def true_twin(
     world = World(ground, tensor(GRAVITY), torch.tensor([0.0, 1.0, 0.0]), box)
     falling = tensor([0.0, -drop.speed, 0.0])
     start = Start(tensor(drop.rotation), tensor(begun.mean(0)), falling, torch.zeros(3))
-    return Twin(made.to(device).eval(), world, 1 / body.footage.fps, None, start)
+    return TrueTwin(made.to(device).eval(), world, 1 / body.footage.fps, None, start)

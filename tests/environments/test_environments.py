@@ -85,6 +85,13 @@ def test_the_truth_is_what_the_films_show():
     )
     with pytest.raises(ConfigError, match=r"scene\.name: expected one of the built-in"):
         true_twin("unicorn")
+    for call in (
+        twin.summary, lambda: print(twin.material), lambda: twin.material.E, lambda: twin.export_material("nowhere"),
+        lambda: twin.worlds(2, laws=[{"E": 1e4}, {}]), lambda: twin.worlds(2, laws=torch.zeros(2, 2)),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=r"^material: .* the truth, whose law is hidden"):
+            call()
+    assert repr(twin).startswith("TrueTwin(Body(2006 particles")
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -105,7 +112,7 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     assert torch.equal(a.observed, task.draw(5, torch.Generator().manual_seed(1)).observed)
     with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
         task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
-    with pytest.raises(ConfigError, match="task: expected placement or hanging, found"):
+    with pytest.raises(ConfigError, match="task: expected placement or hanging, or a Task, found"):
         task_named("juggling", torch.zeros(2, 3))
 
 

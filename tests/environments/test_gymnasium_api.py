@@ -1,5 +1,8 @@
 """The tasks as Gymnasium environments: its own checker, seeds, vectors of worlds, and a library that learns in them."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +17,8 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from mosa.environments import gymnasium_api  # noqa: E402
 from mosa.environments.gymnasium_api import TwinEnv, TwinVectorEnv  # noqa: E402
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -92,6 +97,27 @@ def test_a_vector_of_worlds_is_its_trials(name):
     assert np.array_equal(np.stack(info["final_obs"]), first)
     assert info["final_info"]["success"].shape == (3,) and not np.array_equal(first, seen)
     assert np.allclose(seen, env.unwrapped.arena.trials.observed.numpy(), atol=1e-6)
+
+
+def test_the_task_of_the_page_is_a_task():
+    """The class of docs/environments.md, in one world and in several."""
+    blocks = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "environments.md").read_text(), re.S
+    )
+    names = {"TwinVectorEnv": TwinVectorEnv}
+    exec(next(block for block in blocks if "class Land(Task)" in block), names)
+    worlds, rewards = names["worlds"], names["rewards"]
+    assert (
+        rewards.shape == (4,) and (rewards < 0).all() and worlds.task.extents == (0.1, 0.08, 0.06)
+    )
+    assert [q.name for q in worlds.task.observations] == ["height", "mark x", "mark z"]
+    assert worlds.task.solids()[0]["name"] == "post"
+    env = TwinEnv(names["Land"](near=10.0), options={"steps": 30})
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros(4, np.float32))
+    assert info["success"] and env.task.steps == 30
+    with pytest.raises(ConfigError, match="task: expected placement or hanging, or a Task, found"):
+        TwinEnv(names["Land"])
 
 
 def test_a_reward_is_minus_the_loss():
