@@ -36,3 +36,30 @@ def test_every_shape_of_a_link_is_a_collider(tmp_path):
         robot.action({"j": 45})
     pose = robot.action({"j": np.pi / 2})["b"]
     assert np.allclose(pose["rotation"], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+WHEEL = """<robot name="wheel"><link name="a"/><link name="b"><collision>
+<geometry><cylinder radius="0.02" length="0.2"/></geometry></collision>
+</link><joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/></joint></robot>"""
+
+
+def test_a_wheel_turns_on_and_degrees_and_shapes_to_look_at_are_refused(tmp_path):
+    pytest.importorskip("yourdfpy")
+    names: dict = {}
+    exec(re.findall(r"```python\n(.*?)```", PAGE, re.S)[0], names)
+    (tmp_path / "wheel.urdf").write_text(WHEEL)
+    robot = names["Links"](tmp_path / "wheel.urdf")
+    assert robot.colliders({"j": 3})[0]["type"] == "cylinder"  # whole numbers, as others
+    for value in (6, 9, 6, 7.5):
+        turned = robot.action({"j": value})["b"]["rotation"]
+        assert turned[1][1] == pytest.approx(np.cos(value))
+    with pytest.raises(
+        ValueError, match=r"^j: expected a step of at most pi rad, found 7.5 to 30: deg"
+    ):
+        robot.action({"j": 30})
+    robot.colliders({"j": 30})  # where it begins
+    (tmp_path / "seen.urdf").write_text(WHEEL.replace("collision>", "visual>"))
+    with pytest.raises(
+        ValueError, match=r"seen\.urdf: expected links with <collision>, found none"
+    ):
+        names["Links"](tmp_path / "seen.urdf")
