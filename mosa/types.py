@@ -16,7 +16,7 @@ Held = TypeVar("Held", bound="DataclassInstance")
 
 
 def in_brief(held: Any) -> str:
-    """A dataclass in one line: of tensors their shapes, of what holds many things how many, of the rest the values."""
+    """A dataclass or named tuple in a line: of tensors their shapes, of what holds many things how many, of the rest the values."""
 
     def said(value: Any) -> str:
         if isinstance(value, Tensor):
@@ -27,7 +27,8 @@ def in_brief(held: Any) -> str:
             return f"{len(value)} items"
         return repr(value)
 
-    parts = ((f.name, getattr(held, f.name)) for f in fields(held) if f.repr)
+    names = getattr(held, "_fields", None) or [f.name for f in fields(held) if f.repr]
+    parts = ((name, getattr(held, name)) for name in names)
     shown = ", ".join(f"{name}={said(value)}" for name, value in parts if value is not None)
     return f"{type(held).__name__}({shown})"
 

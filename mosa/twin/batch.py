@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.modules.body.body import Body, Start, World
+from mosa.modules.body.body import Start, World
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import Driven
@@ -16,7 +16,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.settings import Count, Expected, typed
 from mosa.system.limits import counted
-from mosa.twin.episode import Episode, Stepped, TwinState
+from mosa.twin.episode import Episode, InMotion, TwinState
 from mosa.twin.start import (
     Seconds,
     StartArguments,
@@ -30,29 +30,19 @@ FARTHEST = 100.0
 """Of a law's numbers, which are logarithms or shares: the largest single precision is e^89."""
 
 
-class TwinWorlds:
-    """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
+class TwinWorlds(InMotion):
+    """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads. Of
+    `step` every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
 
-    def __init__(
-        self,
-        body: Body,
-        world: World,
-        frame_dt: float,
-        training_start: Start,
-        count: int,
-        laws: Tensor | None = None,
-    ) -> None:
+    def __init__(self, twin: Any, count: int, laws: Any = None) -> None:
+        body = twin.body
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None:
-            shape = (count, len(read_numbers(body)))
-            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers within {FARTHEST:g}"
+            laws, shape = twin.material.laws(laws), (count, len(read_numbers(body)))
+            said = f"one for each of {count} worlds, a tensor {shape} of finite numbers within {FARTHEST:g}, or [{{'E': 1e4}}, ...]"
             laws = numbers("laws", laws, said, shape, most=FARTHEST)
-        self.body = body
-        self.world = world
-        self.frame_dt = frame_dt
-        self.training_start = training_start
-        self.count, self.laws = count, laws
-        self.episode: Episode | None = None
+        self.body, self.world, self.frame_dt = body, twin.world, twin.frame_dt
+        self.training_start, self.count, self.laws = twin.training_start, count, laws
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 
     def __repr__(self) -> str:
@@ -72,20 +62,20 @@ class TwinWorlds:
         for each; gravity: (count, 3) [m/s^2], None for the world's; others as `Twin.reset`. Errors: ConfigError naming the world.
         """
         check_frames(frames, self.count * len(self.body.rest))
+        more = {"colliders": colliders, "box": box, "driven": driven}
         if not differentiable:
-            world = {"colliders": colliders, "gravity": gravity, "box": box, "driven": driven}
-            check_wants_no_gradients(starts=starts, **world)
-        found = self._found(starts, range(self.count), colliders, box, driven)
+            check_wants_no_gradients(starts=starts, gravity=gravity, **more)
+        found = self._found(starts, range(self.count), more)
         if gravity is not None:
             shape = (self.count, 3)
             gravity = numbers("gravity", gravity, f"finite numbers {shape}", shape)
         self._box = box
-        self.episode = Episode(
+        self._episode = Episode(
             self.body, found[0][1], control_dt or self.frame_dt, [start for start, _ in found],
             variant=variant, frames=frames, substeps=substeps, laws=self.laws, gravity=gravity,
             differentiable=differentiable,
         )  # fmt: skip
-        return self.episode.state
+        return self._episode.state
 
     @typed
     def restart(
@@ -96,18 +86,12 @@ class TwinWorlds:
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
-        which, episode = list(which), self._going()
-        found = [] if starts is None else self._found(starts, which, (), self._box, ())
+        which, episode = list(which), self.episode
+        more = {"colliders": (), "box": self._box, "driven": ()}
+        found = [] if starts is None else self._found(starts, which, more)
         return episode.restart(which, None if starts is None else [start for start, _ in found])
 
-    def _found(
-        self,
-        starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None,
-        which: Sequence[int],
-        colliders: Any,
-        box: Any,
-        driven: Any,
-    ) -> list[tuple[Start, World]]:
+    def _found(self, starts: Any, which: Sequence[int], more: Any) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
         each = [starts or {}] * len(which) if isinstance(starts, Mapping | None) else starts
         if not isinstance(each, (list, tuple)) or not all(isinstance(s, Mapping) for s in each):
@@ -119,7 +103,6 @@ class TwinWorlds:
                 f"starts: expected one, or {len(which)}, one a world, found {len(each)}"
             )
         found: list[tuple[Start, World]] = []
-        more = {"colliders": colliders, "box": box, "driven": driven}
         for i, (b, given) in enumerate(zip(which, each)):
             StartArguments.read(given, f"starts[{b}]")
             if i and given is each[0]:
@@ -130,21 +113,3 @@ class TwinWorlds:
             except ConfigError as error:
                 raise ConfigError(f"starts[{b}]: {error}") from error
         return found
-
-    def _going(self) -> Episode:
-        if self.episode is None:
-            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
-        return self.episode
-
-    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
-        """As `Twin.step`; every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
-        return self._going().step(action)
-
-    @property
-    def state(self) -> TwinState:
-        """As `Twin.state`, of all worlds."""
-        return self._going().state
-
-    @state.setter
-    def state(self, state: TwinState) -> None:
-        self._going().state = state

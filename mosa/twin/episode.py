@@ -7,6 +7,7 @@ for _ in range(50):
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -71,6 +72,14 @@ class TwinState:
         lift = self.lift if self.lift.ndim == 1 else self.lift[:, None]
         return self.x.to(lift.dtype) - lift
 
+    def world(self, number: int) -> TwinState:
+        """Of one of B worlds, as `Twin.export` and `Twin.render` take it. Errors: ConfigError."""
+        if self.x.ndim != 3 or not 0 <= number < len(self.x):
+            raise ConfigError(f"world: expected one of x {tuple(self.x.shape)}, found {number}")
+        alike = ("driven", "frames", "substeps", "time", "lag", *(["lift"] * (self.lift.ndim == 1)))
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in alike}
+        return replace(self, **{name: value[number] for name, value in own.items()})
+
     def tensors(self) -> dict[str, Tensor]:
         """By name, detached: what `torch.save` writes and `read` reads."""
         return {f.name: getattr(self, f.name).detach() for f in fields(self)}
@@ -118,6 +127,8 @@ class Stepped(NamedTuple):
 
     state: TwinState
     reactions: Tensor | None
+
+    __repr__ = in_brief
 
 
 class Episode:
@@ -432,6 +443,39 @@ class Episode:
             raise ConfigError(f"{where}: {error}") from error
 
 
+class InMotion:
+    """What `Twin` and `TwinWorlds` share: the motion that `reset` began, step by step."""
+
+    _episode: Episode | None = None
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """Go one step on: (state, reactions), see `mosa.twin.episode`.
+
+        action: for colliders by name (their number as a text where they have none), either `velocity` (3,) [m/s] and
+        `angular_velocity` (3,) [rad/s] in world axes, about the collider's origin, for this step, or the `position` (3,) [m] and
+        `rotation` ((3,) vector [rad] or (3, 3)) where it shall be after it; three numbers alone are a velocity. A collider that
+        was never in an action follows its own motion; one that was, but is not in this one, stands still.
+        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged."""
+        return self.episode.step(action)
+
+    @property
+    def episode(self) -> Episode:
+        """The motion that `reset` began. Errors: ConfigError before that."""
+        if self._episode is None:
+            raise ConfigError("twin: expected reset(...) before step and state, found no motion")
+        return self._episode
+
+    @property
+    def state(self) -> TwinState:
+        """Of the motion now; set it to go back to an earlier one, or to branch. `state.tensors()` are plain tensors to save, and
+        `TwinState.read` makes them a state again, after a reset with the same arguments."""
+        return self.episode.state
+
+    @state.setter
+    def state(self, state: TwinState) -> None:
+        self.episode.state = state
+
+
 def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
     """new in the worlds that are chosen (B,), old in the others."""
     return torch.where(chosen.to(old.device).view(-1, *(1,) * (old.ndim - 1)), new, old)
@@ -472,6 +516,9 @@ def _worlds(
     else:
         counts = [ready_with(**options).simulator.substeps for _ in each_law(body, laws)]
         fixed = options | {"substeps": max(counts)}
+        if max(counts) >= 2 * min(counts):
+            told = f"laws: all worlds take {max(counts)} substeps, as the stiffest; alone, world {counts.index(min(counts))} takes "
+            warnings.warn(f"{told}{min(counts)} and bounces higher (docs/twin.md)", stacklevel=5)
         found = [ready_with(**fixed).answered() for _ in each_law(body, laws)]
     first = found[0].simulator
     own = first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic

@@ -20,11 +20,12 @@ from mosa.evaluation.analysis.tables import NOTICEABLE
 from mosa.evaluation.uncertainty import determined
 from mosa.modules.adapters.microplane import PAIRS
 from mosa.modules.body.body import Body
-from mosa.modules.body.material import RELATIVE, Material, unit_of
+from mosa.modules.body.material import FORMS, RELATIVE, Material, taken, unit_of
+from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.constitutive.damping import DAMPED, DAMPING
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import AS_USUAL
-from mosa.settings import Positive, check, typed
+from mosa.settings import Positive, check, nearest, typed
 from mosa.twin.presets import preset
 
 SAGS = 0.3  # E over the weight of a column as high as the body, below which its unit is doubted
@@ -33,9 +34,8 @@ SAGS = 0.3  # E over the weight of a column as high as the body, below which its
 class TwinMaterial:
     """The material of a twin. What is set counts from the next `simulate` or `reset` on.
 
-    Reading: `parameters`, `E`, `nu`, `density`, `damping`, `stiffness`, `field`. Setting:
-    `set(E=2e4, damping=5)`, or an attribute, `twin.material.E = 2e4`; `preset("jelly")` takes a
-    known material."""
+    Reading: `parameters`, `E`, `nu`, `density`, `damping`, `stiffness`, `field`. Setting: `set(E=2e4, damping=5)`, or an
+    attribute, `twin.material.E = 2e4`; `preset("jelly")` takes a known material."""
 
     __slots__ = ("_twin",)
     _twin: Any
@@ -59,8 +59,7 @@ class TwinMaterial:
     @property
     @torch.no_grad()
     def parameters(self) -> dict[str, float]:
-        """Values of the law's parameters, SI units, friction_angle in degrees; of a direction its
-        three components."""
+        """Values of the law's parameters, SI units, friction_angle in degrees; of a direction its three components."""
         return {name: float(value) for name, value in self._body.material.physical().items()}
 
     @property
@@ -90,16 +89,14 @@ class TwinMaterial:
 
     @property
     def field(self) -> Tensor:
-        """(N,) factor of the stiffness at every particle: E(X) = E * field. Ones where it does not
-        vary."""
+        """(N,) factor of the stiffness at every particle: E(X) = E * field. Ones where it does not vary."""
         with torch.no_grad():
             return self._body.factor(self._body.heterogeneity).detach().clone()
 
     @property
     def stiffness(self) -> Tensor:
-        """(6, 6) float64 [Pa] at rest, prior and correction, where `field` is 1: stress over strain
-        in Mandel scaling, components xx, yy, zz, yz, zx, xy in the axes of the rest shape. Errors:
-        ConfigError for an adapter without a law."""
+        """(6, 6) float64 [Pa] at rest, prior and correction, where `field` is 1: stress over strain in Mandel scaling,
+        components xx, yy, zz, yz, zx, xy in the axes of the rest shape. Errors: ConfigError for an adapter without a law."""
         body = self._body
         with torch.no_grad():
             alone = in_double(copy.deepcopy(body.material).cpu(), configured=False)
@@ -129,19 +126,24 @@ class TwinMaterial:
     # ---------------------------------------------------------------- setting
     @typed
     def set(self, law: str | None = None, **values: float) -> None:
-        """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa
-        s], and all of `parameters`.
+        """Change the law or its values: E [Pa], nu, density [kg/m^3], damping and bulk_damping [Pa s], and all of `parameters`.
 
-        law: of another one all parameters are needed. The learned correction stays, in proportion
-        to E, and so does `field`. What the run knew about the uncertainty of the law is dropped,
-        and the variants `prior` and `prior_eta` become the material that was set. Errors:
-        ConfigError naming the value."""
-        density = values.pop("density", None)
+        law: of another one all parameters are needed. The learned correction stays, in proportion to E, and so does `field`.
+        What the run knew about the uncertainty of the law is dropped, and the variants `prior` and `prior_eta` become the
+        material that was set. Errors: ConfigError naming the value."""
+        density, law = values.get("density"), None if law == self.law else law
         if density is not None:
             check_density("density", density)
-        same = law in (None, self.law)
-        known = values_of(self._body.material) if same else {}
-        given = {**known, **values}
+        self._take(self._with(values, law), density, new=law is not None)
+
+    def _with(self, values: Mapping[str, float], law: str | None = None) -> Material:
+        """The material with other values, law: or of another one. Errors: ConfigError naming the value."""
+        known = values_of(self._body.material) if law is None else {}
+        names = [*dict.fromkeys([*taken(law or self.law, FORMS), "E", "nu", *DAMPING, "density"])]
+        if strange := [name for name in values if name not in names]:
+            expected = f"expected one of {', '.join(names)}{nearest(strange[0], names, '')}"
+            raise ConfigError(f"{strange[0]}: unknown value; {expected}")
+        given = {**known, **{name: v for name, v in values.items() if name != "density"}}
         if "E" not in known and {"mu", "kappa"} <= set(known) and {"E", "nu"} & set(values):
             E, nu = given.pop("E", self.E), given.pop("nu", self.nu)
             check("E", E, Positive)
@@ -149,16 +151,30 @@ class TwinMaterial:
             given |= {"mu": E / (2 * (1 + nu)), "kappa": E / (3 * (1 - 2 * nu))}
         if not any(given.get(name) for name in DAMPING):
             given = {name: value for name, value in given.items() if name not in DAMPING}
-        modulated = self._body.material.modulated if same else None
+        modulated = self._body.material.modulated if law is None else None
         try:
-            material = Material(law or self.law, given, modulated=modulated)
+            return Material(law or self.law, given, modulated=modulated)
         except ConfigError as error:  # which names them as a configuration does
-            raise ConfigError(str(error).replace("prior.parameters.", "", 1)) from error
-        self._take(material, density, new=not same)
+            said = str(error).removeprefix("prior.parameters").lstrip(".: ")
+            raise ConfigError(said) from error
+
+    def laws(self, each: Any) -> Any:
+        """(len(each), numbers) float64 of the twin's law, each time with other values, a list of mappings; anything else as it
+        is. Errors: ConfigError naming the value."""
+        if not isinstance(each, (list, tuple)) or not all(isinstance(v, Mapping) for v in each):
+            return each
+        names, found = self._body.material.learned, read_numbers(self._body).repeat(len(each), 1)
+        for b, values in enumerate(each):
+            raw = self._with(values).raw
+            if fixed := [name for name in values if name not in names or name not in raw]:
+                own = f"in {', '.join(names)}, inside their ranges, found {', '.join(fixed)}"
+                raise ConfigError(f"laws[{b}]: worlds differ {own}; twin.material.set is for all")
+            for name in values:
+                found[b, names.index(name)] = raw[name].detach()
+        return found
 
     def preset(self, name: str) -> None:
-        """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the
-        learned correction.
+        """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the learned correction.
 
         Errors: ConfigError naming the known ones."""
         found = preset(name)
@@ -212,8 +228,7 @@ def said(law: str, name: str, value: float) -> str:
 
 @torch.no_grad()
 def summary(twin: Any) -> str:
-    """What a twin is, in lines of text with units, and how sure its law is where the run kept
-    that."""
+    """What a twin is, in lines of text with units, and how sure its law is where the run kept that."""
     body, world, material = twin.body, twin.world, twin.material
     volume = float(body.volume.sum())
     sure: Mapping[str, float] = {} if twin.posterior is None else determined(body, twin.posterior)

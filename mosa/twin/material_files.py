@@ -42,8 +42,7 @@ def particles(twin: Any) -> dict[str, np.ndarray]:
 
 
 def described(twin: Any) -> dict[str, Any]:
-    """The material as plain data, SI units, and the parts of it that a simulator of E and nu cannot
-    hold."""
+    """The material as plain data, SI units, and the parts of it that a simulator of E and nu cannot hold."""
     material, lost = twin.material, []
     adapter = twin.body.adapter
     if adapter is not None and adapter.corrects:

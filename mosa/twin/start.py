@@ -133,7 +133,7 @@ def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
 
 def start_in(
     body: Body, world: World, first: Start, *, rotation=None, height=None, position=None, velocity=None, angular_velocity=None,
-    colliders=None, box=None, driven=None,
+    colliders=None, box=None, driven=None, gravity=None,
 ) -> tuple[Start, World]:  # fmt: skip
     """(the start, the world with its colliders and box) of arguments as `Twin.simulate` takes them, None for those of `first`.
 
@@ -149,6 +149,10 @@ def start_in(
     up = world.up.to(body.rest)
     arms = (body.rest - body.center) @ Q.T
     if height is not None:
+        k = int(up.abs().argmax())
+        if isinstance(position, (list, tuple)) and position[k] is not None:
+            said = f"None for {'xyz'[k]} beside height={height:g}, found {position[k]}"
+            raise ConfigError(f"position: expected {said}")
         if height < 0 and world.ground is not None:
             raise ConfigError(f"height: expected metres above the ground, >= 0, found {height:g}")
         ground, low = world.ground.height if world.ground is not None else 0.0, arms @ up
@@ -167,6 +171,8 @@ def start_in(
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
     if driven is not None:
         world = replace(world, driven=driven_from_config(driven, "driven"))
+    if gravity is not None:
+        world = replace(world, gravity=vector("gravity", gravity).detach().to(world.gravity))
     if box is not None:
         world = replace(world, box=box_around(box).to(world.box))
         x, (low, high) = (center + arms).detach(), world.box.to(arms)
@@ -234,8 +240,7 @@ def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | Non
 
 
 class Crossings:
-    """Warns of each pair of solids that comes to overlap, once: what is between them is pressed
-    through them."""
+    """Warns of each pair of solids that comes to overlap, once: what is between them is pressed through them."""
 
     def __init__(self, solids: Sequence[Collider]) -> None:
         endless = HalfSpace, Particles
@@ -276,8 +281,7 @@ class Crossings:
 
 @torch.no_grad()
 def as_started(body: Body, start: Start, places: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """(points [m], velocities [m/s]), (M, 3) both, float64, of places (M, 3) [m] of the rest shape
-    at a start."""
+    """(points [m], velocities [m/s]), (M, 3) both, float64, of places (M, 3) [m] of the rest shape at a start."""
     Q, spin = start.rotation.to(places), start.angular_velocity.to(places)
     arm = (places - body.center) @ Q.T
     moving = start.velocity.to(arm) + torch.linalg.cross(spin.expand_as(arm), arm)

@@ -54,7 +54,7 @@ from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
-from mosa.twin.episode import Episode, Stepped, TwinState, in_order, placed_as, rollout_of
+from mosa.twin.episode import Episode, InMotion, TwinState, in_order, placed_as, rollout_of
 from mosa.twin.material import TwinMaterial, summary
 from mosa.twin.material_files import Formats as MaterialFormats
 from mosa.twin.material_files import export_material
@@ -79,12 +79,12 @@ Draws = Annotated[int, Ge(2), Le(10_000)]
 Views = Sequence[float] | Sequence[Sequence[float]] | Tensor
 Motion = Annotated[
     InstanceOf[Rollout] | Sequence[InstanceOf[TwinState]],
-    Expected("a Rollout, as simulate returns it, or a list of the states of steps, in their order"),
+    Expected("a Rollout, or a list of the states of steps in order (of worlds: each.world(0))"),
     such(lambda v: isinstance(v, Rollout) or in_order(v)),
 ]
 
 
-class Twin:
+class Twin(InMotion):
     """A learned body in its world. `frame_dt` [s]: time between the frames it was trained on."""
 
     def __init__(
@@ -93,7 +93,6 @@ class Twin:
     ) -> None:  # fmt: skip
         self.body, self.world, self.frame_dt = body, world, frame_dt
         self._record, self.training_start, self.posterior = record, training_start, posterior
-        self._episode: Episode | None = None
 
     @property
     def record(self) -> BodyRecord:
@@ -116,9 +115,7 @@ class Twin:
             if record.splats is not None:
                 body.splats = CarriedSplats.read(record.splats.plain(), body.rest)
             world, start = world_of(record), Start.read(record.start.plain())
-        except (
-            Exception
-        ) as error:  # every part has been checked; a stranger's may still fit no body
+        except Exception as error:  # every part has been checked; all may still fit no body
             kind = "" if isinstance(error, MosaError) else f"{type(error).__name__}: "
             reason = " ".join(f"{kind}{error}".split())[:300]
             raise DataError(
@@ -171,25 +168,24 @@ class Twin:
         box: Sequence[Sequence[float]] | Tensor | None = None,
         driven: Sequence[Driven | Mapping[str, Any]] | None = None,
         substeps: Substeps | None = None,
+        gravity: Sequence[float] | None = None,
     ) -> Rollout:
         """Roll the learned law out from a new start.
 
-        rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; position: (3,) [m]
-        of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
-        of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
-        sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
-        holds the forces on them.
-        driven: sets of particles that are held, moved or loaded, instead of the world's
-        (docs/driven.md); their reactions come after those of the colliders. box: (2, 3) [m] the
-        lower and the upper corner of what no particle may leave, None for the scene's; walls of
-        the world stay where they are. substeps: of a frame, as `reset` takes them.
-        No gradients: `reset(differentiable=True)` and `step` have
-        them, and a tensor that requires them is refused. Errors: ConfigError naming the argument
-        (also a solid that the body starts in), SimulationDiverged (the body leaves the box)."""
+        rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; position: (3,)
+        [m] of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in
+        place of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
+        sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the
+        result holds the forces on them. driven: sets of particles that are held, moved or loaded, instead of the world's
+        (docs/driven.md); their reactions come after those of the colliders. box: (2, 3) [m] the lower and the upper corner of
+        what no particle may leave, None for the scene's; walls of the world stay where they are. substeps: of a frame, as
+        `reset` takes them. gravity: (3,) [m/s^2], None for the world's. No gradients: `reset(differentiable=True)` and `step`
+        have them, and a tensor that requires them is refused. Errors: ConfigError naming the argument (also a solid that the
+        body starts in), SimulationDiverged (the body leaves the box)."""
         check_frames(frames, len(self.body.rest))
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
-                 "driven": driven}  # fmt: skip
+                 "driven": driven, "gravity": gravity}  # fmt: skip
         check_wants_no_gradients(**given)
         with (
             torch.no_grad(),
@@ -225,19 +221,19 @@ class Twin:
         differentiable: bool = False,
         box: Sequence[Sequence[float]] | Tensor | None = None,
         driven: Sequence[Driven | Mapping[str, Any]] | None = None,
+        gravity: Sequence[float] | None = None,
     ) -> TwinState:
         """Begin a motion that `step` goes on with; returns its state at time 0.
 
-        rotation, height, position, velocity, angular_velocity, colliders, variant, box, driven: as
-        `simulate`. control_dt [s]: of a step,
-        the `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
-        motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
-        (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
-        require gradients are refused. Errors: ConfigError."""
+        rotation, height, position, velocity, angular_velocity, colliders, variant, box, driven, gravity: as `simulate`.
+        control_dt [s]: of a step, the `frame_dt` of the training by default; substeps: of every step, None for as many as the
+        time step bound asks for in a motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients
+        reach tensors among these arguments (a rotation as a matrix), the actions, and the law's parameters; it keeps states
+        between the passes. Without it tensors that require gradients are refused. Errors: ConfigError."""
         check_frames(frames, len(self.body.rest))
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
                  "angular_velocity": angular_velocity, "colliders": colliders, "box": box,
-                 "driven": driven}  # fmt: skip
+                 "driven": driven, "gravity": gravity}  # fmt: skip
         if not differentiable:
             check_wants_no_gradients(**given)
         start, world = start_in(self.body, self.world, self.training_start, **given)
@@ -248,40 +244,14 @@ class Twin:
         warn_of_creep(self.body, world, self._episode.frame_dt, self._episode.substeps)
         return self._episode.state
 
-    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
-        """Go one step on: (state, reactions), see `mosa.twin.episode`.
-
-        action: for colliders by name (their number as a text where they have none), either `velocity` (3,) [m/s] and
-        `angular_velocity` (3,) [rad/s] in world axes, about the collider's origin, for this step, or the `position` (3,) [m] and
-        `rotation` ((3,) vector [rad] or (3, 3)) where it shall be after it; three numbers alone are a velocity. A collider that
-        was never in an action follows its own motion; one that was, but is not in this one, stands still.
-        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged."""
-        return self.episode.step(action)
-
-    @property
-    def episode(self) -> Episode:
-        """The motion that `reset` began. Errors: ConfigError before that."""
-        if self._episode is None:
-            raise ConfigError("twin: expected reset(...) before step and state, found no motion")
-        return self._episode
-
-    @property
-    def state(self) -> TwinState:
-        """Of the motion now; set it to go back to an earlier one, or to branch. `state.tensors()` are plain tensors to save, and
-        `TwinState.read` makes them a state again, after a reset with the same arguments."""
-        return self.episode.state
-
-    @state.setter
-    def state(self, state: TwinState) -> None:
-        self.episode.state = state
-
     @typed
-    def worlds(self, count: Count, laws: Tensor | None = None) -> TwinWorlds:
+    def worlds(self, count: Count, laws: Tensor | Sequence[Any] | None = None) -> TwinWorlds:
         """`count` copies of the body, each in a world of its own, that are reset and stepped together.
 
-        laws: (count, numbers) of a law for each, as `posterior.draws(count)` gives them, None for the learned one in all.
-        Errors: ConfigError."""
-        return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
+        laws: of each world values that differ from the twin's, [{"E": 1e4, "nu": 0.3}, ...], as `material.set` takes them; or
+        (count, numbers) as `posterior.draws(count)` gives them, in columns `posterior.names` (E as its logarithm); None for the
+        twin's law in all. Errors: ConfigError."""
+        return TwinWorlds(self, count, laws)
 
     @torch.no_grad()
     @typed
@@ -294,14 +264,12 @@ class Twin:
         zoom: Positive = 1.0,
         shadow: bool = True,
     ) -> Tensor:
-        """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and
-        among `colliders`, those that the rollout was simulated with (None: the world's). rollout:
-        or a list of the states of T steps, whose solids are drawn where they were then (None: those of
-        `reset`). Half spaces are not drawn. size [px]: of a square, or (width, height). view: (3,)
-        from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None
-        for the side and a little above. zoom: magnification about the middle of the motion. shadow: on
-        the ground, of the body and of the solids, under light from above.
-        Errors: ConfigError."""
+        """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and among `colliders`, those
+        that the rollout was simulated with (None: the world's). rollout: or a list of the states of T steps, whose solids are
+        drawn where they were then (None: those of `reset`). Half spaces are not drawn. size [px]: of a square, or (width,
+        height). view: (3,) from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None for the
+        side and a little above. zoom: magnification about the middle of the motion. shadow: on the ground, of the body and of
+        the solids, under light from above. Errors: ConfigError."""
         return self._pictures(*self._met(rollout, colliders), size, view, zoom, shadow)
 
     def _pictures(
@@ -363,13 +331,12 @@ class Twin:
         motion: Rollout | Sequence[TwinState],
         colliders: Sequence[Collider | Mapping[str, Any]] | None,
     ) -> tuple[Rollout, tuple[Collider, ...]]:
-        """(rollout, its solids), both as `render` takes them. Errors: ConfigError where it was not
-        simulated with as many."""
+        """(rollout, its solids), both as `render` takes them. Errors: ConfigError where it was not simulated with as many."""
         if isinstance(motion, Rollout):
             rollout, world = motion, self.world
             met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         else:
-            rollout, world = rollout_of(motion), self.episode.world
+            rollout, world = rollout_of(motion), (self._episode or self).world
             met = len(motion[0].collider_position)
         if rollout.x.shape[1:] != self.body.rest.shape:
             raise ConfigError(
@@ -391,18 +358,17 @@ class Twin:
 
     @typed
     def export(
-        self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "learned twin",
+        self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         size: Pixels = 400, fps: Positive | None = None, view: Views | None = None, zoom: Positive = 1.0,
         shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
-        """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
-        one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
-        images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those that
-        the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view, zoom
-        and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px
-        above and below. Errors, before anything is written: ConfigError where they are not, or a
-        format's or the video's program is missing."""
+        """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of
+        `colliders`; one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of
+        the body that its images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those
+        that the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view, zoom
+        and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px above and below.
+        Errors, before anything is written: ConfigError where they are not, or a format's or the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
         check_formats(formats)
         if video:
@@ -433,11 +399,10 @@ class Twin:
     def export_material(
         self, folder: str | Path, formats: MaterialFormats = ("json", "npz")
     ) -> Path:
-        """Write the material for other simulators into `folder`: `material.json` (E, nu, density,
-        damping, 6x6 stiffness, and what these leave out), `particles.npz` (points, volume, mass, E
-        and nu of every particle), and with newton_usd, mujoco or obj in `formats` `newton.usda`,
-        `mujoco.xml` or `surface.obj`. SI units. Errors: ConfigError for an unknown format, without
-        usd-core, or for a body thinner than a cell of the grid."""
+        """Write the material for other simulators into `folder`: `material.json` (E, nu, density, damping, 6x6 stiffness, and
+        what these leave out), `particles.npz` (points, volume, mass, E and nu of every particle), and with newton_usd, mujoco
+        or obj in `formats` `newton.usda`, `mujoco.xml` or `surface.obj`. SI units. Errors: ConfigError for an unknown format,
+        without usd-core, or for a body thinner than a cell of the grid."""
         return export_material(self, folder, formats)
 
     def summary(self) -> str:

@@ -89,8 +89,8 @@ class Live:
         """What `Twin.reset` takes."""
         heading, axis = self.axes(drop)
         return {
-            "rotation": (*axis, drop.tilt), "height": float(drop.height), "velocity": tuple(drop.speed * heading),
-            "angular_velocity": tuple(2 * math.pi * drop.spin * axis),
+            "rotation": (*(axis if drop.tilt else self.up), drop.tilt), "height": float(drop.height),
+            "velocity": tuple(drop.speed * heading), "angular_velocity": tuple(2 * math.pi * drop.spin * axis),
         }  # fmt: skip
 
     def home(self) -> np.ndarray:

@@ -148,8 +148,26 @@ def test_the_states_of_steps_are_shown_as_the_rollout_is(tmp_path):
     assert len(clip.times) == 4 and clip.solids == (Box((0.6, 0.1, 0.6)),)
     with pytest.raises(ConfigError, match="expected the 1 that"):
         one.export(moved, tmp_path, colliders=[])
+    worlds = one.worlds(2)
+    both = [
+        worlds.reset([{}, {"position": (0.02, None, 0)}], colliders=[plate]),
+        worlds.step().state,
+    ]
+    with pytest.raises(
+        ConfigError, match=r"^rollout: .* \(of worlds: each.world\(0\)\), found \[Twin"
+    ):
+        one.export(both, tmp_path)
+    one.export([each.world(1) for each in both], tmp_path, video=False, colliders=[plate])
+    saved = np.load(tmp_path / "rollout.npz")
+    assert np.array_equal(saved["simulation/x"][1], both[1].positions[1])
+    assert saved["simulation/collider_position"][1, 0] == pytest.approx(
+        both[1].collider_position[1, 0]
+    )
+    for state, number in ((both[0], 2), (both[0], -1), (moved[0], 0)):
+        with pytest.raises(ConfigError, match=rf"^world: expected one of x .*, found {number}"):
+            state.world(number)
     for wrong in (moved[::-1], [moved[0], moved[0]], [], [moved[0], rollout]):
-        with pytest.raises(ConfigError, match=r"^rollout: expected a Rollout, .* or a list of the"):
+        with pytest.raises(ConfigError, match=r"^rollout: expected a Rollout, or a list of the"):
             one.render(wrong)
 
 

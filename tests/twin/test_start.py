@@ -90,6 +90,8 @@ def test_a_plane_that_faces_another_way_and_a_mesh_in_millimetres_are_named(tmp_
     [
         ({"rotation": (0, 1, 0, 1.57)}, r"found 1.57, which is 90 degrees in radians"),
         ({"colliders": [{**FLOOR, "rotation": (1, 0, 0, -3.1416)}]}, r"180 degrees in radians"),
+        ({"rotation": (0.7071, 0, 0.7071, 0)}, r"^rotation: .* turns by 0 degrees: was it a quat"),
+        ({"colliders": [{**FLOOR, "rotation": (0.924, 0.383, 0, 0)}]}, r"was it a quaternion\?"),
         ({"height": 200}, r"^height: expected metres above the ground, found 200 m for a body of"),
         (
             {"colliders": [{"type": "sphere", "radius": 0.1, "position": [-325, 100, 0]}]},
@@ -175,6 +177,22 @@ def test_a_rollout_takes_as_many_substeps_as_it_is_told():
     assert made.simulate(frames=3, substeps=64, **STILL).counts == (64, 64)
     with pytest.raises(ConfigError, match="substeps"):
         made.simulate(frames=3, substeps=1, **STILL)
+
+
+def test_another_gravity_is_that_of_the_fall():
+    made, pull = twin(), (0.5, -1.62, 0.0)
+    state = made.reset(gravity=pull, **STILL)
+    first = state.positions.mean(0)
+    for _ in range(4):
+        state = made.step().state
+    fallen = 0.5 * torch.tensor(pull) * (4 * FRAME_DT) ** 2
+    torch.testing.assert_close(state.positions.mean(0) - first, fallen, rtol=0, atol=1e-5)
+    x = made.simulate(gravity=pull, frames=5, **STILL).x[-1]
+    torch.testing.assert_close(x, state.positions, rtol=0, atol=1e-6)
+    assert float(made.world.gravity[1]) == pytest.approx(-9.8)
+    for wrong in (-1.62, (0, -1.62), "moon"):
+        with pytest.raises(ConfigError, match=r"^gravity: expected three finite numbers"):
+            made.reset(gravity=wrong)
 
 
 def test_a_value_of_the_material_is_named_as_it_was_set():

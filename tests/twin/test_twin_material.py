@@ -76,6 +76,93 @@ def test_a_value_out_of_range_is_named():
     assert material.nu == pytest.approx(NU)
 
 
+def test_an_unknown_value_is_named_with_those_of_the_law():
+    material = twin(adapter=False).material
+    known = "expected one of E, nu, damping, bulk_damping, density"
+    with pytest.raises(ConfigError, match=f"^rho: unknown value; {known}$"):
+        material.set(rho=900)
+    with pytest.raises(ConfigError, match=f"^densty: unknown value; {known}; the nearest is dens"):
+        material.densty = 900
+    with pytest.raises(
+        ConfigError, match=r"^yield: unknown value; expected one of E, yield_stress, nu"
+    ):
+        material.set(law="von_mises", **{"yield": 2e4})
+    with pytest.raises(ConfigError, match=r"^E goes with nu, found E, yield_stress"):
+        material.set(law="von_mises", E=1e5, yield_stress=2e4)
+
+
+NUMBERS = 0.2 * torch.randn(19, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("preset, laws", [
+    (None, [{"E": 2 * E}, {"nu": 0.2, "E": 2 * E}, {}]),
+    ("jelly", [{"E": 2e4}, {}]), ("clay", [{"yield_stress": 1e3}, {}]), ("honey", [{"mu": 10.0}, {"kappa": 1e4}]),
+])  # fmt: skip
+def test_worlds_of_other_values_are_twins_whose_material_was_set(preset, laws):
+    def made():
+        found = twin(numbers=NUMBERS, modes=True)
+        if preset:
+            found.material.preset(preset)
+        return found
+
+    together, motion = made(), {"height": 0.02, "frames": 6, "substeps": 160}
+    worlds = together.worlds(len(laws), laws=laws)
+    before = together.material.parameters
+    worlds.reset({"height": motion.pop("height")}, **motion)
+    for _ in range(5):
+        found = worlds.step().state.positions
+    for b, values in enumerate(laws):
+        alone = made()
+        alone.material.set(**values)
+        assert together.material.parameters == before != alone.material.parameters or not values
+        expected = alone.simulate(height=0.02, **motion).x[-1]
+        assert torch.allclose(found[b], expected, rtol=0, atol=1e-9)
+    assert float((found[0] - found[1]).abs().max()) > 1e-5
+
+
+def test_values_that_worlds_cannot_differ_in_are_named():
+    made = twin(adapter=False)
+    for values, said in (
+        ({"rho": 1.0}, "rho: unknown value; expected one of E, nu, "),
+        ({"nu": 0.7}, "nu: expected a number between 0 and 0.49"),
+        ({"E": "soft"}, "E: expected a number"),
+        (
+            {"density": 900},
+            r"laws\[1\]: worlds differ in E, nu, .* found density; twin.material.set",
+        ),
+        ({"damping": 5.0}, r"laws\[1\]: worlds differ in E, nu, .* found damping;"),
+        ({"nu": 0.0}, r"laws\[1\]: worlds differ in E, nu, inside their ranges, found nu;"),
+    ):
+        with pytest.raises(ConfigError, match=f"^{said}"):
+            made.worlds(2, laws=[{}, values])
+    for laws in ({"E": 1e4}, [{"E": 1e4}], [1e4, 2e4]):
+        with pytest.raises(
+            ConfigError, match=r"^laws: expected one for each of 2 worlds, .*, or \[{'E'"
+        ):
+            made.worlds(2, laws=laws)
+
+
+def rebound(worlds, **options):
+    """[m] of the lowest point after the first bounce, by world."""
+    worlds.reset({"height": 0.1}, frames=20, **options)
+    low = torch.stack([worlds.step().state.positions[..., 1].amin(1) for _ in range(20)])
+    return [float(path[int(path.argmin()) :].max()) for path in low.mT]
+
+
+def test_substeps_damp_and_worlds_of_unlike_stiffness_say_so():
+    made = twin(adapter=False, precision=32)
+    alone = made.worlds(1)
+    heights = [rebound(alone, substeps=count)[0] for count in (20, 40, 80, 160)]
+    assert heights == sorted(heights, reverse=True) and heights[-1] < 0.9 * heights[0]
+    both = made.worlds(2, laws=[{}, {"E": 50 * E}])
+    with pytest.warns(
+        UserWarning, match=r"^laws: all .* alone, world 0 takes \d+ and bounces high"
+    ):
+        soft, _ = rebound(both)
+    assert soft == pytest.approx(rebound(alone, substeps=both.episode.substeps)[0], rel=1e-4)
+    assert soft < 0.95 * rebound(alone)[0]
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_can_be_simulated(name):
     made = twin(modes=True, precision=32)
@@ -107,8 +194,18 @@ def test_summary_and_reprs_are_short_and_have_units():
     state = made.reset(frames=2)
     rollout = made.simulate(frames=2)
     sure = Posterior([f"a[{i}]" for i in range(70)], torch.zeros(70), torch.eye(70), torch.ones(70))
-    for each in (state, rollout, made.world, made.training_start, made.body, made.worlds(2), sure):
+    for each in (
+        state,
+        made.step(),
+        rollout,
+        made.world,
+        made.training_start,
+        made.body,
+        made.worlds(2),
+        sure,
+    ):
         assert len(repr(each)) < 500 and type(each).__name__ in repr(each)
+    assert repr(made.step()).startswith("Stepped(state=TwinState(x=(120, 3)")
     assert "x=(2, 120, 3)" in repr(rollout) and repr(made.worlds(2)).startswith(
         "TwinWorlds(2 worlds"
     )

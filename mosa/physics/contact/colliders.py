@@ -295,6 +295,9 @@ def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
             f"rotation: expected (ax, ay, az, degrees), found {value.tolist()}, a quaternion by "
             "its norm of 1"
         )
+    if float(value[3]) == 0 and int((value != 0).sum()) > 1 and abs(float(value.norm()) - 1) < 1e-3:
+        told = f"rotation: {value.tolist()} turns by 0 degrees: was it a quaternion?"
+        warnings.warn(told, stacklevel=5)
     found = [abs(float(value[3])) / math.radians(each) for each in TURNS]
     if near := [each for each, ratio in zip(TURNS, found) if abs(ratio - 1) < 1e-3]:
         warnings.warn(

@@ -121,9 +121,7 @@ def check_above(planes: np.ndarray, ends: np.ndarray, x: Tensor) -> None:
     normals, offsets = planes[:, None, :3], planes[:, 3, None]
     boxes = ends.reshape(2, -1, 3)
     highest = np.maximum(normals * boxes[0], normals * boxes[1]).sum(-1) - offsets
-    askew = (
-        np.abs(normals[:, 0]).max(-1) < 1
-    )  # a box reaches farther along such normals than the body in it
+    askew = np.abs(normals[:, 0]).max(-1) < 1  # there a box reaches farther than the body in it
     if askew.any():
         there = x.detach() @ torch.from_numpy(normals[askew, 0]).to(x).T
         highest[askew] = there.amax(-2).reshape(len(boxes[0]), -1).T.cpu().numpy() - offsets[askew]

@@ -241,7 +241,7 @@ def test_an_argument_of_the_wrong_form_is_named(arguments, message):
 
 
 def test_a_start_is_put_beside_where_the_training_was():
-    """The body moves as from its own place, numbers that are None are kept, and the height wins along `up`."""
+    """The body moves as from its own place, numbers that are None are kept, and a height takes the place of the one along `up`."""
     made = twin()
     usual = made.simulate(frames=3)
     aside = made.simulate(
@@ -249,7 +249,11 @@ def test_a_start_is_put_beside_where_the_training_was():
     )  # whole cells, so that the grid lies the same
     moved = torch.tensor([0.12, 0.0, -0.06])
     torch.testing.assert_close(aside.x, usual.x + moved, rtol=0, atol=1e-5)
-    high = made.simulate(frames=1, position=(0.12, 5.0, 0.0), height=0.2)
+    high = made.simulate(frames=1, position=(0.12, None, 0.0), height=0.2)
+    with pytest.raises(
+        ConfigError, match=r"^position: expected None for y beside height=0.2, found 5"
+    ):
+        made.simulate(frames=1, position=(0.12, 5.0, 0.0), height=0.2)
     assert float(high.x[0, :, 1].min()) == pytest.approx(0.2, abs=1e-5)
     for wrong in ([0.1, 0.2], "here", [0.0, float("inf"), 0.0], [True, 0.0]):
         with pytest.raises(ConfigError, match="position: expected three finite numbers"):
