@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import functools
 import os
+import sys
+import threading
+from collections.abc import Callable
 
 import warp as wp
+
+ONE_PARSER = sys.version_info < (3, 11, 8) or (3, 12) <= sys.version_info < (3, 12, 2)
+"""CPython's `ast.parse` keeps its depth for all threads together (gh-106905): it fails where garbage collection lets another in."""
 
 
 @functools.cache
 def start_warp() -> None:
-    """Initialise Warp. Its library writes to the file of stderr itself that there is no driver."""
+    """Initialise Warp. Its library writes to the file of stderr itself that there is no driver. It parses each kernel that is made:
+    films do so in a thread beside the reconstruction, so `ast.parse` is for one thread at a time where Python needs that."""
+    if ONE_PARSER:
+        ast.parse = _one_at_a_time(ast.parse)
     wp.config.log_level = wp.LOG_WARNING
     if has_driver():
         wp.init()
@@ -29,6 +39,17 @@ def start_warp() -> None:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(silent)
+
+
+def _one_at_a_time(function: Callable) -> Callable:
+    lock = threading.RLock()
+
+    @functools.wraps(function)
+    def alone(*args, **kwargs):
+        with lock:
+            return function(*args, **kwargs)
+
+    return alone
 
 
 def has_driver() -> bool:
