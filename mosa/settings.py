@@ -205,8 +205,10 @@ def mistake(
 
 
 def nearest(key: str, known: list[str], where: str) -> str:
-    """The end of a message on an unknown key: which known one is like it, nothing where none is."""
-    near = get_close_matches(key, known, 1)
+    """The end of a message on an unknown key: which known one is like it, first one that
+    begins it (no_rot of no_rotation), nothing where none is."""
+    near = get_close_matches(key, known, 3)
+    near.sort(key=lambda name: not key.startswith(name) or key[len(name) :][:1] == ".")
     return f"; the nearest is {f'{where}.{near[0]}'.strip('.')}" if near else ""
 
 

@@ -77,8 +77,8 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
         if ";" in "".join(header):
             wrong += ": separate columns by commas, and write numbers with a decimal point"
         raise DataError(
-            f"tests: {path}: expected the columns {', '.join(NEEDED)} and of "
-            f"{', '.join(COLUMNS)} any others, found {wrong}"
+            f"tests: {path}: expected the columns {', '.join(NEEDED)}, and if wanted "
+            f"{', '.join(name for name in COLUMNS if name not in NEEDED)}; found {wrong}"
         )
     if not rows:
         raise DataError(f"tests: {path}: expected rows below the header, found none")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,10 +18,12 @@ from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_of_idle
 from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import RunRecord
+from mosa.data.io.forces import curves_of, forces_from_config
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.modules.body.body import Body, Start, World
+from mosa.modules.fitting.search.backbone import FURTHEST
 from mosa.physics.contact.colliders import Collider, colliders_from_config
 from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.overlap import check_clear
@@ -127,11 +130,36 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
             )
 
 
+def check_curves(cfg: DictConfig, scenes: Sequence[Scene]) -> None:
+    """Measured forces cover frames of their film; scenes: the training film first. Errors: ConfigError."""
+    curves = forces_from_config(plain(cfg.world).get("forces"))
+    for scene in scenes:
+        for curve in curves_of(curves, scene.sequence, scene is scenes[0]):
+            curve.means(len(scene.training_frames), float(scene.times[1] - scene.times[0]))
+
+
 def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
     """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
     for prefix, start in found.items():
         x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
         check_clear(world.colliders, x, f"the body of {prefix}", spacing=body.spacing)
+
+
+def check_held(world: World, body: Body) -> None:
+    """Something touches the body that is to deform, and its stiffness can bear its weight, up to where a calibration searches.
+    Errors: ConfigError naming the key."""
+    if not (world.ground or world.planes or world.colliders or world.driven):
+        raise ConfigError(
+            "world.driven: expected something that holds, drives or touches the body (a clamp or grip; or scene.ground, "
+            "world.walls, world.colliders), found nothing: in free flight it does not deform, so nothing determines its law"
+        )
+    E = float(body.material.physical().get("E", torch.tensor(math.inf)).detach())
+    weight = body.density * float(world.gravity.norm()) * body.size
+    if FURTHEST * E < weight:
+        raise ConfigError(
+            f"prior.parameters.E: expected Pa (1 MPa is 1e6), found {E:.3g}: the body's weight is a pressure of {weight:.3g} Pa "
+            f"(density {body.density:g} kg/m^3, {body.size:.3g} m), and a search goes up to {FURTHEST:g} times the start"
+        )
 
 
 def warn_of_little(

@@ -41,7 +41,9 @@ from mosa.training.outputs import figures_of, optimized, start_figures, write_ou
 from mosa.training.preflight import (
     check_begin,
     check_configuration,
+    check_curves,
     check_evaluation,
+    check_held,
     check_seen,
     check_starts,
     evaluated_scene,
@@ -108,6 +110,7 @@ def train(cfg: DictConfig) -> float | None:
             _ = data.scenes
     if begun is not None:
         check_same_data(begun, data.fingerprints, cfg.ckpt_path)
+    check_curves(cfg, [scene] if scene.synthetic else [scene, *data.scenes[1]])
     filmed = scene.markers is None
     if filmed:
         check_seen(cfg, scene)
@@ -165,6 +168,7 @@ def train(cfg: DictConfig) -> float | None:
 def learn(module: LitMosa, data: SceneDataModule, trainer: L.Trainer, ckpt_path: str | None) -> str:
     """The run's fit, from its checks to its warnings. Returns what `fit` does. Errors: MosaError."""
     body, starts, recordings = module.body, data.starts, [data.scene, *data.scenes[1]]
+    check_held(module.world, body)
     check_starts(module.world, body, starts)
     warn_of_little(module.world, body, starts, recordings)
     warn_of_other_bodies(body, starts, recordings)

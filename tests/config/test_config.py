@@ -57,6 +57,7 @@ def test_a_mistyped_option_is_refused(override):
 
 @pytest.mark.parametrize("override, message", [
     ("prior=neo_hokean", r"prior: expected .*, found neo_hokean; .*neo_hookean; .* hydra\.searchpath"),
+    ("ablation=no_rotation", "found no_rotation; the nearest is no_rot;"),
     ("callbacks=[default,early_stoping]", "callbacks: expected one of default, early_st.*nearest is early_stopping"),
     ("hydra/launcher=rai", "hydra/launcher: expected one of .*basic"),
     ("prior=null", r"prior: expected one of auto, .*, found null; without prior= "),

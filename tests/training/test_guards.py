@@ -6,11 +6,13 @@ import os
 import struct
 import sys
 import zlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 from omegaconf import OmegaConf
+from small_bodies import small_body
 from strangers import checkpoint, saved
 
 from mosa.config.build import rehearse
@@ -20,9 +22,17 @@ from mosa.data.images.reading import check_amount, read_image
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.mesh import field_of_mesh
+from mosa.physics.world import World
 from mosa.reconstruction.cache import StageCache
 from mosa.system.limits import machine_memory
-from mosa.training.preflight import check_begin, check_configuration, check_particles, check_seen
+from mosa.training.preflight import (
+    check_begin,
+    check_configuration,
+    check_curves,
+    check_held,
+    check_particles,
+    check_seen,
+)
 from mosa.training.run_folder import read_figures
 from mosa.types import Ground
 from tests.config.test_command_settings import composed
@@ -51,6 +61,36 @@ def test_walls_beside_a_ground_that_slopes_are_refused_before_the_reconstruction
         ConfigError, match=r"plane 0 .*mode sticky.*right angles.*scene\.ground\.mode=touch"
     ):
         check_seen(cfg, scene)
+
+
+def test_a_body_that_nothing_touches_is_refused_before_its_fit():
+    body = small_body(adapter=False, E=1e4)
+    free = World(
+        None, torch.tensor([0.0, -9.8, 0.0]), torch.tensor([0.0, 1.0, 0.0]), torch.zeros(2, 3)
+    )
+    with pytest.raises(ConfigError, match=r"world\.driven: .*clamp.*found nothing: in free flight"):
+        check_held(free, body)
+    held = replace(free, ground=Ground(0.0, "sticky"))
+    check_held(held, body)
+    with torch.no_grad():
+        body.material.raw["E"].fill_(math.log(0.2))
+    weight = 9.8 * body.density * body.size
+    with pytest.raises(ConfigError, match=rf"E: expected Pa .*found 0\.2: .* of {weight:.3g} Pa"):
+        check_held(held, body)
+
+
+@pytest.mark.parametrize("recording", [None, "again"])
+def test_a_force_beside_the_film_is_refused_before_the_reconstruction(tmp_path, recording):
+    """As one whose times are milliseconds."""
+    (tmp_path / "cell.csv").write_text("time,fy\n20,1\n560,2\n")
+    entry = {"of": "plate", "file": str(tmp_path / "cell.csv"), "recording": recording}
+    films = [SimpleNamespace(sequence=name, training_frames=range(14), times=0.04 * torch.arange(14))
+             for name in ("press", "again")]  # fmt: skip
+    cfg = OmegaConf.create({"world": {"forces": [entry]}})
+    with pytest.raises(ConfigError, match=r"'plate' that covers .*0 to 0\.52 s.*found 20 to 560 s"):
+        check_curves(cfg, films)
+    (tmp_path / "cell.csv").write_text("time,fy\n0.02,1\n0.56,2\n")
+    check_curves(cfg, films)
 
 
 def test_a_fit_goes_on_from_its_own_checkpoint_alone(tmp_path):

@@ -69,7 +69,7 @@ class ForceCurve:
     def means(self, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
         """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its
         standard deviation (T - 1, 3) [N], with what a grid gets wrong). The samples are joined by
-        straight lines."""
+        straight lines. Errors: ConfigError where they cover none."""
         ends = frame_dt * torch.arange(frames, dtype=torch.float64)
         whole = torch.zeros(1, 3, dtype=torch.float64)
         steps = 0.5 * (self.forces[1:] + self.forces[:-1]) * self.times.diff()[:, None]
@@ -86,6 +86,11 @@ class ForceCurve:
         covered = (ends[:-1] >= self.times[0] - slack) & (ends[1:] <= self.times[-1] + slack)
         mean[~covered] = torch.nan
         mean[blanks[at][1:] > blanks[at - 1][:-1]] = torch.nan
+        if not bool(torch.isfinite(mean).any()):
+            raise ConfigError(
+                f"world.forces: expected a curve of {self.of!r} that covers an interval between frames (0 to "
+                f"{float(ends[-1]):.6g} s), found {float(self.times[0]):.6g} to {float(self.times[-1]):.6g} s"
+            )
         inside = (self.times[:, None] > ends[:-1]) & (self.times[:, None] <= ends[1:])
         count = inside.sum(0).clamp_min(1)[:, None]
         sd = (self.noise() ** 2 / count + (MODEL_ERROR * self.largest) ** 2).sqrt().expand_as(mean)
@@ -200,11 +205,6 @@ def compared_forces(
         )
     for curve, column in zip(curves, columns_of(curves, world.solids)):
         mean, sd = (t.to(rollout.x.device) for t in curve.means(len(rollout.x), frame_dt))
-        if not bool(torch.isfinite(mean).any()):
-            raise ConfigError(
-                f"world.forces: expected a curve of {curve.of!r} that covers an interval between "
-                f"frames, found {curve.times[0]:.6g} to {curve.times[-1]:.6g} s"
-            )
         felt = rollout.reactions.mean(1)[:, column, :3].double()
         there = torch.isfinite(mean)
         parts.append((felt[there], mean[there], sd[there]))

@@ -230,9 +230,12 @@ class Material(nn.Module):
                 f"by {', '.join(parameters)} (mu, lam come from E, nu)"
             )
         if takes != gives:
+            idle = [n for n in parameters if not takes.issuperset(GIVES.get(n, (n,)))]
+            lacks = f"none for {', '.join(sorted(takes - gives))}" if takes - gives else ""
+            found = " and ".join(filter(None, (", ".join(idle), lacks)))
             raise ConfigError(
-                f"prior.parameters: law {law} takes {', '.join(sorted(takes))}; {', '.join(parameters)} give "
-                f"{', '.join(sorted(gives))} (mu, lam come from E, nu; friction_alpha from friction_angle)"
+                f"prior.parameters: law {law} takes {', '.join(sorted(takes))} (mu, lam come from E, nu; friction_alpha "
+                f"from friction_angle), found {found}"
             )
 
     def _add(self, name: str, value: float | Sequence[float], learned: bool) -> None:

@@ -182,8 +182,8 @@ class SecondLook:
             modes, matrices, about, positions, second[1], second[0], first_contact
         )
         log.info(
-            "motion of %s: its bias towards the prediction is measured by a second prediction: the weight of the prediction is "
-            "%.3g of the images' (median direction), which explains %.0f%% of the change",
+            "motion of %s: found about two predictions, to see how far it follows them: a prediction weighs %.3g times as much "
+            "as the images (median direction); this explains %.0f%% of the difference between the two",
             self.scene.sequence, strength, 100 * (1 - left),
         )  # fmt: skip
         return self.cues(positions), response if left < UNEXPLAINED else None

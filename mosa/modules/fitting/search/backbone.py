@@ -96,6 +96,7 @@ class Starts:
         modulated = self.material.modulated
         self.modulated = [n for n in STIFFNESS if n in self.learned and n in modulated]
         self._scores: dict[tuple[float, ...], float] = {}
+        self.failed: Exception | None = None  # of a start that cannot be simulated
         seats, body = len(calibration.newton.seats), calibration.body
         self._bodies = [*(copy.deepcopy(body) for _ in range(seats - 1)), body]
 
@@ -138,7 +139,8 @@ class Starts:
         try:
             self.begin_at(row, body)
             return self.calibration.score(body=body)
-        except (SimulationDiverged, ConfigError):
+        except (SimulationDiverged, ConfigError) as error:
+            self.failed = error
             return math.inf
         finally:
             self._bodies.append(body)
@@ -207,7 +209,7 @@ def rows_of_grid(starts: Starts, columns: Sequence[dict[str, float]]) -> list[di
     if not math.isfinite(grid[best()]):
         raise SimulationDiverged(
             "fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
-            "nearer to the body's, or raise simulation.max_substeps"
+            f"nearer to the body's, or raise simulation.max_substeps ({starts.failed})"
         )
     numbers: dict[tuple[int, int], float | None] = {place: middle for place in grid}
     nearest = sorted(grid, key=grid.__getitem__)[:NEAREST]
