@@ -54,6 +54,9 @@ def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stag
             return f"fit.{own} runs {runs}"
         return "no stage runs Gauss-Newton" if need == "newton" else (
             "all stages run Gauss-Newton, which compares motion cues alone (fit=adam does not)")  # fmt: skip
+    if need == "adapted":
+        alone = stages and all(stage.newton and stage.calibrates for stage in stages)
+        return "an isotropic law is calibrated on positions alone" if alone else None
     key, unequal, value = need.partition("!=") if "!=" in need else need.partition("=")
     found = word(getattr(settings, key))
     return (
@@ -66,8 +69,10 @@ def sentences(
 ) -> Iterator[str]:
     """One for each key of the overrides (KEY=VALUE), and each weight of another package's loss term, that has no effect."""
     given = [override.partition("=")[0].lstrip("+~").split("@")[0] for override in overrides]
-    further = settings.losses.model_extra or {}  # without defaults: somebody set them
-    set_ = [f"losses.{name}" for name, weight in further.items() if weight]
+    # without defaults: somebody set them; and what an option of another group switches off, as ablation=no_rot does
+    losses, fields = settings.losses, type(settings.losses).model_fields
+    set_ = [f"losses.{name}" for name, weight in (losses.model_extra or {}).items() if weight]
+    set_ += [f"losses.{n}" for n, f in fields.items() if f.default and not getattr(losses, n)]
     for key in dict.fromkeys([*given, *set_]):
         if (reason := without_effect(settings, key.split("."), stages)) is not None:
             yield f"{key}: has no effect in this run: {reason}"

@@ -19,4 +19,4 @@ class EvaluationSettings(Settings):
     assignment: Count = 512
     """points of the exact assignment of the earth mover's distance"""
     video: bool = True
-    """make video.mp4 and strip.png"""
+    """make video.mp4"""

@@ -29,6 +29,7 @@ from mosa.evaluation.analysis.tables import (
     parameter_table,
     results_table,
     unexplained_text,
+    worse_text,
 )
 from mosa.evaluation.evaluate import (
     Sequence,
@@ -121,22 +122,25 @@ def write_outputs(
     marked = [s for s in evaluated if s.scene.markers is not None]
     if marked:
         write_markers(folder, body, marked, kept, video=cfg.evaluation.video)
-    elif cfg.evaluation.video:
+    else:
         simulated = [s for s in evaluated if TITLES.keys() & kept[s.prefix].keys()]
         shown = [s for s in simulated if s.prefix.startswith("test")] or simulated[:1]
         if shown:
             far = (distances(body, s.scene, kept[s.prefix]).values() for s in shown)
             limit = error_limit(d for each in far for d in each)
             compared = {s.prefix: compare(body, s, kept[s.prefix], limit=limit) for s in shown}
-            write_comparisons(folder, compared)
-    law = body.material.law
+            write_comparisons(folder, compared, video=cfg.evaluation.video)
+    law, learned = body.material.law, body.material.learned
+    fixed = [n for n in body.material.physical() if not {n, f"{n[:-2]}_1"}.intersection(learned)]
+    fixed += ["contact_offset_m"] * (world.ground is None)
     if doubt := unexplained_text(figures, world):
         warn(
             "the learned law does not explain the motion: see the first lines of results.md",
             stacklevel=1,
         )
-    parts = (note, doubt, results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
-             determined_text(figures, law), force_lines(figures), geometry_lines(figures))  # fmt: skip
+    parts = (note, doubt or worse_text(figures), results_table(figures), columns_text(figures, evaluated[0].scene.name),
+             parameter_table(figures, law, fixed), determined_text(figures, law), force_lines(figures),
+             geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:
         partial.write_text(table + "\n")

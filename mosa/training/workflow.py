@@ -124,15 +124,15 @@ def train(cfg: DictConfig) -> float | None:
     cm3 = 1e6 * float(shape.volume.sum())
     log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), cm3, dx)
     resolved = resolution(shape.rest, data.reconstruction.spacing, dx)
-    if not resolved.enough:
-        warnings.warn(
-            f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
-            f"{ENOUGH:g}: the grid makes them too stiff and the learned law compensates for it, so it may predict worse "
-            f"than its prior; take about {resolved.particles} particles{', or adapter=none' if cfg.adapter.name else ''}",
-            stacklevel=1,
-        )
+    thin = "" if resolved.enough else (
+        f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
+        f"{ENOUGH:g}: the grid makes them too stiff and the learned law compensates for it, so it may predict worse "
+        f"than its prior; take about {resolved.particles} particles{', or adapter=none' if cfg.adapter.name else ''}"
+    )  # fmt: skip
+    if thin:
+        warnings.warn(thin, stacklevel=1)
     with timed(times, "starts"):
-        if filmed and cfg.evaluation.video:
+        if filmed:
             write_first_picture(folder, data, trainer.loggers)
         starts = data.starts
     for prefix, start in starts.items():
@@ -161,7 +161,7 @@ def train(cfg: DictConfig) -> float | None:
     logged = trainer.callback_metrics.items()
     figures |= {k: float(v) for k, v in logged if k.startswith(VALIDATION)}
     log_outcome(trainer.loggers, plain(cfg), figures)
-    write_outputs(folder, cfg, body, evaluated, figures, kept, world, cut)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world, f"{cut}\n\n{thin}".strip())
     return optimized(figures, cfg.optimized_metric)
 
 

@@ -53,6 +53,9 @@ def test_a_script_of_one_s_own_hears_it_too(monkeypatch):
     (["simulation.dx=0.01", "simulation.particles=500", "simulation.min_substeps=3"],
      ["simulation.particles", "simulation.min_substeps"]),
     (["reconstruction.carried.iterations=0", "reconstruction.carried.degree=2"], ["reconstruction.carried.degree"]),
+    (["ablation=no_motion"], ["losses.flow"]), (["ablation=no_motion", "fit=adam"], []), (["ablation=no_rot"], []),
+    (["ablation=no_rot", "adapter=none", "heterogeneity.enabled=false"], ["losses.rotation"]),
+    (["ablation=no_rot", "adapter=none", "heterogeneity.enabled=false", "fit=adam"], []),
     (["scene=tiny", "simulation.adaptive=true", "simulation.min_substeps=3", "seed=3"], []),
 ])  # fmt: skip
 def test_what_has_no_effect_is_said(overrides, expected):

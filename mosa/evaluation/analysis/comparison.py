@@ -101,9 +101,8 @@ def compare(
 ) -> Comparison:
     """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
-    The error is each particle's distance to the true motion where that is known, else the difference of the images.
-    limit [m]: the distance that has the last colour (`error_limit` of this sequence).
-    """
+    The error is each particle's distance to the true motion where that is known, else the difference of the images. limit [m]: the
+    distance that has the last colour (`error_limit` of this sequence)."""
     scene, view = shown.scene, View.of(shown.scene, body.size, width)
     seen_of = {
         v: view.drawn(seen(body, variants[v].x, variants[v].F_tot)) for v in TITLES if v in variants
@@ -291,13 +290,15 @@ def legend(shown: Comparison) -> np.ndarray:
     return picture
 
 
-def write_comparisons(folder: Path, shown: Mapping[str, Comparison]) -> None:
-    """video.mp4 of the last sequence and strip.png of all. shown: by the prefix of the sequence."""
+def write_comparisons(folder: Path, shown: Mapping[str, Comparison], *, video: bool = True) -> None:
+    """strip.png of all sequences; video: also video.mp4 of the last. shown: by the prefix of the sequence."""
     prefix, last = list(shown.items())[-1]
     below = {last.label: np.repeat(legend(last)[None], len(last.moments), 0)}
     below |= {f"{title}: {last.label}": images for title, images in last.errors.items()}
     footer = [f"{prefix}   {moment}" for moment in last.moments]
-    write_video(folder / "video.mp4", side_by_side(last.images, below=below, footer=footer), fps=6)
+    if video:
+        film = side_by_side(last.images, below=below, footer=footer)
+        write_video(folder / "video.mp4", film, fps=6)
     rows, notes = {}, {}
     for prefix, each in shown.items():
         notes[f"{prefix}: real"] = each.moments

@@ -31,10 +31,9 @@ def write_markers(
     *,
     video: bool = False,
 ) -> None:
-    """markers.npz with `<name>/measured`, `<name>/predicted` [T, M, 3] (m), `<name>/times` [T] (s),
-    points in the order of `scene.tracked`; markers.png: displacements [mm] of the points that move most, along the axis in
-    which they do, measured (dots) and predicted (lines). video: also video.mp4 of the last sequence
-    and strip.png of the first swing of all (`film`)."""
+    """markers.npz with `<name>/measured`, `<name>/predicted` [T, M, 3] (m), `<name>/times` [T] (s), points in the order of
+    `scene.tracked`; markers.png: displacements [mm] of the points that move most, along the axis in which they do, measured (dots)
+    and predicted (lines); strip.png: the first swing of all (`film`). video: also video.mp4 of the last sequence."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
@@ -54,10 +53,9 @@ def write_markers(
         own = {"measured": measured, "predicted": predicted, "times": times}
         arrays |= {f"{s.prefix}/{name}": values for name, values in own.items()}
         moved = measured - s.scene.markers.rest.numpy()
-        if video:
-            films[s.prefix] = film(body, s.scene, kept[s.prefix]["adapted"], measured, predicted)
-            far = np.linalg.norm(predicted - predicted[0], axis=-1).mean(1)
-            swings[s.prefix] = min(2 * int(far.argmax()), len(times) - 1)
+        films[s.prefix] = film(body, s.scene, kept[s.prefix]["adapted"], measured, predicted)
+        far = np.linalg.norm(predicted - predicted[0], axis=-1).mean(1)
+        swings[s.prefix] = min(2 * int(far.argmax()), len(times) - 1)
         spread = np.nanstd(moved, 0)
         along = int(spread.sum(0).argmax())
         for k, m in enumerate(np.argsort(-spread[:, along])[:SHOWN]):
@@ -78,9 +76,9 @@ def write_markers(
         said = "red measured, blue predicted"
         prefix = list(films)[-1]
         footer = [f"{prefix}   {moment}" for moment in moments[prefix]]
-        write_video(
-            folder / "video.mp4", side_by_side({said: films[prefix]}, footer=footer), fps=20
-        )
+        if video:
+            shown = side_by_side({said: films[prefix]}, footer=footer)
+            write_video(folder / "video.mp4", shown, fps=20)
         most = max(swings.values()) + 1
         write_strip(
             folder / "strip.png",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
+from mosa.data.io.forces import FAR
 from mosa.evaluation.metrics import IMAGE_METRICS, MOTION_METRICS
 from mosa.modules.body.material import RELATIVE, unit_of
 from mosa.modules.fitting.search.ground import (
@@ -83,16 +84,17 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
     return [n for n in ("train", "frames", "camera") if n in names] + others
 
 
-def parameter_table(figures: Mapping[str, float], law: str) -> str:
+def parameter_table(figures: Mapping[str, float], law: str, fixed: Collection[str] = ()) -> str:
     """Markdown table of identified parameters: of the prior and of the learned law, each with its relative error where the
-    truth is known. law: of the prior, which says what they are measured in."""
+    truth is known. law: of the prior, which says what they are measured in; fixed: those that were not learned, no rows."""
     found = (k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and k.count("/") == 1)
-    names = [name for name in found if not name.endswith(("_relative_error", "_ratio"))]
+    names = [n for n in found if n not in fixed and not n.endswith(("_relative_error", "_ratio"))]
     stages = ("id_prior", "id")
     rows = [[with_unit(law, n), *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
             for n in names]  # fmt: skip
-    return markdown(["parameter", "prior", "adapted", "error of prior", "error of adapted"], rows)
+    header = ["parameter", "prior", "adapted", "error of prior", "error of adapted"]
+    return markdown(header, rows) if rows else ""
 
 
 def with_unit(law: str, name: str) -> str:
@@ -176,6 +178,8 @@ def form_text(errors: Mapping[str, float]) -> str:
             f" A richer law is only learned where this error is below {WORTH:g} of the isotropic "
             "one, because errors of contact and cues can look like slight anisotropy."
         )
+    if taken == named(()):
+        said += " Its numbers come from positions: cues of rotation and stretch (losses) had no part in them."
     return said
 
 
@@ -231,16 +235,20 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]
+    for of, off in _part(figures, "forces/", "/rms_share").items():
+        if off > FAR * (allowed := figures[f"forces/{of}/allowed_share"]):
+            lines.append(
+                f"- The force on {of} is **not met**: off by {off:.0%} of the largest measured, allowed are {allowed:.1%}. "
+                "Do not use these numbers: check its sign, axes, times and unit (N)."
+            )
     says = "with a standard deviation of"
     for name in RELATIVE:
         if (sd := figures.get(f"posterior/{name}_relative_sd")) is not None:
-            lines.append(
-                f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, {says} {sd:.1%}."
-            )
-    if "posterior/friction_angle_sd" in figures:
+            found = f"= {figures[f'id/{name}']:.4g} {unit_of(law, name)}, {says} {sd:.1%}"
+            lines.append(f"- {name} {found if sd <= 1 else f'is *not* determined ({found[2:]})'}.")
+    if (sd := figures.get("posterior/friction_angle_sd")) is not None:
         lines.append(
-            f"- friction angle = {figures['id/friction_angle']:.3g} degrees, with a standard deviation of "
-            f"{figures['posterior/friction_angle_sd']:.2g}."
+            f"- friction angle = {figures['id/friction_angle']:.3g} degrees, {says} {sd:.2g}."
         )
     if "posterior/nu_sd" in figures:
         lines.append(
@@ -289,6 +297,19 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
             f"{sd * 1e3:.1f} mm (rms){covered}."
         )
     return "\n".join(lines)
+
+
+def worse_text(figures: Mapping[str, float]) -> str:
+    """That the learned law predicts what was held out worse than its prior, with both figures; empty where it does not."""
+    for name, least in (("rms_m", 1.01), ("psnr_crop", 0.998)):
+        own, prior = (figures.get(f"{model}test/{name}", math.nan) for model in ("", "prior/"))
+        label, scale, digits = UNITS[name]
+        if own > least * prior if least > 1 else own < least * prior:
+            return (
+                f"**The learned law predicts held-out recordings worse than its prior** ({label}: {own * scale:.{digits}f} "
+                f"against {prior * scale:.{digits}f}): use the prior (adapter=none), or learn from more recordings."
+            )
+    return ""
 
 
 def unexplained_text(figures: Mapping[str, float], world: World) -> str:

@@ -17,12 +17,10 @@ class Criterion(Settings):
     needs: ClassVar[dict[str, str]] = {"gain": "name!=free"}
 
     name: Literal["free", "corrected", "both"] = "corrected"
-    """corrected: after every frame the velocities are corrected towards what was seen, and the next
-    frame is predicted; free: rollouts from the start, as the paper has it; both: each with half of
-    the weight"""
+    """corrected: after every frame the velocities are corrected towards what was seen, and the next frame is predicted; free:
+    rollouts from the start, as the paper has it; both: each with half of the weight"""
     gain: float = Field(0.5, gt=0, le=1)
-    """corrected: share of the distance from the observation that the corrected velocity closes in a
-    frame"""
+    """corrected: share of the distance from the observation that the corrected velocity closes in a frame"""
 
     @property
     def gains(self) -> tuple[float, ...]:
@@ -39,16 +37,14 @@ class IdentificationSettings(Settings):
     count: Positive = 30.0
     """independent data in a frame of the cues: neighbouring particles move alike"""
     grid_error: Annotated[float, Interval(ge=0, le=10)] = 1.0
-    """of the grid, in differences from one that is 1.25 times as coarse: no frame is trusted beyond
-    it, and a multiple of it is identified beside the law; 0: none, and for the parts of the law an
-    assumed one"""
+    """of the grid, in differences from one that is 1.25 times as coarse: no frame is trusted beyond it, and a multiple of it is
+    identified beside the law; 0: none, and for the parts of the law an assumed one"""
     model_error: float = Field(0.02, ge=0, le=1)
     """error of the simulation from other causes, in grid cells"""
     operator_sd: Positive = 0.1
     """prior standard deviation of the adapter's numbers, before the evidence finds their size"""
     stiffness_sd: Positive = 0.12
-    """prior standard deviation of the stiffness modes, as `operator_sd`; it falls with the wave
-    number k as (1 + (k/2)^2)^(-1/2)"""
+    """prior standard deviation of the stiffness modes, as `operator_sd`; it falls with the wave number k as (1 + (k/2)^2)^(-1/2)"""
     known: Text | None = None
     """checkpoint of another fit, or material.json of mosa-material: what it says of the law's
     numbers is their prior (docs/several_recordings.md)"""
@@ -64,7 +60,8 @@ class LossWeights(Settings):
     model_config = ConfigDict(extra="allow")
     where: ClassVar[str] = "losses"
     needs: ClassVar[dict[str, str]] = {
-        "image mask flow heterogeneity operator operator_variance further": "adam"
+        "image mask flow heterogeneity operator operator_variance further": "adam",
+        "rotation stretch": "adapted",
     }
     __pydantic_extra__: dict[str, Weight] = Field(init=False)
 
@@ -84,10 +81,9 @@ class LossWeights(Settings):
     """not in the paper: particle positions of the reconstruction, over the object's size;
     Gauss-Newton uses it if the weight is above 0"""
     operator: Weight = 0.0
-    """not in the paper: root mean square of the entries of C and of L_pre, L_post, as in a group
-    lasso. The weight applies if the calibrated prior misses the reconstruction by 1 % of the
-    object's size, and falls as 1 / misfit^2 (misfit: of the model that the joint stage starts from,
-    at least 0.1 %)"""
+    """not in the paper: root mean square of the entries of C and of L_pre, L_post, as in a group lasso. The weight applies if the
+    calibrated prior misses the reconstruction by 1 % of the object's size, and falls as 1 / misfit^2 (misfit: of the model that the
+    joint stage starts from, at least 0.1 %)"""
     operator_variance: Weight = 0.0
     """not in the paper: variance of the operator over particles and states"""
 

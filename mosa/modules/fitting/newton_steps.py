@@ -83,9 +83,8 @@ class NewtonSteps:
         return identification
 
     def share_columns(self, stage: Stage, identification: Identification) -> None:
-        """Where the stages `prior_eta` and `joint` begin at the same numbers, the first Jacobian of
-        the joint stage contains the other one's: it is made once, in `prior_eta`. A fit that is
-        resumed between them makes it again."""
+        """Where the stages `prior_eta` and `joint` begin at the same numbers, the first Jacobian of the joint stage contains the
+        other one's: it is made once, in `prior_eta`. A fit that is resumed between them makes it again."""
         if stage.learns_adapter:
             identification.first, self.columns = self.columns, None
             return
@@ -196,9 +195,10 @@ class NewtonSteps:
         self.parts = own.held_back()
         if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):
             return own
-        log.info("parts of the law that are kept: %s; errors of held-back frames: %s", best, ", ".join(
-            f"{name} {1e3 * error:.2f} mm" for name, error in self.parts.items()))  # fmt: skip
         kept = [part for part in PARTS if part in best.split("+")]
+        log.info("parts of the law that are kept: %s; errors of held-back frames: %s%s", best, ", ".join(
+            f"{name} {1e3 * error:.2f} mm" for name, error in self.parts.items()),
+            "" if kept else "; its numbers come from positions, cues of rotation and stretch have no part in them")  # fmt: skip
         with torch.no_grad():
             if "operator" in own.parts and "operator" not in kept:
                 body.adapter.numbers.zero_()

@@ -201,6 +201,8 @@ def test_legend_video_and_strip(body, tmp_path):
     middle = picture[picture.shape[0] // 2 + 3]
     coloured = np.ptp(middle.astype(int), axis=1) > 20
     assert 0.75 < coloured.mean() <= 0.8 and picture.shape == found.images["real"].shape[1:]
+    write_comparisons(tmp_path, {"test/first": found, "test/drop": found}, video=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["strip.png"]
     write_comparisons(tmp_path, {"test/first": found, "test/drop": found})
     height, width = found.images["real"].shape[1:3]
     video = iio.imread(tmp_path / "video.mp4")

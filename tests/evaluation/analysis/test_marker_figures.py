@@ -53,6 +53,8 @@ def test_the_file_of_points_is_one_that_the_viewer_reads(tmp_path):
         sequence="train", times=torch.arange(3) / 50,
     )  # fmt: skip
     sequence = SimpleNamespace(prefix="train", scene=scene)
+    write_markers(tmp_path, body, [sequence], {"train": {"adapted": rollout}}, video=False)
+    assert not (tmp_path / "video.mp4").exists() and (tmp_path / "strip.png").is_file()
     write_markers(tmp_path, body, [sequence], {"train": {"adapted": rollout}}, video=True)
     found = read_npz(tmp_path / "markers.npz")
     assert set(found) == {"train/measured", "train/predicted", "train/times"}

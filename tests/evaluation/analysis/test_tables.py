@@ -8,7 +8,9 @@ from omegaconf import OmegaConf
 from mosa.evaluation.analysis.tables import (
     columns_text,
     determined_text,
+    form_text,
     parameter_table,
+    worse_text,
 )
 from mosa.modules.body import material
 from mosa.modules.body.material import LOG, register_form, taken, unit_of
@@ -29,6 +31,9 @@ def test_both_stages_have_their_error_where_the_truth_is_known():
         ["E [Pa]", "1.1e+05", "95000", "10.0%", "5.0%"],
         ["contact_offset_m", "0.01", "nan", "", ""],
     ]
+    rows = cells_of(parameter_table(figures, "neo_hookean", ["contact_offset_m"]))
+    assert [row[0] for row in rows[2:]] == ["E [Pa]"]
+    assert parameter_table(figures, "neo_hookean", ["contact_offset_m", "E"]) == ""
 
 
 @pytest.mark.parametrize("file", sorted(PRIORS.glob("*.yaml")), ids=lambda file: file.stem)
@@ -73,11 +78,43 @@ def test_a_parameter_of_another_package_has_the_unit_that_it_was_registered_with
     ("herschel_bulkley", {"id/mu": 1e4, "posterior/mu_relative_sd": 0.1}, "- mu = 1e+04 Pa, with a standard deviation of 10.0%."),
     ("herschel_bulkley", {"id/viscosity": 10.0, "posterior/viscosity_relative_sd": 0.5},
      "- viscosity = 10 Pa s, with a standard deviation of 50.0%."),
+    ("neo_hookean~damped", {"id/damping": 38.75, "posterior/damping_relative_sd": 3.863},
+     "- damping is *not* determined (38.75 Pa s, with a standard deviation of 386.3%)."),
     ("drucker_prager", {"id/friction_angle": 39.2, "posterior/friction_angle_sd": 4.8},
      "- friction angle = 39.2 degrees, with a standard deviation of 4.8."),
 ])  # fmt: skip
 def test_what_is_determined_has_its_unit(law, figures, said):
     assert said in determined_text(figures | {"posterior/draws": 12}, law).splitlines()
+
+
+@pytest.mark.parametrize(("off", "said"), [(0.634, True), (0.019, False)])
+def test_a_force_that_is_not_met_stands_before_the_numbers(off, said):
+    """A load cell's curve with the wrong sign gave a tenth of E, "with a standard deviation of 17%"."""
+    figures = {"forces/upper/rms_share": off, "forces/upper/allowed_share": 0.011, "id/E": 2.9e4,
+               "posterior/E_relative_sd": 0.17, "posterior/draws": 12}  # fmt: skip
+    first = determined_text(figures, "neo_hookean").splitlines()[2]
+    assert first.startswith("- The force on upper is **not met**: off by 63%") == said
+    assert first.startswith("- E = ") != said
+
+
+@pytest.mark.parametrize(("own", "prior", "said"), [
+    ({"rms_m": 0.0123}, {"rms_m": 0.00987}, "(rms [mm]: 12.30 against 9.87)"),
+    ({"rms_m": 0.00987}, {"rms_m": 0.00987}, ""), ({"rms_m": 0.005, "psnr_crop": 24.0}, {"rms_m": 0.009, "psnr_crop": 24.0}, ""),
+    ({"psnr_crop": 24.5}, {"psnr_crop": 26.0}, "(PSNR crop: 24.50 against 26.00)"), ({"rms_m": 0.01}, {}, ""),
+])  # fmt: skip
+def test_a_law_that_predicts_worse_than_its_prior_is_said_first(own, prior, said):
+    figures = {f"test/{name}": value for name, value in own.items()}
+    figures |= {f"prior/test/{name}": value for name, value in prior.items()}
+    text = worse_text(figures)
+    assert said in text and bool(text) == bool(said)
+
+
+@pytest.mark.parametrize(("errors", "said"), [((5e-3, 4.5e-3), True), ((5e-3, 3e-3), False)])
+def test_cues_that_the_isotropic_law_did_not_use_are_said(errors, said):
+    assert (
+        "rotation and stretch (losses) had no part"
+        in form_text(dict(zip(("isotropic", "operator"), errors)))
+    ) == said
 
 
 @pytest.mark.parametrize("taken, lines", [("isotropic", 0), ("operator", 2), ("stiffness", 1)])
