@@ -90,7 +90,6 @@ class Cameras:
 
 
 AUTO = "auto"  # mode of a ground: how it is touched is found with the law
-GROUND_MODES = ("sticky", "slip", "separate", "touch")
 RUBBING = ("separate", "touch")
 """Of these modes, those with friction: the body leaves the ground freely, and is met at nodes or at its own particles."""
 

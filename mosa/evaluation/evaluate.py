@@ -314,8 +314,7 @@ def floor_figures(
     """What no law can get below, to read the figures of a model against.
 
     `floor/<part>/...`: the true law on the learner's own grid and particles, on synthetic scenes, over the same frames and with as
-    many points as the models. `floor/sampling/...`: two random samplings of the true shape, where true positions are known.
-    """
+    many points as the models. `floor/sampling/...`: two random samplings of the true shape, where true positions are known."""
     from mosa.evaluation.floor import floor_rollout
 
     figures, known = {}, [s for s in evaluated if s.scene.truth is not None]

@@ -29,11 +29,10 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     """Positions (T, N, 3) [m] of the body's particles under the hidden material of a built-in scene, simulated where the body is,
     returned on the CPU.
 
-    world: `mosa.modules.body.body.World`; its ground, walls and colliders act as in `Body.simulate`.
-    body: `mosa.modules.body.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is
-    left between this and the truth is the learner's discretisation: differences below it mean nothing.
-    As the contact height is fitted, two fits of one body have different floors.
-    Errors: ConfigError where the scene is not a built-in one; SimulationDiverged."""
+    world: `mosa.modules.body.body.World`; its ground, walls and colliders act as in `Body.simulate`. body:
+    `mosa.modules.body.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is left
+    between this and the truth is the learner's discretisation: differences below it mean nothing. As the contact height is fitted,
+    two fits of one body have different floors. Errors: ConfigError where the scene is not a built-in one; SimulationDiverged."""
     truth, hidden = scene.truth, hidden_of(scene)
     settings, frame_dt = body.settings, float(scene.times[1] - scene.times[0])
     rest, device = body.rest.detach().float().cpu(), body.rest.device

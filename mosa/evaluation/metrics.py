@@ -60,11 +60,9 @@ RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")  # by `evalu
 def interpolate_motion(rest: Tensor, positions: Tensor, query: Tensor) -> Tensor:
     """True motion at rest positions `query` (N, 3): (T, N, 3) [m], from true rest points (M, 3) and positions (T, M, 3).
 
-    A linear fit to the nearest true rest points, weighted by inverse distance. A plain weighted mean lies at the
-    neighbours' centroid, not at the query, and has a floor of millimetres on a body that turns. What the neighbours leave
-    open (fewer than four of them, or all in a plane) is taken from the affine motion of the whole, what that leaves open
-    from its translation.
-    """
+    A linear fit to the nearest true rest points, weighted by inverse distance. A plain weighted mean lies at the neighbours'
+    centroid, not at the query, and has a floor of millimetres on a body that turns. What the neighbours leave open (fewer than four
+    of them, or all in a plane) is taken from the affine motion of the whole, what that leaves open from its translation."""
     points, wanted = rest.cpu().double(), query.cpu().double()
     displaced = positions.cpu().double() - points
     ranks = np.arange(1, min(NEIGHBOURS, len(points)) + 1)
@@ -144,9 +142,8 @@ def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 
 def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
     """`count` independent random points (count, 3) [m] of the shape that `cloud` (M, 3) [m] fills, M > 1.
 
-    A point of the cloud, drawn with replacement and displaced within its cell: a cube of side s, which the density gives,
-    4/3 pi r_k^3 = (k + 1/2) s^3 with r_k the distance to the k-th neighbour, median over the cloud.
-    """
+    A point of the cloud, drawn with replacement and displaced within its cell: a cube of side s, which the density gives, 4/3 pi
+    r_k^3 = (k + 1/2) s^3 with r_k the distance to the k-th neighbour, median over the cloud."""
     points = cloud.detach().cpu().double().numpy()
     generator = np.random.default_rng(seed)
     # at 12 a lattice gives its own spacing to 2 %, and so does a random cloud
@@ -168,8 +165,7 @@ def sampling_floors(
 ) -> dict[str, float]:
     """`cd_sq_m2`, `cd_m`, `emd_m` between two random samplings of one shape, of `first` and `second` points.
 
-    cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.
-    """
+    cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones."""
     a = resample_shape(cloud, first, 2 * seed + 101)
     b = resample_shape(cloud, second, 2 * seed + 102)
     apart = emd(a, b, samples=assignment, seed=seed)
@@ -189,8 +185,7 @@ def psnr(rendered: Tensor, real: Tensor) -> float:
 def ssim(rendered: Tensor, real: Tensor) -> float:
     """Mean over images (T, H, W, 3) in [0, 1] of the SSIM (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5.
 
-    Over all pixels, with borders reflected (torchmetrics, kornia; others leave 5 px at the border out). At least 6 x 6 px.
-    """
+    Over all pixels, with borders reflected (torchmetrics, kornia; others leave 5 px at the border out). At least 6 x 6 px."""
     shapes = tuple(rendered.shape), tuple(real.shape)
     if shapes[0] != shapes[1]:
         raise ValueError(f"ssim: expected images of one shape, found {shapes[0]} and {shapes[1]}")

@@ -92,8 +92,7 @@ def model_card(
     world: World,
     version: str,
 ) -> str:
-    """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and
-    variant; version: of mosa."""
+    """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and variant; version: of mosa."""
     law, name = body.material.law, sequences[0].scene.name
     # a fit may leave out parts that the body has: their numbers are then 0
     learns = body.adapter is not None and body.adapter.corrects

@@ -1,6 +1,5 @@
 """Check that a held-out film shows the reconstructed body: renders the body at the film's estimated start and compares it with the
-first frame. A start is estimated for any body in any light, so that only this comparison detects a wrong body or exposure.
-"""
+first frame. A start is estimated for any body in any light, so that only this comparison detects a wrong body or exposure."""
 
 from __future__ import annotations
 

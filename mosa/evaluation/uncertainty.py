@@ -54,11 +54,10 @@ def predicted_spread(
     The variance of a position, summed over its three components, is that of the draws (times `DRAWN`^2), that among the forms of
     the law (`Posterior.rivals`, times `FORMS`^2), and the square of what the model gets wrong on the training sequence itself
     (`Posterior.model_error`), which is `ELSEWHERE` times as much on a sequence that was not learned from. Draws and rivals that
-    cannot be simulated are left out and counted; sequences on which the law itself cannot are left out. known: positions
-    (T, N, 3) [m] that the law itself predicts, by the sequence's prefix, where they are at hand. Figures: posterior/draws,
-    posterior/rivals, posterior/<prefix>/sd_m and, after first contact and where the true motion is known,
-    posterior/<prefix>/coverage: the share of the particles' errors within two standard deviations.
-    """
+    cannot be simulated are left out and counted; sequences on which the law itself cannot are left out. known: positions (T, N, 3)
+    [m] that the law itself predicts, by the sequence's prefix, where they are at hand. Figures: posterior/draws, posterior/rivals,
+    posterior/<prefix>/sd_m and, after first contact and where the true motion is known, posterior/<prefix>/coverage: the share of
+    the particles' errors within two standard deviations."""
     generator = torch.Generator().manual_seed(seed)
 
     base: dict[str, Tensor] = dict(known or {})
@@ -198,11 +197,10 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
 def determined(
     body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1
 ) -> dict[str, float]:
-    """What the data say about the law: standard deviations of the global parameters
-    (`posterior/<name>_sd`, relative for moduli; the spread over other forms of the law that explain the
-    data is part of them), how many of the operator's numbers and of the stiffness modes they
-    determine, and the 95 % cone about the stiffest direction: of draws about every form of the law
-    that explains the data, each form as likely as the others."""
+    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli;
+    the spread over other forms of the law that explain the data is part of them), how many of the operator's numbers and of the
+    stiffness modes they determine, and the 95 % cone about the stiffest direction: of draws about every form of the law that
+    explains the data, each form as likely as the others."""
     figures: dict[str, float] = {}
     mean = posterior.mean
     forms = torch.stack([mean, *(n.to(mean) for n in posterior.rivals.values())])

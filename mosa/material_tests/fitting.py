@@ -1,8 +1,7 @@
 """Least squares of a law's numbers to stress-strain tests: starts, noise, posterior, tests left out.
 
 The numbers are the law's unconstrained parameters, as a fit to films learns them (`Material.raw`), and those of the learned
-stiffness, each with a normal prior of one standard deviation that the evidence chooses (MacKay 1992), as in `identification`.
-"""
+stiffness, each with a normal prior of one standard deviation that the evidence chooses (MacKay 1992), as in `identification`."""
 
 from __future__ import annotations
 

@@ -26,10 +26,9 @@ from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
 GOOD, CLEAR, WIDE, SAME, SOFTEST, LONGEST = 0.95, 1.5, 0.4, 1.1, 1e3, 15.0
-"""R2 below which a fit is warned of; ratio of errors above which tests prefer one reading of stress, and
-logarithm of the stretch above which others are asked for it; ratio above which exports differ from the
-fit; E [Pa] below which the unit is doubted: most gels and tissues have more; and the stretch above which
-strain is suspected: rubber breaks before."""
+"""R2 below which a fit is warned of; ratio of errors above which tests prefer one reading of stress, and logarithm of the stretch
+above which others are asked for it; ratio above which exports differ from the fit; E [Pa] below which the unit is doubted: most
+gels and tissues have more; and the stretch above which strain is suspected: rubber breaks before."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 

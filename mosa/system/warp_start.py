@@ -8,7 +8,6 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Callable
 
 import warp as wp
 
@@ -21,7 +20,13 @@ def start_warp() -> None:
     """Initialise Warp. Its library writes to the file of stderr itself that there is no driver. It parses each kernel that is made:
     films do so in a thread beside the reconstruction, so `ast.parse` is for one thread at a time where Python needs that."""
     if ONE_PARSER:
-        ast.parse = _one_at_a_time(ast.parse)
+        parse, lock = ast.parse, threading.RLock()
+
+        def alone(*args, **kwargs):
+            with lock:
+                return parse(*args, **kwargs)
+
+        ast.parse = alone
     wp.config.log_level = wp.LOG_WARNING
     if has_driver():
         wp.init()
@@ -39,17 +44,6 @@ def start_warp() -> None:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(silent)
-
-
-def _one_at_a_time(function: Callable) -> Callable:
-    lock = threading.RLock()
-
-    @functools.wraps(function)
-    def alone(*args, **kwargs):
-        with lock:
-            return function(*args, **kwargs)
-
-    return alone
 
 
 def has_driver() -> bool:

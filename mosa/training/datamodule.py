@@ -63,8 +63,7 @@ class SceneDataModule(L.LightningDataModule):
 
     Batches: train_dataloader has `MotionBatch` (some views of all frames that may be read), one epoch a pass over the views;
     val_dataloader the held-out cameras and the held-out frames of the training sequence, where there are any; test_dataloader the
-    held-out sequences (`evaluation.Sequence`); predict_dataloader new starts in the words of `Twin.simulate`.
-    """
+    held-out sequences (`evaluation.Sequence`); predict_dataloader new starts in the words of `Twin.simulate`."""
 
     def __init__(
         self,

@@ -1,7 +1,6 @@
 """A job of train.py or eval.py from outside: its exit code, its one message, and what a sweep says about the jobs that failed.
 
-Imported by every process of a sweep, whatever its launcher, through `hydra.callbacks`; it imports nothing heavy.
-"""
+Imported by every process of a sweep, whatever its launcher, through `hydra.callbacks`; it imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -259,9 +258,8 @@ def held_back() -> Iterator[None]:
 
 @tolerant_output()  # also in a launcher's worker, and for the message
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
-    """job(cfg) and its result. A mistake of the user ends in one message and exit code 2. In a sweep
-    every error is kept for the end, the result is infinite, and the other jobs go on.
-    A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    """job(cfg) and its result. A mistake of the user ends in one message and exit code 2. In a sweep every error is kept for the
+    end, the result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
     begun.append(True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)

@@ -131,8 +131,7 @@ def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     """Fits a body to one or more sequences in stages: the loss is the mean over them.
 
-    It has no body until `setup` has asked the data module for its particles, or a checkpoint was loaded.
-    """
+    It has no body until `setup` has asked the data module for its particles, or a checkpoint was loaded."""
 
     def __init__(
         self, first: str | Mapping[str, Any] | DictConfig | None = None, *overrides: str
@@ -483,8 +482,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.log_dict(figures, batch_size=1)  # `test/<metric>` of several sequences is averaged
 
     def predict_step(self, batch: Mapping[str, Any], batch_idx: int) -> Rollout:
-        """The law's rollout from a new start. batch: keyword arguments of `Twin.simulate`. Errors:
-        ConfigError."""
+        """The law's rollout from a new start. batch: keyword arguments of `Twin.simulate`. Errors: ConfigError."""
         if not isinstance(batch, Mapping):  # to Lightning a mapping in a list is a loader of keys
             raise ConfigError(
                 f"predict: expected starts as mappings like {{'height': 0.2}}, found "
@@ -575,8 +573,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     # ---------------------------------------------------------------- logs
     def figures(self) -> dict[str, float]:
-        """What was searched: distances [m] and gains of backbones and contacts, errors [m] of held-back
-        frames."""
+        """What was searched: distances [m] and gains of backbones and contacts, errors [m] of held-back frames."""
         found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
         found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
         found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}

@@ -32,9 +32,8 @@ def overrides_of(job: Path) -> dict[str, str]:
 
 
 def sweep_table(folder: str | Path) -> list[Row]:
-    """A row for each job: job, state (complete | failed | not complete), message of a failure, its
-    overrides, total time [s], and all figures of its metrics.json. Errors: DataError where the
-    folder has no jobs, or for a damaged file."""
+    """A row for each job: job, state (complete | failed | not complete), message of a failure, its overrides, total time [s], and
+    all figures of its metrics.json. Errors: DataError where the folder has no jobs, or for a damaged file."""
     folder = Path(folder)
     rows: list[Row] = []
     for job in jobs_of(folder):

@@ -1,5 +1,4 @@
-"""Measured forces as observations: a load cell's curve, compared with what a solid or a driven set
-takes in a rollout."""
+"""Measured forces as observations: a load cell's curve, compared with what a solid or a driven set takes in a rollout."""
 
 from __future__ import annotations
 
@@ -36,10 +35,9 @@ class Measured(Settings):
 
 @dataclass(frozen=True, eq=False)
 class ForceCurve:
-    """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on,
-    ascending; forces: (n, 3) [N], NaN for a component that was not measured; sd [N]: noise of one
-    sample, None: found from the samples' roughness; recording: in which it was measured, None:
-    the first."""
+    """Force on what is called `of`, as the body exerts it. times: (n,) [s] from frame 0 on, ascending; forces: (n, 3) [N], NaN for
+    a component that was not measured; sd [N]: noise of one sample, None: found from the samples' roughness; recording: in which it
+    was measured, None: the first."""
 
     of: str
     times: Tensor
@@ -53,8 +51,7 @@ class ForceCurve:
         return self.of if self.recording is None else f"{self.recording}/{self.of}"
 
     def noise(self) -> float:
-        """Standard deviation of one sample [N]: of white noise the second differences have six
-        times its variance."""
+        """Standard deviation of one sample [N]: of white noise the second differences have six times its variance."""
         if self.sd is not None:
             return self.sd
         rough = self.forces.diff(n=2, dim=0)
@@ -67,9 +64,8 @@ class ForceCurve:
         return float(self.forces.nan_to_num().abs().max())
 
     def means(self, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
-        """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its
-        standard deviation (T - 1, 3) [N], with what a grid gets wrong). The samples are joined by
-        straight lines. Errors: ConfigError where they cover none."""
+        """(mean force (T - 1, 3) [N] in each frame interval, NaN where it is not covered; its standard deviation (T - 1, 3) [N],
+        with what a grid gets wrong). The samples are joined by straight lines. Errors: ConfigError where they cover none."""
         ends = frame_dt * torch.arange(frames, dtype=torch.float64)
         whole = torch.zeros(1, 3, dtype=torch.float64)
         steps = 0.5 * (self.forces[1:] + self.forces[:-1]) * self.times.diff()[:, None]
@@ -102,9 +98,8 @@ def forces_from_config(
 ) -> tuple[ForceCurve, ...]:
     """Of entries {of: name of a collider or driven set, file: csv, sd [N], recording: name}.
 
-    Columns of the file: time [s], fx, fy, fz [N].
-    A column that is missing, and an empty cell, was not measured. Errors: ConfigError naming the
-    entry, DataError the file."""
+    Columns of the file: time [s], fx, fy, fz [N]. A column that is missing, and an empty cell, was not measured. Errors:
+    ConfigError naming the entry, DataError the file."""
     check("world.forces", items, Entries | None)
     read = [Measured.read(item, f"world.forces[{i}]") for i, item in enumerate(items or ())]
     return tuple(
@@ -163,8 +158,7 @@ def columns_of(curves: Sequence[ForceCurve], solids: Sequence[Collider]) -> list
 def force_residuals(
     rollout: Rollout, curves: Sequence[ForceCurve], world: World, frame_dt: float
 ) -> Tensor:
-    """(M,) differences from the mean forces of all frame intervals that were measured, over their
-    standard deviations."""
+    """(M,) differences from the mean forces of all frame intervals that were measured, over their standard deviations."""
     parts = compared_forces(rollout, curves, world, frame_dt)
     return torch.cat([(felt - mean) / sd for felt, mean, sd in parts])
 

@@ -75,8 +75,7 @@ def directions_on_sphere(count: int = 200) -> Tensor:
 def stress_jacobian(adapter: Adapter, w: Tensor, s: Tensor) -> Tensor:
     """d tau_hat/d tau_iso at held stretch, (N, 6, 6) on vech components, I where the law is the prior.
 
-    w, s: (N, 6) dimensionless states vech(W - I) and vech(R^T tau R)/E_ref. The networks' dependence on the stress is included.
-    """
+    w, s: (N, 6) dimensionless states vech(W - I) and vech(R^T tau R)/E_ref. The networks' dependence on the stress is included."""
     adapter = adapter.in_double()
     s = s.detach().double().cpu().requires_grad_(True)
     with torch.enable_grad():
@@ -89,8 +88,7 @@ def stress_jacobian(adapter: Adapter, w: Tensor, s: Tensor) -> Tensor:
 def redistribution_response(jacobian: Tensor, directions: Tensor) -> Tensor:
     """w(n) = |(d tau_hat/d tau_iso - I) : n n^T| (..., K) of (..., 6, 6) on vech components; 0 for the prior alone.
 
-    directions: (K, 3) unit vectors. The paper's formula lacks the - I, with which its text ('near zero') fits.
-    """
+    directions: (K, 3) unit vectors. The paper's formula lacks the - I, with which its text ('near zero') fits."""
     change = mandel_matrix(jacobian) - torch.eye(6).to(jacobian)
     return (change @ dyads(directions).to(jacobian).T).norm(dim=-2)
 
@@ -124,8 +122,7 @@ def uniaxial_stress(
 ) -> Tensor:
     """Axial stress (K,) [Pa] at Hencky strain `strain` along each of (K, 3), all other stress components zero.
 
-    Newton's method on the strain and the axial stress. Errors: SimulationDiverged naming the direction without an equilibrium.
-    """
+    Newton's method on the strain and the axial stress. Errors: SimulationDiverged naming the direction without an equilibrium."""
     N = dyads(directions).double()
     K = len(N)
     H, axial = strain * N, torch.zeros(K, dtype=torch.float64)
@@ -161,8 +158,7 @@ def directional_modulus(
 ) -> Tensor:
     """E(n) (K,) [Pa] along (K, 3): central difference of the uniaxial stress at +-strain, lateral stress free.
 
-    states: of the prior at its global parameters; adapter: None for the prior alone, whose E(n) is Young's modulus.
-    """
+    states: of the prior at its global parameters; adapter: None for the prior alone, whose E(n) is Young's modulus."""
     response = response_of(states, adapter)
     tension, compression = (uniaxial_stress(response, directions, e) for e in (strain, -strain))
     return (tension - compression) / (2 * strain)

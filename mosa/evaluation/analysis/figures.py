@@ -90,8 +90,7 @@ def side_by_side(
 def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -> Path:
     """H.264 video; the size is padded to even numbers. Plays slower than real time where fps is below the capture's.
 
-    Errors: ImportError or RuntimeError without an ffmpeg (`ffmpeg` says it before); OSError where that cannot write.
-    """
+    Errors: ImportError or RuntimeError without an ffmpeg (`ffmpeg` says it before); OSError where that cannot write."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = frames[0].shape[:2]

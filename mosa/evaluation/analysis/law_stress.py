@@ -54,8 +54,7 @@ def bound_at(name: str, value: float) -> float:
 
 @torch.no_grad()
 def values_of(material: Material) -> dict[str, Any]:
-    """What `Material` takes: a number of each parameter, three of a direction; what is held is at
-    its bound exactly."""
+    """What `Material` takes: a number of each parameter, three of a direction; what is held is at its bound exactly."""
     values: dict[str, Any] = {}
     found = material.physical()
     for name in material.names:

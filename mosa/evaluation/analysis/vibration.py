@@ -48,8 +48,7 @@ def vibration_growth(
 
     The block, 2 cells x 1 x 1 times `cells`, is given the velocity of its first longitudinal mode, at most `amplitude` times the
     speed of sound in a bar, about the strain; float64 on the CPU. adapter: switched on, or None for the prior; stride: substeps
-    between its evaluations; density [kg/m^3]. At most 1 where the law has an energy, infinite where the block bursts.
-    """
+    between its evaluations; density [kg/m^3]. At most 1 where the law has an energy, infinite where the block bursts."""
     E = longitudinal_modulus(material)
     dx, spacing = 1.0, 0.5
     axes = [

@@ -1,7 +1,6 @@
 """The learned body: rest particles with appearance, a prior law with its parameters, heterogeneity, and the stress adapter.
 
-One module for fitting, evaluation and later use, so that what is learned is what is simulated.
-"""
+One module for fitting, evaluation and later use, so that what is learned is what is simulated."""
 
 from __future__ import annotations
 
@@ -176,9 +175,8 @@ class Body(nn.Module):
         self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool,
         viscosity: float = 0.0, given: int | None = None,
     ) -> int:  # fmt: skip
-        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the
-        adapter and to `EVEN`; those that are given, where they are enough. Errors: ConfigError
-        naming how many are needed."""
+        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter and to `EVEN`; those
+        that are given, where they are enough. Errors: ConfigError naming how many are needed."""
         settings = self.settings
         count = required_substeps(
             modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt,
@@ -209,11 +207,10 @@ class Body(nn.Module):
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
         model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
-        adapter (penalties, mean |C|). observed, gain: (T, N, 3) [m]
-        and a number; at every frame the velocities are corrected towards what was seen, but for what was `unseen` of the positions
-        in a frame (`ready.corrected_rollout`). substeps: of
-        every frame, where differences hold them fixed; None: as many as the time step bound asks for.
-        Errors: SimulationDiverged, ConfigError (time step)."""
+        adapter (penalties, mean |C|). observed, gain: (T, N, 3) [m] and a number; at every frame the velocities are corrected
+        towards what was seen, but for what was `unseen` of the positions in a frame (`ready.corrected_rollout`). substeps: of every
+        frame, where differences hold them fixed; None: as many as the time step bound asks for. Errors: SimulationDiverged,
+        ConfigError (time step)."""
         ready = self.ready(start, world, frames, frame_dt, model=model, substeps=substeps)
         return ready.simulate(
             frames, world.solids, collect=collect, progress=progress, observed=observed, gain=gain,

@@ -66,8 +66,7 @@ class ContactOffset(nn.Module):
     ) -> tuple[float, tuple[float, float]]:
         """(standard deviation about `START`, bounds) [cells].
 
-        ground: where its accuracy is known, the bounds are two deviations; free: whether only free
-        rollouts are compared."""
+        ground: where its accuracy is known, the bounds are two deviations; free: whether only free rollouts are compared."""
         if ground is not None and ground.accuracy is not None:
             sd = math.hypot(self.GRID, ground.accuracy / dx)
             low, high = self.LIMITS

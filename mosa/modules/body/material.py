@@ -148,14 +148,12 @@ def taken(law: str, names: Iterable[str]) -> tuple[str, ...]:
 class Material(nn.Module):
     """Parameters of one prior law.
 
-    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees;
-    of a direction three numbers of any length); frozen: names that are not learned; modulated:
-    names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa
-    together). damping, bulk_damping among the parameters: with a viscous branch of the law
+    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees; of a direction three numbers of
+    any length); frozen: names that are not learned; modulated: names the heterogeneity factor multiplies, by default the stiffness
+    (E, or mu and kappa together). damping, bulk_damping among the parameters: with a viscous branch of the law
     (`constitutive.damping`). friction_cone: of `friction_alpha`. candidates: laws among which a calibration chooses, with law=auto;
-    until then it is the first. Each reads those of `parameters` that it has. A parameter that starts on
-    a bound of its range is held there.
-    Errors: ConfigError naming the parameter, what was expected and what was found."""
+    until then it is the first. Each reads those of `parameters` that it has. A parameter that starts on a bound of its range is
+    held there. Errors: ConfigError naming the parameter, what was expected and what was found."""
 
     def __init__(
         self, law: str, parameters: Mapping[str, float | Sequence[float]],

@@ -125,18 +125,16 @@ def corrected_rollout(
     roll: Callable[..., Rollout], state, observed: Tensor, gain: float, frame_dt: float,
     unseen: Callable[[Tensor, int], Tensor] | None = None, first: int = 0,
 ) -> Rollout:  # fmt: skip
-    """Frames predicted one by one: after each, v += gain (x_seen - x)/frame_dt. Its positions are
-    those before the correction. first: the frame that `state` is of; the result begins with it.
+    """Frames predicted one by one: after each, v += gain (x_seen - x)/frame_dt. Its positions are those before the correction.
+    first: the frame that `state` is of; the result begins with it.
 
-    roll: a simulator's rollout with everything but state, frames and times given; observed:
-    (T, N, 3) [m] with its frame 0; frame_dt [s]; unseen: of positions [m] in a frame, what would
-    not have been observed of them, and is no distance then.
+    roll: a simulator's rollout with everything but state, frames and times given; observed: (T, N, 3) [m] with its frame 0;
+    frame_dt [s]; unseen: of positions [m] in a frame, what would not have been observed of them, and is no distance then.
     Differentiable.
 
-    In a free rollout the errors of grid and contact accumulate through the bounce, and a law is
-    bent to undo them. A prediction error method (Ljung, System Identification, chapter 3) asks
-    less: from what was seen up to a frame, predict the next. Here the observer is Luenberger's
-    with a fixed gain on the velocities; positions and deformation gradients stay the simulation's."""
+    In a free rollout the errors of grid and contact accumulate through the bounce, and a law is bent to undo them. A prediction
+    error method (Ljung, System Identification, chapter 3) asks less: from what was seen up to a frame, predict the next. Here the
+    observer is Luenberger's with a fixed gain on the velocities; positions and deformation gradients stay the simulation's."""
 
     def corrected(there, frame: int):
         away = observed[frame] - there.x

@@ -41,18 +41,15 @@ class PriorSection(Settings):
     where: ClassVar[str] = "prior"
 
     law: Text
-    """name of the law, which prior=<law> sets (docs/choosing.md); auto: chosen among
-    `candidates`"""
+    """name of the law, which prior=<law> sets (docs/choosing.md); auto: chosen among `candidates`"""
     parameters: Section
-    """parameters of the law by name, in SI units: where a fit starts; the material of
-    mosa-splats"""
+    """parameters of the law by name, in SI units: where a fit starts; the material of mosa-splats"""
     frozen: Names | None = None
     """parameters that are not learned"""
     modulated: Names | None = None
     """parameters that the heterogeneity multiplies; null: the stiffness"""
     candidates: Names | None = None
-    """with law=auto: the laws that are calibrated and compared; those that yield or
-    flow only where the body stays deformed"""
+    """with law=auto: the laws that are calibrated and compared; those that yield or flow only where the body stays deformed"""
     options: Section | None = None
     """options of the law (below)"""
 
@@ -71,8 +68,7 @@ class WorldSection(Settings):
     """sets of the body's particles that are held, moved or loaded, such as {name: clamp, type: box,
     size: [0.1, 0.1, 0.1], position: [0, 0, 0]} (docs/driven.md)"""
     forces: Entries | None = []
-    """forces measured on colliders and driven sets, such as {of: clamp, file: force.csv, sd: 0.02}
-    (docs/driven.md)"""
+    """forces measured on colliders and driven sets, such as {of: clamp, file: force.csv, sd: 0.02} (docs/driven.md)"""
 
 
 def names(values: Any) -> tuple[str, ...]:

@@ -20,8 +20,7 @@ class TimeStepping(Settings):
     needs: ClassVar[dict[str, str]] = {"min_substeps": "adaptive=true"}
 
     stride: Substeps = 8
-    """substeps between evaluations of the adapter's networks (adapter=mosa, direct); a frame has a
-    multiple of it"""
+    """substeps between evaluations of the adapter's networks (adapter=mosa, direct); a frame has a multiple of it"""
     max_substeps: Substeps = 400
     """substeps of a frame, at most"""
     courant: float = Field(0.6, gt=0, le=1)
@@ -52,8 +51,7 @@ class SimulationSection(TimeStepping):
     needs: ClassVar[dict[str, str]] = {"particles": "dx=null"}
 
     particles: Annotated[int, Interval(ge=8, le=10**8)] | Literal["auto"] = "auto"
-    """particles of the body; auto: as many as its thin parts need, 4000 to 6000 on a CPU and to
-    30000 on a GPU"""
+    """particles of the body; auto: as many as its thin parts need, 4000 to 6000 on a CPU and to 30000 on a GPU"""
     particles_per_cell: float = Field(4, ge=1, le=64)
     """particles per grid cell"""
     dx: Positive | None = None

@@ -1,8 +1,7 @@
 """Spatial variation of the stiffness as a sum of smooth modes: eta(X) = sum_k a_k B_k(X), for identification with few numbers.
 
-B_k are products of cosines on the body's box, from half a wave along its longest side down to a shortest wavelength, each with
-mean 0 and variance 1 over the particles. P(X) = P_global (1 + amplitude tanh eta(X)) as in `heterogeneity` (paper, section 3.1).
-"""
+B_k are products of cosines on the body's box, from half a wave along its longest side down to a shortest wavelength, each with mean
+0 and variance 1 over the particles. P(X) = P_global (1 + amplitude tanh eta(X)) as in `heterogeneity` (paper, section 3.1)."""
 
 from __future__ import annotations
 

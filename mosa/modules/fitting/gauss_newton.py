@@ -6,8 +6,7 @@ the last matrix is the Laplace approximation of the posterior.
 
 A Jacobian costs a rollout for every number, a step one. So several steps are taken with one Jacobian, which each of them puts right
 along its own direction (Broyden, A class of methods for solving nonlinear simultaneous equations, 1965): where columns are a little
-wrong and residuals are not small, Gauss-Newton alone stops short of the minimum.
-"""
+wrong and residuals are not small, Gauss-Newton alone stops short of the minimum."""
 
 from __future__ import annotations
 

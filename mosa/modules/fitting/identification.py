@@ -1,15 +1,13 @@
 """Identification of a body's few numbers by Gauss-Newton: what is compared, and what was found.
 
 The numbers are those of `learned_numbers`; what is compared are the motion cues (`residuals`), in the rollouts that the criterion
-asks for (`Ready.simulate`).
-"""
+asks for (`Ready.simulate`)."""
 
 from __future__ import annotations
 
 import copy
 import itertools
 import math
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -30,6 +28,7 @@ from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
 from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.constitutive.laws import law_named
+from mosa.system.threads import cores
 from mosa.types import MarkerCues, Rollout
 
 COUNTED_AT_FIRST = 100 / 30
@@ -70,18 +69,17 @@ IMPLAUSIBLE = 3.0
 class Identification:
     """One stage's. takes: with start, cues, frame_dt; kinds: which of position, rotation, stretch are compared.
 
-    The stage `prior` learns the backbone alone from positions, `prior_eta` also the stiffness
-    modes, `joint` the adapter too. All compare predictions of the criterion; the calibration of a
-    law that flows or yields, or with adaptive substeps, compares free rollouts.
+    The stage `prior` learns the backbone alone from positions, `prior_eta` also the stiffness modes, `joint` the adapter too. All
+    compare predictions of the criterion; the calibration of a law that flows or yields, or with adaptive substeps, compares free
+    rollouts.
 
-    Errors of the grid must not be taken for the law's. The two later stages roll the same numbers
-    out on a grid `COARSER` times as coarse too. The difference, frame by frame, is noise that no
-    frame is trusted beyond, and its direction is free: a share of it, known to within
-    `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
+    Errors of the grid must not be taken for the law's. The two later stages roll the same numbers out on a grid `COARSER` times as
+    coarse too. The difference, frame by frame, is noise that no frame is trusted beyond, and its direction is free: a share of it,
+    known to within `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
 
-    parts: those of `search.parts` that the law may have; known: what another experiment said of its
-    numbers, in place of the prior of those that are learned; progress: called after every column of
-    a Jacobian; seats: rollouts side by side; None: as many as the machine has room for."""
+    parts: those of `search.parts` that the law may have; known: what another experiment said of its numbers, in place of the prior
+    of those that are learned; progress: called after every column of a Jacobian; seats: rollouts side by side; None: as many as the
+    machine has room for."""
 
     def __init__(
         self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,
@@ -144,9 +142,7 @@ class Identification:
         """Rollouts side by side, of as many numbers."""
         if self.body.rest.is_cuda:
             return 1
-        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
-        cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-        return max(1, min(self.settings.threads or min(cores, MOST_THREADS), numbers))
+        return max(1, min(self.settings.threads or min(cores(), MOST_THREADS), numbers))
 
     def _seat(self, body: Body) -> Seat:
         share = torch.zeros(1, dtype=torch.float64)
@@ -214,10 +210,9 @@ class Identification:
 
     @torch.no_grad()
     def _flights(self) -> dict[tuple[int, float], tuple[Tensor, Rollout]]:
-        """By pair: the contact's offset (3,) [m], and the frames in which the body is seen more than
-        `CLEAR` cells above the ground. The law's numbers hardly change these, so rollouts for a
-        Jacobian begin after them. Empty where something else than the ground may be met, and where
-        columns are rolled out as so many worlds."""
+        """By pair: the contact's offset (3,) [m], and the frames in which the body is seen more than `CLEAR` cells above the
+        ground. The law's numbers hardly change these, so rollouts for a Jacobian begin after them. Empty where something else than
+        the ground may be met, and where columns are rolled out as so many worlds."""
         world, flights = self.world, {}
         alone = world.ground is not None and not (world.planes or world.solids or world.driven)
         if not alone or self.newton.many is not None or self.body.settings.adaptive:
@@ -353,12 +348,11 @@ class Identification:
 
     @torch.no_grad()
     def score(self, gains: Sequence[float] | None = None, body: Body | None = None) -> float:
-        """Error of the predictions [m] with these gains, by default the stage's own, of the body or a copy: the geometric
-        mean over the frames after the first of the root mean square distance over particles, above
-        the floor of the noise.
+        """Error of the predictions [m] with these gains, by default the stage's own, of the body or a copy: the geometric mean over
+        the frames after the first of the root mean square distance over particles, above the floor of the noise.
 
-        This is the likelihood of the positions where each frame has an unknown noise of its own,
-        so that frames which no law predicts do not decide. Of free rollouts it is `distance`."""
+        This is the likelihood of the positions where each frame has an unknown noise of its own, so that frames which no law
+        predicts do not decide. Of free rollouts it is `distance`."""
         gains = gains or self.gains
         body = self.body if body is None else body
         if not any(gains):
@@ -408,9 +402,8 @@ class Identification:
 
     @torch.no_grad()
     def iterate(self) -> dict[str, float]:
-        """One iteration of Gauss-Newton: a pass, or, in the stage `prior_eta`, `SERVES` with one
-        Jacobian, each under its own noise. Returns the last one's report (`GaussNewton.iterate`).
-        `prepare` comes before it, or is done here."""
+        """One iteration of Gauss-Newton: a pass, or, in the stage `prior_eta`, `SERVES` with one Jacobian, each under its own
+        noise. Returns the last one's report (`GaussNewton.iterate`). `prepare` comes before it, or is done here."""
         first, self.first = self.first, None
         report = self._pass(first)
         for _ in range(SERVES - 1 if self.compares else 0):
@@ -542,9 +535,8 @@ class Identification:
 
     @torch.no_grad()
     def held_back(self) -> dict[str, float]:
-        """Error of held-back frames [m] of the law and of each law with fewer of its parts, see
-        `search.parts`. Measured forces are never held back. Empty before the first iteration, and
-        where forces alone are compared."""
+        """Error of held-back frames [m] of the law and of each law with fewer of its parts, see `search.parts`. Measured forces are
+        never held back. Empty before the first iteration, and where forces alone are compared."""
         newton, seat = self.newton, self.newton.seats[0]
         if newton.columns is None or self.noise is None or not any(self.kinds):
             return {}

@@ -1,7 +1,6 @@
 """The few numbers of a body that Gauss-Newton learns: which they are, their prior, and a body as the law of other numbers.
 
-They are the prior's global parameters, the contact offset, the adapter's numbers and the stiffness modes', in this order.
-"""
+They are the prior's global parameters, the contact offset, the adapter's numbers and the stiffness modes', in this order."""
 
 from __future__ import annotations
 
@@ -22,8 +21,7 @@ from mosa.types import Ground
 FINER = 0.25
 """Steps of the joint stage's differences over those of a calibration, which begins further from its end. What one-sided differences
 get wrong falls with their step, and on two drops it had stopped the fit: the rabbit's ended at a cost of 675, with these steps at
-585, and its held-out error fell from 0.56 to 0.51 of the prior's
-(docs/lab/2026-11-identification.md)."""
+585, and its held-out error fell from 0.56 to 0.51 of the prior's (docs/lab/2026-11-identification.md)."""
 
 STIFFNESS_SPREAD = 0.3
 """Of the logarithm of the factor that the evidence gives to `stiffness_sd`. Without a prior of its own the evidence makes the field
@@ -48,8 +46,7 @@ def limits_of(name: str) -> tuple[float, float]:
 
 
 def warn_of_ends(material: Material) -> None:
-    """A warning for numbers that a fit took to the end of their range, as it does where a body has
-    another law."""
+    """A warning for numbers that a fit took to the end of their range, as it does where a body has another law."""
     ends = []
     for name, raw in material.raw.items():
         form, raw = FORMS.get(name), raw.detach()

@@ -1,10 +1,8 @@
 """Distances between a rollout and the motion cues as least squares wants them, with a noise that is found from them.
 
 Three fields per rollout, over frames and particles: position [m], rotation [rad] (vector of R_cue^T R) and singular values [-].
-Each
-frame of each field is divided by its own root mean square, floored at what the cues can be trusted to. Particles near each other
-move alike, and so do frames: a frame counts as `count` independent data, not as many as it has particles.
-"""
+Each frame of each field is divided by its own root mean square, floored at what the cues can be trusted to. Particles near each
+other move alike, and so do frames: a frame counts as `count` independent data, not as many as it has particles."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Steps of Adam after which the body cannot be simulated are taken back, and the ones that follow are half as long.
 
 Networks that stand in for a law can be moved by one step to where an element turns inside out. A line search would ask for a
-rollout more in each step; taking back the rare one that fails asks for none.
-"""
+rollout more in each step; taking back the rare one that fails asks for none."""
 
 from __future__ import annotations
 

@@ -21,8 +21,7 @@ class StageSettings(Settings):
     }
 
     optimizer: Literal["auto", "gauss_newton", "adam"] = "auto"
-    """auto: Gauss-Newton if the stage learns no network (adapter=operator or none,
-    heterogeneity.kind=modes), else Adam"""
+    """auto: Gauss-Newton if the stage learns no network (adapter=operator or none, heterogeneity.kind=modes), else Adam"""
     newton_iterations: Count = 8
     """iterations of Gauss-Newton, at most, each with a Jacobian of its own"""
     looks: Whole = 0

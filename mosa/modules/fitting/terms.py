@@ -1,7 +1,6 @@
 """The loss terms of a fit by Adam, by name: each is a function of what one step sees, and has its weight in `losses`.
 
-A new term is one function and one call of `register_term`. The terms of the paper are thin: their mathematics is in `losses.py`.
-"""
+A new term is one function and one call of `register_term`. The terms of the paper are thin: their mathematics is in `losses.py`."""
 
 from __future__ import annotations
 

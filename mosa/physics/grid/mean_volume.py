@@ -31,7 +31,6 @@ OWN_FLUID = 0.02
 J_MIN = wp.constant(wp.float64(0.05))
 """Ratios of volume are held above it, as singular values are in logarithms."""
 
-_OWN = wp.constant(wp.float64(OWN))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))

@@ -23,8 +23,7 @@ Calibration = Any
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 OFFSET_STEPS = (-0.2, 0.05, 0.3, 0.55, 0.8)
 POISSON_STEPS = (0.32, 0.2, 0.42)
-"""Grid of the search: multiples of the configured stiffness, contact offsets [cells], and Poisson
-numbers, the middle one first."""
+"""Grid of the search: multiples of the configured stiffness, contact offsets [cells], and Poisson numbers, the middle one first."""
 NEAREST, ENTERED = 6, 3
 """Places of that grid at which all Poisson numbers are tried; its valleys in which Gauss-Newton begins."""
 CONTACT, YIELD = "contact", "yield_stress"
@@ -149,10 +148,9 @@ class Starts:
 def search(calibration: Calibration) -> float:
     """Start a calibration near the smallest score [m], which is returned.
 
-    The deepest valleys of a coarse grid (`rows_of_grid`) come first; where there are several,
-    Gauss-Newton begins in each, and the deepest after a few iterations is entered. Laws with
-    parameters that the grid has not go on by a compass search in all of them (Kolda, Lewis, Torczon,
-    SIAM Review 45, 2003), laws of `MANY` numbers by Gauss-Newton from its end and from other starts
+    The deepest valleys of a coarse grid (`rows_of_grid`) come first; where there are several, Gauss-Newton begins in each, and the
+    deepest after a few iterations is entered. Laws with parameters that the grid has not go on by a compass search in all of them
+    (Kolda, Lewis, Torczon, SIAM Review 45, 2003), laws of `MANY` numbers by Gauss-Newton from its end and from other starts
     (`nearest_end`). Errors: those of `rows_of_grid` and `nearest_end`."""
     starts = Starts(calibration)
     columns, learned = starts.columns(), starts.learned
@@ -178,9 +176,8 @@ def search(calibration: Calibration) -> float:
 def rows_of_grid(starts: Starts, columns: Sequence[dict[str, float]]) -> list[dict[str, float]]:
     """The deepest valleys, at most `ENTERED`, the lowest first, of a grid of stiffness and `columns`.
 
-    It is searched at a middle Poisson number, further where its best is at an end of the stiffness;
-    the other Poisson numbers at the `NEAREST` best places. Errors: SimulationDiverged where none
-    can be simulated."""
+    It is searched at a middle Poisson number, further where its best is at an end of the stiffness; the other Poisson numbers at
+    the `NEAREST` best places. Errors: SimulationDiverged where none can be simulated."""
     middle, *others = POISSON_STEPS if "nu" in starts.learned else (None,)
     multiples = dict(enumerate(STIFFNESS_STEPS)) if starts.modulated else {0: 1.0}
     grid: dict[tuple[int, int], float] = {}
@@ -230,9 +227,8 @@ def nearest_end(
 ) -> float:
     """Gauss-Newton from several starts, the nearest `kept` of which after a few iterations go on.
 
-    The calibration is left at the nearest end, as if it had not begun, and its score [m] is
-    returned. Starts that cannot be simulated are left out; the error of the first is raised where
-    none of them can."""
+    The calibration is left at the nearest end, as if it had not begun, and its score [m] is returned. Starts that cannot be
+    simulated are left out; the error of the first is raised where none of them can."""
     body = calibration.body
     begun, here = calibration.state(), calibrated(body)
     ends: list[tuple[float, dict[str, dict], dict]] = []
@@ -287,9 +283,8 @@ TRIED = 4
 
 
 BETTER = 0.95
-"""With a yield stress that the motion does not reach von Mises is an elastic law, and both have the
-same error. Of a letter of a liquid and a trophy of sand, elastic laws soft enough to flow through
-the film have 1.2 times the true law's error."""
+"""With a yield stress that the motion does not reach von Mises is an elastic law, and both have the same error. Of a letter of a
+liquid and a trophy of sand, elastic laws soft enough to flow through the film have 1.2 times the true law's error."""
 
 
 def choose_law(
@@ -298,15 +293,14 @@ def choose_law(
     build: Callable[[], Calibration],
     lasts: Callable[[], float],
 ) -> dict[str, float]:
-    """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction
-    [m], all by the elastic laws' criterion; infinite where a law cannot be simulated.
+    """Calibrate candidates and leave `body` at the chosen one. Returns their errors of prediction [m], all by the elastic laws'
+    criterion; infinite where a law cannot be simulated.
 
-    The elastic law with the smallest error is chosen. Where the body stays deformed, or none can be
-    simulated, laws that yield or flow are calibrated too, and the best of them is chosen if its
-    error is below `BETTER` of the elastic one's.
+    The elastic law with the smallest error is chosen. Where the body stays deformed, or none can be simulated, laws that yield or
+    flow are calibrated too, and the best of them is chosen if its error is below `BETTER` of the elastic one's.
 
-    build: a calibration of `body`; lasts: the share of its change of shape that stays (`yielding`).
-    Errors: SimulationDiverged where no law can be simulated."""
+    build: a calibration of `body`; lasts: the share of its change of shape that stays (`yielding`). Errors: SimulationDiverged
+    where no law can be simulated."""
     errors: dict[str, float] = {}
     ends: dict[str, dict[str, dict]] = {}
     begun, gains = calibrated(body), None

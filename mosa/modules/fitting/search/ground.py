@@ -2,12 +2,11 @@
 
 Free rollouts tell a body that slides, as friction shows in where it goes afterwards. Whether one that hardly slides sticks, or
 leaves the ground freely, an isotropic law cannot tell, nor with what friction it slides: its own mistakes are as large. The learned
-law can, when the fit has ended (docs/uncertainty.md#how-the-ground-is-touched). Nor is it known whether a body
-meets it at its surface (`touch`), as one of finite elements, or at a grid's nodes (`separate`): both are tried.
+law can, when the fit has ended (docs/uncertainty.md#how-the-ground-is-touched). Nor is it known whether a body meets it at its
+surface (`touch`), as one of finite elements, or at a grid's nodes (`separate`): both are tried.
 
-So a contact is chosen twice: by `choose_ground` with the isotropic law, before anything else is learned, and by
-`gains_of_contacts` and `learned_on` with the learned one. Contacts have names (`named`), by which reports read their figures.
-"""
+So a contact is chosen twice: by `choose_ground` with the isotropic law, before anything else is learned, and by `gains_of_contacts`
+and `learned_on` with the learned one. Contacts have names (`named`), by which reports read their figures."""
 
 from __future__ import annotations
 

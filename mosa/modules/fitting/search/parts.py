@@ -1,11 +1,9 @@
 """Parts of a learned law: anisotropy (`operator`), a stiffness that varies (`stiffness`), or neither.
 
-A richer law always reproduces the film better, as it also explains errors of grid, contact and form.
-So each law predicts frames that were held back from it: the frames after first contact are divided
-into `FOLDS` stretches, and each stretch is left out in turn. What a second grid would predict
-differently counts as error of every law, so that a gain within what the grid gets wrong is none.
-The laws are nested in the fitted one, whose Jacobian says how they move: no rollout is needed.
-"""
+A richer law always reproduces the film better, as it also explains errors of grid, contact and form. So each law predicts frames
+that were held back from it: the frames after first contact are divided into `FOLDS` stretches, and each stretch is left out in
+turn. What a second grid would predict differently counts as error of every law, so that a gain within what the grid gets wrong is
+none. The laws are nested in the fitted one, whose Jacobian says how they move: no rollout is needed."""
 
 from __future__ import annotations
 
@@ -49,14 +47,13 @@ def held_back(
     squares: Sequence[Tensor], owners: Sequence[str], numbers: Tensor, mean: Tensor, precision: Tensor,
     stretches: Sequence[Sequence[int]], compared: Mapping[int, tuple[int, float, float | None]],
 ) -> dict[str, float]:  # fmt: skip
-    """Error [m] of each law's predictions of held-back positions, by `named`: geometric mean over
-    frames of the root mean square distance, that between two grids included.
+    """Error [m] of each law's predictions of held-back positions, by `named`: geometric mean over frames of the root mean square
+    distance, that between two grids included.
 
-    squares: (D + 1, D + 1) matrix [J r]^T [J r] of each frame's whitened residuals, of what belongs
-    to no frame, then of each frame's positions alone; owners: block of each of the D numbers;
-    numbers: (D,) where they stand; mean (D,), precision (D, D): of their prior; stretches: frames
-    that are left out together; compared: of each frame, the index of its positions in `squares`,
-    the length [m] of their unit and the distance [m] between two grids, None where it is unknown."""
+    squares: (D + 1, D + 1) matrix [J r]^T [J r] of each frame's whitened residuals, of what belongs to no frame, then of each
+    frame's positions alone; owners: block of each of the D numbers; numbers: (D,) where they stand; mean (D,), precision (D, D): of
+    their prior; stretches: frames that are left out together; compared: of each frame, the index of its positions in `squares`, the
+    length [m] of their unit and the distance [m] between two grids, None where it is unknown."""
     whole = torch.stack(list(squares[: len(squares) - len(compared)])).sum(0)
     parts = [part for part in PARTS if part in owners]
     errors: dict[str, float] = {}

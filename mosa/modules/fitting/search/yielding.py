@@ -1,8 +1,7 @@
 """Whether a body yields: its film ends in a shape that an elastic law does not predict.
 
-After an impact an elastic body oscillates about its shape at rest, so that the mean of its later
-shapes is near that. A body that has yielded keeps most of its largest change of shape.
-"""
+After an impact an elastic body oscillates about its shape at rest, so that the mean of its later shapes is near that. A body that
+has yielded keeps most of its largest change of shape."""
 
 from __future__ import annotations
 
@@ -21,14 +20,12 @@ from mosa.types import MarkerCues
 LASTS = 0.7
 """Share of the largest change of shape from which laws that yield or flow are compared as well.
 
-Chosen between two motions from images: of an elastic fish that topples (0.65) and of gorilla_v2,
-which yields (0.83; 0.73 unexplained). True motions keep at most 0.50 of it in fifteen elastic
-bodies, at least 0.84 in ten that yield or flow."""
+Chosen between two motions from images: of an elastic fish that topples (0.65) and of gorilla_v2, which yields (0.83; 0.73
+unexplained). True motions keep at most 0.50 of it in fifteen elastic bodies, at least 0.84 in ten that yield or flow."""
 NEAR = 0.9
 """Of the largest change of shape: the frames after the first that has so much tell what lasts."""
 LEAST, FEWEST = 0.01, 8
-"""Of the body's size: a smaller change of shape is within the error of the cues. And frames of a film
-whose end tells something."""
+"""Of the body's size: a smaller change of shape is within the error of the cues. And frames of a film whose end tells something."""
 
 
 @torch.no_grad()
@@ -68,8 +65,7 @@ def lasting(body: Body, takes: Sequence, world: World, unexplained: bool = False
 
 
 def changed(x: Tensor) -> Tensor:
-    """(T, N, 3) [m] of points x (T, N, 3) from where they were in the first frame, without the
-    rigid motion of the body."""
+    """(T, N, 3) [m] of points x (T, N, 3) from where they were in the first frame, without the rigid motion of the body."""
     arms = x - x.mean(1, keepdim=True)
     rotation, _ = polar(arms.mT @ arms[0])
     return arms @ rotation - arms[0]
