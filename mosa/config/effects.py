@@ -55,8 +55,9 @@ def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stag
         return "no stage runs Gauss-Newton" if need == "newton" else (
             "all stages run Gauss-Newton, which compares motion cues alone (fit=adam does not)")  # fmt: skip
     if need == "adapted":
-        alone = stages and all(stage.newton and stage.calibrates for stage in stages)
-        return "an isotropic law is calibrated on positions alone" if alone else None
+        alone = {(stage.newton, stage.calibrates) for stage in stages} == {(True, True)}
+        positions = alone and getattr(settings, "position", True)
+        return "an isotropic law is calibrated on positions alone" if positions else None
     key, unequal, value = need.partition("!=") if "!=" in need else need.partition("=")
     found = word(getattr(settings, key))
     return (

@@ -56,6 +56,7 @@ def test_a_script_of_one_s_own_hears_it_too(monkeypatch):
     (["ablation=no_motion"], ["losses.flow"]), (["ablation=no_motion", "fit=adam"], []), (["ablation=no_rot"], []),
     (["ablation=no_rot", "adapter=none", "heterogeneity.enabled=false"], ["losses.rotation"]),
     (["ablation=no_rot", "adapter=none", "heterogeneity.enabled=false", "fit=adam"], []),
+    (["losses.rotation=0", "losses.position=0", "adapter=none", "heterogeneity.enabled=false"], []),
     (["scene=tiny", "simulation.adaptive=true", "simulation.min_substeps=3", "seed=3"], []),
 ])  # fmt: skip
 def test_what_has_no_effect_is_said(overrides, expected):
