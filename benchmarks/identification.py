@@ -34,8 +34,7 @@ from mosa.evaluation.uncertainty import (
     LEAST_DRAWS,
     among_forms,
     determined,
-    drawn_motions,
-    rival_motions,
+    motions_under,
     total_spread,
 )
 from mosa.modules.body.body import Start
@@ -192,10 +191,11 @@ def held_out(by_sequence: dict[str, float]) -> float:
 def coverage(case: SimpleNamespace, found: dict[str, Tensor], posterior: Posterior) -> float | None:
     """Share of held-out particle errors after contact within two predicted standard deviations, as `predicted_spread` has them;
     None without held-out sequences or draws that can be simulated."""
-    drawn = drawn_motions(
-        case.body, posterior.draws(DRAWS, torch.Generator().manual_seed(0)), lambda: motions(case)
-    )
-    others, within = rival_motions(case.body, posterior, lambda: motions(case)), []
+    predicted = lambda body: motions(SimpleNamespace(**vars(case) | {"body": body}))  # noqa: E731
+    law, rivals = case.body.material.law, list(posterior.rivals.items())
+    laws = [(law, n) for n in posterior.draws(DRAWS, torch.Generator().manual_seed(0))]
+    drawn = motions_under(case.body, laws, predicted)
+    others, within = motions_under(case.body, rivals, predicted), []
     for prefix in (name for name in found if name.startswith("test") and len(drawn) >= LEAST_DRAWS):
         s = case.problem["sequences"][prefix]
         sd = total_spread(torch.stack([x[prefix] for x in drawn]), posterior.model_error,

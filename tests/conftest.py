@@ -25,9 +25,13 @@ LONG = ("integration", "experiments", "physics_verification", "analysis")
 FIRST = "test_main_job.py"
 """Its first run makes the scene and the reconstruction that others find in the cache."""
 
-UNOPTIMISED = ("constitutive",)
-"""Folders whose tests launch each of their many kernels a few times. Clang's -O0 gives the same bits
+UNOPTIMISED = ("constitutive", "test_stress.py")
+"""Folders and files whose tests launch each of their many kernels a few times. Clang's -O0 gives the same bits
 and compiles in a third of the time of -O2. They come last: a process keeps a kernel as compiled."""
+
+
+def unoptimised(path: Path) -> bool:
+    return not {path.name, path.parent.name}.isdisjoint(UNOPTIMISED)
 
 
 def pytest_configure(config):
@@ -43,7 +47,7 @@ def pytest_collection_modifyitems(items):
     items.sort(
         key=lambda item: (
             item.path.name != FIRST,
-            item.path.parent.name in UNOPTIMISED,
+            unoptimised(item.path),
             item.path.parent.name not in LONG,
             item.path not in slow,
             -tests[item.path],
@@ -71,7 +75,7 @@ def pytest_sessionfinish():
 @pytest.fixture(autouse=True, scope="module")
 def optimisation(request):
     """How Warp compiles for a CPU: as in the program, or without optimisation (`UNOPTIMISED`)."""
-    if request.path.parent.name in UNOPTIMISED and not torch.cuda.is_available():
+    if unoptimised(request.path) and not torch.cuda.is_available():
         wp.config.optimization_level = 0
     yield
     wp.config.optimization_level = None

@@ -75,12 +75,12 @@ def predicted_spread(
             "posterior/model_error_m": posterior.model_error,
         }, {}
 
-    def positions() -> dict[str, Tensor]:
-        found = apart(body, sequences, lambda own, s: _positions(own, s, world))
-        return {s.prefix: x for s, x in zip(sequences, found)}
+    def positions(own: Body) -> dict[str, Tensor]:
+        return {s.prefix: _positions(own, s, world) for s in sequences}
 
-    drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
-    others = rival_motions(body, posterior, positions)
+    laws = [(body.material.law, numbers) for numbers in posterior.draws(draws, generator)]
+    drawn = motions_under(body, laws, positions, quiet=False)
+    others = motions_under(body, list(posterior.rivals.items()), positions)
     figures: dict[str, float] = {
         "posterior/draws": float(len(drawn)),
         "posterior/rivals": float(len(others)),
@@ -119,32 +119,26 @@ Predicted = TypeVar("Predicted")
 
 
 @torch.no_grad()
-def drawn_motions(
-    body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False
-) -> list[Predicted]:
-    """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
-    found, every = [], each_law(body, laws)
-    for _ in tqdm(every, "draws of the posterior", total=len(laws), leave=False, disable=quiet):
-        try:
-            found.append(predict())
-        except MosaError:
-            continue
-    return found
+def motions_under(
+    body: Body, laws: Ordered[tuple[str, Tensor]], predict: Callable[[Body], Predicted], *, quiet: bool = True
+) -> list[Predicted]:  # fmt: skip
+    """What predict(body) says as each of the laws (name, numbers (D,)), `apart`; those that cannot be simulated are left out."""
 
-
-@torch.no_grad()
-def rival_motions(
-    body: Body, posterior: Posterior, predict: Callable[[], Predicted]
-) -> list[Predicted]:
-    """What predict() says of `body` as each of the posterior's rivals in turn; those that cannot be simulated are left out."""
-    found = []
-    for law, numbers in posterior.rivals.items():
-        with as_rival(body, law, numbers):
+    def tried(own: Body, law: tuple[str, Tensor]) -> Predicted | None:
+        with as_rival(own, *law):
             try:
-                found.append(predict())
+                return predict(own)
             except MosaError:
-                continue
-    return found
+                return None
+
+    bar = tqdm(
+        apart(body, laws, tried),
+        "draws of the posterior",
+        total=len(laws),
+        leave=False,
+        disable=quiet,
+    )
+    return [found for found in bar if found is not None]
 
 
 def among_forms(base: Tensor, others: Ordered[Tensor]) -> Tensor | None:

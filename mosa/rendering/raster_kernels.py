@@ -95,7 +95,7 @@ def raster_kernels(dtype: type, channels: int):
         width: int, height: int, ends: wp.array(dtype=wp.int32), grad_image: wp.array(dtype=vecc),
         # changed: final transmittance on entry; `behind` is dL/dT_final T_final on entry
         transmittance: wp.array(dtype=dtype), behind: wp.array(dtype=dtype),
-        # out
+        # out, of each image
         moments: wp.array(dtype=record), grad_features: wp.array(dtype=vecc),
     ):  # fmt: skip
         b = wp.tid()
@@ -152,7 +152,6 @@ def raster_kernels(dtype: type, channels: int):
                                     gyy += gq * dy * dy
                 zero = dtype(0.0)
                 moments[i] = record(gq_sum, gx, gy, gxx, gxy, gyy, zero, zero)
-                k = b * feature_stride + n
-                grad_features[k] = grad_features[k] + gf
+                grad_features[i] = gf
 
     return forward, backward

@@ -6,7 +6,9 @@ one entry per (tile, Gaussian) pair that is visible. Nothing grows with Gaussian
 """
 
 import functools
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
@@ -20,6 +22,7 @@ from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
 from mosa.rendering.tile_kernels import tile_kernels, tile_threads
 from mosa.rendering.tile_lists import tile_lists
+from mosa.system.threads import cores, threaded
 
 NEAR, EXTENT, ALPHA_MAX = 0.01, 3.33, 0.999
 """Nearest depth [m], extent of a Gaussian in standard deviations, cap of alpha: gsplat's."""
@@ -60,10 +63,15 @@ class Splat(torch.autograd.Function):
         means, covariances, opacities, features, K, w2c = (
             x.detach().contiguous() for x in (means, covariances, opacities, features, K, w2c)
         )
+
+        def seen(some: slice) -> tuple[Tensor, ...]:
+            own = replace(geometry, state_index=geometry.state_index[some])
+            records, depths = project(means, covariances, opacities, K[some], w2c[some], own)
+            lists = depth_lists(depths, records, own)
+            return *composite(lists, records, _of(features, some), own), records, *lists
+
         with warp_stream(means.device), turn(means.device):
-            records, depths = project(means, covariances, opacities, K, w2c, geometry)
-            lists = depth_lists(depths, records, geometry)
-            image, transmittance, ends = composite(lists, records, features, geometry)
+            image, transmittance, ends, records, *lists = _in_parts(seen, features, geometry)
         ctx.save_for_backward(
             means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists
         )
@@ -77,13 +85,43 @@ class Splat(torch.autograd.Function):
             ctx.saved_tensors
         )
         g = ctx.geometry
+        incoming, outgoing = grad_image.contiguous(), grad_alpha.contiguous()
+
+        def moved(some: slice) -> tuple[Tensor, ...]:
+            return composite_backward(
+                tuple(t[some] for t in lists), records[some], _of(features, some), ends[some],
+                transmittance[some], incoming[some], outgoing[some], g,
+            )  # fmt: skip
+
         with warp_stream(features.device), turn(features.device):
-            incoming = grad_image.contiguous(), grad_alpha.contiguous()
-            moments, grad_features = composite_backward(
-                lists, records, features, ends, transmittance, *incoming, g
-            )
+            moments, grad_features = _in_parts(moved, features, g)
             gradients = project_backward(means, covariances, opacities, K, w2c, records, moments, g)
+        if len(grad_features) > len(features):  # image after image, whatever the parts were
+            grad_features = functools.reduce(torch.add, grad_features)[None]
         return *gradients, grad_features, None, None, None
+
+
+_compiled = set[tuple]()
+"""What `_in_parts` has run: each of its threads would compile the kernels."""
+
+
+def _in_parts(
+    function: Callable[[slice], tuple[Tensor, ...]], features: Tensor, g: Geometry
+) -> Iterable[Tensor]:
+    """function(some images), on a CPU on as many threads as there are cores, and what it returns of all images."""
+    images, kind = len(g.state_index), (function.__name__, features.dtype, features.shape[-1])
+    count = 1
+    if features.is_cpu and g.scan == "gaussian":
+        count = min(images, cores()) if kind in _compiled else 1
+        _compiled.add(kind)
+    ends = [images * i // count for i in range(count + 1)]
+    parts = list(threaded(function, [slice(*both) for both in itertools.pairwise(ends)]))
+    return parts[0] if count == 1 else map(torch.cat, zip(*parts))
+
+
+def _of(features: Tensor, some: slice) -> Tensor:
+    """Those of some images, which may share them."""
+    return features if len(features) == 1 else features[some]
 
 
 def project(
@@ -132,7 +170,7 @@ def composite_backward(
     lists: tuple[Tensor, ...], records: Tensor, features: Tensor, ends: Tensor, transmittance: Tensor,
     grad_image: Tensor, grad_alpha: Tensor, g: Geometry,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Moments (B, N, 8) of the records (records.py) and the gradient of the features."""
+    """Moments (B, N, 8) of the records (records.py) and the gradient of the features, on a CPU (B, N, C) if shared too."""
     scalar, channels = SCALARS[records.dtype], features.shape[-1]
     found, exact = (torch.zeros_like(records), torch.zeros_like(features)), False
     if g.scan == "tile":
@@ -141,6 +179,7 @@ def composite_backward(
         threads, state = tile_threads(len(records), g.width, g.height), (transmittance, grad_alpha)
     else:
         _, kernel = raster_kernels(scalar, channels)
+        found = found[0], records.new_zeros(*records.shape[:2], channels)
         threads, state = len(records), (transmittance.clone(), -grad_alpha * transmittance)
     given = [*map(_flat, lists), *_splats(records, features, g), _flat(ends), _flat(grad_image, 1)]
     given += map(_flat, state)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import functools
 import os
 import re
 import sys
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
@@ -34,13 +36,50 @@ def cores() -> int:
 
 
 def threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    """function(item) of each item, in their order, on as many threads as this process has cores."""
-    workers = min(len(items), cores())
-    if workers <= 1:
+    """function(item) of each item, in their order, by this thread and the others that there are cores for. It may itself ask for
+    that: what no other thread has begun this one does."""
+    others = min(len(items), cores()) - 1
+    if others < 1:
         yield from map(function, items)
         return
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(function, items)
+    found = deque[Future[Result]](Future() for _ in items)
+    left: deque[tuple[Any, ...]] = deque((function, *each) for each in zip(items, found))
+    helping = [_helpers(os.getpid()).submit(_work_off, left) for _ in range(others)]
+    try:
+        while found:
+            while not found[0].done() and _worked(left):
+                pass
+            yield found.popleft().result()
+    finally:
+        left.clear()  # what waits for a helper still refers to it
+        wait([each for each in helping if not each.cancel()])
+
+
+def _work_off(left: deque[tuple[Any, ...]]) -> None:
+    while _worked(left):
+        pass
+
+
+def _worked(left: deque[tuple[Any, ...]]) -> bool:
+    """Whether anything was left, the first of which is done then."""
+    try:
+        function, item, result = left.popleft()
+    except IndexError:
+        return False
+    try:
+        result.set_result(function(item))
+    except BaseException as error:
+        left.clear()
+        result.set_exception(error)
+        if not isinstance(error, Exception):
+            raise
+    return True
+
+
+@functools.cache
+def _helpers(process: int) -> ThreadPoolExecutor:
+    """Of this process: a forked one has no threads of the first one's."""
+    return ThreadPoolExecutor(max(1, cores() - 1))
 
 
 def apart(

@@ -35,8 +35,7 @@ from mosa.evaluation.analysis.figures import ffmpeg, side_by_side, to_uint8, wri
 from mosa.evaluation.uncertainty import (
     DRAWS,
     among_forms,
-    drawn_motions,
-    rival_motions,
+    motions_under,
     total_spread,
 )
 from mosa.modules.body.body import Body, Start, World
@@ -141,15 +140,20 @@ class Twin(InMotion):
                 "again), or its run kept none (a fit by Gauss-Newton does: fit.joint.optimizer=auto)"
             )
         rollout = self.simulate(**start)
-        laws = self.posterior.draws(draws, torch.Generator().manual_seed(seed))
-        found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
+        drawn = self.posterior.draws(draws, torch.Generator().manual_seed(seed))
+        own, rivals = self.body.material.law, list(self.posterior.rivals.items())
+
+        def predicted(body: Body) -> Tensor:
+            given = self.world, self.frame_dt, self._record, self.training_start
+            return Twin(body, *given).simulate(**start).x
+
+        found = motions_under(self.body, [(own, numbers) for numbers in drawn], predicted)
         if len(found) < 2:
             raise ConfigError(
                 f"predict: expected at least two of {draws} draws of the law that can be "
                 f"simulated, found {len(found)}"
             )
-        others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
-        forms = among_forms(rollout.x, others)
+        forms = among_forms(rollout.x, motions_under(self.body, rivals, predicted))
         return rollout, total_spread(torch.stack(found), self.posterior.model_error, forms)
 
     @typed

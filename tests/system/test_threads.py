@@ -1,8 +1,12 @@
 """Work in threads comes back in order, with its errors."""
 
+import functools
 import os
 import threading
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 from mosa.system.threads import settle_threads, threaded
@@ -19,6 +23,27 @@ def test_results_keep_the_order_of_the_items(monkeypatch):
         return 10 * item
 
     assert list(threaded(late_first, range(7))) == [10 * i for i in range(7)]
+
+
+def test_threads_share_work_out_among_threads_and_keep_none_of_it(monkeypatch):
+    """One helper, which is busy with the other item: both ask it for help, do all by themselves, and what they had goes at once."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr("mosa.system.threads._helpers", lambda _: pool)
+    both, kept = threading.Barrier(2, timeout=10), []
+
+    def outer(item: int) -> list[int]:
+        both.wait()
+        work = functools.partial(lambda array, i: i * len(array), np.zeros(item))
+        kept.append(weakref.ref(work.args[0]))
+        found = list(threaded(work, range(3)))
+        del work
+        both.wait()
+        assert not any(each() is not None for each in kept)
+        both.wait()
+        return found
+
+    with ThreadPoolExecutor(1) as pool:
+        assert list(threaded(outer, [5, 7])) == [[0, 5, 10], [0, 7, 14]]
 
 
 @pytest.mark.parametrize("cores", [1, 2])

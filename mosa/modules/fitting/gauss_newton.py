@@ -337,14 +337,14 @@ class GaussNewton:
         }
 
     @torch.no_grad()
-    def transferred(self, steps: int) -> tuple[Tensor, float]:
+    def transferred(self, steps: int, seat: Seat) -> tuple[Tensor, float]:
         """(numbers (D,), cost) at which a model that moves with its numbers much as this one does explains the data, after `steps`
-        with the last iteration's Jacobian. The first seat is asked, as that other model, and left where it stands.
+        with the last iteration's Jacobian. seat: of that other model, left where it stands.
 
         Errors: ValueError before the first iteration; what the model raises where it stands."""
         if self.matrix is None or self.columns is None:
             raise ValueError("transferred: expected an iteration before it is asked for")
-        seat, precision, mean = self.seats[0], self.precision(), self.mean()
+        precision, mean = self.precision(), self.mean()
         begun = numbers = seat.read()
         best: tuple[float, Tensor] | None = None
         try:

@@ -28,7 +28,7 @@ from mosa.modules.fitting.search.backbone import OFFSET_STEPS, search
 from mosa.modules.fitting.search.parts import FOLDS, PARTS, held_back
 from mosa.modules.fitting.stages import Stage
 from mosa.physics.constitutive.laws import law_named
-from mosa.system.threads import cores
+from mosa.system.threads import apart, cores, threaded
 from mosa.types import MarkerCues, Rollout
 
 COUNTED_AT_FIRST = 100 / 30
@@ -306,13 +306,20 @@ class Identification:
         """Of the difference between the two grids, which is identified beside the numbers; 0 where none is."""
         return float(self.newton.seats[0].tensors[-1]) if self.two_grids else 0.0
 
-    def _coarser(self) -> list[residuals.Fields] | None:
-        """What the numbers predict on a coarser grid; None where it cannot simulate them."""
+    def _coarser(self) -> Body:
+        """A copy of the body on a coarser grid."""
         body = copy.deepcopy(self.body)
         body.settings = body.settings.but(dx=COARSER * body.settings.dx)
+        return body
+
+    @torch.no_grad()  # a thread has its own switch
+    def _predicted(self, body: Body) -> list[residuals.Fields] | None:
+        """Of the body, or of its copy on a coarser grid; None where that cannot simulate the numbers."""
         try:
             return self._fields(body)
         except SimulationDiverged:
+            if body is self.body:
+                raise
             return None
 
     def _floors(self, cells: float) -> tuple[float, float, float]:
@@ -321,9 +328,10 @@ class Identification:
     @torch.no_grad()
     def _measure_noise(self) -> None:
         """Noise and what the grid gets wrong, at the numbers in use."""
-        found = self._fields(self.body)
-        if self.two_grids and (coarser := self._coarser()) is not None:
-            self.grid_difference = residuals.difference(found, coarser)
+        bodies = [self.body, self._coarser()] if self.two_grids else [self.body]
+        found, *others = (threaded if self.body.rest.is_cpu else map)(self._predicted, bodies)
+        if others and others[0] is not None:
+            self.grid_difference = residuals.difference(found, others[0])
         model_error = 0.0 if self.calibrating else self.settings.model_error
         least = self._floors(model_error)
         wrong = self.grid_difference and [
@@ -505,7 +513,7 @@ class Identification:
     def _grids_part(self, there: list[residuals.Fields]) -> Tensor | None:
         """Of a calibration: `grid_error` times the difference of `there`, its residuals where it stands, from those on the coarser
         grid, whitened as these are. None without a second grid."""
-        coarser = self._coarser() if self.settings.grid_error > 0 else None
+        coarser = self._predicted(self._coarser()) if self.settings.grid_error > 0 else None
         if coarser is None:
             return None
         return self.settings.grid_error * self._compared(residuals.difference(there, coarser), 0.0)
@@ -517,21 +525,25 @@ class Identification:
         own, newton = self.body.material.law, self.newton
         if self.calibrating or own not in RIVALS:
             return {}
-        kept = len(newton.seats[0].read()) - self.two_grids  # the share of the grids is last
-        found, own_cost = {}, self.cost()
-        for law in RIVALS:
-            if law == own:
-                continue
-            self.body.material.law = law
+        numbers = newton.seats[0].read()
+        kept = len(numbers) - self.two_grids  # the share of the grids is last
+        own_cost = self.cost()
+
+        def tried(body: Body, law: str) -> Tensor | None:
+            body.material.law = law
+            seat = self._seat(body)
+            seat.write(numbers)
             try:
-                numbers, cost = newton.transferred(RIVAL_STEPS)
+                found, cost = newton.transferred(RIVAL_STEPS, seat)
             except MosaError:  # it cannot be simulated there
-                continue
+                return None
             finally:
-                self.body.material.law = own
-            if cost < IMPLAUSIBLE * own_cost:
-                found[law] = numbers[:kept]
-        return found
+                body.material.law = own
+            return found[:kept] if cost < IMPLAUSIBLE * own_cost else None
+
+        others = [law for law in RIVALS if law != own]
+        found = zip(others, apart(self.body, others, tried))
+        return {law: each for law, each in found if each is not None}
 
     @torch.no_grad()
     def held_back(self) -> dict[str, float]:

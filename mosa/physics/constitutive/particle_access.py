@@ -148,7 +148,8 @@ TURNED = f"""
     typedef decltype(field.data[0].data[0][0] + 0) S;
     typedef S W __attribute__((ext_vector_type({LANES})));
     typedef double V __attribute__((ext_vector_type({LANES})));
-    if (i % {LANES} == 0) {{
+    // once, and not in the kernel and again in its adjoint
+    const auto find = [&]() __attribute__((noinline)) {{
         V a[9], b[9], size = 0;
         ALL(k, 9) {{
             W w;
@@ -175,7 +176,8 @@ TURNED = f"""
             turning &= ~found;
         }}
         ALL(k, 9 * {LANES}) block.data[k / 9].data[k % 9 / 3][k % 3] = found[k / 9] ? a[k % 9][k / 9] : 0;
-    }}
+    }};
+    if (i % {LANES} == 0) find();
     const double* own = block.data[i % {LANES}].data[0];
     return own[0] != 0 || own[1] != 0 || own[2] != 0;
 #endif

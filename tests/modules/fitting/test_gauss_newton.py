@@ -434,7 +434,7 @@ def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
     newton.iterate(learn=False)
     here = newton.seats[0].read()
     newton.seats[0].residuals = linear_residuals(newton, A, other)
-    found, cost = newton.transferred(1)
+    found, cost = newton.transferred(1, newton.seats[0])
     away = found - newton.mean()
     gradient = A.T @ (A @ found - other) + newton.precision() @ away
     assert gradient.abs().max() < 1e-6 * (A.T @ other).abs().max()
@@ -445,8 +445,9 @@ def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
 
 
 def test_nothing_is_transferred_before_an_iteration():
+    newton = linear(two_blocks(), drawn(5, 4), drawn(5))
     with pytest.raises(ValueError, match="expected an iteration"):
-        linear(two_blocks(), drawn(5, 4), drawn(5)).transferred(1)
+        newton.transferred(1, newton.seats[0])
 
 
 def linear_residuals(newton, A, b):
