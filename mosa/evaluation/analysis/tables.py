@@ -179,7 +179,7 @@ def form_text(errors: Mapping[str, float]) -> str:
             "one, because errors of contact and cues can look like slight anisotropy."
         )
     if taken == named(()):
-        said += " Cues of rotation and stretch had no part in it (unless losses.position=0)."
+        said += " Cues of rotation and stretch had no part in this law's numbers (unless losses.position=0)."
     return said
 
 
