@@ -135,7 +135,7 @@ def distances(body: Body, scene: Scene, variants: Mapping[str, Rollout]) -> dict
     """(T, N) [m] of each model's particles to the true motion; none where that is not known."""
     if (target := true_motion(body, scene)) is None:
         return {}
-    return {v: (variants[v].x - target).norm(dim=-1).cpu() for v in TITLES if v in variants}
+    return {v: (variants[v].x.cpu() - target).norm(dim=-1) for v in TITLES if v in variants}
 
 
 def error_limit(far: Iterable[Tensor]) -> float:
