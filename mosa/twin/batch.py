@@ -24,6 +24,7 @@ from mosa.twin.start import (
     check_frames,
     check_wants_no_gradients,
     start_in,
+    warn_of_creep,
 )
 
 FARTHEST = 100.0
@@ -75,6 +76,7 @@ class TwinWorlds(InMotion):
             variant=variant, frames=frames, substeps=substeps, laws=self.laws, gravity=gravity,
             differentiable=differentiable,
         )  # fmt: skip
+        warn_of_creep(self.body, found[0][1], self._episode.frame_dt, self._episode.substeps)
         return self._episode.state
 
     @typed

@@ -77,8 +77,9 @@ class TwinState:
         if self.x.ndim != 3 or not 0 <= number < len(self.x):
             raise ConfigError(f"world: expected one of x {tuple(self.x.shape)}, found {number}")
         alike = ("driven", "frames", "substeps", "time", "lag", *(["lift"] * (self.lift.ndim == 1)))
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in alike}
-        return replace(self, **{name: value[number] for name, value in own.items()})
+        whole = {f.name: getattr(self, f.name) for f in fields(self)}
+        own = {k: value if k in alike else value[number] for k, value in whole.items()}
+        return OneWorld(**own)
 
     def tensors(self) -> dict[str, Tensor]:
         """By name, detached: what `torch.save` writes and `read` reads."""
@@ -92,6 +93,10 @@ class TwinState:
             found = ", ".join(map(str, tensors)) if isinstance(tensors, Mapping) else shown(tensors)
             raise DataError(f"state: expected {', '.join(sorted(names))}, found {found}")
         return cls(**tensors)
+
+
+class OneWorld(TwinState):
+    """Of one of many worlds, whose solids the twin itself does not know."""
 
 
 def in_order(states: Sequence[TwinState]) -> bool:

@@ -233,8 +233,8 @@ def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | Non
     if speed > CREEP:
         warnings.warn(
             "substeps: solids that hold the body by friction let it slide at about "
-            f"{1e3 * speed:.2g} mm/s with {substeps} substeps; substeps={enough} give "
-            f"{1e3 * CREEP:.2g} mm/s",
+            f"{1e3 * speed:.2g} mm/s with {substeps} substeps by its weight alone; substeps={enough} give "
+            f"{1e3 * CREEP:.2g} mm/s. A squeezed body needs more: double them until the motion stays",
             stacklevel=4,
         )
 

@@ -53,7 +53,15 @@ from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
-from mosa.twin.episode import Episode, InMotion, TwinState, in_order, placed_as, rollout_of
+from mosa.twin.episode import (
+    Episode,
+    InMotion,
+    OneWorld,
+    TwinState,
+    in_order,
+    placed_as,
+    rollout_of,
+)
 from mosa.twin.material import TwinMaterial, summary
 from mosa.twin.material_files import Formats as MaterialFormats
 from mosa.twin.material_files import export_material
@@ -342,6 +350,11 @@ class Twin(InMotion):
         else:
             rollout, world = rollout_of(motion), (self._episode or self).world
             met = len(motion[0].collider_position)
+            if met and colliders is None and isinstance(motion[0], OneWorld):
+                raise ConfigError(
+                    f"colliders: expected the {met} that `worlds(...).reset` was given, found none: "
+                    "states of one of many worlds do not hold them"
+                )
         if rollout.x.shape[1:] != self.body.rest.shape:
             raise ConfigError(
                 f"rollout: expected one of this body's {len(self.body.rest)} particles, found {rollout!r}"

@@ -157,6 +157,10 @@ def test_the_states_of_steps_are_shown_as_the_rollout_is(tmp_path):
         ConfigError, match=r"^rollout: .* \(of worlds: each.world\(0\)\), found \[Twin"
     ):
         one.export(both, tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"the 1 that `worlds\(...\).reset` was given, found none"
+    ):
+        one.export([each.world(1) for each in both], tmp_path, video=False)
     one.export([each.world(1) for each in both], tmp_path, video=False, colliders=[plate])
     saved = np.load(tmp_path / "rollout.npz")
     assert np.array_equal(saved["simulation/x"][1], both[1].positions[1])
