@@ -46,10 +46,13 @@ def stride(substeps: int) -> int:
 @pytest.mark.parametrize("law, substeps", paths(ELASTIC))
 def test_18_smooth_laws(law, substeps):
     """dL/d(every parameter), dL/dv0 and dL/d(weights) of a vibrating block in flight. Fibres that go slack have a kink: of such a
-    law the path is smooth but for the particles that cross it, so that the difference's step is small and its error measured."""
+    law the path is smooth but for the particles that cross it, so that the difference's step is small and its error measured. In one
+    substep hardly one crosses it, and what a small step of the fibre's exponent changes is lost in rounding."""
     kinked = "fibre" in law_named(law).parameters
     case = Case(law, substeps, stride=stride(substeps))
-    found = case.compare(both_steps=kinked, scale=0.001 if kinked else 1.0)
+    found = case.compare(
+        both_steps=kinked, scale=(0.1 if substeps == 1 else 0.01) if kinked else 1.0
+    )
     assert_agreement(found, smooth=not kinked)
 
 

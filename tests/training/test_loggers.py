@@ -35,7 +35,7 @@ def test_a_group_or_several_name_the_loggers(tmp_path, override, kinds):
 
 @pytest.mark.parametrize("overrides, message", [
     (["+logger.mlflow.tracking_uri=x"], r"logger\.mlflow: expected a section with _target_"),
-    (["+logger.mine._target_=nowhere.Logger"], r"logger\.mine: .*imported.* found nowhere\.Logger \(No module named"),
+    (["+logger.mine._target_=nowhere_at_all.Logger"], r"logger\.mine: .*imported.* found nowhere_at_all\.Logger \(No module named"),
     (["+logger.mine._target_=mosa.types.Grund"], r"\(the module mosa\.types has no Grund; the nearest is Ground"),
     (["logger=csv", "+logger.csv.projekt=x"], r"logger\.csv\.projekt: unknown key"),
     (["+logger.mine={_target_: mosa.types.Ground, height: 0.0}"], r"logger\.mine: expected a Logger of Lightning, found Ground"),
