@@ -46,8 +46,8 @@ def stride(substeps: int) -> int:
 @pytest.mark.parametrize("law, substeps", paths(ELASTIC))
 def test_18_smooth_laws(law, substeps):
     """dL/d(every parameter), dL/dv0 and dL/d(weights) of a vibrating block in flight. Fibres that go slack have a kink: of such a
-    law the path is smooth but for the particles that cross it, so that the difference's step is small and its error measured. In one
-    substep hardly one crosses it, and what a small step of the fibre's exponent changes is lost in rounding."""
+    law the path is smooth but for the particles that cross it, so that the difference's step is small and its error measured.
+    In one substep hardly one crosses it, and what a small step of the fibre's exponent changes is lost in rounding."""
     kinked = "fibre" in law_named(law).parameters
     case = Case(law, substeps, stride=stride(substeps))
     found = case.compare(
