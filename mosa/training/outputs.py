@@ -131,6 +131,7 @@ def write_outputs(
             compared = {s.prefix: compare(body, s, kept[s.prefix], limit=limit) for s in shown}
             write_comparisons(folder, compared, video=cfg.evaluation.video)
     law, learned = body.material.law, body.material.learned
+    # of a direction (fibre_x, _y, _z) two angles are learned, fibre_1 and fibre_2
     fixed = [n for n in body.material.physical() if not {n, f"{n[:-2]}_1"}.intersection(learned)]
     fixed += ["contact_offset_m"] * (world.ground is None)
     if doubt := unexplained_text(figures, world):

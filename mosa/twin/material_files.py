@@ -65,7 +65,8 @@ def described(twin: Any) -> dict[str, Any]:
 
 def export_material(twin: Any, folder: str | Path, formats: Sequence[str] = FORMATS[:2]) -> Path:
     """`Twin.export_material`."""
-    folder, values = made_folder(folder), particles(twin)
+    values = particles(twin)  # before a folder is made: the truth refuses
+    folder = made_folder(folder)
     if "json" in formats:
         with written_whole(folder / "material.json") as partial:
             partial.write_text(json.dumps(described(twin), indent=1))

@@ -59,7 +59,7 @@ def drawn(made, count, seed=0):
     return made.task.draw(count, torch.Generator().manual_seed(seed))
 
 
-def test_the_truth_is_what_the_films_show():
+def test_the_truth_is_what_the_films_show(tmp_path):
     """Also of a drop that was not for training, and in two worlds."""
     film_of, sequence = object_named("tiny"), "test_60"
     surface, particles, _ = built(film_of.shape, film_of.pitch, film_of.spacing, 0)
@@ -86,11 +86,12 @@ def test_the_truth_is_what_the_films_show():
     with pytest.raises(ConfigError, match=r"scene\.name: expected one of the built-in"):
         true_twin("unicorn")
     for call in (
-        twin.summary, lambda: print(twin.material), lambda: twin.material.E, lambda: twin.export_material("nowhere"),
+        twin.summary, lambda: print(twin.material), lambda: twin.material.E, lambda: twin.export_material(tmp_path / "none"),
         lambda: twin.worlds(2, laws=[{"E": 1e4}, {}]), lambda: twin.worlds(2, laws=torch.zeros(2, 2)),
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=r"^material: .* the truth, whose law is hidden"):
             call()
+    assert not (tmp_path / "none").exists()
     assert repr(twin).startswith("TrueTwin(Body(2006 particles")
 
 

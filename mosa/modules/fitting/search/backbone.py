@@ -108,7 +108,7 @@ class Starts:
         return row | ({} if nu is None else {"nu": FORMS["nu"].inverse(nu)}) | further
 
     def columns(self) -> list[dict[str, float]]:
-        """Of the grid, beside the stiffness: yield stresses, or contact offsets."""
+        """Of the grid, beside the stiffness: yield stresses of a law that has one and fewer than `MANY` numbers, or offsets."""
         if YIELD in self.learned and len(self.learned) < MANY:
             return [{YIELD: self._begins[YIELD] + step} for step in YIELD_STEPS]
         cells = self.calibration.offsets
