@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -29,10 +29,11 @@ NEAREST, ENTERED = 6, 3
 CONTACT, YIELD = "contact", "yield_stress"
 """Names among the numbers of a start: of the contact offset; of what takes its place in that grid where a law has it. Beside a
 yield stress far from the truth, the best stiffness is a wrong one."""
-YIELD_STEPS = (-2.2, -1.1, 0.0, 1.1, 2.2)
-"""Steps of its logarithm: a factor of 3."""
+YIELD_STEP, YIELD_STEPS = 1.1, 2
+"""Of its logarithm, a factor of 3; so many of them up and down."""
 FURTHER, FURTHEST = 1.5, 100.0
-"""Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
+"""Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness. The
+yield stress goes on alike, by its own factor."""
 STRIDES = {
     **dict.fromkeys((*STIFFNESS, "yield_stress"), 1.1), **dict.fromkeys(("viscosity", "damping", "bulk_damping"), 1.6),
     "cohesion": 0.5, "nu": 0.8, "friction_angle": 0.8, CONTACT: 0.15,
@@ -94,6 +95,7 @@ class Starts:
         self.learned, self._begins = self.material.learned, self.material.begins
         modulated = self.material.modulated
         self.modulated = [n for n in STIFFNESS if n in self.learned and n in modulated]
+        self.yields = YIELD in self.learned and len(self.learned) < MANY
         self._scores: dict[tuple[float, ...], float] = {}
         self.failed: Exception | None = None  # of a start that cannot be simulated
         seats, body = len(calibration.newton.seats), calibration.body
@@ -107,12 +109,16 @@ class Starts:
         row = {n: self._begins[n] + shift * (n in self.modulated) for n in self.learned}
         return row | ({} if nu is None else {"nu": FORMS["nu"].inverse(nu)}) | further
 
-    def columns(self) -> list[dict[str, float]]:
+    def columns(self) -> dict[int, dict[str, float]]:
         """Of the grid, beside the stiffness: yield stresses of a law that has one and fewer than `MANY` numbers, or offsets."""
-        if YIELD in self.learned and len(self.learned) < MANY:
-            return [{YIELD: self._begins[YIELD] + step} for step in YIELD_STEPS]
+        if self.yields:
+            return {j: self.yielding(j) for j in range(-YIELD_STEPS, YIELD_STEPS + 1)}
         cells = self.calibration.offsets
-        return [{} if each is None else {CONTACT: each} for each in cells]
+        return dict(enumerate({} if each is None else {CONTACT: each} for each in cells))
+
+    def yielding(self, step: int) -> dict[str, float]:
+        """So many steps from the configured yield stress."""
+        return {YIELD: self._begins[YIELD] + step * YIELD_STEP}
 
     @torch.no_grad()
     def begin_at(self, row: dict[str, float], body: Body | None = None) -> None:
@@ -173,36 +179,42 @@ def search(calibration: Calibration) -> float:
     return starts.score(row)
 
 
-def rows_of_grid(starts: Starts, columns: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+def rows_of_grid(starts: Starts, columns: dict[int, dict[str, float]]) -> list[dict[str, float]]:
     """The deepest valleys, at most `ENTERED`, the lowest first, of a grid of stiffness and `columns`.
 
-    It is searched at a middle Poisson number, further where its best is at an end of the stiffness; the other Poisson numbers at
-    the `NEAREST` best places. Errors: SimulationDiverged where none can be simulated."""
+    It is searched at a middle Poisson number, further where its best is at an end of the stiffness or of the yield stress; the
+    other Poisson numbers at the `NEAREST` best places. Errors: SimulationDiverged where none can be simulated."""
     middle, *others = POISSON_STEPS if "nu" in starts.learned else (None,)
     multiples = dict(enumerate(STIFFNESS_STEPS)) if starts.modulated else {0: 1.0}
+    columns = dict(columns)
     grid: dict[tuple[int, int], float] = {}
 
-    def add(*some: int) -> None:
-        places = {
-            (i, j): starts.row(multiples[i], middle, further)
-            for i in some
-            for j, further in enumerate(columns)
-        }
-        grid.update(zip(places, starts.scores(list(places.values()))))
+    def add(some: Iterable[int], others: Iterable[int]) -> None:
+        places = list(itertools.product(some, others))
+        rows = [starts.row(multiples[i], middle, columns[j]) for i, j in places]
+        grid.update(zip(places, starts.scores(rows)))
 
     def best() -> tuple[int, int]:
-        return min(grid, key=grid.__getitem__)
+        """Of equal ones that with the lowest yield stress: higher ones that the motion does not reach tell nothing."""
+        return min(grid, key=lambda place: (grid[place], place[1]))
 
-    add(*multiples)
-    for end, step in ((min, -1), (max, 1)):
-        while (
-            starts.modulated
-            and best()[0] == (i := end(multiples))
-            and math.isfinite(grid[best()])
-            and 1 / FURTHEST < multiples[i] * FURTHER**step < FURTHEST
-        ):
-            multiples[i + step] = multiples[i] * FURTHER**step
-            add(i + step)
+    def beyond(axis: Mapping[int, Any], place: int) -> int | None:
+        """The next place of an axis whose end this is."""
+        return {min(axis): place - 1, max(axis): place + 1}.get(place)
+
+    add(multiples, columns)
+    while math.isfinite(grid[best()]):
+        i, j = best()
+        row = beyond(multiples, i) if starts.modulated else None
+        column = beyond(columns, j) if starts.yields else None
+        if row is not None and 1 / FURTHEST < (m := multiples[i] * FURTHER ** (row - i)) < FURTHEST:
+            multiples[row] = m
+            add([row], columns)
+        elif column is not None and abs(column) * YIELD_STEP < math.log(FURTHEST):
+            columns[column] = starts.yielding(column)
+            add(multiples, [column])
+        else:
+            break
     if not math.isfinite(grid[best()]):
         raise SimulationDiverged(
             "fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
