@@ -24,6 +24,7 @@ from mosa.settings import (
     Text,
     Three,
     Weight,
+    Zoom,
     is_number,
     such,
 )
@@ -68,8 +69,9 @@ class FilmSection(Settings):
     """direction from the object to the camera in the file's axes, or a list of such, [[x, y, z],
     ...], through which the camera turns about `up` while the film goes on; null: from the side, a
     little above"""
-    zoom: Positive = 1.0
-    """magnification about the middle of the motion; 1: all of it is in the picture"""
+    zoom: Zoom = 1.0
+    """magnification, or a list like [1, 3], from and to, through which the camera comes nearer while
+    the film goes on; 1: all of the motion is in the picture. Above 1 the camera follows the object"""
     shadow: bool = True
     """shadows of the object and the obstacles on the ground, under light from above"""
     caption: bool = True

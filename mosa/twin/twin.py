@@ -48,7 +48,7 @@ from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.rendering.cameras import look_at
-from mosa.settings import Count, Expected, Number, Pixels, Positive, Seed, such, typed
+from mosa.settings import Count, Expected, Number, Pixels, Positive, Seed, Zoom, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
 from mosa.system.whole_files import made_folder, written_whole
@@ -273,15 +273,15 @@ class Twin(InMotion):
         size: Pixels = 400,
         colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         view: Views | None = None,
-        zoom: Positive = 1.0,
+        zoom: Zoom = 1.0,
         shadow: bool = True,
     ) -> Tensor:
         """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and among `colliders`, those
         that the rollout was simulated with (None: the world's). rollout: or a list of the states of T steps, whose solids are
         drawn where they were then (None: those of `reset`). Half spaces are not drawn. size [px]: of a square, or (width,
         height). view: (3,) from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None for the
-        side and a little above. zoom: magnification about the middle of the motion. shadow: on the ground, of the body and of
-        the solids, under light from above. Errors: ConfigError."""
+        side and a little above. zoom: magnification, or several, spread over the frames; above 1 the camera follows the
+        body. shadow: on the ground, of the body and of the solids, under light from above. Errors: ConfigError."""
         return self._pictures(*self._met(rollout, colliders), size, view, zoom, shadow)
 
     def _pictures(
@@ -290,7 +290,7 @@ class Twin(InMotion):
         solids: Sequence[Collider],
         size: int | Sequence[int],
         view: Views | None,
-        zoom: float,
+        zoom: float | Sequence[float],
         shadow: bool,
     ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
@@ -305,14 +305,19 @@ class Twin(InMotion):
         level = side - (side @ up) * up
         side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
         width, height = (size, size) if isinstance(size, int) else size
-        focal, frames = zoom * LENS * min(width, height), len(rollout.x)
+        frames = len(rollout.x)
+        nearer = spread(np.log(np.atleast_1d(zoom)), frames).exp().to(body.rest)
+        # the nearer, the more the camera looks at the body, which may be anywhere on its way
+        follow = (1 - nearer**-2).clamp_min(0)[:, None]
+        aims = target + follow * (rollout.x.mean(1).to(low) - target)
         # without zoom a ball around all places of the particles fills the shorter side, but for a margin
         far = (4 * LENS**2 + 1) ** 0.5 * (0.53 * float((high - low).norm()) + body.spacing)
         toward = viewed_from(side / side.norm() + 0.25 * up if view is None else view, up, frames)
-        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-        w2c = look_at(target + far * toward, target.expand_as(toward), up).cpu()
+        K = torch.tensor([[0, 0, width / 2], [0, 0, height / 2], [0, 0, 1.0]]).repeat(frames, 1, 1)
+        K[:, 0, 0] = K[:, 1, 1] = LENS * min(width, height) * nearer.cpu()
+        w2c = look_at(aims + far * toward, aims, up).cpu()
         names = tuple(f"frame {t}" for t in range(frames))
-        cameras = Cameras(K.to(w2c).expand(frames, 3, 3), w2c, width, height, names)
+        cameras = Cameras(K.to(w2c), w2c, width, height, names)
         shown = seen(body, rollout.x, rollout.F_tot)
         ends, convex = [len(shown.opacities)], [False]
         for k, solid in enumerate(solids):
@@ -321,7 +326,8 @@ class Twin(InMotion):
             convex.append(not isinstance(solid.shape, SignedDistanceField))
         white, floors = np.full((height, width, 3), 255, np.uint8), []
         for t, points in enumerate(shown.means):
-            if t == 0 or not torch.equal(w2c[t], w2c[t - 1]):  # the camera has moved
+            # the camera has moved
+            if t == 0 or not (w2c[t].equal(w2c[t - 1]) and K[t].equal(K[t - 1])):
                 camera = cameras.select([t])
                 lines = ground_lines(self.world, camera, body.size, target.cpu())
                 floor = on_ground(white, lines, 1, torch.ones(3)) / np.float32(255)
@@ -377,7 +383,7 @@ class Twin(InMotion):
     def export(
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
-        size: Pixels = 400, fps: Positive | None = None, view: Views | None = None, zoom: Positive = 1.0,
+        size: Pixels = 400, fps: Positive | None = None, view: Views | None = None, zoom: Zoom = 1.0,
         shadow: bool = True, caption: bool = True,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of
@@ -447,12 +453,15 @@ def viewed_from(view: Views, up: Tensor, frames: int = 1, name: str = "view") ->
     aside = torch.linalg.cross(up, ahead)
     turns = np.unwrap(torch.atan2(level @ aside, level @ ahead).cpu().numpy())
     rises = torch.atan2(given @ up, level.norm(dim=1)).cpu().numpy()
-    at, places = np.linspace(0, len(given) - 1, frames), np.arange(len(given))
-    turn, rise = (
-        torch.from_numpy(np.interp(at, places, v)).to(up)[:, None] for v in (turns, rises)
-    )
+    turn, rise = (spread(v, frames).to(up)[:, None] for v in (turns, rises))
     toward: Tensor = rise.cos() * (turn.cos() * ahead + turn.sin() * aside) + rise.sin() * up
     return toward
+
+
+def spread(values: np.ndarray, frames: int) -> Tensor:
+    """(frames,) of values (K,), evenly from the first to the last."""
+    at = np.linspace(0, len(values) - 1, frames)
+    return torch.from_numpy(np.interp(at, np.arange(len(values)), values))
 
 
 def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:

@@ -229,6 +229,28 @@ def test_zoom_shows_so_much_less():
     far, near = (one.render(rollout, size=64, zoom=zoom, shadow=False) for zoom in (0.5, 1.0))
     whole, part = ((each[..., 0] - each[..., 1] > 0.3)[0].sum() for each in (near, far))
     assert 3 < whole / part < 5
+    for wrong in (0, [], [1, -2], "a", [[1, 2]], None):
+        with pytest.raises(
+            ConfigError, match=r"^zoom: expected a number above 0 .*or a list of such"
+        ):
+            one.render(rollout, zoom=wrong)
+
+
+def test_a_camera_comes_near_a_body_that_has_fallen():
+    """By even ratios, and looks at the body then, which is low in the picture of its whole way."""
+    one = twin()
+    rollout = one.simulate(frames=20, height=0.8, velocity=(0, 0, 0), box=[[-9] * 3, [9] * 3])
+    one.body.colors.copy_(torch.tensor([1.0, 0.0, 0.0]))
+    far, near = (one.render(rollout, size=96, zoom=z, shadow=False) for z in (1.0, [1, 2, 4]))
+    places = []
+    for t, times in ((0, 1), (19, 4)):
+        (whole, seen) = (each[t, ..., 0] - each[t, ..., 1] > 0.3 for each in (far, near))
+        assert (seen.sum() / whole.sum()).sqrt() == pytest.approx(times, rel=0.15)
+        places += [float(each.nonzero()[:, 0].double().mean()) - 47.5 for each in (whole, seen)]
+    assert places[2] > 12 and abs(places[3]) < 0.4 * places[2] and places[0] == places[1] < -12
+    assert (
+        one.render(rollout, size=48, zoom=[3])[5] == one.render(rollout, size=48, zoom=3)[5]
+    ).all()
 
 
 def test_a_camera_goes_along_its_views():
