@@ -20,6 +20,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import (
@@ -362,7 +363,7 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
     """The keyword arguments of a class or function as settings, from their annotations. given: those that no key says.
 
     An argument without an annotation may be anything."""
-    call = build.__init__ if inspect.isclass(build) else build
+    call = build.__init__ if inspect.isclass(build) and not is_dataclass(build) else build
     hints = typing.get_type_hints(call, include_extras=True)
     wanted = {}
     for name, p in inspect.signature(build).parameters.items():

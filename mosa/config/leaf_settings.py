@@ -237,7 +237,7 @@ class SearchSection(Settings):
 
 
 OPTIONS = (
-    "steps low high near lean still tilt aim askew far close aside free leaning hardest before grip shut closing squeeze "
+    "steps substeps low high near lean still tilt aim askew far close aside free leaning hardest before grip shut closing squeeze "
     "unsteady_tilt unsteady_aim unsteady_throw"
 ).split()
 """Fields of the tasks' classes (docs/environments.md)."""

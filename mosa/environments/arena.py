@@ -129,11 +129,14 @@ class Arena:
         return trials.observed.cpu()
 
     def act(self, action: Tensor) -> None:
-        """Let go as actions (B, A) in [-1, 1] say, and play to the end of the episode."""
+        """Let go as actions (B, A) say, of which all beyond [-1, 1] counts as its end, and play to the end of the episode. Errors:
+        ConfigError before a reset, and for another shape."""
+        shape = len(self.begun), len(self.task.actions)
+        action = numbers("action", action, f"{shape} finite numbers", shape).clamp(-1, 1)
         starts = self.task.starts(self.trials, action, self.rest, self.gravity)
         state = self.worlds.reset(
             starts, colliders=self.task.solids(), variant=self.simulator.variant, control_dt=self.task.control_dt,
-            frames=self.task.steps, differentiable=self.differentiable,
+            frames=self.task.steps, differentiable=self.differentiable, substeps=self.task.substeps,
         )  # fmt: skip
         self._see(state)
         for step in range(self.task.steps):
@@ -143,11 +146,6 @@ class Arena:
         """(B,) of the moments seen last; of a world that diverged the loss of a body far away."""
         found = torch.stack(self.last[-LAST:]).mean(0)
         return torch.where(self.diverged.to(found.device), found.new_tensor(LOST), found)
-
-    def taken(self, action: Any) -> Tensor:
-        """(B, A) in [-1, 1] of an action that others give. Errors: ConfigError before a reset, and for another shape."""
-        shape = len(self.begun), len(self.task.actions)
-        return numbers("action", action, f"{shape} finite numbers", shape).float().clamp(-1, 1)
 
     @property
     def begun(self) -> Trials:
@@ -160,7 +158,11 @@ class Arena:
 
     def success(self) -> Tensor:
         """(B,) bool, at the end."""
-        return self.task.succeeded(self.trials, self.view).cpu() & ~self.diverged
+        found = torch.as_tensor(self.task.succeeded(self.trials, self.view)).cpu()
+        if found.dtype != torch.bool or found.shape != self.diverged.shape:
+            said = f"expected ({self.count},) flags, found {found.dtype} {tuple(found.shape)}"
+            raise ConfigError(f"task {self.task.name}: succeeded: {said}")
+        return found & ~self.diverged
 
     def _advance(self, command) -> None:
         for _ in range(self.count + 1):

@@ -20,6 +20,7 @@ from mosa.environments.pictures import picture
 from mosa.environments.task import Task
 from mosa.environments.tasks import TASKS, task_named
 from mosa.errors import ConfigError
+from mosa.physics.engine.inputs import numbers
 from mosa.settings import Count, Section, Seed, typed
 from mosa.twin.twin import Pixels
 
@@ -59,7 +60,7 @@ class _Worlds:
     @torch.no_grad()
     def _step(self, actions: np.ndarray) -> np.ndarray:
         """Rewards (B,) of actions; the episodes are over then."""
-        self.arena.act(self.arena.taken(actions))
+        self.arena.act(actions)
         return -_array(self.arena.loss()).astype(np.float64)
 
 
@@ -98,7 +99,10 @@ class TwinEnv(gymnasium.Env, _Worlds):
         return self._draw(self.np_random, self.render_mode is not None)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        reward = self._step(action[None] if isinstance(action, np.ndarray) else [action])
+        if self.arena.trials is not None and self.arena.last:
+            raise ConfigError("environment: expected reset() after an episode's end, found none")
+        expected = f"{(shape := self.action_space.shape)} finite numbers"
+        reward = self._step(numbers("action", action, expected, shape)[None])
         info = {"success": bool(self.arena.success()[0]), "diverged": bool(self.arena.diverged[0])}
         return _array(self.arena.begun.observed)[0], float(reward[0]), True, False, info
 

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.motion import exponential
+from mosa.physics.engine.inputs import numbers
+from mosa.physics.engine.simulator import Substeps
 from mosa.physics.world import World
 from mosa.system.limits import counted
 from mosa.types import Ground
@@ -74,8 +76,9 @@ class Task(ABC):
     """A hand lets go: it chooses the tilt, and where the body's centre shall be when it arrives. What follows is the body's law.
 
     The hand holds the body without deforming it, its lowest particle `low` to `high` [m] above what it falls on. extents: (3,) of
-    the body at rest [m], from which sizes follow, set by `task_named`; steps: control steps of an episode of `control_dt` [s];
-    tilt [rad], aim [m]: the most that an action may ask for; unsteady_tilt, unsteady_aim: by how much the hand is off at most.
+    the body at rest [m], from which sizes follow, set by `task_named`; steps: control steps of an episode of `control_dt` [s] and
+    `substeps`; tilt [rad], aim [m]: the most that an action may ask for; unsteady_tilt, unsteady_aim: by how much the hand is
+    off at most.
     """
 
     extents: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -85,6 +88,7 @@ class Task(ABC):
     aim: Length = 0.12
     low: Height = 0.3
     high: Height = 0.5
+    substeps: Substeps | None = None
     unsteady_tilt: Angle = 0.02
     unsteady_aim: Length = 0.005
     name: ClassVar[str] = ""
@@ -173,7 +177,8 @@ class Task(ABC):
         down = self.thrown(given)
         fallen = (down.square() + 2 * gravity * (trials.observed[:, 0] - CLEARANCE)).sqrt()
         time = (fallen - down) / gravity
-        tilts, flight = self.release(trials, given, time)
+        released = self.release(trials, given, time)
+        tilts, flight = (self.told("release", each, len(trials), 2) for each in released)
         found = []
         for b in range(len(trials)):
             turn = torch.stack([tilts[b, 0], 0 * tilts[b, 0], tilts[b, 1]]).double()
@@ -214,4 +219,11 @@ class Task(ABC):
 
     def loss(self, trials: Trials, view: View) -> Tensor:
         """(B,) log(1 + miss): 0 where all is as wanted; a trial that is lost does not outweigh the others."""
-        return torch.log1p(self.miss(trials, view))
+        found = self.told("miss", self.miss(trials, view), len(trials))
+        if float(found.min()) < 0:
+            raise ConfigError(f"task {self.name}: miss: expected 0 or more, found {found.min():g}")
+        return torch.log1p(found)
+
+    def told(self, method: str, value: Any, *shape: int) -> Tensor:
+        """What a method of a task returned. Errors: ConfigError where that is something else."""
+        return numbers(f"task {self.name}: {method}", value, f"finite numbers {shape}", shape)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -191,7 +191,8 @@ def task_named(name: str | Task, rest: Tensor, **options: Any) -> Task:
     the task. Errors: ConfigError naming what is unknown."""
     extents = tuple(round(float(e), 2) for e in (rest.amax(0) - rest.amin(0)))
     if isinstance(name, Task):
-        return replace(name, extents=extents, **options)
+        own = {f.name: getattr(name, f.name) for f in fields(name) if f.init}
+        return call("options", type(name), own | options | {"extents": extents})
     said = Expected(f"{' or '.join(TASKS)}, or a Task")
     check("task", name, Annotated[Literal[tuple(TASKS)], said])
     return call("options", TASKS[name], options, extents=extents)

@@ -176,6 +176,14 @@ def test_a_hand_reaches_its_aim_in_free_fall():
     )
 
 
+@pytest.mark.parametrize("answer", [torch.zeros(3, 3), torch.zeros(4), torch.zeros(4, 4), None,
+                                    torch.full((3, 4), torch.nan)])  # fmt: skip
+def test_a_policy_that_answers_with_another_shape_is_named(answer):
+    made = arena("placement", 3, steps=1)
+    with pytest.raises(ConfigError, match=r"^action: expected \(3, 4\) finite numbers, found"):
+        play(made, drawn(made, 3), lambda observed: answer)
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_every_trial_is_its_own_world(name):
     """The same trials in three worlds and in one at a time; the recorded motion ends where the view is."""

@@ -154,6 +154,8 @@ def test_calls_out_of_turn_and_wrong_actions_and_seeds_are_named():
             env.reset(seed=seed)
     env.reset(seed=0)
     nan = np.full(4, np.nan)
+    with pytest.raises(ConfigError, match=r"expected \(4,\) finite numbers, found shape \(1, 4\)"):
+        env.step(np.zeros((1, 4)))
     for action in (
         np.zeros(3),
         np.zeros((1, 4)),
@@ -166,5 +168,50 @@ def test_calls_out_of_turn_and_wrong_actions_and_seeds_are_named():
         np.zeros(4, complex),
         [[1], 2],
     ):
-        with pytest.raises(ConfigError, match=r"^action: expected \(1, 4\) finite numbers"):
+        with pytest.raises(ConfigError, match=r"^action: expected \(4,\) finite numbers"):
             env.step(action)
+
+
+def test_an_episode_ends_with_its_step_and_takes_actions_of_torch_too():
+    env, rewards = TwinEnv("placement", options=options("placement")), []
+    for action in (np.full(4, 0.3), torch.full((4,), 0.3), [0.3] * 4, np.full(4, 9.0), np.ones(4)):
+        env.reset(seed=1)
+        rewards.append(env.step(action)[1])
+        with pytest.raises(ConfigError, match=r"expected reset\(\) after an episode's end"):
+            env.step(action)
+    assert rewards[0] == pytest.approx(rewards[1]) == pytest.approx(rewards[2])
+    assert rewards[3] == rewards[4] != rewards[0]  # beyond 1 is 1
+
+
+def test_a_task_takes_as_many_substeps_as_it_is_told():
+    env = TwinEnv("placement", options={"steps": 2, "substeps": 48})
+    env.reset(seed=0)
+    env.step(np.zeros(4))
+    assert env.arena.worlds.episode.substeps == 48
+
+
+@pytest.mark.parametrize("change, said", [
+    ({"miss": lambda *a: torch.tensor(1.0)}, r"task land: miss: .* numbers \(2,\), found shape \(\)"),
+    ({"miss": lambda self, t, view: view.center}, r"miss: .* \(2,\), found shape \(2, 3\)"),
+    ({"miss": lambda *a: torch.tensor([0.0, -2.0])}, "miss: expected 0 or more, found -2"),
+    ({"miss": lambda *a: torch.full((2,), torch.nan)}, "miss: expected finite numbers"),
+    ({"succeeded": lambda *a: True}, r"succeeded: expected \(2,\) flags, found torch.bool \(\)"),
+    ({"succeeded": lambda *a: torch.ones(2)}, r"succeeded: expected \(2,\) flags, found torch.fl"),
+    ({"release": lambda self, t, g, time: (g[:, :3], g[:, 2:4])}, r"release: .* \(2, 2\), found shape"),
+    ({"near": "5 cm"}, "options.near: expected a number, found '5 cm'"),
+    ({"steps": 2.5}, "options.steps: expected a whole number"),
+])  # fmt: skip
+def test_a_task_s_own_mistake_is_named(change, said):
+    page = (ROOT / "docs" / "environments.md").read_text()
+    names = {"TwinVectorEnv": lambda *a, **k: TwinVectorEnv(*a, **k)}
+    block = next(b for b in re.findall(r"```python\n(.*?)```", page, re.S) if "class Land" in b)
+    exec(block.partition("\nworlds =")[0], names)
+    values = {key: change[key] for key in ("near", "steps") if key in change}
+    methods = {key: value for key, value in change.items() if key not in values}
+    kind = type("Own", (names["Land"],), methods)
+    with pytest.raises(ConfigError, match=said):
+        worlds = TwinVectorEnv(kind(**{"steps": 2, **values}), 2)
+        worlds.reset(seed=0)
+        worlds.step(worlds.action_space.sample())
+    with pytest.raises(ConfigError, match=r"options.nier: unknown key; .* nearest is options.near"):
+        TwinVectorEnv(names["Land"](), 2, options={"nier": 0.1})
