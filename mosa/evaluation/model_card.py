@@ -91,8 +91,9 @@ def model_card(
     kept: Kept,
     world: World,
     version: str,
+    note: str = "",
 ) -> str:
-    """Markdown. figures: of the run, of which some may be missing; kept: rollouts by prefix and variant; version: of mosa."""
+    """Markdown. figures: of the run, some may be missing; kept: rollouts by prefix and variant; version: of mosa; note: on all."""
     law, name = body.material.law, sequences[0].scene.name
     # a fit may leave out parts that the body has: their numbers are then 0
     learns = body.adapter is not None and body.adapter.corrects
@@ -106,7 +107,7 @@ def model_card(
     )
     unsure = "This fit keeps no posterior: how sure the law is, is not known."
     doubt = tables.unexplained_text(figures, world)
-    errors = (doubt, tables.results_table(figures), tables.columns_text(figures, name))
+    errors = (note, doubt, tables.results_table(figures), tables.columns_text(figures, name))
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),
         "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law)}",

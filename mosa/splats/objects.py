@@ -25,7 +25,6 @@ from mosa.data.formats.scene_from_footage import check_density
 from mosa.data.io.gaussian_ply import read_ply
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Start
-from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.inputs import numbers
 from mosa.reconstruction.gaussians.initial import inherited_colors
 from mosa.reconstruction.geometry.filling import fill
@@ -37,7 +36,6 @@ from mosa.settings import Number, Positive, typed
 from mosa.system.limits import named_device
 from mosa.training.preflight import check_splats
 from mosa.training.run_folder import most_particles, quiet, run_folder
-from mosa.twin.rollout_file import poses
 from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats, metres
@@ -184,17 +182,7 @@ def object_twin(
     if settings.appearance == "splats":
         body.splats = CarriedSplats(shown, body.rest)
     start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
-    twin = Twin(body.eval(), world_of(record), record.frame_dt, record, start)
-    for k, solid in enumerate(twin.world.colliders):
-        middle = poses([solid], torch.zeros(1))[0][0, 0].to(direction)
-        above, far = float(middle @ direction) - ground, reach(solid.shape)
-        if far > 0 and above < -0.99 * far:
-            warnings.warn(
-                f"colliders[{k}]: its position {metres(middle)} is {-above:.3g} m below the ground, "
-                f"where nothing meets it: up is {metres(direction)}",
-                stacklevel=2,
-            )
-    return twin
+    return Twin(body.eval(), world_of(record), record.frame_dt, record, start)
 
 
 @torch.no_grad()

@@ -130,11 +130,11 @@ def run_command(run: Callable[[], None]) -> None:
                 if begun and not isinstance(error, HydraException):
                     raise
                 given = sys.argv[1:]
-                message = (
-                    f"ConfigError: {said_of(error, given)}\n(in: {' '.join(given)[:300]})\n"
+                message = f"ConfigError: {said_of(error, given)}\n(in: {' '.join(given)[:300]})\n"
+                message += "a decimal is written with a point" if "Ambiguous" in message else (
                     "`+` adds keys that no file of conf/ has, as a law's parameters; all keys: "
                     "python -m mosa.config.reference <command> [KEY]"
-                )
+                )  # fmt: skip
             print(f"\n{message}", file=sys.stderr)
             sys.exit(2)
 

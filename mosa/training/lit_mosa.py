@@ -577,6 +577,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
         found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
         found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}
+        if self.parts:
+            found["held_back/position_weight"] = self.weights.get("position", 0.0)
         found |= {f"id_prior/ground/{k}_m": v for k, v in self.grounds.items() if math.isfinite(v)}
         gains = self.ground_gains.items()
         return found | {f"id_prior/ground/{k}_gain": v for k, v in gains if math.isfinite(v)}

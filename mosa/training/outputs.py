@@ -49,6 +49,7 @@ from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.whole_files import written_whole
 from mosa.training.run_folder import VALIDATION, write_figures
 from mosa.twin.rollout_file import save_rollout, save_spread, save_truth
+from mosa.twin.start import warn_of_unmet
 from mosa.types import Rollout
 
 log = logging.getLogger(__name__)
@@ -113,6 +114,8 @@ def write_outputs(
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
         motions = {prefix: each[variant] for prefix, each in kept.items() if variant in each}
         save_rollout(folder / name, motions, world.solids)
+    moved = [each["adapted"] for each in kept.values() if "adapted" in each]
+    warn_of_unmet(moved, world.colliders, body, world)
     told = [s for s in evaluated if s.scene.truth is not None]
     if known := {s.prefix: true_motion(body, s.scene) for s in told}:
         save_truth(folder / "truth.npz", known)
@@ -147,7 +150,7 @@ def write_outputs(
         partial.write_text(table + "\n")
     if (folder / "checkpoints").is_dir():
         with written_whole(folder / "checkpoints" / FILE) as partial:
-            partial.write_text(model_card(figures, body, evaluated, kept, world, __version__))
+            partial.write_text(model_card(figures, body, evaluated, kept, world, __version__, note))
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
 

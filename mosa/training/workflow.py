@@ -161,7 +161,10 @@ def train(cfg: DictConfig) -> float | None:
     logged = trainer.callback_metrics.items()
     figures |= {k: float(v) for k, v in logged if k.startswith(VALIDATION)}
     log_outcome(trainer.loggers, plain(cfg), figures)
-    write_outputs(folder, cfg, body, evaluated, figures, kept, world, f"{cut}\n\n{thin}".strip())
+    small = HydraConfig.get().runtime.choices.get("debug")
+    smoke = f"**A small smoke run (debug={small}): its figures mean nothing.**" if small else ""
+    note = "\n\n".join(filter(None, (smoke, cut, thin)))
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world, note)
     return optimized(figures, cfg.optimized_metric)
 
 

@@ -165,13 +165,22 @@ class TwinMaterial:
             return each
         names, found = self._body.material.learned, read_numbers(self._body).repeat(len(each), 1)
         for b, values in enumerate(each):
-            raw = self._with(values).raw
+            self._doubt(other := self._with(values), self.density)
+            raw = other.raw
             if fixed := [name for name in values if name not in names or name not in raw]:
                 own = f"in {', '.join(names)}, inside their ranges, found {', '.join(fixed)}"
                 raise ConfigError(f"laws[{b}]: worlds differ {own}; twin.material.set is for all")
             for name in values:
                 found[b, names.index(name)] = raw[name].detach()
         return found
+
+    def _doubt(self, material: Material, density: float) -> None:
+        """Warn of an E that was not meant in Pa."""
+        weight = density * float(self._twin.world.gravity.norm()) * self._body.size
+        E = float(material.physical().get("E", torch.tensor(torch.inf)).detach().max())
+        if E < SAGS * weight:
+            said = f"E: {E:.3g} Pa does not carry the body's weight ({weight:.3g} Pa at its foot)"
+            warnings.warn(f"{said}: in Pa?", stacklevel=4)
 
     def preset(self, name: str) -> None:
         """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the learned correction.
@@ -199,13 +208,7 @@ class TwinMaterial:
                 settings["adapter"] = {"name": None}
             if body.heterogeneity is None:
                 settings["heterogeneity"] = {"enabled": False}
-        weight = density * float(twin.world.gravity.norm()) * body.size
-        stiffest_E = float(material.physical().get("E", torch.tensor(torch.inf)).detach().max())
-        if stiffest_E < SAGS * weight:
-            warnings.warn(
-                f"E: {stiffest_E:.3g} Pa does not carry the body's weight ({weight:.3g} Pa at its foot): in Pa?",
-                stacklevel=3,
-            )
+        self._doubt(material, density)
         changed = twin.record.but(settings=settings, law=None, density=density)
         twin._record, twin.posterior, body.density = changed, None, density
         body.material = material.to(body.rest)

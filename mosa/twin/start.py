@@ -37,8 +37,9 @@ from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.inputs import FASTEST, numbers, vector
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
+from mosa.twin.rollout_file import poses
 from mosa.twin.shown_solids import surface
-from mosa.types import metres
+from mosa.types import Rollout, metres
 
 UNDER = 0.25
 """Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
@@ -46,6 +47,8 @@ STORED_BYTES = 4 * (3 + 3 + 9 + 9)
 """Of a particle in a frame of a rollout: x, v, F, F_tot."""
 LARGE = 50.0
 """A mesh's length, a solid's distance and a height, over the body's size, from which their unit is doubted."""
+BESIDE = 0.5
+"""Of the body's size, from which a solid is too far away to be meant."""
 CREEP = 5e-3
 """[m/s] of a held body from which the number of substeps is doubted."""
 
@@ -196,6 +199,9 @@ def start_in(
             continue
         expected, far = f"{field}[{i}]: expected a", LARGE * body.size
         away = float((pose_at(each.motion)[0] - center.detach().cpu()).norm()) - reach(each.shape)
+        if (deep := buried(each, world)) > 0:
+            said = f"above the ground, found its highest point {deep:.3g} m below it"
+            warnings.warn(f"{expected} solid {said}: up is {metres(up)}", stacklevel=4)
         if isinstance(each.shape, SignedDistanceField) and (size := each.shape.extent) > far:
             warnings.warn(
                 f"{expected} mesh about as large as the body of {body.size:.3g} m, "
@@ -208,6 +214,8 @@ def start_in(
                 f"{away:.3g} m away: lengths are in metres",
                 stacklevel=4,
             )
+    if float(world.gravity @ world.up) > 0:
+        warnings.warn(f"gravity: {metres(world.gravity)} m/s^2 points up", stacklevel=4)
     if world.ground is not None:
         heights = ((center + arms) @ up).detach()
         below = float((heights < world.ground.height - 0.25 * body.spacing).double().mean())
@@ -237,6 +245,40 @@ def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | Non
             f"{1e3 * CREEP:.2g} mm/s. A squeezed body needs more: double them until the motion stays",
             stacklevel=4,
         )
+
+
+def warn_of_unmet(
+    motions: Sequence[Rollout], solids: Sequence[Collider], body: Body, world: World
+) -> None:
+    """Warn of solids that feel nothing in all motions of a body and stay `BESIDE` it."""
+    told = []
+    for k, solid in enumerate(solids):
+        felt = (m.reactions is not None and bool(m.reactions[..., k, :].any()) for m in motions)
+        if isinstance(solid.shape, (HalfSpace, Particles)) or any(felt):
+            continue
+        away = math.inf
+        for motion in motions:
+            places = (part[:, 0] for part in poses([solid], motion.times))
+            for x, at, turned in zip(motion.x, *places):
+                q = (x.detach().cpu().double() - at) @ turned
+                d = signed_distance(solid.shape, q)  # far from a mesh 1e30
+                away = min(away, float(d.where(d < 1e29, q.norm(dim=1) - reach(solid.shape)).min()))
+        if BESIDE * body.size < away < LARGE * body.size and not buried(solid, world):
+            told.append(f"{solid.name or k} never nearer than {away:.2g} m")
+    if told:
+        said = f"expected solids that the body comes to, found {', '.join(told)}"
+        warnings.warn(f"colliders: {said}", stacklevel=4)
+
+
+@torch.no_grad()
+def buried(solid: Collider, world: World) -> float:
+    """How far [m] the highest point of a solid at its start is below the ground; 0 where it is not."""
+    if world.ground is None:
+        return 0.0
+    at, turned = (part[0, 0] for part in poses([solid], torch.zeros(1)))
+    points = surface(solid.shape, 0.1 * reach(solid.shape)).double() @ turned.mT + at
+    deep = world.ground.height - float((points @ world.up.double().cpu()).max())
+    return deep if deep > 0.05 * half_width(solid.shape) else 0.0
 
 
 class Crossings:

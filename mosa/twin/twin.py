@@ -77,6 +77,7 @@ from mosa.twin.start import (
     check_wants_no_gradients,
     start_in,
     warn_of_creep,
+    warn_of_unmet,
 )
 from mosa.types import Cameras, Rollout
 
@@ -214,7 +215,9 @@ class Twin(InMotion):
                 times = self.frame_dt * torch.arange(frames)
                 for moment in zip(*poses(world.colliders, times)):
                     crossings.look(*moment)
-            return ready.simulate(frames, world.solids, progress=lambda _: bar.update())
+            rollout = ready.simulate(frames, world.solids, progress=lambda _: bar.update())
+        warn_of_unmet([rollout], world.colliders, self.body, world)
+        return rollout
 
     @typed
     def reset(
@@ -393,6 +396,8 @@ class Twin(InMotion):
         and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px above and below.
         Errors, before anything is written: ConfigError where they are not, or a format's or the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
+        if rollout.reactions is None:  # of steps
+            warn_of_unmet([rollout], solids, self.body, self.world)
         check_formats(formats)
         if video:
             ffmpeg("video")

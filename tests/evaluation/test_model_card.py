@@ -33,8 +33,12 @@ def test_the_card_says_what_was_filmed_what_is_known_and_where_it_holds():
                  "## Licence", "| rms [mm]"):  # fmt: skip
         assert part in said, part
     assert "nan" not in model_card({"id/E": 3e4}, body, evaluated, {}, STICKY, "1")
-    unsure = model_card({}, body, evaluated, {}, STICKY, "1")
-    assert "keeps no posterior" in unsure and "stretches" not in unsure
+    unsure = model_card({}, body, evaluated, {}, STICKY, "1", "a smoke run")
+    assert (
+        "## Errors\na smoke run\n" in unsure
+        and "keeps no posterior" in unsure
+        and "stretches" not in unsure
+    )
 
 
 def test_parts_that_a_fit_left_out_are_not_said_to_be_learned():

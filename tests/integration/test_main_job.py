@@ -120,6 +120,10 @@ def test_a_run_leaves_its_outputs(run):
     richest = figures["held_back/operator+stiffness_m"]
     assert richest < figures["held_back/isotropic_m"]  # something was learned
     assert figures["unexplained/train/share"] < 0.3 and figures["unexplained/train/off_m"] > 0
+    smoke = "**A small smoke run (debug=default): its figures mean nothing.**"
+    assert (run / "results.md").read_text().startswith(smoke)
+    assert smoke in (run / "checkpoints" / "model_card.md").read_text()
+    assert figures["held_back/position_weight"] == 1
     assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
 
 
@@ -339,6 +343,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: nowhere.ckpt: no such file"),
         (["ckpt_path=conf"], "ckpt_path: conf: a folder; a run writes"),
         (["losses.colour=1"], "colour"),
+        (["scene.scale=0,5"], "a decimal is written with a point"),
         (["trainer.devices=[1000]", "trainer.accelerator=gpu"], "trainer=cpu runs without one"),
         (["fit.clip=abc"], "fit.clip: expected a number above 0 and at most 1e+20, found 'abc'"),
         (["scene=pacnerf", "scene.path=/nonexistent"], "/nonexistent"),

@@ -8,6 +8,8 @@ import torch
 from small_bodies import FRAME_DT, WORLD, small_body, start
 
 from mosa.errors import ConfigError
+from mosa.physics.contact.colliders import colliders_from_config
+from mosa.twin.start import warn_of_unmet
 from mosa.twin.twin import Twin
 
 STILL = {"velocity": (0, 0, 0), "angular_velocity": (0, 0, 0)}
@@ -104,6 +106,61 @@ def test_radians_and_millimetres_are_asked_about(given, said):
         twin().reset(**STILL | given)
 
 
+def told(run) -> list[str]:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        run()
+    return [str(each.message) for each in said if issubclass(each.category, UserWarning)]
+
+
+@pytest.mark.parametrize("solid, said", [
+    ({"position": [0.6, 0.05, 0]}, "found ball never nearer than 0.5 m"),
+    ({"position": [0.6, 0.05, 0], "motion": {"velocity": [-3.0, 0, 0]}}, ""),
+    ({"position": [0.1, 0.05, 0]}, ""), ({"position": [0.12, 0.05, 0]}, ""),  # met, and missed by 2 cm
+    ({"position": [0, -0.2, 0]}, "found its highest point 0.15 m below"),
+    ({"position": [0, -0.04, 0]}, ""),
+])  # fmt: skip
+def test_a_solid_that_a_whole_motion_does_not_come_near_is_named_once(solid, said):
+    ball = {"type": "sphere", "name": "ball", "radius": 0.05, "mode": "separate", **solid}
+    found = told(lambda: twin().simulate(frames=12, height=0.1, **STILL, colliders=[ball]))
+    assert len(found) == bool(said) and said in "".join(found)
+
+
+def test_a_solid_that_actions_do_not_bring_near_is_named_with_the_film_of_the_steps(tmp_path):
+    made = twin()
+    ball = {"type": "sphere", "name": "ball", "radius": 0.05, "position": [0.6, 0.35, 0]}
+    wall = {"type": "plane", "normal": [1, 0, 0], "position": [-3, 0, 0]}  # is for safety
+
+    def stepped(speed: float) -> None:
+        states = [made.reset(**STILL, colliders=[ball, wall], gravity=(0, 0, 0), control_dt=0.02)]
+        states += [made.step({"ball": (speed, 0, 0)}).state for _ in range(10)]
+        made.export(states, tmp_path, video=False)
+
+    assert told(lambda: stepped(-2.4)) == []
+    assert "found ball never nearer than 0.5 m" in told(lambda: stepped(2.4))[0]
+
+
+def test_a_solid_that_one_of_several_recordings_meets_is_none_to_name():
+    made, ball = twin(), {"type": "sphere", "radius": 0.05, "position": [0.6, 0.05, 0]}
+    met, missed = (
+        made.simulate(frames=10, height=0.1, **STILL | {"velocity": (v, 0, 0)}, colliders=[ball])
+        for v in (4, 0)
+    )
+    solids = colliders_from_config([ball], "colliders")
+    assert told(lambda: warn_of_unmet([missed, met], solids, made.body, made.world)) == []
+    (said,) = told(lambda: warn_of_unmet([missed], solids, made.body, made.world))
+    assert "found 0 never nearer than 0.5 m" in said
+
+
+def test_a_mesh_far_away_has_a_distance(tmp_path):
+    path = tmp_path / "tetrahedron.obj"
+    path.write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    far = {"type": "mesh", "path": str(path), "position": [1, 0.3, 0]}
+    (said,) = told(lambda: twin().simulate(frames=2, **STILL, colliders=[far]))
+    away = float(said.partition("found 0 never nearer than ")[2].removesuffix(" m"))
+    assert 0.7 < away < 0.95
+
+
 def test_a_solid_in_millimetres_that_holds_the_body_is_named():
     with pytest.raises(
         ConfigError, match=r"it reaches 86.6 m from its origin \(lengths are in metre"
@@ -193,6 +250,8 @@ def test_another_gravity_is_that_of_the_fall():
     x = made.simulate(gravity=pull, frames=5, **STILL).x[-1]
     torch.testing.assert_close(x, state.positions, rtol=0, atol=1e-6)
     assert float(made.world.gravity[1]) == pytest.approx(-9.8)
+    with pytest.warns(UserWarning, match=r"^gravity: \[0.0, 9.8, 0.0\] m/s\^2 points up"):
+        made.reset(gravity=(0, 9.8, 0), **STILL)
     for wrong in (-1.62, (0, -1.62), "moon"):
         with pytest.raises(ConfigError, match=r"^gravity: expected three finite numbers"):
             made.reset(gravity=wrong)
@@ -201,3 +260,13 @@ def test_another_gravity_is_that_of_the_fall():
 def test_a_value_of_the_material_is_named_as_it_was_set():
     with pytest.raises(ConfigError, match=r"^E: expected a number, found"):
         twin().material.E = "2e4"
+
+
+def test_a_law_in_megapascals_is_asked_about_in_worlds_too():
+    made = twin()
+    for begin in (
+        lambda: made.worlds(2, laws=[{"E": 0.03}, {}]),
+        lambda: made.material.set(E=0.03),
+    ):
+        with pytest.warns(UserWarning, match=r"^E: 0.03 Pa does not carry the body's weight"):
+            begin()

@@ -162,8 +162,8 @@ def _asked(gains: Mapping[str, float]) -> str:
     return said
 
 
-def form_text(errors: Mapping[str, float]) -> str:
-    """Which parts the learned law has, and why. errors: [m] of held-back frames, by `parts.named`."""
+def form_text(errors: Mapping[str, float], positions: float = 1.0) -> str:
+    """Which parts the learned law has, and why. errors: [m] of held-back frames, by `parts.named`; positions: losses.position."""
     words = {"isotropic": "isotropic and the same everywhere", "operator": "anisotropic",
              "stiffness": "of a stiffness that varies over the body",
              "operator+stiffness": "anisotropic, of a stiffness that varies over the body"}  # fmt: skip
@@ -178,8 +178,8 @@ def form_text(errors: Mapping[str, float]) -> str:
             f" A richer law is only learned where this error is below {WORTH:g} of the isotropic "
             "one, because errors of contact and cues can look like slight anisotropy."
         )
-    if taken == named(()):
-        said += " Cues of rotation and stretch had no part in this law's numbers (unless losses.position=0)."
+    if taken == named(()) and positions:
+        said += " Cues of rotation and stretch had no part in this law's numbers."
     return said
 
 
@@ -231,7 +231,7 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         for part in filter(None, (ground_text(distances, gains), ground_table(distances, gains))):
             lines += [part, ""]
     if held_back := _part(figures, "held_back/"):
-        lines += [form_text(held_back), ""]
+        lines += [form_text(held_back, figures.get("held_back/position_weight", 1.0)), ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]
@@ -288,13 +288,11 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
                 "prior values."
             )
     if (sd := figures.get("posterior/test/sd_m")) is not None:
-        sure = figures.get("posterior/test/coverage")
-        covered = (
-            "" if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations"
-        )
+        sure = figures.get("posterior/test/coverage", math.nan)
+        covered = f"; {sure:.0%} of the errors lie within two such deviations, where 95% should"
         lines.append(
             "- Held-out positions after contact have a predicted standard deviation (not an error) of "
-            f"{sd * 1e3:.1f} mm (rms){covered}."
+            f"{sd * 1e3:.1f} mm (rms){'' if math.isnan(sure) else covered}."
         )
     return "\n".join(lines)
 

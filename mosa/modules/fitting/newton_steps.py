@@ -196,9 +196,10 @@ class NewtonSteps:
         if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):
             return own
         kept = [part for part in PARTS if part in best.split("+")]
+        alone = not kept and self.weights.get("position", 0.0) != 0
         log.info("parts of the law that are kept: %s; errors of held-back frames: %s%s", best, ", ".join(
             f"{name} {1e3 * error:.2f} mm" for name, error in self.parts.items()),
-            "" if kept else "; cues of rotation and stretch had no part in its numbers (unless losses.position=0)")  # fmt: skip
+            "; cues of rotation and stretch had no part in its numbers" * alone)  # fmt: skip
         with torch.no_grad():
             if "operator" in own.parts and "operator" not in kept:
                 body.adapter.numbers.zero_()
