@@ -300,6 +300,9 @@ class MaterialSettings(LawSections):
     carry no stress"""
     symmetry: Literal["full", "orthotropic"] = "full"
     """symmetry of the learned stiffness; orthotropic: mirrors across x, y and z"""
+    evidence: bool = True
+    """whether the stiffness' numbers have a prior, of a size by the evidence; false: least squares
+    alone, as published fits: nearer to the tests, farther from those left out"""
     starts: int = Field(4, ge=1, le=100)
     """starts of the least squares; the best result is kept"""
     leave_out: bool = True

@@ -91,13 +91,15 @@ class Law:
 class Fitting:
     """`law` against `data`. seed: of the starts; known: what another experiment said of some of the
     numbers (the stiffness' by the names operator[k]), which is their prior; true: the data are
-    Cauchy's stresses. Errors: SimulationDiverged where no start can be evaluated."""
+    Cauchy's stresses; evidence: whether the stiffness' numbers have a prior. Errors: SimulationDiverged
+    where no start can be evaluated."""
 
     def __init__(
         self, law: Law, data: Measurements, incompressible: bool, *, starts: int, seed: int,
-        known: Posterior | None = None, true: bool = False,
+        known: Posterior | None = None, true: bool = False, evidence: bool = True,
     ) -> None:  # fmt: skip
         self.law, self.data, self.starts, self.seed = law, data, starts, seed
+        self.evidence = evidence
         self.begin = law.get()
         self.specimens = Specimens(data, incompressible, true)
         self.unit = float(np.sqrt(np.mean(data.value**2)))
@@ -121,7 +123,7 @@ class Fitting:
     def fit(self, rows: np.ndarray | None = None) -> Fit:
         """The best of all starts on the stresses `rows` (m,) bool, or all; `predicted` is of all of them."""
         rows = np.ones(len(self.data.value), bool) if rows is None else rows
-        noise, sigma = 0.1, SIGMA
+        noise, sigma = 0.1, SIGMA if self.evidence else UNKNOWN
 
         def residuals(theta: np.ndarray, noise: float, sigma: float) -> np.ndarray:
             try:
@@ -155,7 +157,7 @@ class Fitting:
             shares = 1 - np.diag(covariance @ prior)
             determined, effective = shares[self.own], float(shares.sum())
             noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0) + LEAST**2))
-            if self.own.any():
+            if self.own.any() and self.evidence:
                 own = (best.x[self.own] ** 2).sum() / max(determined.sum(), 1e-3)
                 sigma = float(np.clip(np.sqrt(own), FEWEST, MOST))
             best = solve(best.x, 100)

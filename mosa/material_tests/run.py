@@ -63,7 +63,7 @@ def fit_tests(cfg: DictConfig) -> float:
     law, known = build_law(values), None
     if values["known"] is not None:
         known = known_numbers(values["known"], law.material, law.adapter, "known")
-    options = {name: values[name] for name in ("incompressible", "starts", "seed")}
+    options = {name: values[name] for name in ("incompressible", "starts", "seed", "evidence")}
     fitting = Fitting(law, data, known=known, true=values["stress"] == "cauchy", **options)
     if not fitting.law.names:
         raise ConfigError("prior.frozen: expected a parameter that is learned, found none")
