@@ -22,6 +22,8 @@ from mosa.settings import nearest, node_of
 from mosa.system.refused import causes
 
 GROUPED = "scene"  # the group whose option a bare name chooses
+PLUGINS = {"optuna": "sweep", "joblib": "sweep", "submitit_slurm": "sweep", "ray": "ray"}
+"""Of Hydra, by the names of their options: extras of this package."""
 CHOSEN = ("adapter", "trainer", "callbacks", "logger")  # their keys depend on the option
 
 
@@ -110,6 +112,8 @@ def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
             f"{nearest(found[2], options, '')}; files of your own: hydra.searchpath=[file://<folder>], "
             f"which holds {found[1]}/{found[2]}.yaml"
         )
+        if found[2] in PLUGINS:
+            said = f"{found[1]}={found[2]}: expected its plugin of Hydra, found none; pip install 'mosa[{PLUGINS[found[2]]}]'"
     if "Config group override must be a string" in said and "NoneType" in said:
         said = "a group, as scene, prior or adapter: expected the name of an option, found null"
         words = (word.lstrip("+").partition("=") for word in given)

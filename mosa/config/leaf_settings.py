@@ -246,8 +246,9 @@ OPTIONS = (
 class EnvironmentsSettings(Settings):
     """python -m mosa.environments"""
 
+    extensions: Extensions = []
     task: Text = "placement"
-    """placement or hanging"""
+    """placement or hanging, or the name of a task of an extension"""
     checkpoint: Text | None = None
     """checkpoint of a run: source of the learned and of the isotropic twin"""
     simulator: Annotated[

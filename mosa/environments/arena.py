@@ -102,13 +102,14 @@ class Played:
 
 
 class Arena:
-    """`worlds` copies of a simulator's body at a task. One after the other: `reset` with trials, then `act`."""
+    """`worlds` copies of a simulator's body at a task, of the law's values `laws` as `Twin.worlds` takes
+    them. One after the other: `reset` with trials, then `act`."""
 
-    def __init__(self, simulator: Simulator, task: Task, worlds: int) -> None:
+    def __init__(self, simulator: Simulator, task: Task, worlds: int, laws: Any = None) -> None:
         self.simulator, self.task, self.count = simulator, task, worlds
         twin = copy.copy(simulator.twin)
         twin.world = task.world(twin.world)
-        self.body, self.worlds = twin.body, twin.worlds(worlds)
+        self.body, self.worlds = twin.body, twin.worlds(worlds, laws)
         self.gravity = float(twin.world.gravity.norm())
         self.weights = (self.body.volume / self.body.volume.sum()).detach()
         self.rest = (self.body.rest - self.body.center).detach()

@@ -13,11 +13,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mosa.config.build import plain
+from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import EnvironmentsSettings
 from mosa.environments.arena import SIMULATORS
 from mosa.environments.policies import SEARCHES
 from mosa.environments.study import UNTRAINED, Bench, make_jobs, one, table
-from mosa.environments.tasks import TASKS
+from mosa.environments.task import TASKS
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.figures import ffmpeg
 from mosa.settings import arguments_of, check
@@ -30,6 +31,7 @@ AT_A_TIME = 8  # worlds on a CPU: more would only wait for its cores
 
 def setting_of(values: dict) -> EnvironmentsSettings:
     """Checked, with the worlds and the task's options that it takes. Errors: ConfigError naming the key."""
+    load_extensions(values.get("extensions"))
     setting = EnvironmentsSettings.read(values)
     device, worlds = named_device(setting.device), setting.worlds
     if worlds == "auto":

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from mosa.environments.arena import Arena, simulator_named
 from mosa.environments.pictures import picture
-from mosa.environments.task import Task
-from mosa.environments.tasks import TASKS, task_named
+from mosa.environments.task import TASKS, Task
+from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError
 from mosa.physics.engine.inputs import numbers
 from mosa.settings import Count, Section, Seed, typed
@@ -42,12 +42,18 @@ class _Worlds:
     arena: Arena
 
     def _spaces(
-        self, worlds: int, task: str | Task, simulator: str, options: dict | None, **of: Any
+        self,
+        worlds: int,
+        task: str | Task,
+        simulator: str,
+        options: dict | None,
+        laws: Any = None,
+        **of: Any,
     ) -> tuple[spaces.Box, spaces.Box]:
         """(observations: ranges of a start, wider by rounding; actions). Errors: ConfigError, DataError."""
         made = simulator_named(simulator, **of)
         task = task_named(task, made.twin.body.rest, **(options or {}))
-        self.arena, self.task = Arena(made, task, worlds), task
+        self.arena, self.task = Arena(made, task, worlds, laws), task
         low, high = np.array([(q.low, q.high) for q in task.observations], np.float32).T
         seen = spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
         return seen, spaces.Box(-1.0, 1.0, (len(task.actions),), np.float32)
@@ -130,7 +136,8 @@ def held(arena: Arena) -> tuple[Tensor, Tensor, None]:
 
 
 class TwinVectorEnv(VectorEnv, _Worlds):
-    """`worlds` bodies at a task, stepped together: on a GPU in the same launches. Arguments, actions, observations and rewards as
+    """`worlds` bodies at a task, stepped together: on a GPU in the same launches; laws: of each, as
+    `Twin.worlds` takes them. Further arguments, actions, observations and rewards as
     `TwinEnv`. All episodes end at once and begin anew in the same step (`AutoresetMode.SAME_STEP`): its observations are those of
     the new trials, `info["final_obs"]` and `info["final_info"]["success"]` those of the ended ones."""
 
@@ -140,9 +147,15 @@ class TwinVectorEnv(VectorEnv, _Worlds):
     def __init__(
         self, task: str | Task = "placement", worlds: Count = 8, *, simulator: str = "learned",
         checkpoint: str | Path | None = None, scene: str | None = None, device: str = "cpu", spacing: float | None = None,
-        options: Section | None = None,
+        options: Section | None = None, laws: Any = None,
     ) -> None:  # fmt: skip
-        of = {"checkpoint": checkpoint, "scene": scene, "device": device, "spacing": spacing}
+        of = {
+            "checkpoint": checkpoint,
+            "scene": scene,
+            "device": device,
+            "spacing": spacing,
+            "laws": laws,
+        }
         found = self._spaces(worlds, task, simulator, options, **of)
         self.single_observation_space, self.single_action_space = found
         self.num_envs, self.render_mode = worlds, None

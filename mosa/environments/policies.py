@@ -107,6 +107,14 @@ class PolicyChecks:
 
     def found(self) -> Found:
         """The policy as it was at its best."""
+        best = min(self.history, key=lambda look: look["loss"])
+        if best["iteration"] == 0:
+            self.say("no look was better than the policy that the search began from, which is kept: "
+                     "try a smaller search.rate, or a larger search.batch")  # fmt: skip
+        elif best is not self.history[-1]:
+            self.say(
+                f"the policy of iteration {best['iteration']} is kept, loss {best['loss']:.3f}"
+            )
         self.policy.load_state_dict(self.best[1])
         seconds = time.perf_counter() - self.began
         return Found(self.policy.requires_grad_(False), self.history, seconds, self.played)

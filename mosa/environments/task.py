@@ -71,6 +71,10 @@ class Quantity:
     high: float
 
 
+TASKS: dict[str, type[Task]] = {}
+"""By name: those of `tasks.py`, and every class of one's own that has one."""
+
+
 @dataclass(frozen=True)
 class Task(ABC):
     """A hand lets go: it chooses the tilt, and where the body's centre shall be when it arrives. What follows is the body's law.
@@ -95,6 +99,11 @@ class Task(ABC):
     ground_friction: ClassVar[float] = 0.3
     watched_height: ClassVar[float] = 0.15
     """Height [m] of what pictures look at, where nothing lies under the body."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if cls.name:
+            TASKS[cls.name] = cls
 
     def __post_init__(self) -> None:
         """Errors: ConfigError for a range whose end is below its beginning."""
@@ -220,7 +229,7 @@ class Task(ABC):
     def loss(self, trials: Trials, view: View) -> Tensor:
         """(B,) log(1 + miss): 0 where all is as wanted; a trial that is lost does not outweigh the others."""
         found = self.told("miss", self.miss(trials, view), len(trials))
-        if float(found.min()) < 0:
+        if float(found.detach().min()) < 0:
             raise ConfigError(f"task {self.name}: miss: expected 0 or more, found {found.min():g}")
         return torch.log1p(found)
 

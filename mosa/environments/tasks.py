@@ -16,6 +16,7 @@ from annotated_types import Interval
 from torch import Tensor
 
 from mosa.environments.task import (
+    TASKS,
     Angle,
     Height,
     Length,
@@ -183,7 +184,6 @@ class Hanging(Task):
 
 
 SIDES = (("left", -1.0), ("right", 1.0))  # of the jaws, and the sign of their z
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging)}
 
 
 def task_named(name: str | Task, rest: Tensor, **options: Any) -> Task:

@@ -269,8 +269,8 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         with held(folder, (cfg or {}).get("resume") == "auto") if folder else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
-        last = f"{folder or '<run folder>'}/checkpoints/last.ckpt"
-        message = f"stopped; resume with ckpt_path={last}, where the fit had begun"
+        last = Path(folder or ".", "checkpoints", "last.ckpt")
+        message = "stopped" + f"; resume with ckpt_path={last}" * last.is_file()
         leave(message, 143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"

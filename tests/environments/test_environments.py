@@ -243,6 +243,10 @@ def test_descent_through_the_simulator_lowers_the_loss():
     validation = check.task.draw(2, torch.Generator().manual_seed(10**6))
     kept, _ = play_all(check, validation, LinearPolicy.read(check.task, found.policy.written()))
     assert float(kept.mean()) == pytest.approx(min(losses))
+    said = []
+    still = Search(iterations=2, batch=2, rate=1e-12, every=1, validation=2)
+    by_gradient(train, check, still, seed=0, say=said.append)
+    assert "policy that the search began from, which is kept" in said[-1]
     with pytest.raises(DataError, match="policy: expected the numbers of a policy for placement"):
         LinearPolicy.read(check.task, {"weight": [[1.0]]})
 
@@ -395,6 +399,19 @@ def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
                             ({"search": {**values["search"], "rat": 1}}, "search.rat: unknown key")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
             command.setting_of({**values, **change})
+
+
+def test_the_command_takes_the_task_of_an_extension(tmp_path, monkeypatch):
+    (tmp_path / "own_tasks.py").write_text(
+        "from dataclasses import dataclass\nfrom mosa.environments.tasks import Placement\n\n\n"
+        "@dataclass(frozen=True)\nclass Far(Placement):\n    name = 'far_away'\n    aim: float = 0.3\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    values = node_of(EnvironmentsSettings) | {"task": "far_away"}
+    with pytest.raises(ConfigError, match=r"task: expected placement or .*, found 'far_away'"):
+        command.setting_of(values)
+    command.setting_of(values | {"extensions": ["own_tasks"]})
+    assert TASKS.pop("far_away").aim == 0.3
 
 
 def test_a_picture_shows_the_body_on_its_box():

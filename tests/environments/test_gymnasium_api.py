@@ -116,8 +116,26 @@ def test_the_task_of_the_page_is_a_task():
     env.reset(seed=0)
     *_, info = env.step(np.zeros(4, np.float32))
     assert info["success"] and env.task.steps == 30
-    with pytest.raises(ConfigError, match="task: expected placement or hanging, or a Task, found"):
+    with pytest.raises(
+        ConfigError, match=r"task: expected placement or hanging.*, or a Task, found"
+    ):
         TwinEnv(names["Land"])
+
+
+def test_worlds_have_materials_of_their_own():
+    """Soft and stiff bodies are let go alike and end elsewhere; one law for all is the twin's."""
+    ends = {}
+    for name, laws in (("own", [{"E": 2e4}, {"E": 2e5}]), ("alike", None)):
+        worlds = TwinVectorEnv("placement", 2, options={"steps": 20}, laws=laws)
+        worlds.reset(seed=0)
+        trials = worlds.arena.trials
+        worlds.arena.reset(
+            type(trials)(*(each[:1].expand_as(each) for each in (trials.observed, trials.hidden)))
+        )
+        worlds.step(np.zeros((2, 4), np.float32))
+        ends[name] = worlds.arena.view.center
+    assert torch.equal(ends["alike"][0], ends["alike"][1])
+    assert (ends["own"][0] - ends["own"][1]).norm() > 1e-4
 
 
 def test_a_reward_is_minus_the_loss():

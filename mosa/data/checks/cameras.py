@@ -86,6 +86,11 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
                 f"{[round(x, 3) for x in center.tolist()]} m in frame {frame}, its line of sight {where}: expected a calibration "
                 "and images that belong together, look for a wrong pose, a swapped name or an image of another frame"
             )
+        if not bool(torch.isfinite(off).any()):
+            raise DataError(
+                f"{label}: expected cameras that look at the object, found that all look away from it in frame {frame}: are "
+                "the poses in other axes than the format's (OpenCV's z points forward, OpenGL's backward)?"
+            )
         listed = ", ".join(f"{n} by {o:.2g}" for n, o in zip(names, off.tolist()) if o > AGREEMENT)
         raise DataError(
             f"{label}: the cameras do not see one object in frame {frame}: expected the lines of sight through the mattes' "

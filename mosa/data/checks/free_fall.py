@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from itertools import combinations, pairwise
+from itertools import accumulate, combinations, groupby, pairwise
 from typing import NamedTuple
 
 import torch
@@ -21,6 +21,8 @@ from mosa.types import REST, Scene
 PIXELS, RADII, FINE = 0.25, 0.02, 0.3
 """Noise of a point of the track, the larger of: in pixels, and in radii of the object (a silhouette's centroid is not the body's).
 FINE: share of it that is assumed at least where residuals say how large it is."""
+LIGHT, HEAVY = 0.5, 30.0
+"""Gravity [m/s^2] of asteroids and of the largest planets, beyond which its unit is doubted."""
 SURE, SUSPECT = 2.0, 1.3
 """Factors of an acceleration or an energy from which on data are refused, and warned of, where noise cannot explain it. Free frames
 of the built-in scenes and the bird fall with 0.93 to 1.07 of the stated gravity, and end with at most 1.01 of their energy."""
@@ -189,10 +191,12 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
                 f"a stated gravity of {g:.3g}: check {keys}"
             )
     ground = -math.inf if scene.ground is None else scene.ground.height
-    free = int((track.low > ground + 0.3 * track.radius).int().cumprod(0).sum())
+    aloft = track.low > ground + 0.3 * track.radius
+    free = int(aloft.int().cumprod(0).sum())
     if scene.last_free_frame is not None:
         free = min(free, scene.last_free_frame + 1)
     if free < 3:
+        check_flight(track, aloft, label, g, down, keys)
         return
     a, error = parabola(track, free)
     along = float(a @ down)
@@ -214,6 +218,24 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
         )
 
 
+def check_flight(
+    track: Track, aloft: Tensor, label: str, g: float, down: Tensor, keys: str
+) -> None:
+    """Where too few frames are before contact: of the longest flight after it, which something unseen may touch, a warning."""
+    flights = [len(list(run)) * up for up, run in groupby(aloft.tolist())]
+    starts = [0, *accumulate(len(list(run)) for _, run in groupby(aloft.tolist()))]
+    if (frames := max(flights)) > 3:
+        first = starts[flights.index(frames)]
+        a, error = parabola(track._replace(points=track.points[first:]), frames)
+        if not g / SUSPECT - error < float(a @ down) < g * SUSPECT + error:
+            found = f"the object falls with {float(a @ down):.3g} +- {error:.2g} m/s^2"
+            where = f"{label}: aloft, in frames {first} to {first + frames - 1}, {found}"
+            warnings.warn(f"{where}, under a stated gravity of {g:.3g}: check {keys}", stacklevel=5)
+    elif not LIGHT < g < HEAVY:
+        said = f"{label}: expected scene.gravity in m/s^2, found {g:.3g}"
+        warnings.warn(f"{said}, which this film cannot tell", stacklevel=5)
+
+
 def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
     """Of its energy the falling centre keeps at most all: a film that runs backwards gains some."""
     up = scene.up.double()
@@ -227,7 +249,7 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
         f"{label}: the object has {float(energy[last]):.3g} J/kg in frames {last} to {last + 1}, {start:.3g} at the start: "
         "expected a fall, in which the ground takes energy"
     )
-    cause = "a film that runs backwards (times negated, frames in descending order)?"
+    cause = "another gravity (scene.gravity), or a film that runs backwards (times negated, frames in descending order)?"
     if scene.ground is not None and float(track.low[0]) < scene.ground.height + 0.3 * track.radius:
         cause = "a film that begins after contact (start it earlier, scene.frames), or one that runs backwards?"
     if beyond and float(energy[last]) > SURE * start:

@@ -70,6 +70,8 @@ def read_transforms(
     """
     file = Path(path)
     file = file / "transforms.json" if file.is_dir() or not file.suffix else file
+    if not file.is_file():
+        raise DataError(f"{file}: file not found; a relative scene.path begins at scene.root")
     document = read_json(file)
     shots = read_shots(file, document, fps)
     cameras, by_camera = group(shots, file)

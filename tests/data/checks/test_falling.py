@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from mosa.data.checks.cameras import check_agreement
 from mosa.data.checks.free_fall import check_direction, check_fall, parabola, track_of
 from mosa.data.checks.validation import validate
 from mosa.data.scene import load_scene
@@ -121,6 +122,35 @@ def test_a_gravity_that_the_object_does_not_follow_is_refused(scene):
         check_fall(
             replace(scene, gravity=aside, up=-aside / 9.8, ground=None, last_free_frame=7), "scene"
         )
+
+
+def test_a_gravity_is_told_by_the_flight_after_a_bounce_where_none_is_before(monkeypatch):
+    monkeypatch.setitem(globals(), "FRAMES", 20)
+    whole = ball()
+    late = replace(reordered(whole, list(range(8, 20))), times=whole.times[8:] - whole.times[8])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_fall(late, "scene")
+    with pytest.warns(
+        UserWarning,
+        match=r"aloft, in frames \d+ to \d+, the object falls with 9\.\d+ .* gravity of 29\.4",
+    ):
+        check_fall(replace(late, gravity=3 * late.gravity), "scene")
+    short = replace(reordered(late, [0, 1, 2, 3]), times=late.times[:4])
+    with pytest.warns(
+        UserWarning,
+        match=r"expected scene.gravity in m/s\^2, found 980, which this film cannot tell",
+    ):
+        check_fall(replace(short, gravity=100 * late.gravity), "scene")
+
+
+def test_cameras_that_all_look_away_are_named_as_that(scene):
+    turned = scene.cameras.w2c.clone()
+    turned[:, 1:3] *= -1  # OpenCV's axes read as OpenGL's
+    with pytest.raises(
+        DataError, match=r"all look away from it in frame 0: are the poses in other axes"
+    ):
+        check_agreement(replace(scene, cameras=replace(scene.cameras, w2c=turned)), "scene")
 
 
 def test_a_film_that_runs_backwards_is_refused(scene):
