@@ -25,7 +25,10 @@ LONG = ("integration", "experiments", "physics_verification", "analysis")
 FIRST = "test_main_job.py"
 """Its first run makes the scene and the reconstruction that others find in the cache."""
 
-UNOPTIMISED = ("constitutive", "test_stress.py")
+LAST = ("test_rollout_gradients.py", "test_stress.py")
+"""By then their kernels are in the cache, compiled for other files: beside those, both processes would compile them."""
+
+UNOPTIMISED = ("constitutive",)
 """Folders and files whose tests launch each of their many kernels a few times. Clang's -O0 gives the same bits
 and compiles in a third of the time of -O2. They come last: a process keeps a kernel as compiled."""
 
@@ -47,7 +50,7 @@ def pytest_collection_modifyitems(items):
     items.sort(
         key=lambda item: (
             item.path.name != FIRST,
-            unoptimised(item.path),
+            unoptimised(item.path) or item.path.name in LAST,
             item.path.parent.name not in LONG,
             item.path not in slow,
             -tests[item.path],

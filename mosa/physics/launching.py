@@ -69,6 +69,8 @@ class Turns(ContextDecorator):
 ON_CPU = Turns()
 """Of this process."""
 NOTHING = nullcontext()
+_first: dict[wp.Module, threading.Lock] = {}
+"""Whose turn it is to compile a module: each thread would, beside the others."""
 
 
 def turn(device: torch.device):
@@ -88,6 +90,9 @@ def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = Non
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None
     with NOTHING if device.is_cuda else ON_CPU:
+        if not (device.is_cuda or kernel.module.execs):
+            with _first.setdefault(kernel.module, threading.Lock()):
+                wp.load_module(kernel.module, device)
         wp.launch(
             kernel, dim, inputs=inputs, adj_inputs=adj_inputs or [], adjoint=adj_inputs is not None, device=device,
             block_dim=block,

@@ -81,6 +81,7 @@ def stepped(tmp_path_factory, cache):
         cache,
         *adam,
         "fit.prior.lr_contact=2",
+        "reconstruction.informed.iterations=0",
         "logger=[tensorboard,csv]",
         *FEW_FIGURES,
     )

@@ -3,8 +3,9 @@
 import threading
 
 import pytest
+import warp as wp
 
-from mosa.physics.launching import Turns
+from mosa.physics.launching import Turns, launch
 
 LONG = 30.0
 """Seconds after which a wait has failed: nothing here takes time."""
@@ -124,3 +125,27 @@ def test_many_threads_never_launch_into_a_capture():
         thread.join(LONG)
     assert not any(thread.is_alive() for thread in threads)
     assert not wrong and len(captured) == 120 and not inside
+
+
+def test_of_threads_that_come_to_a_kernel_at_once_the_first_compiles_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(wp.config, "optimization_level", 0)
+    made, compiled, together = wp.Module._compile, [], threading.Barrier(2)
+    monkeypatch.setattr(wp.Module, "_compile", lambda *a, **k: compiled.append(made(*a, **k)))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def count(a: wp.array(dtype=int)):
+        wp.atomic_add(a, 0, 1)
+
+    numbers = wp.zeros(1, dtype=int, device="cpu")
+
+    def run():
+        together.wait(LONG)
+        launch(count, 5, [numbers], wp.get_device("cpu"))
+
+    threads = [threading.Thread(target=run) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(LONG)
+    assert compiled == [True] and numbers.numpy() == [10]

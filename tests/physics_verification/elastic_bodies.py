@@ -7,10 +7,10 @@ import math
 import numpy as np
 import torch
 from bodies import DENSITY, NU, eyes, lattice, parameters_of, resting, uniform_volume
-from substep_reference import unvech
 from torch import Tensor
 
 from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.material_operations import kirchhoff_stress
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
@@ -68,7 +68,7 @@ def interior_force(law: str, dtype: torch.dtype) -> tuple[float, float]:
     state = ParticleState(state.x, state.v, state.C_affine, many, many)
     sim = Simulator(law, dx=dx, substeps=1, frame_dt=dt, gravity=(0, 0, 0), dtype=dtype)
     parameters = parameters_of(law)
-    tau = float(sim.material_state(many[:1], state.C_affine[:1], parameters).stress.abs().max())
+    tau = float(_stress(sim, many[:1], state.C_affine[:1], parameters).abs().max())
     v = (
         sim.rollout(state, parameters, uniform_volume(state, dx / 2), DENSITY, 2, started=True)
         .final.v.double()
@@ -120,7 +120,7 @@ def column(
         )
         C = torch.zeros_like(rollout.F[0])
         tau = (
-            torch.stack([_spatial_stress(sim, F, C, parameters)[:, 1, 1] for F in rollout.F[1:]])
+            torch.stack([_stress(sim, F, C, parameters)[:, 1, 1] for F in rollout.F[1:]])
             .mean(0)
             .double()
         )
@@ -130,10 +130,10 @@ def column(
     return y, tau, float(slope / (DENSITY * GRAVITY))
 
 
-def _spatial_stress(sim: Simulator, F: Tensor, C: Tensor, parameters: dict) -> Tensor:
-    U, _, Vh = torch.linalg.svd(F)
-    R = U @ Vh
-    return R @ unvech(sim.material_state(F, C, parameters).stress) @ R.mT
+def _stress(sim: Simulator, F: Tensor, C: Tensor, parameters: dict) -> Tensor:
+    """Kirchhoff stress (N, 3, 3) [Pa], by the kernel that simulates."""
+    n = len(F)
+    return kirchhoff_stress(sim.law, F, C, sim.pack(parameters, n, eyes(n, F.dtype)))
 
 
 def wave(law: str, cells: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, float]:
