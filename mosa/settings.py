@@ -168,7 +168,8 @@ class Settings(BaseModel, metaclass=_Checked):
     @classmethod
     def part(cls, values: Mapping[str, Any]) -> Self:
         """Of a configuration that may have further keys. Errors: ConfigError."""
-        return cls.read({key: value for key, value in values.items() if key in cls.model_fields})
+        fields = cls.model_fields
+        return cls.read({key: value for key, value in values.items() if key in fields})
 
     def but(self, **changes: Any) -> Self:
         """A copy with other values of these fields. Errors: ConfigError."""

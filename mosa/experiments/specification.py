@@ -249,6 +249,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     found: dict[Path, Job] = {}
     for options in itertools.product(*experiment.axes.values()):
         place = dict(zip(experiment.axes, options))
+        check_apart(place)
         own = [each for option in options for each in option.overrides]
         for seed in experiment.seeds:
             overrides = (*experiment.common, *own, *more, f"seed={seed}")
@@ -267,6 +268,19 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             alone = experiment.alone
             found[folder] = Job(folder, overrides, seed, (place,), minutes, *shared, alone)
     return list(found.values())
+
+
+def check_apart(place: Mapping[str, Option]) -> None:
+    """Errors: ConfigError where two axes give one key different values, of which only the last would count."""
+    settled: dict[str, tuple[str, str]] = {}
+    for axis, option in place.items():
+        for key, _, value in (each.partition("=") for each in option.overrides):
+            other, given = settled.setdefault(key, (axis, value))
+            if other != axis and given != value:
+                raise ConfigError(
+                    f"axes: expected one value of {key}, found {given} on {other} and {value} on {axis}: leave it out of one "
+                    "axis, as in {rabbit: [scene=rabbit]} in place of {of: objects}"
+                )
 
 
 USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])  # keys of use, no film

@@ -166,6 +166,17 @@ def test_cells_that_need_the_same_run_share_it(tmp_path):
     assert not {job.folder for job in again} & {job.folder for job in jobs}
 
 
+def test_a_key_that_two_axes_set_is_named(tmp_path):
+    """Of two priors only the last would count: a row of another law would be the columns' law."""
+    laws = (Option("mine", ("prior=my_law",)), Option("ours", ("prior=neo_hookean",)))
+    scenes = (Option("rabbit", ("scene=rabbit", "prior=neo_hookean")),)
+    with pytest.raises(
+        ConfigError, match="one value of prior, found my_law on law and neo_hookean on scene: leave"
+    ):
+        jobs_of(experiment(axes={"law": laws, "scene": scenes}), tmp_path)
+    jobs_of(experiment(axes={"law": laws[1:], "scene": scenes}), tmp_path)  # the same value
+
+
 def test_a_folder_s_name_does_not_depend_on_the_order_of_different_keys():
     assert folder_name(["a=1", "b=2", "seed=0"]) == folder_name(["b=2", "seed=0", "a=1"])
     assert folder_name(["a=1", "a=2"]) != folder_name(["a=2", "a=1"])  # the last one holds

@@ -144,15 +144,16 @@ PROPERTIES = {
     "symmetry": "a symmetric Kirchhoff stress: a skew part is a torque from nothing",
     "objectivity": "tau(Q F) = Q tau(F) Q^T of every rotation Q: a turned body has the turned stress (F F^T in place of F^T F?)",
     "gradient": "an adjoint that is the derivative of the stress: see Warp's notes on differentiable functions",
+    "rest": "a stiffness at rest that resists every strain: a wrong sign?",
     "loops": "a stress that is the derivative of an energy: closed loops of deformation make work",
 }
 
 
 @typed
-@typed
 def check_law(law: Text, parameters: Section) -> dict[str, float]:
     """Relative errors of a registered law, at 100 drawn deformations: `symmetry`, `objectivity`, `gradient` (adjoint
-    against differences), `loops` (d P/dF against its transpose; not of laws that yield or flow). Warns above `WRONG`.
+    against differences), `rest` (how far below 0 a stiffness at rest is), `loops` (d P/dF against its transpose; these two not of
+    laws that yield or flow). Warns above `WRONG`.
 
     parameters: as `prior.parameters`. Errors: ConfigError for an unknown law or parameter."""
     return errors_of(in_double(Material(law, parameters)))
@@ -180,6 +181,11 @@ def errors_of(material: Material) -> dict[str, float]:
         dP = dP - torch.einsum("nil,njk->nijkl", tau @ inverse.mT, inverse)
         parts["loops"] = dP, dP.permute(0, 3, 4, 1, 2)
     found = {k: float((a - b).abs().max() / b.abs().max()) for k, (a, b) in parts.items()}
+    if "loops" in parts:
+        C = tangent(material, None, torch.eye(3, dtype=F.dtype)[None])[0]
+        C = (C + C.transpose(2, 3)).reshape(9, 9)  # symmetric strains
+        stiffness = torch.linalg.eigvalsh(C + C.T)  # three are 0, of rotations
+        found["rest"] = float((-stiffness[0] / stiffness.abs().max()).clamp_min(0))
     for name, error in found.items():
         if not error < WRONG:
             said = f"{name} is off by {error:.2g} of the largest: expected {PROPERTIES[name]}"

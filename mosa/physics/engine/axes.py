@@ -109,16 +109,16 @@ def shift_to(
 ) -> tuple[float, ...] | None:
     """`Axes.shift` for particles between `ends` (`ends_of`), of positions of a type, on a grid of dx [m], None where they are near
     the origin. Errors: ConfigError where the type has no digits for the place, or where worlds are too far from each other."""
+    far = float(np.abs(ends).max())
+    if not 2 * far >= 0.5 * PERIOD * dx or far == float("inf"):
+        return None  # near enough in any axes; or the first substep names the particle
     low, high = ends.reshape(2, -1, 3)[0].min(0), ends.reshape(2, -1, 3)[1].max(0)
-    far, wide = float(np.abs([low, high]).max()), float((high - low).max())
-    if not far < float("inf"):
-        return None  # the first substep names the particle
     if far * torch.finfo(dtype).eps > COARSE * dx:
         raise ConfigError(
             f"x: particles are {far:.3g} m from the origin, where {dtype} has no digits for a grid of {dx:.3g} m: "
             "give x in float64, or place body, ground and solids nearer to the origin"
         )
-    if ends.ndim == 3 and wide > SPREAD * PERIOD * dx:
+    if ends.ndim == 3 and (wide := float((high - low).max())) > SPREAD * PERIOD * dx:
         raise ConfigError(
             f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
             "meet, and may be in one place"

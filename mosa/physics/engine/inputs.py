@@ -154,19 +154,21 @@ def checked_density(
         density = density.detach().to(volume)
         ends = (*torch.aminmax(volume), *torch.aminmax(density))
     names = [name for name in law.offsets if name in MODULI]
-    # columns one by one: a list of them is copied to a CUDA device, which waits for it
-    columns = [packed.detach()[:, law.offsets[name]] for name in names]
-    moduli = torch.stack(columns, 1) if columns else packed.detach()[:, :0]
-    least = moduli.nan_to_num().amin(0)  # NaN: of another law of a mixture
+    # columns from the first modulus to the last: a list of them is copied to a CUDA device, which waits for it
+    first = min((law.offsets[name] for name in names), default=0)
+    span = packed.detach()[:, first : max((law.offsets[name] + 1 for name in names), default=0)]
     masses = density * volume
-    told = torch.cat([torch.stack([*ends, masses.mean()]).to(least), least]).tolist()
-    found, mass, own = told[: len(ends)], told[len(ends)], dict(zip(names, told[len(ends) + 1 :]))
+    told = torch.cat([torch.stack([*ends, masses.mean()]).to(span), span.amin(0)]).tolist()
+    found, mass, least = told[: len(ends)], told[len(ends)], told[len(ends) + 1 :]
+    if any(math.isnan(each) for each in least):  # of another law of a mixture
+        least = span.nan_to_num().amin(0).tolist()
+    own = {name: least[law.offsets[name] - first] for name in names}
     if not (found[0] > 0 and found[1] < math.inf):
         raise ConfigError("volume: expected positive, finite numbers [m^3] for all particles")
     if found[2:] and not (found[2] > 0 and found[3] < math.inf):
         raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
     if own.get("lam", 0) < 0 and "mu" in names:  # seldom
-        mu, lam = (moduli[:, names.index(name)].nan_to_num() for name in ("mu", "lam"))
+        mu, lam = (span[:, law.offsets[name] - first].nan_to_num() for name in ("mu", "lam"))
         own["lam"] = float((lam + 2 / 3 * mu).min())
     for name, value in own.items():
         if value < 0:

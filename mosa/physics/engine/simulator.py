@@ -35,6 +35,7 @@ from mosa.physics.engine.material_operations import material_state
 from mosa.physics.engine.numerics import Numerics, flat
 from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.engine.stepping import Prepared, Stepper
+from mosa.physics.grid.window import extent
 from mosa.physics.launching import SCALARS
 from mosa.physics.time.clock import Adaptive, Clock, Moment
 from mosa.physics.time.time_step import MOST_SUBSTEPS
@@ -160,6 +161,12 @@ class Simulator:
         rotation: (N, 3, 3), fills the law's reference rotation. worlds: (W N, SLOTS), one world's after the other's; values may
         then also be (W, N) or (W, 1), vectors (W, N, k) or (W, 1, k). Errors: ConfigError naming a missing, unknown or misshapen
         one."""
+        return self._packed(parameters, particles, rotation, worlds)
+
+    def _packed(
+        self, parameters: dict, particles: int, rotation: Tensor | None, worlds: int | None
+    ) -> Tensor:
+        """`pack`, of arguments that were looked at already."""
         shape = (particles,) if worlds is None else (worlds, particles)
         like = self.numerics.planes  # of its type and on its device
         factor = YIELD_CONVENTIONS[self.options.yield_convention]
@@ -279,10 +286,12 @@ class Simulator:
         each = inputs.motions_of_worlds(asked.motions, self.colliders, worlds)
         if self.numerics.driven:
             held = self._held(held, state.x, each, asked.start_time)
-        ends = ends_of(state.x)
+        known = extent(state.x.detach(), state.v.detach()).double().numpy(force=True)
+        ends = known[..., :6].reshape(-1, 2, 3).swapaxes(0, 1)  # of x, (2, 1 or B, 3)
+        ends = ends[:, 0] if worlds is None else ends
         if (shift := self._origin(state.x, ends, held)) != self._axes.shift:
             self._move(shift)
-        axes = self._axes
+        axes, given = self._axes, state
         state = axes.state(state, self.dtype)
         if not asked.started:
             inputs.check_above(self._walls, ends if axes == Axes() else ends_of(state.x), state.x)
@@ -293,6 +302,10 @@ class Simulator:
             turned = axes.vectors(torch.tensor(gravities, dtype=torch.float64))
             gravities = tuple(map(tuple, turned.tolist()))
         prepared = self._prepare(state, asked, worlds, gravities, held)
+        if worlds is None:
+            prepared.lanes.solvers[0].know(
+                (given.x, given.v), known[None]
+            )  # of other memory where the axes differ
         choose = None
         if timing is not None:
             solids = max(
@@ -330,7 +343,7 @@ class Simulator:
         volume, adapter, stride = asked.volume.detach().contiguous(), asked.adapter, asked.stride
         F = state.F if worlds is None else state.F.flatten(0, 1)
         rotation = inputs.polar_rotation(F) if self.law.reference is not None else None
-        packed = self.pack(asked.parameters, len(volume), rotation, worlds)
+        packed = self._packed(asked.parameters, len(volume), rotation, worlds)
         density, mean_mass = inputs.checked_density(asked.density, volume, self.law, packed)
         cutoff = self.options.mass_cutoff
         if cutoff is None:

@@ -146,7 +146,7 @@ class SegmentSolver:
         bounds = extent(*(self._apart(t) for t in final[:2]))
         # float64 holds the flags exactly
         numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(force=True)
-        self._know(final, numbers[4:].reshape(-1, 12))
+        self.know(final, numbers[4:].reshape(-1, 12))
         return [int(n) for n in numbers[:4]]
 
     def _apart(self, t: Tensor) -> Tensor:
@@ -169,10 +169,11 @@ class SegmentSolver:
         """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""
         if self._known is None or not same_memory(self._known[0], state[:2]):
             bounds = extent(*(self._apart(t) for t in state[:2]))
-            self._know(state, bounds.double().numpy(force=True))
+            self.know(state, bounds.double().numpy(force=True))
         return self._known[1]
 
-    def _know(self, state: State, bounds: np.ndarray) -> None:
+    def know(self, state: Sequence[Tensor], bounds: np.ndarray) -> None:
+        """`bounds` of a state (x, v, ...) that the host has already."""
         # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
         self._known = [t.detach() for t in state[:2]], bounds
 

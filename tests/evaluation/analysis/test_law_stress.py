@@ -48,7 +48,7 @@ def test_a_wrong_law_is_found(function, wrong):
     register_law(name, function, ("mu", "lam"), needs_positive_J=True)
     with pytest.warns(UserWarning, match=f"law '{name}': loops is off by .*energy"):
         found = mosa.check_law(name, SOLID)
-    assert {key for key, error in found.items() if error > 1e-2} == wrong
+    assert {key for key, error in found.items() if error > 1e-2} == wrong and found["rest"] < 1e-8
     assert all(found[key] < 1e-8 for key in found.keys() - wrong)
     before = torch.random.get_rng_state()
     with pytest.warns(UserWarning, match="is off by"):
@@ -64,7 +64,23 @@ def test_a_right_law_passes(law, more):
         warnings.simplefilter("error")
         found = mosa.check_law(law, SOLID | more)
         check_own(Material(law, SOLID | more))
-    assert set(found) == {"symmetry", "objectivity", "gradient", "loops"}
+    assert set(found) == {"symmetry", "objectivity", "gradient", "rest", "loops"}
+
+
+@wp.func
+def turned_sign(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    """-mu (b - I) + lam log(J) I: an energy, without a minimum at rest."""
+    one = wp.identity(n=3, dtype=wp.float64)
+    return p[1] * wp.log(wp.determinant(F)) * one - p[0] * (F * wp.transpose(F) - one)
+
+
+def test_a_law_whose_rest_is_unstable_is_found():
+    register_law("checked_turned_sign", turned_sign, ("mu", "lam"), needs_positive_J=True)
+    with pytest.warns(UserWarning, match="rest is off by .* resists every strain: a wrong sign"):
+        found = mosa.check_law("checked_turned_sign", SOLID)
+    mu, lam = 1e5 / 2.6, 3e4 / 1.3 / 0.4
+    assert found["rest"] == pytest.approx(2 * mu / max(2 * mu, abs(3 * lam - 2 * mu)))
+    assert all(error < 1e-8 for key, error in found.items() if key != "rest")
 
 
 def test_parameters_are_a_section():
