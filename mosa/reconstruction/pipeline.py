@@ -40,7 +40,7 @@ from mosa.rendering.rasterizer import rasterize
 from mosa.system.progress import tqdm
 from mosa.types import Appearance, Reconstruction, Scene, Splats, metres
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 """Raised when a stage computes something else from the same settings."""
 
 

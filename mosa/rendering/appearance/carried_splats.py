@@ -36,7 +36,7 @@ class CarriedSplats(nn.Module):
         kept = {f"bound_{name}": value for name, value in bound.items()} | vars(splats)
         kept |= {"harmonics": appearance.harmonics, "normals": normals, "light": light}
         for name, value in kept.items():
-            like = particles.device if name == "bound_index" else particles
+            like = particles if value.is_floating_point() else particles.device
             self.register_buffer(name, value.detach().to(like), persistent=False)
 
     def __len__(self) -> int:

@@ -96,8 +96,31 @@ def test_a_tearing_body_does_not_draw_its_splats_out():
     P = lattice()
     torn = P.clone()
     torn[P[:, 0] > 0.35] += torch.tensor([5.0, 0, 0]).double()
-    carried = bind(drawn_splats(), P).carry(torn[None])
+    X = drawn_splats()
+    carried = bind(X, P).carry(torn[None])
     assert float(torch.linalg.svdvals(carried.gradients).max()) < STRETCH_LIMIT * (1 + 1e-9)
+    # none is left in the gap
+    away = carried.means[0] - X
+    away = torch.minimum(away.norm(dim=1), (away - torch.tensor([5.0, 0, 0])).norm(dim=1))
+    assert float(away.max()) < 0.01
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.15, 0.25])
+def test_splats_below_a_slab_stay_outside_of_the_ball_that_it_drapes_over(radius):
+    """A slab whose columns lie on a ball or far below, its splats half a spacing below the lowest particles: an affine fit over two
+    spacings went up to 0.7 spacings deep."""
+    spacing = 0.05
+    sides = [torch.arange(n, dtype=torch.float64) * spacing for n in (21, 21, 4)]
+    P = torch.cartesian_prod(*sides) - torch.tensor([0.5, 0.5, 0.0])
+    side = torch.linspace(-0.45, 0.45, 91, dtype=torch.float64)
+    X = torch.cartesian_prod(side, side, torch.tensor([-0.5 * spacing], dtype=torch.float64))
+    high = radius + 0.5 * spacing  # of the lowest particles' centres, above the ball's
+    lift = (high**2 - P[:, :2].square().sum(1)).sqrt().nan_to_num(-2 * high) - high
+    draped = torch.cat([P[:, :2], (P[:, 2] + lift)[:, None]], 1)
+    center = torch.tensor([0.0, 0.0, -high])
+    assert float((draped - center).norm(dim=1).min()) == pytest.approx(high)
+    carried = bind(X, P).carry(draped[None]).means[0]
+    assert float((carried - center).norm(dim=1).min()) > radius
 
 
 def test_few_particles_are_refused():
