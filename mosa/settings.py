@@ -108,7 +108,8 @@ Pixels = Annotated[
     Expected("a whole number of at least 8 and at most 8192, or two such, [width, height]"),
     such(lambda v: isinstance(v, int) or len(v) == 2),
 ]
-Zoom = Positive | Annotated[Sequence[Positive], Expected("a list of such"), Len(1)]
+Nearer = Annotated[float, Gt(0), Le(20)]
+Zoom = Nearer | Annotated[Sequence[Nearer], Expected("a list of such"), Len(1)]
 Names = Annotated[
     list[str], Expected("a list of names like [a, b], each once"),
     such(lambda v: len(set(v)) == len(v)),

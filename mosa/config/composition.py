@@ -77,6 +77,8 @@ def options_of(group: str) -> dict[str, list[str]]:
 def way_out(key: str) -> str:
     """The end of a message on a key that the configuration lacks: other options of its group that have it, keys of that name in its
     sections, or the nearest known key, with + where no file has that argument of a Trainer."""
+    if key in ("run_dir", "out_dir", "output_dir"):
+        return "; expected hydra.run.dir=<folder>"
     group, _, name = key.partition(".")
     having = [option for option, keys in options_of(group).items() if key in keys] if name else []
     if having:

@@ -70,8 +70,8 @@ class FilmSection(Settings):
     ...], through which the camera turns about `up` while the film goes on; null: from the side, a
     little above"""
     zoom: Zoom = 1.0
-    """magnification, or a list like [1, 3], from and to, through which the camera comes nearer while
-    the film goes on; 1: all of the motion is in the picture. Above 1 the camera follows the object"""
+    """magnification, or a list like [1, 3] or [1, 4, 2, 1], spread evenly over the film; 1: all of the
+    motion is in the picture. Above 1 the camera follows the object"""
     shadow: bool = True
     """shadows of the object and the obstacles on the ground, under light from above"""
     caption: bool = True

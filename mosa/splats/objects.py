@@ -229,5 +229,5 @@ def drop(cfg: DictConfig) -> None:
         rotation=settings.rotation, velocity=settings.velocity, angular_velocity=settings.angular_velocity,
     )  # fmt: skip
     kinds = {"formats": settings.formats, "video": settings.video, **settings.film.plain()}
-    twin.export(rollout, folder, title="object", **kinds)
+    twin.export(rollout, folder, title="object", progress=True, **kinds)
     log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)

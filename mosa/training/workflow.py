@@ -214,7 +214,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         asked = {k: simulate[k] for k in readers if simulate[k] is not None}
         given = {k: readers[k](value, f"simulate.{k}") for k, value in asked.items()}
         world = replace(twin.world, **given)
-        written = twin.export(rollout, folder, colliders=world.solids, video=cfg.evaluation.video)
+        filmed = {"video": cfg.evaluation.video, "progress": True}
+        written = twin.export(rollout, folder, colliders=world.solids, **filmed)
         log.info("simulated %d frames into %s", len(rollout.x), written)
         return None
     scene, held_out = load_sequences(plain(evaluated_scene(cfg, twin).scene))

@@ -185,8 +185,12 @@ def start_in(
                 f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
                 f"{metres(world.box)} m; its centre is at {metres(center)} m"
             )
-    field = "world.colliders" if colliders is None else "colliders"
-    pressed = check_clear(world.colliders, center + arms, "the body", field, body.spacing)
+    field, whose = "colliders", ""
+    if colliders is None:
+        field, whose = "world.colliders", "it comes with the twin's run: colliders=[] leaves it out"
+    pressed = check_clear(
+        world.colliders, center + arms, "the body", field, body.spacing, hint=whose
+    )
     if pressed > 0.25 * body.spacing:
         warnings.warn(
             f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} "
@@ -208,10 +212,11 @@ def start_in(
                 f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
                 stacklevel=4,
             )
-        elif away > far:
+        elif away > far or half_width(each.shape) > 10 * body.size:
+            thick = f"one {2 * half_width(each.shape):.3g} m thick"
             warnings.warn(
-                f"{expected} solid within reach of the body of {body.size:.3g} m, found it "
-                f"{away:.3g} m away: lengths are in metres",
+                f"{expected} solid within reach of the body of {body.size:.3g} m, found "
+                f"{f'it {away:.3g} m away' if away > far else thick}: lengths are in metres",
                 stacklevel=4,
             )
     if float(world.gravity @ world.up) > 0:
@@ -264,7 +269,7 @@ def warn_of_unmet(
                 d = signed_distance(solid.shape, q)  # far from a mesh 1e30
                 away = min(away, float(d.where(d < 1e29, q.norm(dim=1) - reach(solid.shape)).min()))
         if BESIDE * body.size < away < LARGE * body.size and not buried(solid, world):
-            told.append(f"{solid.name or k} never nearer than {away:.2g} m")
+            told.append(f"{solid.name or f'colliders[{k}]'} never nearer than {away:.2g} m")
     if told:
         said = f"expected solids that the body comes to, found {', '.join(told)}"
         warnings.warn(f"colliders: {said}", stacklevel=4)

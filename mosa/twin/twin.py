@@ -44,6 +44,7 @@ from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
 from mosa.physics.contact.driven import Driven
 from mosa.physics.contact.mesh import SignedDistanceField
+from mosa.physics.contact.reference import signed_distance
 from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
@@ -51,6 +52,7 @@ from mosa.rendering.cameras import look_at
 from mosa.settings import Count, Expected, Number, Pixels, Positive, Seed, Zoom, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
+from mosa.system.threads import cores
 from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import (
@@ -283,8 +285,8 @@ class Twin(InMotion):
         that the rollout was simulated with (None: the world's). rollout: or a list of the states of T steps, whose solids are
         drawn where they were then (None: those of `reset`). Half spaces are not drawn. size [px]: of a square, or (width,
         height). view: (3,) from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None for the
-        side and a little above. zoom: magnification, or several, spread over the frames; above 1 the camera follows the
-        body. shadow: on the ground, of the body and of the solids, under light from above. Errors: ConfigError."""
+        side and a little above. zoom: magnification of at most 20, or several, spread over the frames; above 1 the camera follows
+        the body. shadow: on the ground, of the body and of the solids, under light from above. Errors: ConfigError."""
         return self._pictures(*self._met(rollout, colliders), size, view, zoom, shadow)
 
     def _pictures(
@@ -295,6 +297,7 @@ class Twin(InMotion):
         view: Views | None,
         zoom: float | Sequence[float],
         shadow: bool,
+        progress: bool = False,
     ) -> Tensor:
         body, up = self.body, self.world.up.to(self.body.rest)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
@@ -318,34 +321,46 @@ class Twin(InMotion):
         toward = viewed_from(side / side.norm() + 0.25 * up if view is None else view, up, frames)
         K = torch.tensor([[0, 0, width / 2], [0, 0, height / 2], [0, 0, 1.0]]).repeat(frames, 1, 1)
         K[:, 0, 0] = K[:, 1, 1] = LENS * min(width, height) * nearer.cpu()
-        w2c = look_at(aims + far * toward, aims, up).cpu()
+        eyes = aims + far * toward
+        w2c = look_at(eyes, aims, up).cpu()
         names = tuple(f"frame {t}" for t in range(frames))
         cameras = Cameras(K.to(w2c), w2c, width, height, names)
         shown = seen(body, rollout.x, rollout.F_tot)
         ends, convex = [len(shown.opacities)], [False]
         for k, solid in enumerate(solids):
+            at, turned = (part[:, 0] for part in poses([solid], rollout.times))
+            q = ((eyes.cpu().double() - at)[:, None] @ turned)[:, 0]
+            if 0 < reach(solid.shape) and float(signed_distance(solid.shape, q).min()) < 0:
+                named = solid.name or f"colliders[{k}]"
+                warn(f"{named}: the camera is inside of it: not drawn", stacklevel=4)
+                continue
             shown = with_solids(shown, solids[k : k + 1], rollout.times, up, body.size / 30)
             ends.append(len(shown.opacities))
             convex.append(not isinstance(solid.shape, SignedDistanceField))
-        white, floors = np.full((height, width, 3), 255, np.uint8), []
-        for t, points in enumerate(shown.means):
-            # the camera has moved
-            if t == 0 or not (w2c[t].equal(w2c[t - 1]) and K[t].equal(K[t - 1])):
+        white, images, floors = np.full((height, width, 3), 255, np.uint8), [], []
+        with tqdm(total=frames, desc="film", unit="frame", disable=not progress) as bar:
+            for t, points in enumerate(shown.means):
                 camera = cameras.select([t])
-                lines = ground_lines(self.world, camera, body.size, target.cpu())
-                floor = on_ground(white, lines, 1, torch.ones(3)) / np.float32(255)
-            floors.append(floor.copy())
-            if not (lines and shadow):
-                continue
-            dark = [
-                ground_shadow(part, self.world, camera, body.size, filled)
-                for part, filled in zip(points.tensor_split(ends[:-1]), convex)
-            ]
-            # none shines through between the body's splats
-            free = 1 - outline(points[: ends[0]], camera, body.size)
-            floors[t] *= (1 - DARK * free * np.max(dark, 0))[..., None]
-        behind = torch.from_numpy(np.stack(floors)).to(body.rest)
-        return shown.film(cameras, behind).clamp(0, 1).cpu()
+                # the camera has moved
+                if t == 0 or not (w2c[t].equal(w2c[t - 1]) and K[t].equal(K[t - 1])):
+                    lines = ground_lines(self.world, camera, body.size, target.cpu())
+                    floor = on_ground(white, lines, 1, torch.ones(3)) / np.float32(255)
+                floors.append(floor.copy())
+                if lines and shadow:
+                    dark = [
+                        ground_shadow(part, self.world, camera, body.size, filled)
+                        for part, filled in zip(points.tensor_split(ends[:-1]), convex)
+                    ]
+                    # none shines through between the body's splats
+                    free = 1 - outline(points[: ends[0]], camera, body.size)
+                    floors[-1] *= (1 - DARK * free * np.max(dark, 0))[..., None]
+                if len(floors) == cores() or t == frames - 1:
+                    some = list(range(t + 1))[-len(floors) :]
+                    behind = torch.from_numpy(np.stack(floors)).to(body.rest)
+                    images.append(shown.during(some).film(cameras.select(some), behind))
+                    bar.update(len(floors))
+                    floors = []
+        return torch.cat(images).clamp(0, 1).cpu()
 
     def _met(
         self,
@@ -387,14 +402,15 @@ class Twin(InMotion):
         self, rollout: Motion, folder: str | Path, *, video: bool = True, title: str = "twin",
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         size: Pixels = 400, fps: Positive | None = None, view: Views | None = None, zoom: Zoom = 1.0,
-        shadow: bool = True, caption: bool = True,
+        shadow: bool = True, caption: bool = True, progress: bool = False,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of
         `colliders`; one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of
         the body that its images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those
         that the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view, zoom
-        and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px above and below.
-        Errors, before anything is written: ConfigError where they are not, or a format's or the video's program is missing."""
+        and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px above and below;
+        progress: a bar on the terminal. Errors, before anything is written: ConfigError where they are not, or a format's or
+        the video's program is missing."""
         rollout, solids = self._met(rollout, colliders)
         if rollout.reactions is None:  # of steps
             warn_of_unmet([rollout], solids, self.body, self.world)
@@ -412,7 +428,7 @@ class Twin(InMotion):
         save_frames(splats, folder / "splats", formats, rate=1 / apart, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            images = self._pictures(rollout, solids, size, view, zoom, shadow)
+            images = self._pictures(rollout, solids, size, view, zoom, shadow, progress)
             plain = map(to_uint8, images)
             frames = side_by_side({title: images}, footer=moments) if caption else list(plain)
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))

@@ -69,6 +69,7 @@ def test_a_mistyped_option_is_refused(override):
     ("scene.test=[]", "scene=markers, pacnerf, .* have it, .* brings its own held-out"),
     ("particles=200", r"'particles'; expected .*simulation\.particles"),
     ("fps=24", r"'fps'; expected .*film\.fps"),
+    ("run_dir=a", r"'run_dir'; expected hydra\.run\.dir=<folder>"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):

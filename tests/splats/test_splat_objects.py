@@ -230,7 +230,7 @@ def test_the_command_makes_all_of_it(tmp_path):
     assert film.get(cv2.CAP_PROP_FRAME_HEIGHT) == 64  # no caption
     said = done.stdout + done.stderr
     assert "no size given: 1 unit is 1 m;" in said and "600 Gaussians, 0.2 m long; " in said
-    assert "ground at 0.0 m along it" in said
+    assert "ground at 0.0 m along it" in said and "film: 100% 3/3" in said
 
 
 @pytest.mark.parametrize(
@@ -253,6 +253,7 @@ def test_the_command_makes_all_of_it(tmp_path):
             r"^film\.view: expected a direction that is not",
         ),
         ("film", {"view": []}, r"^film\.view: expected three numbers, or a list of such, or null"),
+        ("film", {"zoom": 30}, r"^film\.zoom: expected a number above 0 and at most 20, or a list"),
         ("film", {"size": [160, 90, 3]}, r"^film\.size: expected a whole number .*, or two such"),
     ],
 )

@@ -2,13 +2,15 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import ConvexHull
 
 from mosa.errors import ConfigError
-from mosa.evaluation.analysis.comparison import ground_shadow
+from mosa.evaluation.analysis import comparison
+from mosa.evaluation.analysis.comparison import ground_shadow, outline
 from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Sphere, colliders_from_config
 from mosa.physics.contact.mesh import field_of_triangles
 from mosa.rendering.appearance.carried_splats import Seen
@@ -196,6 +198,42 @@ def test_a_shadow_lies_below_the_body_and_sharpens_as_it_lands():
     assert buried.shape == (64, 64) and not buried.any()
 
 
+def test_shadow_and_outline_of_a_body_wider_than_a_picture_take_no_longer(monkeypatch):
+    """Discs that close gaps grow with the body on the picture: at zoom=500 they had 10,000 px and took hours."""
+    disc, radii = comparison._disc, []
+
+    def noted(radius):
+        radii.append(radius)
+        return disc(radius)
+
+    monkeypatch.setattr(comparison, "_disc", noted)
+    w2c = look_at(torch.tensor([0.0, 10.0, 0.01]), torch.zeros(3), UP)[None]
+    ball = surface(Sphere(0.5), 0.02)
+
+    def seen(focal: float, side: int, *rest):
+        K = torch.tensor([[[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]]])
+        camera = Cameras(K, w2c, side, side, ("view",))
+        return outline(ball, camera, 1.0), ground_shadow(ball + 0.5 * UP, twin().world, camera, 1.0)
+
+    coarse, fine = seen(4000.0, 600), seen(12000.0, 1800)  # px: 400 and 1200 of the ball
+    for one, other in zip(coarse, fine):
+        assert one.shape == (600, 600) and other.shape == (1800, 1800)
+        there = cv2.resize(other, (600, 600), interpolation=cv2.INTER_AREA)
+        assert one.max() > 0.9 and np.abs(there - one).mean() < 0.01
+    assert all(part.shape == (64, 64) for part in seen(1e6, 64))
+    assert max(radii) < 30
+
+
+def test_a_solid_that_holds_the_camera_is_not_drawn_and_is_named():
+    one, view = twin(), (0, 0.3, 1)
+    wall = {"type": "box", "size": [3, 3, 3], "position": [0, -5, 0]}
+    rollout, alone = (one.simulate(frames=2, height=0.1, colliders=c) for c in ([wall], []))
+    around = {**wall, "position": [0, 0, 1.8]}
+    with pytest.warns(UserWarning, match=r"^colliders\[0\]: the camera is inside of it: not drawn"):
+        held = one.render(rollout, size=48, colliders=[around], view=view)
+    assert torch.equal(held, one.render(alone, size=48, view=view))
+
+
 def test_a_shadow_darkens_the_floor_and_not_the_body():
     """Cream, as near to the white floor as a shadow once took for it, that falls onto the ground."""
     one, cream = twin(), torch.tensor([254.0, 237.0, 229.0]) / 255
@@ -229,9 +267,9 @@ def test_zoom_shows_so_much_less():
     far, near = (one.render(rollout, size=64, zoom=zoom, shadow=False) for zoom in (0.5, 1.0))
     whole, part = ((each[..., 0] - each[..., 1] > 0.3)[0].sum() for each in (near, far))
     assert 3 < whole / part < 5
-    for wrong in (0, [], [1, -2], "a", [[1, 2]], None):
+    for wrong in (0, [], [1, -2], "a", [[1, 2]], None, 500, [1, 20.5]):
         with pytest.raises(
-            ConfigError, match=r"^zoom: expected a number above 0 .*or a list of such"
+            ConfigError, match=r"^zoom: expected a number above 0 and at most 20, or a list of such"
         ):
             one.render(rollout, zoom=wrong)
 

@@ -1,6 +1,7 @@
 """Starts of a twin among solids: what is refused, and what is warned of."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -99,6 +100,10 @@ def test_a_plane_that_faces_another_way_and_a_mesh_in_millimetres_are_named(tmp_
             {"colliders": [{"type": "sphere", "radius": 0.1, "position": [-325, 100, 0]}]},
             r"^colliders\[0\]: expected a solid within reach .* found it 340 m away: .* metres",
         ),
+        (
+            {"colliders": [{"type": "sphere", "radius": 5, "position": [-5.5, 0.3, 0]}]},
+            r"^colliders\[0\]: .* body of 0.\d+ m, found one 10 m thick: lengths are in metres",
+        ),
     ],
 )
 def test_radians_and_millimetres_are_asked_about(given, said):
@@ -149,7 +154,7 @@ def test_a_solid_that_one_of_several_recordings_meets_is_none_to_name():
     solids = colliders_from_config([ball], "colliders")
     assert told(lambda: warn_of_unmet([missed, met], solids, made.body, made.world)) == []
     (said,) = told(lambda: warn_of_unmet([missed], solids, made.body, made.world))
-    assert "found 0 never nearer than 0.5 m" in said
+    assert "found colliders[0] never nearer than 0.5 m" in said
 
 
 def test_a_mesh_far_away_has_a_distance(tmp_path):
@@ -157,7 +162,7 @@ def test_a_mesh_far_away_has_a_distance(tmp_path):
     path.write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     far = {"type": "mesh", "path": str(path), "position": [1, 0.3, 0]}
     (said,) = told(lambda: twin().simulate(frames=2, **STILL, colliders=[far]))
-    away = float(said.partition("found 0 never nearer than ")[2].removesuffix(" m"))
+    away = float(said.partition("found colliders[0] never nearer than ")[2].removesuffix(" m"))
     assert 0.7 < away < 0.95
 
 
@@ -166,6 +171,20 @@ def test_a_solid_in_millimetres_that_holds_the_body_is_named():
         ConfigError, match=r"it reaches 86.6 m from its origin \(lengths are in metre"
     ):
         twin().reset(colliders=[{"type": "box", "size": [100, 100, 100], "position": [0, 0.1, 0]}])
+    with pytest.raises(ConfigError, match=r"inside of it .* it reaches 5 m .*in metres\)$"):
+        twin().reset(colliders=[{"type": "sphere", "radius": 5, "position": [0, 0.1, 0]}])
+
+
+def test_a_solid_of_the_twin_s_run_that_holds_the_body_says_so():
+    made = twin()
+    ball = {"type": "sphere", "radius": 0.1, "position": [0, 0.3, 0]}
+    made.world = replace(made.world, colliders=colliders_from_config([ball]))
+    whose = (
+        r"^world\.colliders\[0\]: .*; it comes with the twin's run: colliders=\[\] leaves it out$"
+    )
+    with pytest.raises(ConfigError, match=whose):
+        made.simulate(frames=2, position=(0, 0.3, 0))
+    assert len(made.simulate(frames=2, position=(0, 0.3, 0), colliders=[]).x) == 2
 
 
 @pytest.mark.parametrize("mode, speed", [("separate", 20), ("sticky", 35)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ DIFFERENCE = 0.5  # largest image difference that has a colour of its own
 NEAR_BACKGROUND = 12
 """8-bit levels: ground lines are drawn where a pixel is as close to the background as that, so that they lie behind the object."""
 
+WIDEST = 512.0  # px of a body whose outline and shadow are drawn as finely as the picture
 DARK = 0.45  # of the light that a shadow takes where it is deepest
 
 
@@ -224,18 +226,21 @@ def ground_shadow(
         return dots
     soft = 0.03 + 0.1 * float((high.min() / size).clamp(0, 1))
     whole = cv2.dilate(dots, _disc(0.03 * wide))  # no gaps between points
-    return cv2.GaussianBlur(whole, (0, 0), max(soft * wide, 0.5))
+    shade = cv2.GaussianBlur(whole, (0, 0), max(soft * wide, 0.5))
+    return cv2.resize(shade, (cameras.width, cameras.height))
 
 
 def outline(points: Tensor, cameras: Cameras, size: float) -> np.ndarray:
     """(H, W), 1 where one camera sees a body with points (N, 3) [m], gaps between them closed, and
     0 elsewhere. size: of the body [m]."""
     dots, wide = _dots(points.double().cpu(), cameras, size)
-    return cv2.morphologyEx(dots, cv2.MORPH_CLOSE, _disc(0.05 * wide))
+    whole = cv2.morphologyEx(dots, cv2.MORPH_CLOSE, _disc(0.05 * wide))
+    return cv2.resize(whole, (cameras.width, cameras.height))
 
 
 def _dots(points: Tensor, cameras: Cameras, size: float, convex: bool = False) -> tuple[np.ndarray, float]:  # fmt: skip
-    """((H, W) 1 at the pixels of points (N, 3), or inside of their hull, px of `size` or 0 where none is in front)."""
+    """((h, w) 1 at the pixels of points (N, 3), or inside of their hull, px of `size` or 0 where none is in front). Of a picture in
+    which `size` is wider than `WIDEST`, a smaller one: discs that grow with the body would take minutes."""
     w2c, K = cameras.w2c[0].double().cpu(), cameras.K[0].double().cpu()
     seen = points @ w2c[:3, :3].T + w2c[:3, 3]
     seen = seen[seen[:, 2] > 0]
@@ -243,13 +248,16 @@ def _dots(points: Tensor, cameras: Cameras, size: float, convex: bool = False) -
     if not len(seen):
         return np.zeros(shape), 0.0
     pixel = ((seen @ K.T)[:, :2] / seen[:, 2:]).numpy()
+    wide = size * float(K[0, 0] / seen[:, 2].mean())
+    if wide > WIDEST:
+        wide, share = WIDEST, WIDEST / wide
+        shape = (math.ceil(share * shape[0]), math.ceil(share * shape[1]))
+        pixel *= share
     if convex:
         hull = cv2.convexHull(pixel.clip(-1e4, 1e4).astype(np.int32))
-        dots = cv2.fillConvexPoly(np.zeros(shape), hull, 1.0)
-    else:
-        edges = ((0, shape[0]), (0, shape[1]))
-        dots = np.histogram2d(pixel[:, 1], pixel[:, 0], shape, edges)[0].clip(max=1)
-    return dots, size * float(K[0, 0] / seen[:, 2].mean())
+        return cv2.fillConvexPoly(np.zeros(shape), hull, 1.0), wide
+    edges = ((0, shape[0]), (0, shape[1]))
+    return np.histogram2d(pixel[:, 1], pixel[:, 0], shape, edges)[0].clip(max=1), wide
 
 
 def _disc(radius: float) -> np.ndarray:

@@ -15,8 +15,8 @@ from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import pose_at
 from mosa.physics.contact.reference import signed_distance
 
-HUGE = 20.0
-"""[m] that a solid reaches from its origin from which its unit is doubted."""
+HUGE = 10.0
+"""Of the body's extent, that a solid reaches from its origin from which its unit is doubted."""
 MOST = 0.01
 """Share of a body's particles that may be deeper than a quarter of their spacing, or of a thin solid: where both touch, they
 are half a spacing outside."""
@@ -24,13 +24,15 @@ are half a spacing outside."""
 
 @torch.no_grad()
 def check_clear(
-    colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0, poses: tuple = (),
+    colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders",
+    spacing: float = 0.0, poses: tuple = (), hint: str = "",
 ) -> float:  # fmt: skip
     """How deep [m] the body starts in the contact of a solid, which begins half a spacing outside of
     it; below 0 where it is clear.
 
     x: (N, 3) [m] of particles where the body starts, and their spacing [m]; where: what starts, for the message; poses: position
-    (K, 3) [m] and rotation (K, 3, 3) of the colliders now, () for theirs at t = 0. Errors: ConfigError naming the colliders."""
+    (K, 3) [m] and rotation (K, 3, 3) of the colliders now, () for theirs at t = 0; hint: more for the message.
+    Errors: ConfigError naming the colliders."""
     deep, places, pressed = [], [], -math.inf
     colliders = [each for each in colliders if not isinstance(each.shape, Particles)]
     for k, collider in enumerate(colliders):
@@ -52,7 +54,8 @@ def check_clear(
     share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:
         inside = [i for i, each in enumerate(deep) if bool(each.any())]
-        hints = dict.fromkeys(_hint(colliders[i]) for i in inside)
+        size = float((x.amax(0) - x.amin(0)).max())
+        hints = dict.fromkeys([*(_hint(colliders[i], size) for i in inside), hint])
         named = " and ".join(
             f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside
         )
@@ -64,12 +67,12 @@ def check_clear(
     return pressed
 
 
-def _hint(collider: Collider) -> str:
-    """What may be wrong with a solid that the body is in."""
+def _hint(collider: Collider, size: float) -> str:
+    """What may be wrong with a solid that a body of a size [m] is in."""
     if isinstance(collider.shape, HalfSpace):
         return "a plane fills all below its xy plane (normal: towards the free side)"
     if isinstance(collider.shape, SignedDistanceField):
         return f"its mesh is {collider.shape.extent:.3g} m long (scale: 0.001 for a file in mm)"
-    if (far := reach(collider.shape)) > HUGE:
+    if (far := reach(collider.shape)) > HUGE * size:
         return f"it reaches {far:.3g} m from its origin (lengths are in metres)"
     return ""

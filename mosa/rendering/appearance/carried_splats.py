@@ -100,6 +100,12 @@ class Seen:
         given = self.means, self.covariances, self.opacities, colors, cameras, index
         return rasterize(*given, background)[0]
 
+    def during(self, frames: list[int]) -> Seen:
+        """The same over some of its frames."""
+        same = "opacities", "harmonics"
+        given = vars(self).items()
+        return Seen(**{k: v if v is None or k in same else v[frames] for k, v in given})
+
     def colors(self) -> Tensor:
         """(T, M, 3) in [0, 1], averaged over all directions, in each frame's light."""
         constant = spherical_harmonics.mean_colors(self.harmonics)
