@@ -113,6 +113,16 @@ def image_matrices(
         # an odd step meets all four channels
         return values[:, :: 2 * (values.shape[1] // (2 * VALUES)) + 1]
 
+    def gram(here: Tensor, at: Tensor, window: Windows) -> Tensor:
+        """(D, D) of one view. Each of two threads holds one Jacobian at a time, which is made in place."""
+        base = images(here, at, window)
+        weight = ((base - some_of(window.images, window.mattes)).abs() + ABSOLUTE).rsqrt()
+        J = base.new_empty(size, base.shape[1])
+        for rows, some in zip(J.split(TOGETHER), directions.split(TOGETHER)):
+            rows.copy_(images(here + STEP * some, at, window))
+        J.sub_(base).div_(STEP).mul_(weight)
+        return (J @ J.T).double() / J.shape[1]
+
     @torch.no_grad()  # a thread has its own switch
     def matrix(frame: int) -> Tensor:
         at = torch.tensor([frame], device=device)
@@ -122,12 +132,7 @@ def image_matrices(
         chosen = range(frame % step, len(own), step)
         H = torch.zeros(size, size, dtype=torch.float64, device=device)
         for view in chosen:
-            window = own.select(torch.tensor([view], device=device))
-            base = images(here, at, window)
-            weight = ((base - some_of(window.images, window.mattes)).abs() + ABSOLUTE).rsqrt()
-            moved = [images(here + STEP * d, at, window) for d in directions.split(TOGETHER)]
-            J = (torch.cat(moved) - base) / STEP * weight
-            H += (J @ J.T).double() / J.shape[1] / len(chosen)
+            H += gram(here, at, own.select(torch.tensor([view], device=device))) / len(chosen)
         return H
 
     for H in (threaded if found.is_cpu else map)(matrix, range(1, len(target.offsets))):
