@@ -26,25 +26,24 @@ SETTINGS = build_settings(
 
 
 @pytest.fixture(scope="module")
-def spacing(squashed):
-    return spacing_for(squashed, 700, SETTINGS)
-
-
-@pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture(scope="module")
-def found(squashed, spacing, cache):
-    # the truth is taken away: reading it would be an error
-    return reconstruct(
-        replace(squashed, truth=None),
-        settings=SETTINGS,
-        spacing=spacing,
-        cache_dir=cache,
-        progress=False,
-    )
+def unknown(squashed):
+    """The truth is taken away: reading it would be an error."""
+    return replace(squashed, truth=None)
+
+
+@pytest.fixture(scope="module")
+def spacing(unknown, cache):
+    return spacing_for(unknown, 700, SETTINGS, cache_dir=cache)
+
+
+@pytest.fixture(scope="module")
+def found(unknown, spacing, cache):
+    return reconstruct(unknown, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
 
 
 def true_positions(squashed, particles):
@@ -186,27 +185,28 @@ def test_a_damaged_stage_is_computed_again_and_the_rest_kept(
     assert damaged.stat().st_size > 1000
 
 
-def test_held_out_cameras_and_frames_have_no_influence(squashed):
-    """Garbage in held-out images and mattes leaves the result bit-equal."""
+def quickly(scene, settings, cache):
+    """Of 200 particles, with one search of the geometry."""
+    spacing = spacing_for(scene, 200, settings, cache_dir=cache)
+    return reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache, progress=False)
+
+
+def test_held_out_cameras_and_frames_have_no_influence(squashed, tmp_path):
+    """Garbage in held-out images and mattes leaves the result bit-equal. Each with a cache of its own, as their keys are equal."""
     quick = build_settings(resolution=32, ridge_passes=4, points=200, static={"iterations": 3}, appearance={"iterations": 3},
                            dynamic={"modes": 8, "track_iterations": 2, "iterations": 2}, carried={"iterations": 3})  # fmt: skip
     held = replace(squashed, holdout_cameras=(2,), holdout_frames=(4,))
     images, mattes = squashed.images.clone(), squashed.mattes.clone()
     images[2], mattes[2], images[:, 4], mattes[:, 4] = 0.1, 0.0, 0.9, 0.0
     spoiled = replace(held, images=images, mattes=mattes)
-    results = [
-        reconstruct(
-            s, settings=quick, spacing=spacing_for(s, 200, quick), cache_dir=None, progress=False
-        )
-        for s in (held, spoiled)
-    ]
+    results = [quickly(s, quick, tmp_path / str(k)) for k, s in enumerate((held, spoiled))]
     assert results[0].cues.positions.shape[0] == 4
     assert torch.equal(results[0].cues.positions, results[1].cues.positions)
     assert torch.equal(results[0].splats.colors, results[1].splats.colors)
     assert torch.equal(results[0].appearance.harmonics, results[1].appearance.harmonics)
 
 
-def test_gaussian_cues_come_from_free_shapes(squashed):
+def test_gaussian_cues_come_from_free_shapes(squashed, tmp_path):
     quick = {"resolution": 32, "ridge_passes": 4, "points": 200, "static": {"iterations": 3}, "appearance": {"iterations": 3},
              "carried": {"iterations": 3}}  # fmt: skip
     dynamic = {"modes": 8, "track_iterations": 2, "iterations": 2}
@@ -214,13 +214,7 @@ def test_gaussian_cues_come_from_free_shapes(squashed):
         build_settings(**quick, cue="gaussian", dynamic=dynamic)
     settings = build_settings(**quick, cue="gaussian", dynamic=dynamic | {"free_shape": True})
     scene = replace(squashed, holdout_frames=(3, 4))
-    cues = reconstruct(
-        scene,
-        settings=settings,
-        spacing=spacing_for(scene, 200, settings),
-        cache_dir=None,
-        progress=False,
-    ).cues
+    cues = quickly(scene, settings, tmp_path).cues
     assert torch.allclose(cues.stretch[0], torch.ones_like(cues.stretch[0]), atol=1e-5)
     assert float((cues.stretch[1] - 1).abs().max()) > 1e-6 and cues.weight.min() == 1
     assert torch.allclose(torch.linalg.det(cues.rotation), torch.ones_like(cues.weight), atol=1e-4)
