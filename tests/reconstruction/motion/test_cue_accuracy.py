@@ -119,21 +119,16 @@ def test_errors_are_those_that_were_put_in(squashed):
 
 
 @pytest.fixture(scope="module")
-def seen(squashed):
+def seen(squashed, tmp_path_factory):
     """One reconstruction with free shapes: both forms from the same positions' fit, and the truth at its particles."""
     settings = build_settings(
         resolution=56, points=1000, static={"iterations": 80}, appearance={"iterations": 60}, cue="gaussian",
         dynamic={"modes": 40, "track_iterations": 30, "track_views": 2, "iterations": 30, "free_shape": True},
         carried={"iterations": 1},
     )  # fmt: skip
-    blind = replace(squashed, truth=None)
-    result = reconstruct(
-        blind,
-        settings=settings,
-        spacing=spacing_for(squashed, 600, settings),
-        cache_dir=None,
-        progress=False,
-    )
+    blind, cache = replace(squashed, truth=None), tmp_path_factory.mktemp("cache")
+    spacing = spacing_for(blind, 600, settings, cache_dir=cache)
+    result = reconstruct(blind, settings=settings, spacing=spacing, cache_dir=cache, progress=False)
     cues, rest = result.cues, result.splats.means
     forms = {
         "gaussian": cues,
