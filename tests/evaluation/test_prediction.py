@@ -14,6 +14,7 @@ from mosa.evaluation.uncertainty import (
     DRAWN,
     ELSEWHERE,
     FORMS,
+    GRID,
     INFLATION,
     among_forms,
     determined,
@@ -147,8 +148,8 @@ def test_forms_of_a_law_that_explain_the_data_make_its_moduli_less_sure():
     other = numbers - torch.tensor([math.log(2), 0.0]).double()
     with_rival = replace(own, rivals={"stvk": other})
     alone, both = (determined(body, p)["posterior/E_relative_sd"] for p in (own, with_rival))
-    assert alone == pytest.approx(0.03, rel=0.01)
-    assert both == pytest.approx(math.hypot(0.03, FORMS * math.log(2) / 2), rel=0.05)
+    assert alone == pytest.approx(math.hypot(0.03, GRID), rel=0.01)
+    assert both == pytest.approx(math.hypot(0.03, GRID, FORMS * math.log(2) / 2), rel=0.05)
     assert (
         determined(body, with_rival)["posterior/nu_sd"] == determined(body, own)["posterior/nu_sd"]
     )
