@@ -149,14 +149,8 @@ class TwinVectorEnv(VectorEnv, _Worlds):
         checkpoint: str | Path | None = None, scene: str | None = None, device: str = "cpu", spacing: float | None = None,
         options: Section | None = None, laws: Any = None,
     ) -> None:  # fmt: skip
-        of = {
-            "checkpoint": checkpoint,
-            "scene": scene,
-            "device": device,
-            "spacing": spacing,
-            "laws": laws,
-        }
-        found = self._spaces(worlds, task, simulator, options, **of)
+        of = {"checkpoint": checkpoint, "scene": scene, "device": device, "spacing": spacing}
+        found = self._spaces(worlds, task, simulator, options, laws, **of)
         self.single_observation_space, self.single_action_space = found
         self.num_envs, self.render_mode = worlds, None
         self.action_space = batch_space(self.single_action_space, worlds)

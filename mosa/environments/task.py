@@ -102,7 +102,7 @@ class Task(ABC):
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        if cls.name:
+        if "name" in vars(cls):  # a variant under an inherited name does not take its place
             TASKS[cls.name] = cls
 
     def __post_init__(self) -> None:

@@ -212,8 +212,8 @@ def determined(
             sd = physical_sd(name, raw, float(variance.sqrt()))
             if name in RELATIVE:
                 value = float(body.material.physical_of(name, raw))
-                found = math.hypot(sd / value, GRID * (name in STIFFNESS))
-                figures[f"posterior/{name}_relative_sd"] = found
+                grid = GRID if name in STIFFNESS else 0.0
+                figures[f"posterior/{name}_relative_sd"] = math.hypot(sd / value, grid)
             else:
                 figures[f"posterior/{name}_sd"] = sd
         elif name in ("operator", "stiffness"):

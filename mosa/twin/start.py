@@ -31,7 +31,7 @@ from mosa.physics.contact.colliders import (
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import pose_at
-from mosa.physics.contact.overlap import check_clear
+from mosa.physics.contact.overlap import HUGE, check_clear
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.inputs import FASTEST, numbers, vector
@@ -212,7 +212,7 @@ def start_in(
                 f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
                 stacklevel=4,
             )
-        elif away > far or half_width(each.shape) > 10 * body.size:
+        elif away > far or half_width(each.shape) > HUGE * body.size:
             thick = f"one {2 * half_width(each.shape):.3g} m thick"
             warnings.warn(
                 f"{expected} solid within reach of the body of {body.size:.3g} m, found "

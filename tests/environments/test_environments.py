@@ -412,6 +412,8 @@ def test_the_command_takes_the_task_of_an_extension(tmp_path, monkeypatch):
         command.setting_of(values)
     command.setting_of(values | {"extensions": ["own_tasks"]})
     assert TASKS.pop("far_away").aim == 0.3
+    type("Nearer", (TASKS["placement"],), {})  # under the inherited name
+    assert TASKS["placement"].__name__ == "Placement"
 
 
 def test_a_picture_shows_the_body_on_its_box():

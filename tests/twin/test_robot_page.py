@@ -58,6 +58,15 @@ def test_a_wheel_turns_on_and_degrees_and_shapes_to_look_at_are_refused(tmp_path
     ):
         robot.action({"j": 30})
     robot.colliders({"j": 30})  # where it begins
+    shape = WHEEL[WHEEL.index("<collision>") : WHEEL.index("</link><joint")]
+    (tmp_path / "two.urdf").write_text(WHEEL.replace(shape, 2 * shape))
+    with pytest.raises(ValueError, match=r"expected one <collision> in a link, found .*'b': 2"):
+        names["Links"](tmp_path / "two.urdf")
+    more = '<link name="c"/><joint name="k" type="continuous"><parent link="b"/><child link="c"/>'
+    follower = f'{more}<mimic joint="j"/></joint></robot>'
+    (tmp_path / "mimic.urdf").write_text(WHEEL.replace("</robot>", follower))
+    with pytest.raises(ValueError, match="k: follows j: expected the value of that joint alone"):
+        names["Links"](tmp_path / "mimic.urdf").colliders({"j": 1, "k": 2})
     (tmp_path / "seen.urdf").write_text(WHEEL.replace("collision>", "visual>"))
     with pytest.raises(
         ValueError, match=r"seen\.urdf: expected links with <collision>, found none"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from itertools import accumulate, combinations, groupby, pairwise
+from itertools import combinations, groupby, pairwise
 from typing import NamedTuple
 
 import torch
@@ -222,10 +222,10 @@ def check_flight(
     track: Track, aloft: Tensor, label: str, g: float, down: Tensor, keys: str
 ) -> None:
     """Where too few frames are before contact: of the longest flight after it, which something unseen may touch, a warning."""
-    flights = [len(list(run)) * up for up, run in groupby(aloft.tolist())]
-    starts = [0, *accumulate(len(list(run)) for _, run in groupby(aloft.tolist()))]
-    if (frames := max(flights)) > 3:
-        first = starts[flights.index(frames)]
+    runs = (list(run) for _, run in groupby(range(len(aloft)), aloft.tolist().__getitem__))
+    flight = max((run for run in runs if aloft[run[0]]), key=len, default=[])
+    if (frames := len(flight)) > 3:
+        first = flight[0]
         a, error = parabola(track._replace(points=track.points[first:]), frames)
         if not g / SUSPECT - error < float(a @ down) < g * SUSPECT + error:
             found = f"the object falls with {float(a @ down):.3g} +- {error:.2g} m/s^2"

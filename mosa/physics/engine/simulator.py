@@ -303,9 +303,8 @@ class Simulator:
             gravities = tuple(map(tuple, turned.tolist()))
         prepared = self._prepare(state, asked, worlds, gravities, held)
         if worlds is None:
-            prepared.lanes.solvers[0].know(
-                (given.x, given.v), known[None]
-            )  # of other memory where the axes differ
+            # where the axes differ the particles are in other memory, and it looks again
+            prepared.lanes.solvers[0].know((given.x, given.v), known[None])
         choose = None
         if timing is not None:
             solids = max(
