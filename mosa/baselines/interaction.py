@@ -59,6 +59,11 @@ class InteractionNetwork(Adapter):
         self.net = TwoHiddenLayers(3, 2, hidden)
         zero_outputs(self.net[-1])
         self.register_buffer("scale", torch.tensor(SCALE), persistent=False)
+        self._dynamics: Interactions | None = None
+
+    def __getstate__(self) -> dict:
+        # CUDA graphs can be neither copied nor pickled
+        return {**super().__getstate__(), "_dynamics": None}
 
     def settle(self, rest: Tensor, volume: Tensor) -> None:
         """Choose nodes and bonds of a body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError for too few particles."""
@@ -142,7 +147,9 @@ class InteractionNetwork(Adapter):
     def simulator(self, density: float, world, frame_dt: float) -> Interactions:
         """What rolls the nodes out in a world, in place of the body's `Simulator`. Errors: ConfigError."""
         self.check_on()
-        return Interactions(self, density, world, frame_dt)
+        if self._dynamics is None or not self._dynamics.serves(density, world, frame_dt):
+            self._dynamics = Interactions(self, density, world, frame_dt)
+        return self._dynamics
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         raise ConfigError("adapter=interaction has no stress; expected `Body.simulate`")

@@ -1,6 +1,7 @@
 """How nodes move under learned pair forces (`interaction.py`): symplectic Euler over frames, with an adjoint of each frame.
 
-Only the nodes at the frames are kept: the adjoint runs the frame again.
+Only the nodes at the frames are kept: the adjoint runs the frame again. A substep is some forty operations on a few thousand
+bonds, so that a GPU would wait for their launches; both passes of a frame are CUDA graphs there.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from torch.autograd.function import once_differentiable
 from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.launching import same_memory
 from mosa.types import ParticleState, Rollout
 
 
@@ -30,6 +32,15 @@ class Interactions:
         # half of the limit of stability, 2/fastest, for bonds at their stiffest
         self.substeps = math.ceil(frame_dt * fastest)
         self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt
+        self.gravity, self.up = (t.detach().to(network.rest) for t in (world.gravity, world.up))
+        self.E_ref, self.read = float(network.E_ref), [t.detach() for t in network.buffers()]
+        self.passes: Callable[..., tuple[Tensor, Tensor]] | None = None
+
+    def serves(self, density: float, world, frame_dt: float) -> bool:
+        """Whether these are the dynamics of the network as it is now, for such a body."""
+        asked = (density, frame_dt, float(self.network.E_ref))
+        alike = asked == (self.density, self.frame_dt, self.E_ref) and world is self.world
+        return alike and same_memory(self.read, list(self.network.buffers()))
 
     def rollout(
         self, state: ParticleState, *, frames: int, parameters=None, volume=None, density=None, adapter=None, stride=None,
@@ -43,9 +54,14 @@ class Interactions:
         x, v = state.x[network.nodes], state.v[network.nodes]
         C = state.C_affine
         recorded = [(state.x, state.v, state.F)]
-        names, weights = zip(*network.net.named_parameters())
+        weights = tuple(network.net.parameters())
+        if self.passes is None:
+            self.passes = self.frame
+            if x.is_cuda:
+                samples = tuple(t.detach().clone().requires_grad_() for t in (x, v, *weights))
+                self.passes = torch.cuda.make_graphed_callables(self.frame, samples)
         for frame in range(1, frames):
-            x, v = Frame.apply(self, names, x, v, *weights)
+            x, v = Frame.apply(self.passes, x, v, *weights)
             if not bool(torch.isfinite(x).all()):
                 raise SimulationDiverged(
                     f"adapter=interaction: a position is not finite in frame {frame}; lower "
@@ -68,22 +84,26 @@ class Interactions:
     def stepper(self, *_, **__) -> None:
         raise ConfigError("adapter=interaction: expected a whole rollout (Twin.simulate)")
 
-    def frame(self, x: Tensor, v: Tensor, net: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-        """(x, v) (M, 3) of the nodes one frame later; net: the network."""
+    def frame(self, x: Tensor, v: Tensor, *weights: Tensor) -> tuple[Tensor, Tensor]:
+        """(x, v) (M, 3) of the nodes one frame later; weights: the network's, in its order."""
         network, dt = self.network, self.frame_dt / self.substeps
-        gravity, up = (t.detach().to(x) for t in (self.world.gravity, self.world.up))
+        named = dict(zip((name for name, _ in network.net.named_parameters()), weights, strict=True))
+
+        def net(read: Tensor) -> Tensor:
+            return functional_call(network.net, named, (read,))
+
         mass = self.density * network.node_volume[:, None]
         for _ in range(self.substeps):
-            v = v + dt * (network.forces(x, v, self.density, net) / mass + gravity)
+            v = v + dt * (network.forces(x, v, self.density, net) / mass + self.gravity)
             if self.world.ground is not None:
-                v = self.contact(x, v, up)
+                v = self.contact(x, v)
             x = x + dt * v
         return x, v
 
-    def contact(self, x: Tensor, v: Tensor, up: Tensor) -> Tensor:
+    def contact(self, x: Tensor, v: Tensor) -> Tensor:
         """Velocities after the ground, as a grid node's (`contact/planes.py`), but that a node may leave it in every mode: on a
         grid the particles leave sticky nodes, which are no part of the body."""
-        ground = self.world.ground
+        ground, up = self.world.ground, self.up
         normal = (v @ up)[:, None]
         touching = ((x @ up) - ground.height <= self.network.radius)[:, None] & (normal < 0)
         tangent = v - normal * up
@@ -97,26 +117,21 @@ class Interactions:
 
 
 class Frame(torch.autograd.Function):
-    """`Interactions.frame` of nodes x, v (M, 3) and the network's weights, by their names."""
+    """`Interactions.frame` of nodes x, v (M, 3) and the network's weights, by `passes`: the function or its graphs, which answer in
+    the same memory every time."""
 
     @staticmethod
-    def forward(
-        ctx, dynamics: Interactions, names: tuple[str, ...], x: Tensor, v: Tensor, *weights
-    ):
-        ctx.dynamics, ctx.names = dynamics, names
+    def forward(ctx, passes: Callable[..., tuple[Tensor, Tensor]], *values: Tensor):
+        ctx.passes = passes
         # the weights too: a change of them before the adjoint is then an error
-        ctx.save_for_backward(x, v, *weights)
-        return dynamics.frame(x, v, dynamics.network.net)
+        ctx.save_for_backward(*values)
+        return tuple(t.clone() for t in passes(*values))
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *seeds: Tensor):
         with torch.enable_grad():
             leaves = [t.detach().requires_grad_() for t in ctx.saved_tensors]
-            named, net = dict(zip(ctx.names, leaves[2:], strict=True)), ctx.dynamics.network.net
-            found = ctx.dynamics.frame(
-                *leaves[:2], lambda read: functional_call(net, named, (read,))
-            )
-            gradients = torch.autograd.grad(found, leaves, seeds)
-        needed = ctx.needs_input_grad[2:]
-        return None, None, *(g if own else None for g, own in zip(gradients, needed, strict=True))
+            gradients = torch.autograd.grad(ctx.passes(*leaves), leaves, seeds)
+        needed = ctx.needs_input_grad[1:]
+        return None, *(g.clone() if own else None for g, own in zip(gradients, needed, strict=True))

@@ -273,11 +273,10 @@ def test_the_adjoint_of_its_frames_is_that_of_their_substeps():
     )
     dynamics = body.adapter.simulator(1000.0, WORLD, FRAME_DT)
     dynamics.substeps = 5
-    net = body.adapter.net
-    names, weights = zip(*net.named_parameters())
-    moved = Frame.apply(dynamics, names, x, v, *weights)
-    moved = Frame.apply(dynamics, names, *moved, *weights)
-    there = dynamics.frame(*dynamics.frame(x, v, net), net)
+    weights = tuple(body.adapter.net.parameters())
+    moved = Frame.apply(dynamics.frame, x, v, *weights)
+    moved = Frame.apply(dynamics.frame, *moved, *weights)
+    there = dynamics.frame(*dynamics.frame(x, v, *weights), *weights)
     torch.testing.assert_close(moved, there, rtol=0, atol=0)
     found, expected = (
         torch.autograd.grad(each[0].square().sum() + each[1].sum(), [x, v, *weights])
