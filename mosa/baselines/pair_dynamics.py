@@ -87,7 +87,9 @@ class Interactions:
     def frame(self, x: Tensor, v: Tensor, *weights: Tensor) -> tuple[Tensor, Tensor]:
         """(x, v) (M, 3) of the nodes one frame later; weights: the network's, in its order."""
         network, dt = self.network, self.frame_dt / self.substeps
-        named = dict(zip((name for name, _ in network.net.named_parameters()), weights, strict=True))
+        named = dict(
+            zip((name for name, _ in network.net.named_parameters()), weights, strict=True)
+        )
 
         def net(read: Tensor) -> Tensor:
             return functional_call(network.net, named, (read,))

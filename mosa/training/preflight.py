@@ -32,8 +32,9 @@ from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.pose.starts import first_contact
 from mosa.system.limits import counted
 from mosa.training.memory import ball_of
+from mosa.twin.film import viewed_from
 from mosa.twin.presets import preset
-from mosa.twin.twin import Twin, viewed_from
+from mosa.twin.twin import Twin
 from mosa.types import REST, Scene
 
 PARTICLE_BYTES = 5e3  # of a particle in reconstruction and fit, at least

@@ -24,13 +24,6 @@ from mosa.config.checkpoints import TENSORS, check_kinds, check_numbers, checked
 from mosa.config.record import BodyRecord
 from mosa.data.io.splat_formats import Formats, check_formats, drop_later_frames, save_frames
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation.analysis.comparison import (
-    DARK,
-    ground_lines,
-    ground_shadow,
-    on_ground,
-    outline,
-)
 from mosa.evaluation.analysis.figures import ffmpeg, side_by_side, to_uint8, write_video
 from mosa.evaluation.uncertainty import (
     DRAWS,
@@ -41,18 +34,13 @@ from mosa.evaluation.uncertainty import (
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
-from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
+from mosa.physics.contact.colliders import Collider, colliders_from_config
 from mosa.physics.contact.driven import Driven
-from mosa.physics.contact.mesh import SignedDistanceField
-from mosa.physics.contact.reference import signed_distance
-from mosa.physics.engine.inputs import numbers
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
-from mosa.rendering.cameras import look_at
 from mosa.settings import Count, Expected, Number, Pixels, Positive, Seed, Zoom, such, typed
 from mosa.system.limits import named_device
 from mosa.system.progress import tqdm
-from mosa.system.threads import cores
 from mosa.system.whole_files import made_folder, written_whole
 from mosa.twin.batch import TwinWorlds
 from mosa.twin.episode import (
@@ -64,13 +52,13 @@ from mosa.twin.episode import (
     placed_as,
     rollout_of,
 )
+from mosa.twin.film import Views, film, viewed_from
 from mosa.twin.material import TwinMaterial, summary
 from mosa.twin.material_files import Formats as MaterialFormats
 from mosa.twin.material_files import export_material
 from mosa.twin.rollout_file import poses, save_rollout
 from mosa.twin.shown_body import FILE as BODY_FILE
 from mosa.twin.shown_body import save_body
-from mosa.twin.shown_solids import with_solids
 from mosa.twin.start import (
     Crossings,
     Seconds,
@@ -81,12 +69,9 @@ from mosa.twin.start import (
     warn_of_creep,
     warn_of_unmet,
 )
-from mosa.types import Cameras, Rollout
+from mosa.types import Rollout
 
-LENS = 1.6
-"""Of a video's camera: its focal length over the picture's shorter side."""
 Draws = Annotated[int, Ge(2), Le(10_000)]
-Views = Sequence[float] | Sequence[Sequence[float]] | Tensor
 Motion = Annotated[
     InstanceOf[Rollout] | Sequence[InstanceOf[TwinState]],
     Expected("a Rollout, or a list of the states of steps in order (of worlds: each.world(0))"),
@@ -284,83 +269,11 @@ class Twin(InMotion):
         """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and among `colliders`, those
         that the rollout was simulated with (None: the world's). rollout: or a list of the states of T steps, whose solids are
         drawn where they were then (None: those of `reset`). Half spaces are not drawn. size [px]: of a square, or (width,
-        height). view: (3,) from the body to the camera, or (K, 3), as `viewed_from` spreads them over the frames; None for the
+        height). view: (3,) from the body to the camera, or (K, 3), as `film.viewed_from` spreads them over the frames; None for the
         side and a little above. zoom: magnification of at most 20, or several, spread over the frames; above 1 the camera follows
         the body. shadow: on the ground, of the body and of the solids, under light from above. Errors: ConfigError."""
-        return self._pictures(*self._met(rollout, colliders), size, view, zoom, shadow)
-
-    def _pictures(
-        self,
-        rollout: Rollout,
-        solids: Sequence[Collider],
-        size: int | Sequence[int],
-        view: Views | None,
-        zoom: float | Sequence[float],
-        shadow: bool,
-        progress: bool = False,
-    ) -> Tensor:
-        body, up = self.body, self.world.up.to(self.body.rest)
-        low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
-        # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
-        for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
-            if 0 < (far := reach(solid.shape)) < body.size:
-                low = torch.minimum(low, at.amin(0).to(low) - far)
-                high = torch.maximum(high, at.amax(0).to(high) + far)
-        target = 0.5 * (low + high)
-        side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
-        level = side - (side @ up) * up
-        side = level if float(level.norm()) > 1e-3 else torch.roll(up, 1)
-        width, height = (size, size) if isinstance(size, int) else size
-        frames = len(rollout.x)
-        nearer = spread(np.log(np.atleast_1d(zoom)), frames).exp().to(body.rest)
-        # the nearer, the more the camera looks at the body, which may be anywhere on its way
-        follow = (1 - nearer**-2).clamp_min(0)[:, None]
-        aims = target + follow * (rollout.x.mean(1).to(low) - target)
-        # without zoom a ball around all places of the particles fills the shorter side, but for a margin
-        far = (4 * LENS**2 + 1) ** 0.5 * (0.53 * float((high - low).norm()) + body.spacing)
-        toward = viewed_from(side / side.norm() + 0.25 * up if view is None else view, up, frames)
-        K = torch.tensor([[0, 0, width / 2], [0, 0, height / 2], [0, 0, 1.0]]).repeat(frames, 1, 1)
-        K[:, 0, 0] = K[:, 1, 1] = LENS * min(width, height) * nearer.cpu()
-        eyes = aims + far * toward
-        w2c = look_at(eyes, aims, up).cpu()
-        names = tuple(f"frame {t}" for t in range(frames))
-        cameras = Cameras(K.to(w2c), w2c, width, height, names)
-        shown = seen(body, rollout.x, rollout.F_tot)
-        ends, convex = [len(shown.opacities)], [False]
-        for k, solid in enumerate(solids):
-            at, turned = (part[:, 0] for part in poses([solid], rollout.times))
-            q = ((eyes.cpu().double() - at)[:, None] @ turned)[:, 0]
-            if 0 < reach(solid.shape) and float(signed_distance(solid.shape, q).min()) < 0:
-                named = solid.name or f"colliders[{k}]"
-                warn(f"{named}: the camera is inside of it: not drawn", stacklevel=4)
-                continue
-            shown = with_solids(shown, solids[k : k + 1], rollout.times, up, body.size / 30)
-            ends.append(len(shown.opacities))
-            convex.append(not isinstance(solid.shape, SignedDistanceField))
-        white, images, floors = np.full((height, width, 3), 255, np.uint8), [], []
-        with tqdm(total=frames, desc="film", unit="frame", disable=not progress) as bar:
-            for t, points in enumerate(shown.means):
-                camera = cameras.select([t])
-                # the camera has moved
-                if t == 0 or not (w2c[t].equal(w2c[t - 1]) and K[t].equal(K[t - 1])):
-                    lines = ground_lines(self.world, camera, body.size, target.cpu())
-                    floor = on_ground(white, lines, 1, torch.ones(3)) / np.float32(255)
-                floors.append(floor.copy())
-                if lines and shadow:
-                    dark = [
-                        ground_shadow(part, self.world, camera, body.size, filled)
-                        for part, filled in zip(points.tensor_split(ends[:-1]), convex)
-                    ]
-                    # none shines through between the body's splats
-                    free = 1 - outline(points[: ends[0]], camera, body.size)
-                    floors[-1] *= (1 - DARK * free * np.max(dark, 0))[..., None]
-                if len(floors) == cores() or t == frames - 1:
-                    some = list(range(t + 1))[-len(floors) :]
-                    behind = torch.from_numpy(np.stack(floors)).to(body.rest)
-                    images.append(shown.during(some).film(cameras.select(some), behind))
-                    bar.update(len(floors))
-                    floors = []
-        return torch.cat(images).clamp(0, 1).cpu()
+        motion = self._met(rollout, colliders)
+        return film(self.body, self.world, *motion, size, view, zoom, shadow)
 
     def _met(
         self,
@@ -428,7 +341,9 @@ class Twin(InMotion):
         save_frames(splats, folder / "splats", formats, rate=1 / apart, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            images = self._pictures(rollout, solids, size, view, zoom, shadow, progress)
+            images = film(
+                self.body, self.world, rollout, solids, size, view, zoom, shadow, progress
+            )
             plain = map(to_uint8, images)
             frames = side_by_side({title: images}, footer=moments) if caption else list(plain)
             write_video(folder / "simulation.mp4", frames, fps or max(5.0, 0.3 / apart))
@@ -456,33 +371,6 @@ class Twin(InMotion):
     def __repr__(self) -> str:
         body = self.body
         return f"Twin({len(body.rest)} particles, {1e3 * body.size:.4g} mm, {self.material!r})"
-
-
-def viewed_from(view: Views, up: Tensor, frames: int = 1, name: str = "view") -> Tensor:
-    """(frames, 3) unit directions from a body to the camera. view: (3,), the same in all frames, or
-    (K, 3), spread evenly over the frames: from one to the next the camera turns about `up` by the
-    shorter way, and rises evenly. Errors: ConfigError naming `name`."""
-    expected = "a direction (x, y, z), or a list of such"
-    given = numbers(name, view, expected).to(up)
-    if given.ndim not in (1, 2) or given.shape[-1] != 3 or not len(given):
-        raise ConfigError(f"{name}: expected {expected}, found shape {tuple(given.shape)}")
-    given, up = given.reshape(-1, 3), up / up.norm()
-    level = given - (given @ up)[:, None] * up
-    if not bool((level.norm(dim=1) > 1e-3 * given.norm(dim=1)).all()):
-        raise ConfigError(f"{name}: expected a direction that is not up or down, found {view}")
-    ahead = level[0] / level[0].norm()
-    aside = torch.linalg.cross(up, ahead)
-    turns = np.unwrap(torch.atan2(level @ aside, level @ ahead).cpu().numpy())
-    rises = torch.atan2(given @ up, level.norm(dim=1)).cpu().numpy()
-    turn, rise = (spread(v, frames).to(up)[:, None] for v in (turns, rises))
-    toward: Tensor = rise.cos() * (turn.cos() * ahead + turn.sin() * aside) + rise.sin() * up
-    return toward
-
-
-def spread(values: np.ndarray, frames: int) -> Tensor:
-    """(frames,) of values (K,), evenly from the first to the last."""
-    at = np.linspace(0, len(values) - 1, frames)
-    return torch.from_numpy(np.interp(at, np.arange(len(values)), values))
 
 
 def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:

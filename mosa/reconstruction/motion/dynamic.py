@@ -131,7 +131,9 @@ class Objective:
         """frames: (S,) long; state: (B,) which of them each window shows."""
         carried, settings = self.target.carried, self.settings
         splats = carried.splats
-        sample = self.motion(frames, splats, carried.modes, carried.around)
+        deforms = settings.elastic > 0 or carried.light is not None
+        around = carried.around if deforms else None
+        sample = self.motion(frames, splats, carried.modes, around)
         colors = carried.colors(sample.deformation)
         shown = colors if len(colors) == 1 else colors[state]
         image, alpha = rasterize(
@@ -215,5 +217,11 @@ def fit_motion(
         objective, rate = Objective(motion, target, settings), settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws)
+    precision = torch.get_float32_matmul_precision()
+    try:
+        # a network's products take most of a step on a GPU, and rounding to ten bits half of that time
+        torch.set_float32_matmul_precision("high" if settings.model == "network" else precision)
+        objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws)
+    finally:
+        torch.set_float32_matmul_precision(precision)
     return motion
