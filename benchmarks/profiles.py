@@ -5,8 +5,8 @@
 
 Each parameter is held at multiples of its true value, nu and angles at as many steps of their unconstrained number, while
 Gauss-Newton fits all others and the contact height to the true motion, from the true start. The misfit counts 30 data a frame in
-units of the cues' noise and of what the best law leaves there. A parameter is told where the misfit rises by `RISE` on both
-sides; between these ends is its two-sigma range.
+units of the cues' noise, or of what the best law leaves if that is more. A parameter is told where the misfit rises by `RISE`
+on both sides; between these ends is its two-sigma range.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ UNBOUND = 10.0
 
 
 class Misfit:
-    """Of free rollouts from the true motion after contact, each frame in units of its `noise` [m]; least: the smallest so far."""
+    """Of free rollouts from the true motion after contact, in units of the cues' noise, `sd` [m] a component."""
 
     def __init__(self, case: SimpleNamespace, sd: float, count: float) -> None:
         self.case, self.body, take = case, case.body, case.take
@@ -54,14 +54,24 @@ class Misfit:
             take.first_contact,
         )
         # the fall before it is a parabola whatever the law is
-        skipped, gravity = max(0, self.first - 2), case.world.gravity.to(self.body.rest)
-        t, begun = skipped * take.frame_dt, take.start
+        gravity, begun, skipped = case.world.gravity.to(self.body.rest), take.start, 0
+        while skipped + 2 < self.first:
+            t = (skipped + 2) * take.frame_dt
+            fallen = t * begun.velocity + 0.5 * t**2 * gravity
+            if (
+                float((case.truth[skipped + 2] - case.truth[0] - fallen).abs().max())
+                > 1e-3 * self.body.size
+            ):
+                break
+            skipped += 1
+        t = skipped * take.frame_dt
         fallen = begun.center + t * begun.velocity + 0.5 * t**2 * gravity
         self.start = replace(begun, center=fallen, velocity=begun.velocity + t * gravity)
         self.first, self.frames = self.first - skipped, len(case.truth) - skipped
         self.true = case.truth[skipped:, self.chosen]
-        self.noise, self.count = torch.full_like(self.true[:, 0, 0], 3**0.5 * sd), count
-        self.substeps, self.rms_mm = 0, math.nan
+        self.noise, self.count = 3**0.5 * sd, count
+        self.rms_mm = math.nan
+        self.least = self.substeps = self.ready().simulator.substeps
 
     def ready(self, substeps: int | None = None) -> Ready:
         dt = self.case.take.frame_dt
@@ -69,24 +79,26 @@ class Misfit:
 
     def whitened(self, x: Tensor) -> Tensor:
         unit = (self.count / len(self.chosen)) ** 0.5 / self.noise
-        away = x[:, self.chosen] - self.true
-        self.squares = away.square().sum(-1).mean(-1)
-        return (away * unit[:, None, None])[self.first :].flatten()
+        return unit * (x[:, self.chosen] - self.true)[self.first :].flatten()
 
     @torch.no_grad()
     def residuals(self) -> Tensor:
         return self.whitened(self.ready(self.substeps).simulate(self.frames).x)
 
+    def over(self, least: float) -> float:
+        """How often a misfit counts the variance of its noise, where the best law leaves more than that: the grid's errors."""
+        return max(1.0, least / (self.count * (self.frames - self.first)))
+
     def here(self) -> float:
-        """With the substeps that the law asks for."""
-        self.substeps = self.ready().simulator.substeps
+        """With the substeps of the true law, or what this one asks for: more of them act like another stiffness."""
+        self.substeps = max(self.least, self.ready().simulator.substeps)
         found = float(self.residuals().square().sum())
-        self.rms_mm = 1e3 * float(self.squares[self.first :].mean().sqrt())
+        self.rms_mm = 1e3 * self.noise * (found / self.count / (self.frames - self.first)) ** 0.5
         return found
 
     @torch.no_grad()
-    def fitted(self, held: str | None = None, passes: int = 1) -> float:
-        """After a fit of all numbers but `held` from where they stand, each pass with the substeps that its law asks for."""
+    def fitted(self, held: str) -> float:
+        """After a fit of all numbers but `held` from where they stand."""
         blocks = blocks_of(self.body, adapter=False, heterogeneity=False, settings=IdentificationSettings(),
                            ground=self.case.world.ground, free=True, calibrating=True)  # fmt: skip
         for block in blocks:
@@ -105,11 +117,12 @@ class Misfit:
 
         together = many if self.body.rest.is_cuda else None
         newton = GaussNewton([blocks[i] for i in kept], [seat], steps=STEPS, many=together)
-        for _ in range(passes):
-            self.substeps = self.ready().simulator.substeps
-            if newton.iterate(learn=False)["share"] == 0:
-                break
-        return self.here()
+        before, numbers = self.here(), seat.read()
+        newton.iterate(learn=False)
+        if (after := self.here()) > before:  # in the substeps of its end
+            seat.write(numbers)
+            return self.here()
+        return after
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -152,24 +165,42 @@ def ends(shifts: Sequence[float], rises: Sequence[float]) -> tuple[float, float]
     return (-math.inf if left == math.inf else left), right
 
 
-def profile(misfit: Misfit, name: str, best: Tensor) -> list[tuple[float, float, float]]:
-    """(shift of the unconstrained number from the truth, misfit, rms [mm]) of one parameter, outwards from the truth."""
-    raw, true = misfit.body.material.raw[name], misfit.body.material.begins[name]
-    middle, found, least = MULTIPLES.index(1.0), [], math.inf
-    for side in (MULTIPLES[middle:], MULTIPLES[middle - 1 :: -1]):
-        Seat(misfit.tensors, torch.empty).write(best)
+def profile(misfit: Misfit, name: str) -> dict[float, tuple[float, str]]:
+    """(misfit, what was found) by multiples of one parameter: outwards from the truth, and back from each end, as a fit that
+    begins at its neighbour's may stay in another valley."""
+    material, middle = misfit.body.material, MULTIPLES.index(1.0)
+    true = Seat(misfit.tensors, torch.empty).read()
+    found: dict[float, tuple[float, str]] = {}
+
+    def fitted(multiple: float) -> float:
+        with torch.no_grad():
+            material.raw[name].fill_(material.begins[name] + math.log(multiple))
+        value = misfit.fitted(name)
+        if value < found.get(multiple, (math.inf,))[0]:
+            others = " ".join(
+                f"{k} {float(v.detach()):.3g}" for k, v in material.physical().items()
+            )
+            contact = float(misfit.body.contact.cells.detach())
+            found[multiple] = value, f"{misfit.rms_mm:.2f} mm, {others} contact {contact:.2f}"
+        return value
+
+    for side in (MULTIPLES[middle:], MULTIPLES[middle::-1]):
+        Seat(misfit.tensors, torch.empty).write(true)
+        reached = []
         for multiple in side:
-            with torch.no_grad():
-                raw.fill_(true + math.log(multiple))
             try:
-                found.append((math.log(multiple), misfit.fitted(name), misfit.rms_mm))
+                value = fitted(multiple)
             except MosaError as error:
                 print(f"  {name} times {multiple}: {error}")
                 break
-            least = min(least, found[-1][1])
-            if found[-1][1] > least + ENOUGH:
+            reached.append(multiple)
+            least = min(each[0] for each in found.values())
+            if value > least + ENOUGH * misfit.over(least):
                 break
-    return sorted(found)
+        for multiple in reached[-2::-1]:
+            fitted(multiple)
+    Seat(misfit.tensors, torch.empty).write(true)
+    return dict(sorted(found.items()))
 
 
 @torch.no_grad()
@@ -182,30 +213,27 @@ def profiles(name: str, options: argparse.Namespace) -> None:
     case.body.contact.cells.fill_(lift)
     misfit.here()
     truly = misfit.rms_mm
-    misfit.fitted(passes=4)
-    if options.particles:  # what the grid gets wrong at the best law is noise too
-        misfit.noise = (misfit.noise.square() + misfit.squares).sqrt()
-    least = misfit.here()
-    best = Seat(misfit.tensors, torch.empty).read()
-    values = " ".join(f"{k} {float(v):.4g}" for k, v in material.physical().items())
     print(f"\n{name}: {len(case.body.rest)} particles, dx {1e3 * case.record.dx:.2f} mm (truth {1e3 * case.object.dx:.2f}), cues "
-          f"{1e3 * options.noise * height:.2f} mm off; {truly:.2f} mm at the true parameters, {misfit.rms_mm:.2f} mm at the best: "
-          f"{values} contact {float(case.body.contact.cells):.2f}", flush=True)  # fmt: skip
-    known = [each for each in material.learned if each in case.object.material.known]
-    found = {each: profile(misfit, each, best) for each in known}
-    least = min(least, *(row[1] for rows in found.values() for row in rows))
+          f"{1e3 * options.noise * height:.2f} mm off, {truly:.2f} mm at the true parameters", flush=True)  # fmt: skip
+    known = [
+        each for each in material.learned if each in (options.only or case.object.material.known)
+    ]
+    found = {each: profile(misfit, each) for each in known}
+    least = min(value for rows in found.values() for value, _ in rows.values())
     for each, rows in found.items():
-        shifts, rises = [row[0] for row in rows], [row[1] - least for row in rows]
+        begins = material.begins[each]
 
-        def physical(shift: float, each: str = each) -> float:
-            return float(material.physical_of(each, torch.tensor(material.begins[each] + shift)))
+        def physical(shift: float, each: str = each, begins: float = begins) -> float:
+            return float(material.physical_of(each, torch.tensor(begins + shift)))
 
+        shifts = list(map(math.log, rows))
+        rises = [(value - least) / misfit.over(least) for value, _ in rows.values()]
         sides = ends(shifts, rises)
         told = ("not told", "told on one side", "told")[sum(map(math.isfinite, sides))]
         low, high = (f"{physical(end):.3g}" if math.isfinite(end) else "beyond" for end in sides)
         print(f"  {each} = {physical(0.0):.4g}: {told}, two sigma {low} to {high}")
-        print("    " + "; ".join(f"{physical(shift):.3g}: {rise:.1f} ({mm:.2f} mm)"
-                                 for shift, rise, (*_, mm) in zip(shifts, rises, rows)))  # fmt: skip
+        for shift, rise, (_, said) in zip(shifts, rises, rows.values()):
+            print(f"    {physical(shift):9.3g}: {rise:7.1f}  {said}")
     print(f"  {time.perf_counter() - began:.0f} s", flush=True)
 
 
@@ -224,6 +252,7 @@ def main() -> None:
         "--noise", type=float, default=calibration.NOISE, help="of the cues over the body's height"
     )
     parser.add_argument("--count", type=float, default=30.0, help="independent data of a frame")
+    parser.add_argument("--only", nargs="*", help="parameters; all that are published without it")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--out", type=Path, default=Path("motions"), help="folder of the true motions"
