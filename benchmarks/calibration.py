@@ -85,14 +85,15 @@ def keep(
     material: Hidden | PublishedMaterial,
     seed: int,
     drop: str = "train",
+    device: str = "cpu",
 ) -> Path:
     """The true motion of one of a body's drops: rest (N, 3) as in frame 0 of the training drop, positions (T, N, 3) [m]."""
     began = time.perf_counter()
     surface = extract_surface(SHAPES[body.shape], body.pitch, np.random.default_rng([seed, 1]))
     particles = fill(SHAPES[body.shape], body.spacing, np.random.default_rng([seed, 2]))
     fall = simulate(
-        body, material, particles, surface.vertices, body.drops[drop], body.drops["train"]
-    )
+        body, material, particles, surface.vertices, body.drops[drop], body.drops["train"], device=device
+    )  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
         path,
@@ -148,13 +149,14 @@ def first_contact(truth: np.ndarray, spacing: float) -> int:
 def learner_of(
     path: Path, body: BuiltinObject, cfg: dict, particles: int, seed: int, noise: float, device: str
 ) -> SimpleNamespace:  # fmt: skip
-    """A body of about so many particles with the law of `cfg`, what it learns from, and where its particles truly go; path: what
-    `keep` wrote of the motion of `body`."""
+    """A body of about so many particles (0: those of the truth) with the law of `cfg`, what it learns from, and where its
+    particles truly go; path: what `keep` wrote of the motion of `body`."""
     stored, rng = np.load(path), np.random.default_rng([seed, 12])
-    spacing = (len(stored["shape"]) * body.spacing**3 / particles) ** (1 / 3)
-    points = fill(SHAPES[body.shape], spacing, rng)
+    own = len(stored["shape"])
+    spacing = body.spacing * (own / (particles or own)) ** (1 / 3)
+    points = fill(SHAPES[body.shape], spacing, rng) if particles else stored["shape"]
     rest = points + (stored["rest"] - stored["shape"])[0]
-    truth = carried(stored, rest, body.spacing)
+    truth = carried(stored, rest, body.spacing) if particles else stored["positions"]
     seen = noisy(truth, rest, noise * np.ptp(stored["rest"][:, 1]), rng)
     tensor = lambda a: torch.as_tensor(a, dtype=torch.float32, device=device)  # noqa: E731
     n, reach = len(rest), body.reach or BOX[1][0]

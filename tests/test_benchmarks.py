@@ -129,6 +129,17 @@ def test_fits_of_cues_make_a_table(monkeypatch, tmp_path, capsys):
     assert len({row.count("|") for row in rows}) == 1
 
 
+def test_a_profile_ends_where_the_misfit_has_risen(monkeypatch):
+    """A parabola about 0.5 that rises by 4 at a distance of 1, and one that goes on falling."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    ends = importlib.import_module("profiles").ends
+    shifts = [0.5 * i for i in range(-4, 7)]
+    low, high = ends(shifts, [4 * (shift - 0.5) ** 2 for shift in shifts])
+    assert (low, high) == (pytest.approx(-0.5), pytest.approx(1.5))
+    left, right = ends(shifts, [8.0 * (shift < 0) for shift in shifts])
+    assert left == pytest.approx(-0.25) and right == np.inf
+
+
 def test_the_errors_of_a_calibration_s_cues_are_smooth_and_as_large_as_asked(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     calibration = importlib.import_module("calibration")

@@ -24,8 +24,7 @@ def parameters(
     experiment: Experiment, records: Sequence[Record], stem: Path
 ) -> tuple[str, list[Path]]:
     """A line for each parameter of each built-in body whose law has the form that is identified, with means over the seeds."""
-    asked = {claim.figure: claim.most for claim in experiment.claims if claim.most is not None}
-    limits = {f.figure.removeprefix("id/").removesuffix("_relative_error"): asked.get(f.label)
+    labels = {f.figure.removeprefix("id/").removesuffix("_relative_error"): f.label
               for f in experiment.figures if f.figure.startswith("id/")}  # fmt: skip
     rows, lines = [], []
     for option in experiment.axes[experiment.rows]:
@@ -48,7 +47,10 @@ def parameters(
             over = statistics.stdev(found) if len(found) > 1 else None
             off = statistics.fmean(abs(value / truth - 1) for value in found)
             step = statistics.fmean(abs(math.log(v / truth)) for v in found) if relative else off
-            said = verdict(100 * off, 100 * step, 100 * sd, limits.get(parameter))
+            limits = [claim.limit(option.name) for claim in experiment.claims
+                      if claim.figure == labels.get(parameter)]  # fmt: skip
+            limit = next((each for each in limits if each is not None), None)
+            said = verdict(100 * off, 100 * step, 100 * sd, limit)
             unit = unit_of(material.law, parameter)
             named = f"{parameter} [{unit}]" if unit else parameter
             spread = "" if over is None else f" ± {over:.2g}"

@@ -57,8 +57,8 @@ class Figure:
 class Claim:
     """What the paper or an issue says of a figure (by its label), for the page of results. Either row is ahead of `against`: in one
     column, with `each` in every one of them, else in the mean over those that both have; of one seed by more than `spread`. Or
-    every row is at most `most`; there `unless` names the figure with the posterior's standard deviation, which excuses what it
-    covers twice."""
+    every row, or every one that `most` names, is at most that; there `unless` names the figure with the posterior's standard
+    deviation, which excuses what it covers twice."""
 
     text: str
     figure: str
@@ -67,8 +67,12 @@ class Claim:
     column: str | None = None
     each: bool = False
     spread: float = 0.0
-    most: float | None = None
+    most: float | Mapping[str, float] | None = None
     unless: str | None = None
+
+    def limit(self, row: str) -> float | None:
+        """What the figure of a row is at most; None where the claim says nothing of it."""
+        return self.most.get(row) if isinstance(self.most, Mapping) else self.most
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def place(
 
 def simulate(
     body: BuiltinObject, material: Hidden, particles: np.ndarray, surface: np.ndarray, drop: Drop,
-    training: Drop, *, progress: Callable[[int], None] | None = None,
+    training: Drop, *, progress: Callable[[int], None] | None = None, device: str = "cpu",
 ) -> Fall:  # fmt: skip
     """Particles (N, 3) of the shape's frame through a drop; surface: (M, 3) points of the shape's frame."""
     center = particles.mean(0)
@@ -61,18 +61,19 @@ def simulate(
     simulator = Simulator(
         material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, up=(0.0, 1.0, 0.0),
         ground=Ground(0.0, body.meeting.mode, body.meeting.friction), options=material.options,
+        device=device,
     )  # fmt: skip
     velocity = np.array([0.0, -drop.speed, 0.0])
     n = len(particles)
     lift = np.array([0.0, body.meeting.lift * dx, 0.0])
-    tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
+    tensor = lambda a: torch.tensor(a, dtype=torch.float32, device=device)  # noqa: E731
     F = tensor(drop.rotation).expand(n, 3, 3).contiguous()
     # velocities half a substep early: symplectic Euler then follows the parabola exactly
     early = tensor(velocity) - 0.5 * frame_dt / substeps * tensor(GRAVITY)
     x, v = tensor(start + lift), early.expand(n, 3).contiguous()
-    state = ParticleState(x, v, torch.zeros(n, 3, 3), F, F)
-    volume = torch.full((n,), body.spacing**3)
+    state = ParticleState(x, v, torch.zeros_like(F), F, F)
+    volume = torch.full_like(x[:, 0], body.spacing**3)
     given = material.parameters(tensor(rest)), volume, material.density, body.footage.frames
     with torch.no_grad():
         rollout = simulator.rollout(state, *given, progress=progress)
-    return Fall(rest, rollout.x.double().numpy() - lift, drop.rotation, velocity, substeps)
+    return Fall(rest, rollout.x.double().cpu().numpy() - lift, drop.rotation, velocity, substeps)

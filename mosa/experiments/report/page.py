@@ -297,10 +297,11 @@ def covered(off: float, sd: float, scale: float | None) -> bool:
 
 def within(experiment: Experiment, claim: Claim, rows: Rows, tables: Tables) -> str:
     """Of how many rows a figure is at most what is claimed; of the others, whether twice the posterior's deviation covers it."""
-    known = {row: cell for row in rows if (cell := place_of(rows[row], claim.column)) is not None}
+    limits = {row: most for row in rows if (most := claim.limit(row)) is not None}
+    known = {row: cell for row in limits if (cell := place_of(rows[row], claim.column)) is not None}
     if not known:
         return NOT_RUN
-    above = {row: cell for row, cell in known.items() if not cell.mean <= claim.most}
+    above = {row: cell for row, cell in known.items() if not cell.mean <= limits[row]}
     scales = {f.label: f.scale for f in experiment.figures if f.figure.endswith("_relative_sd")}
     unsure = [] if claim.unless is None else [
         row for row, cell in above.items()
@@ -310,7 +311,8 @@ def within(experiment: Experiment, claim: Claim, rows: Rows, tables: Tables) -> 
     open_ = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
     unit = match[1] if (match := re.search(r"\[(.+)\]$", claim.figure)) else ""
     text = f"{'holds' if not above else 'does not hold' if wrong else open_}, "
-    text += f"{len(known) - len(above)} of {len(known)} within {claim.most:g} {unit}".rstrip()
+    most = " to ".join(f"{each:g}" for each in sorted({limits[row] for row in known}))
+    text += f"{len(known) - len(above)} of {len(known)} within {most} {unit}".rstrip()
     for which, said in (
         (unsure, "not determined, and the posterior says so"),
         (wrong, "beyond it"),
