@@ -217,11 +217,5 @@ def fit_motion(
         objective, rate = Objective(motion, target, settings), settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    precision = torch.get_float32_matmul_precision()
-    try:
-        # a network's products take most of a step on a GPU, and rounding to ten bits half of that time
-        torch.set_float32_matmul_precision("high" if settings.model == "network" else precision)
-        objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws)
-    finally:
-        torch.set_float32_matmul_precision(precision)
+    objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws)
     return motion
