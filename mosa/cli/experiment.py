@@ -104,10 +104,8 @@ def run(options: argparse.Namespace) -> int:
             wanted.setdefault(job.folder, replace(job, turn=turns[name]))
     jobs = list(wanted.values())
     check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
-    for line in spec.estimate(jobs, devices, options.jobs):
+    for line in spec.estimate(jobs, devices, options.jobs, options.overrides):
         print(line, flush=True)
-    if options.overrides:
-        print(f"these minutes are of jobs without --set {' '.join(options.overrides)}", flush=True)
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0

@@ -134,10 +134,9 @@ class TrainSettings(BodySections, DataSections):
     resume: Literal["auto"] | None = None
     """auto: skip where the run folder has metrics.json, go on from its checkpoints/last.ckpt
     (docs/sweeps.md); a checkpoint's path is ckpt_path"""
-    optimized_metric: Figure = "test/rms_m"
-    """figure that a run returns to a sweep; a run that lacks it returns test/rms_m, train/rms_m or
-    a PSNR. A search needs val/loss, which has no substitute, and held-out cameras or frames:
-    otherwise it chooses by the test films"""
+    optimized_metric: Figure = "val/loss"
+    """figure that a search (hydra/sweeper=optuna) minimises. val/... needs held-out cameras or
+    frames; test/... would choose by the test films"""
     criterion: Criterion = Criterion()
     """simulation that is compared with the cues"""
     trainer: Section = {}

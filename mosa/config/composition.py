@@ -13,6 +13,7 @@ from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.extensions import load_extensions
@@ -33,6 +34,13 @@ def current_folder() -> str:
         return "outputs"
     hydra: Any = HydraConfig.get()
     return OmegaConf.select(hydra, "runtime.output_dir") or "outputs"  # --cfg has none
+
+
+def searching() -> bool:
+    """A sweeper that chooses by the runs' figures has begun this run, as Optuna's."""
+    hydra: Any = HydraConfig.get() if HydraConfig.initialized() else OmegaConf.create()
+    sweeper = OmegaConf.select(hydra, "sweeper._target_") or "BasicSweeper"
+    return hydra.get("mode") == RunMode.MULTIRUN and not sweeper.endswith("BasicSweeper")
 
 
 OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)

@@ -8,7 +8,17 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 from mosa.experiments.commits import commit
-from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
+from mosa.experiments.specification import (
+    COMMIT,
+    FAILED,
+    MINUTES,
+    PRESSED,
+    Job,
+    device_kind,
+    in_turn,
+    minutes_left,
+    pace,
+)
 from mosa.experiments.workers import Worker
 from mosa.system.whole_files import write_whole
 from mosa.training.jobs import held_back
@@ -43,6 +53,19 @@ def run_jobs(
         making = {what for job, *_ in running.values() for what in in_making(job)} - known
         return next((job for job in waiting if not {job.film, job.first} & making), None)
 
+    def time_left() -> str:
+        """By the complete jobs: the experiments' files know neither overrides nor this machine."""
+        kind, now = device_kind(devices), time.perf_counter()
+        rate = pace(jobs, kind)
+        if rate is None or not (waiting or running):
+            return ""
+        left = [rate * job.minutes[kind] for job in waiting]
+        left += [
+            max(0.0, rate * job.minutes[kind] - (now - began) / 60)
+            for job, *_, began in running.values()
+        ]
+        return f", about {minutes_left(left, len(devices) * side_by_side):.1f} min left"
+
     try:
         while waiting or running:
             while (job := next_job()) is not None:
@@ -69,7 +92,8 @@ def run_jobs(
                     write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
                 free[device] += reversed(places)
                 outcome = "failed" if job_failed else "complete"
-                print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)  # fmt: skip
+                said = f"{outcome} after {minutes:.1f} min{time_left()}"
+                print(f"[{done}/{total}] {job.folder.name}: {said}", flush=True)
     finally:
         at_work = [places[0] for _, _, places, _ in running.values()]
         for worker in at_work:  # Ctrl-C: each job writes its checkpoint and ends

@@ -250,6 +250,14 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     """The jobs of all combinations of options and seeds, each once: cells that need the same run share it.
 
     A run's folder is named after its overrides, so that other experiments share it too."""
+    for axis, each in experiment.axes.items():
+        for key in (word.partition("=")[0].lstrip("+") for word in more):
+            told = {tuple(w for w in o.overrides if w.startswith(f"{key}=")) for o in each}
+            if len(told) > 1:
+                raise ConfigError(
+                    f"--set {key}: expected a key that tells no options of an axis apart, found one of {axis}, whose "
+                    "rows would all be the same: --only chooses some of them, --specifications adds one (docs/reproduce.md)"
+                )
     found: dict[Path, Job] = {}
     for options in itertools.product(*experiment.axes.values()):
         place = dict(zip(experiment.axes, options))
@@ -345,22 +353,39 @@ def device_kind(devices: Sequence[int | None]) -> str:
     return "cpu" if list(devices) == [None] else "gpu"
 
 
-def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> list[str]:
+def pace(jobs: Sequence[Job], device: str) -> float | None:
+    """Measured time of the complete jobs over their minutes in the experiments' files; None where none is complete."""
+    complete = [(minutes_taken(job) or 0.0, job.minutes[device]) for job in jobs if job.finished]
+    planned = sum(minutes for _, minutes in complete)
+    return sum(taken for taken, _ in complete) / planned if planned else None
+
+
+def minutes_left(left: Sequence[float], slots: int) -> float:
+    """Until jobs of these minutes are complete, which share all places evenly."""
+    return max(sum(left) / slots, max(left, default=0.0))
+
+
+def estimate(
+    jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int, more: Sequence[str] = ()
+) -> list[str]:
     """A line for each job, in the order in which they run, and one for all of them with the minutes until they are complete: those
-    of the experiments' files for the jobs that are left, which share all places evenly."""
+    of the experiments' files times the `pace` of the complete jobs. more: overrides of --set, with which the files' minutes say
+    nothing before a job is complete."""
     device, slots = device_kind(devices), len(devices) * side_by_side
+    measured = pace(jobs, device)
     lines, left = [], []
     for job in in_turn(jobs, devices):
         taken = minutes_taken(job)
         if taken is None:
-            left.append(job.minutes[device])
-        state = f"about {left[-1]:.1f} min" if taken is None else f"complete, {taken:.1f} min"
+            left.append(job.minutes[device] * (measured or 1.0))
+            state = f"about {left[-1]:.1f} min" if measured or not more else "not measured yet"
+        else:
+            state = f"complete, {taken:.1f} min"
         lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
-    minutes = max(sum(left) / slots, max(left, default=0.0))
-    return [
-        *lines,
-        f"{len(jobs)} jobs, {len(left)} to run, about {minutes:.1f} minutes with {slots} side by side",
-    ]
+    about = f"about {minutes_left(left, slots):.1f} minutes with {slots} side by side"
+    if more and not measured:
+        about += f" without --set {' '.join(more)}; with it the time is known after the first job"
+    return [*lines, f"{len(jobs)} jobs, {len(left)} to run, {about}"]
 
 
 def read_job(job: Job) -> dict[str, float | str] | None:

@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import plain
 from mosa.config.checkpoints import check_numbers, check_same, read_checkpoint
+from mosa.config.composition import searching
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.settings import arguments_of, nearest, untold
@@ -109,7 +110,8 @@ def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
     monitors = [
         (f"callbacks: {type(c).__name__}.monitor", getattr(c, "monitor", None)) for c in callbacks
     ]
-    for where, figure in [*monitors, ("optimized_metric", cfg.optimized_metric)]:
+    monitors += [("optimized_metric", cfg.optimized_metric)] if searching() else []
+    for where, figure in monitors:
         # a callback of a user's own may log others, which are less like these
         slip = get_close_matches(str(figure), VALIDATED, 1, 0.9)
         if slip and str(figure) not in VALIDATED:

@@ -11,8 +11,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from mosa import __version__
+from mosa.config.composition import searching
 from mosa.data.io.gaussian_ply import save_ply
 from mosa.data.synthetic.true_geometry import geometry_figures
+from mosa.errors import ConfigError
 from mosa.evaluation.analysis.comparison import (
     TITLES,
     compare,
@@ -47,7 +49,7 @@ from mosa.evaluation.uncertainty import determined, predicted_spread
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.system.whole_files import written_whole
-from mosa.training.run_folder import VALIDATION, write_figures
+from mosa.training.run_folder import write_figures
 from mosa.twin.rollout_file import save_rollout, save_spread, save_truth
 from mosa.twin.start import warn_of_unmet
 from mosa.types import Rollout
@@ -156,12 +158,7 @@ def write_outputs(
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:
-    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks; of image figures the negative. A figure of
-    validation has no fallback: a sweep that is to choose by it is never given one of the test films."""
-    if wanted.startswith(VALIDATION):
-        return figures.get(wanted)
-    for key in (wanted, "test/rms_m", "train/rms_m"):
-        if key in figures:
-            return figures[key]
-    psnrs = ("test/psnr_crop", "train/psnr_crop")
-    return next((-figures[key] for key in psnrs if key in figures), None)
+    """The figure that a search minimises. Errors: ConfigError where a search wants one that this run does not have."""
+    if wanted not in figures and searching():
+        raise ConfigError(f"optimized_metric: expected a figure of metrics.json, found {wanted}")
+    return figures.get(wanted)

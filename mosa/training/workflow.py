@@ -243,7 +243,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = figures_of(settings.evaluation, body, evaluated, world, twin.posterior, folder)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
-    return optimized(figures, "test/rms_m")
+    return figures.get("test/rms_m")
 
 
 def show(body: Body, appearance: str | None) -> None:

@@ -127,12 +127,23 @@ def test_ones_own_folder_has_the_paper_s_axes_and_its_own(tmp_path, capsys):
         run(arguments(["mine", "--specifications", str(tmp_path / "none")]))
 
 
-def test_an_estimate_says_that_it_is_without_what_is_set(tmp_path, capsys):
-    words = ["table_time", "--quick", "--dry-run", "--runs", str(tmp_path)]
-    for more in ([], ["--set", "fit=paper"]):
-        assert run(arguments([*words, *more])) == 0
-        said = capsys.readouterr().out.splitlines()[-1]
-        assert said.endswith("--set fit=paper" if more else "side by side")
+def test_an_estimate_with_overrides_is_that_of_the_jobs_that_are_complete(tmp_path, capsys):
+    words = arguments(["table_time", "--quick", "--dry-run", "--runs", str(tmp_path), "--set", "fit=paper"])  # fmt: skip
+
+    def said() -> list[str]:
+        assert run(words) == 0
+        return capsys.readouterr().out.splitlines()
+
+    first, *_, last = said()
+    assert "not measured yet" in first and "side by side without --set fit=paper; with it" in last
+    folder = tmp_path / first.split(":")[0]
+    write_metrics(replace(jobs_of(experiment(), tmp_path)[0], folder=folder))
+    files = float(re.search(r"about ([0-9.]+) minutes", last)[1])
+    (folder / MINUTES).write_text("60")
+    *_, last = said()
+    assert (
+        float(re.search(r"about ([0-9.]+) minutes", last)[1]) > 10 * files and "--set" not in last
+    )
 
 
 def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
@@ -177,6 +188,13 @@ def test_a_key_that_two_axes_set_is_named(tmp_path):
     jobs_of(experiment(axes={"law": laws[1:], "scene": scenes}), tmp_path)  # the same value
 
 
+def test_what_is_set_for_all_jobs_is_nothing_that_tells_rows_apart(tmp_path):
+    """The rows of two methods would both hold the figures of the one that is set."""
+    with pytest.raises(ConfigError, match=r"--set adapter: .* found one of method, whose rows"):
+        jobs_of(experiment(), tmp_path, ["adapter=mine"])
+    jobs_of(narrowed(experiment(), {"method": ["ours"]}, None), tmp_path, ["adapter=mine"])
+
+
 def test_a_folder_s_name_does_not_depend_on_the_order_of_different_keys():
     assert folder_name(["a=1", "b=2", "seed=0"]) == folder_name(["b=2", "seed=0", "a=1"])
     assert folder_name(["a=1", "a=2"]) != folder_name(["a=2", "a=1"])  # the last one holds
@@ -196,7 +214,8 @@ def test_the_estimate_counts_what_is_left_and_what_works_on_it(tmp_path):
     assert "about 6.0 minutes with 2" in estimate(jobs, [0, 1], 1)[-1]
     assert "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[-1]  # none is shorter for others
     write_metrics(jobs[0], **{"time/fit_s": 300.0})
-    assert "8 jobs, 7 to run, about 33.0 minutes" in estimate(jobs, [None], 1)[-1]
+    # of 3 minutes by the file 6 were taken: twice of 33
+    assert "8 jobs, 7 to run, about 66.0 minutes" in estimate(jobs, [None], 1)[-1]
 
 
 def test_what_runs_alone_comes_last(tmp_path):
@@ -257,7 +276,8 @@ def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_
     jobs = jobs_of(narrowed(experiment(), {}, (0,)), tmp_path)
     failed = running.run_jobs(jobs, [None], 4)
     assert len(failed) == 2 and set(failed.values()) == {"ConfigError: it broke"}
-    assert capsys.readouterr().out.count("complete after") == 2
+    said = capsys.readouterr().out
+    assert said.count("complete after") == 2 and "min left" in said
     firsts = {job.folder.name: job.first for job in jobs}
     done, now = set(), []
     for line in (tmp_path / "log.txt").read_text().splitlines():
