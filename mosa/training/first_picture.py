@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch.loggers import Logger
 
 from mosa.config.build import measured, plain, world_of
+from mosa.data.images.reading import read_image
 from mosa.errors import MosaError
 from mosa.evaluation.analysis.comparison import View
 from mosa.evaluation.analysis.figures import write_strip
@@ -45,8 +46,7 @@ def write_first_picture(folder: Path, data: SceneDataModule, loggers: Sequence[L
     }
     path = write_strip(folder / FILE, rows, notes={"film": view.moments})
     log.info("first picture, the reconstruction beside the prior: %s", path)
-    shown = [each for each in loggers if isinstance(each, PICTURED)]
-    if shown:
-        pixels = [torch.from_numpy(images).movedim(-1, 1) for images in rows.values()]
-        whole = torch.cat([torch.cat(list(row), 2) for row in pixels], 1) / 255
-        add_picture(shown, "film_reconstruction_prior", whole, 0)
+    if shown := [each for each in loggers if isinstance(each, PICTURED)]:
+        add_picture(
+            shown, "film_reconstruction_prior", torch.from_numpy(read_image(path)).movedim(-1, 0), 0
+        )
