@@ -195,7 +195,8 @@ class Viewer:
             colors = np.full_like(colors, GRAY) if under else colors
             points.points = centers.astype(np.float32)
             points.colors = (255 * colors).astype(np.uint8)
-        label.text = f"{name} (gray)" if under else name
+        said = name if len(clip.bodies) > 1 else clip.name  # alone, as of a preset, none is learned
+        label.text = f"{said} (gray)" if under else said
         top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size
         middle = 0.5 * (centers.min(0) + centers.max(0))
         label.position = middle + (top - middle @ clip.up) * clip.up

@@ -688,6 +688,7 @@ def test_the_server_shows_a_learned_body_alone(run):
             shown.layout.value == "learned" and shown.layout.disabled and not shown.legend.visible
         )
         assert shown.nodes["learned"][0].visible and not shown.nodes["observed"][0].visible
+        assert shown.nodes["learned"][2].text == "test/test_60"  # a preset's was not learned
         shown.sequence.value = "train"
         assert (
             shown.layout.value == "side by side"

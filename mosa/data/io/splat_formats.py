@@ -32,7 +32,8 @@ from mosa.types import Appearance, Splats
 
 FORMATS = ("ply", "gltf", "sog", "usd", "rrd")
 Formats = Annotated[
-    Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)}"), such(lambda v: all(name in FORMATS for name in v))
+    Sequence[str], Expected(f"a list of some of {', '.join(FORMATS)} (to other simulators: Twin.export_material)"),
+    such(lambda v: all(name in FORMATS for name in v))
 ]  # fmt: skip
 FRAMES = {"ply": ".ply", "gltf": ".glb", "sog": ".sog"}  # one file a frame
 PACKAGES = {"usd": ("pxr.UsdVol", "ParticleField3DGaussianSplat", "usd-core, 26.3 or newer", "usd"),
