@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
+from warnings import warn
 
 import numpy as np
 import torch
@@ -66,14 +67,19 @@ def described(twin: Any) -> dict[str, Any]:
 def export_material(twin: Any, folder: str | Path, formats: Sequence[str] = FORMATS[:2]) -> Path:
     """`Twin.export_material`."""
     values = particles(twin)  # before a folder is made: the truth refuses
-    folder = made_folder(folder)
+    folder, known = made_folder(folder), described(twin)
+    lost = "; ".join(known["not_in_E_and_nu"])
+    if lost and {"newton_usd", "mujoco"} & set(formats):
+        warn(
+            f"export: newton.usda and mujoco.xml hold E and nu alone, without {lost}", stacklevel=3
+        )
     if "json" in formats:
         with written_whole(folder / "material.json") as partial:
-            partial.write_text(json.dumps(described(twin), indent=1))
+            partial.write_text(json.dumps(known, indent=1))
     if "npz" in formats:
         write_npz(folder / "particles.npz", values)
     if "newton_usd" in formats:
-        save_newton(folder / "newton.usda", twin, values, described(twin))
+        save_newton(folder / "newton.usda", twin, values, known)
     if "mujoco" in formats:
         save_mujoco(folder / "mujoco.xml", twin, values)
     if "obj" in formats:

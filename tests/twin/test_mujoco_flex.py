@@ -63,6 +63,13 @@ def test_a_law_without_E_is_refused(tmp_path):
         save_mujoco(tmp_path / "mujoco.xml", made, values_of(made))
 
 
+def test_what_the_file_cannot_hold_is_said(tmp_path):
+    made = twin()
+    made.material.preset("dry_sand")
+    with pytest.warns(UserWarning, match="E and nu alone, without the law drucker_prager"):
+        made.export_material(tmp_path, ["mujoco"])
+
+
 def test_mujoco_drops_the_body(tmp_path):
     """Free fall as ours; then MuJoCo's nodes lose their velocity at contact: its rebound is 9 %
     lower, its centre up to 25 % of that away within 0.3 s of contact (docs/simulators.md)."""
