@@ -180,7 +180,7 @@ class TwinMaterial:
         E = float(material.physical().get("E", torch.tensor(torch.inf)).detach().max())
         if E < SAGS * weight:
             said = f"E: {E:.3g} Pa does not carry the body's weight ({weight:.3g} Pa at its foot)"
-            warnings.warn(f"{said}: in Pa?", stacklevel=4)
+            warnings.warn(f"{said}: in Pa?", stacklevel=5)
 
     def preset(self, name: str) -> None:
         """Take a known material of `mosa.twin.presets.PRESETS`: the same everywhere, without the learned correction.

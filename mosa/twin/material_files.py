@@ -70,9 +70,7 @@ def export_material(twin: Any, folder: str | Path, formats: Sequence[str] = FORM
     folder, known = made_folder(folder), described(twin)
     lost = "; ".join(known["not_in_E_and_nu"])
     if lost and {"newton_usd", "mujoco"} & set(formats):
-        warn(
-            f"export: newton.usda and mujoco.xml hold E and nu alone, without {lost}", stacklevel=3
-        )
+        warn(f"newton.usda, mujoco.xml: hold E and nu alone, without {lost}", stacklevel=4)
     if "json" in formats:
         with written_whole(folder / "material.json") as partial:
             partial.write_text(json.dumps(known, indent=1))

@@ -66,7 +66,7 @@ def test_a_law_without_E_is_refused(tmp_path):
 def test_what_the_file_cannot_hold_is_said(tmp_path):
     made = twin()
     made.material.preset("dry_sand")
-    with pytest.warns(UserWarning, match="E and nu alone, without the law drucker_prager"):
+    with pytest.warns(UserWarning, match="hold E and nu alone, without the law drucker_prager"):
         made.export_material(tmp_path, ["mujoco"])
 
 
