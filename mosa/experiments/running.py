@@ -7,18 +7,9 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 
+from mosa.experiments import specification as spec
 from mosa.experiments.commits import commit
-from mosa.experiments.specification import (
-    COMMIT,
-    FAILED,
-    MINUTES,
-    PRESSED,
-    Job,
-    device_kind,
-    in_turn,
-    minutes_left,
-    pace,
-)
+from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job
 from mosa.experiments.workers import Worker
 from mosa.system.whole_files import write_whole
 from mosa.training.jobs import held_back
@@ -40,7 +31,7 @@ def run_jobs(
 
     Of jobs that share their films, or a reconstruction, the first runs without the others until these are made; the others find
     them in the cache."""
-    waiting = in_turn([job for job in jobs if not job.finished], devices)
+    waiting = spec.in_turn([job for job in jobs if not job.finished], devices)
     # what earlier commands made is found in the cache, or made again where that is another machine
     known: set[str] = set()
     free = {d: [Worker(environment(d)) for _ in range(side_by_side)] for d in devices}
@@ -55,16 +46,13 @@ def run_jobs(
 
     def time_left() -> str:
         """By the complete jobs: the experiments' files know neither overrides nor this machine."""
-        kind, now = device_kind(devices), time.perf_counter()
-        rate = pace(jobs, kind)
-        if rate is None or not (waiting or running):
+        kind, now = spec.device_kind(devices), time.perf_counter()
+        if (rate := spec.pace(jobs, kind)) is None or not (waiting or running):
             return ""
-        left = [rate * job.minutes[kind] for job in waiting]
-        left += [
-            max(0.0, rate * job.minutes[kind] - (now - began) / 60)
-            for job, *_, began in running.values()
-        ]
-        return f", about {minutes_left(left, len(devices) * side_by_side):.1f} min left"
+        begun = [(job, (now - began) / 60) for job, *_, began in running.values()]
+        whole = [(job, 0.0) for job in waiting]
+        left = [max(0.0, rate * job.minutes[kind] - gone) for job, gone in [*begun, *whole]]
+        return f", about {spec.minutes_left(left, len(devices) * side_by_side):.1f} min left"
 
     try:
         while waiting or running:

@@ -39,11 +39,11 @@ UNITS = {
     "psnr_crop": ("PSNR crop", 1, 2),
     "ssim_crop": ("SSIM crop", 1, 4),
 }
-FIGURES = {
-    "rms_m": "rms*: root mean square distance of particles from their true places after contact",
-    "cd_m": "CD*: mean distance to the nearest true particle, plus that in the other direction",
-    "psnr_crop": "PSNR*, *SSIM*: likeness of pictures in a window around the body, more is better",
-}
+FIGURES = (
+    "*rms*: root mean square distance of particles from their true places after contact; "
+    "*CD*: mean distance to the nearest true particle, plus that in the other direction; "
+    "*PSNR*, *SSIM*: likeness of pictures in a window around the body, more is better"
+)
 
 
 def results_table(
@@ -66,8 +66,8 @@ def results_table(
 
 
 def columns_text(figures: Mapping[str, float], recording: str) -> str:
-    """What rows, columns and figures of `results_table` are; empty where nothing of the training sequence was
-    measured. recording: name of the scene that is learned from first, which no column has."""
+    """What rows, columns and figures of `results_table` are; empty where nothing of the training sequence was measured.
+    recording: name of the scene that is learned from first, which no column has."""
     columns = _sequences(figures)
     if "train" not in columns:
         return ""
@@ -80,9 +80,7 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
     prefixes = dict(MODELS)
     rows = [f"*{name}*: {about}" for name, about in ROWS.items()
             if any(f"{prefixes[name]}{column}/{metric}" in figures for column in columns for metric in UNITS)]  # fmt: skip
-    told = [f"*{about}" for metric, about in FIGURES.items()
-            if any(f"{prefix}{column}/{metric}" in figures for column in columns for prefix in prefixes.values())]  # fmt: skip
-    return f"Rows: {'; '.join(rows)}. Columns: {', '.join(parts)}. Figures: {'; '.join(told)}."
+    return f"Rows: {'; '.join(rows)}. Columns: {', '.join(parts)}. Figures: {FIGURES}."
 
 
 def _sequences(figures: Mapping[str, float]) -> list[str]:

@@ -6,6 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mosa.evaluation.analysis.tables import (
+    FIGURES,
     columns_text,
     determined_text,
     parameter_table,
@@ -140,13 +141,11 @@ def test_the_recording_that_no_column_names_is_said():
     }
     assert columns_text(figures, "drop_1") == (
         "Rows: *adapted*: the learned law. Columns: `train` is the recording drop_1, `train/...` the others that were learned "
-        "from, `test/...` those held out, `test` their mean. Figures: *PSNR*, *SSIM*: likeness of pictures in a window around "
-        "the body, more is better."
+        f"from, `test/...` those held out, `test` their mean. Figures: {FIGURES}."
     )
     assert columns_text({"train/rms_m": 1.0, "floor/train/rms_m": 1.0}, "drop_1") == (
         "Rows: *floor*: the true law on the learner's grid and particles; *adapted*: the learned law. "
-        "Columns: `train` is the recording drop_1. Figures: *rms*: root mean square distance of particles from their true "
-        "places after contact."
+        f"Columns: `train` is the recording drop_1. Figures: {FIGURES}."
     )
     assert (
         columns_text({"test/a/psnr_crop": 30.0}, "a") == ""
