@@ -240,7 +240,7 @@ def test_the_command_makes_all_of_it(tmp_path):
         (
             "formats",
             ["obj"],
-            "formats: expected a list of some of ply, gltf, sog, usd, rrd, found",
+            "formats: expected a list of some of ply, gltf, sog, usd, rrd .to other",
         ),
         ("box", [[0, 0, 0]], "box: expected two corners"),
         ("up", [0, 1], "up: expected three"),

@@ -66,7 +66,10 @@ def test_plyfile_reads_what_is_seen(tmp_path):
 
 
 def test_another_format_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="some of ply, gltf, sog, usd, rrd, found"):
+    with pytest.raises(
+        ConfigError,
+        match=r"some of ply, gltf, sog, usd, rrd .to other simulators: Twin\.export_material., found",
+    ):
         save_frames(drawn(0), tmp_path, ("ply", "obj"))
     assert not (tmp_path / "ply").exists()
 
