@@ -72,12 +72,13 @@ def occupancy(points: Tensor, mattes: Tensor, cameras: Cameras, *, chunk: int = 
 
 def _smallest(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     """Smallest matte value (M,) of points (M, 3), view by view: of most points the first views already say that it is 0."""
-    smallest = torch.ones(len(points), dtype=points.dtype, device=points.device)
-    left = torch.arange(len(points), device=points.device)
+    smallest = torch.zeros(len(points), dtype=points.dtype, device=points.device)
+    left, best = torch.arange(len(points), device=points.device), torch.ones_like(smallest)
     for v in range(len(cameras)):
-        values = matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0]
-        smallest[left] = torch.minimum(smallest[left], values)
-        left = left[smallest[left] > 0]
+        best = best.minimum(matte_values(points, mattes[v : v + 1], cameras.select([v]))[0])
+        seen = (best > 0).nonzero()[:, 0]
+        left, points, best = left[seen], points[seen], best[seen]
+    smallest[left] = best
     return smallest
 
 

@@ -338,3 +338,14 @@ def test_an_adapters_arguments_are_its_own(name):
             build(**{argument: object()})
         with pytest.raises(ConfigError, match=message):
             build_adapter({"name": name, argument: object()})
+
+
+def test_arguments_are_read_without_their_source(monkeypatch):
+    """The search for docstrings that they cannot have read it again for each function."""
+
+    def asked(length: int = 3): ...
+
+    with monkeypatch.context() as unread:
+        unread.setattr("inspect.findsource", lambda _: pytest.fail("a source was read"))
+        arguments = arguments_of(asked, "")
+    assert arguments.read({"length": 4}).length == 4

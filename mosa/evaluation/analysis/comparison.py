@@ -274,9 +274,12 @@ def on_ground(
     # of 1/16 px
     fixed = [np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines]
     cv2.polylines(ink, fixed, False, 255, 1, cv2.LINE_AA, shift=4)
-    behind = np.abs(image - 255.0 * background.numpy()).max(-1) <= NEAR_BACKGROUND
-    share = 0.5 * (ink / 255 * behind)[..., None]
-    return (image * (1 - share) + 120 * share + 0.5).astype(np.uint8)
+    found, drawn = image.copy(), ink > 0
+    under = image[drawn]
+    behind = np.abs(under - 255.0 * background.numpy()).max(-1) <= NEAR_BACKGROUND
+    share = 0.5 * (ink[drawn] / 255 * behind)[..., None]
+    found[drawn] = (under * (1 - share) + 120 * share + 0.5).astype(np.uint8)
+    return found
 
 
 def legend(shown: Comparison) -> np.ndarray:

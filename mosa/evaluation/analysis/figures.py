@@ -141,5 +141,5 @@ def write_strip(
     room = (((0, 0), (0, width - row.shape[1]), (0, 0)) for row in rows)
     rows = [np.pad(row, each, constant_values=255) for row, each in zip(rows, room)]
     with written_whole(path) as partial:
-        imageio.imwrite(partial, np.concatenate(rows), format="PNG")
+        imageio.imwrite(partial, np.concatenate(rows), format="PNG", compress_level=3)
     return path
