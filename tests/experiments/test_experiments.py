@@ -602,7 +602,8 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(
     monkeypatch.setattr(running, "PROGRAM", "starts_once:train")
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
              "--only", "method=ours"]  # fmt: skip
-    more = [f"scene.cache={cache}", "evaluation.samples=500", "evaluation.assignment=100"]
+    more = [f"scene.cache={cache}", "evaluation.samples=500", "evaluation.assignment=100", "evaluation.floor=false",
+            "reconstruction.informed.iterations=0", "identification.grid_error=0"]  # fmt: skip
     words += [word for each in more for word in ("--set", each)]
     assert run(arguments(words)) == 0
     assert "1 jobs, 1 to run" in capsys.readouterr().out  # both read the same run

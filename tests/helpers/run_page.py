@@ -22,6 +22,7 @@ import sys
 import tomllib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +39,7 @@ from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import CaptureSettings, MaterialSettings
 from mosa.environments.command import setting_of
 from mosa.export import run as exported
-from mosa.training import preflight
+from mosa.training import preflight, workflow
 from mosa.viewer import recorded
 
 ROOT = Path(__file__).parents[2]
@@ -154,9 +155,9 @@ def called(main: Callable[[], None]) -> None:
     assert not code, sys.argv  # without the traceback of the exit
 
 
-def launched(words: list[str], **_) -> SimpleNamespace:
+def launched(smaller: Mapping[str, Sequence[str]], words: list[str], **_) -> SimpleNamespace:
     """In place of a process that a page starts."""
-    command([Path(words[0]).name, *words[1:]], {})
+    command([Path(words[0]).name, *words[1:]], smaller)
     return SimpleNamespace(stdout="", stderr="", returncode=0)
 
 
@@ -169,6 +170,7 @@ def looked_at(chosen: Mapping[str, str | None]):
 
 def run(page: Path, before: str, after: str) -> None:
     names: dict = {"SAID": {}, "SMALLER": {}}
+    subprocess.run = partial(launched, names["SMALLER"])
     exec(before, names)
     written(page, Path())
     for block in blocks(page):
@@ -191,8 +193,9 @@ def run(page: Path, before: str, after: str) -> None:
 if __name__ == "__main__":
     name, folder, before, after = sys.argv[1:]
     os.chdir(folder)
-    subprocess.run = launched
     Hydra.get_mode = lambda *_, **__: None  # for which it would compose once more
     recorded.opened = looked_at if REALLY else lambda chosen: sys.exit()
     exported.export = lambda *words: {}
+    # of all runs alike, and looked at in test_main_job.py
+    workflow.write_first_picture = lambda *_: None
     run(ROOT / name, before, after)

@@ -121,6 +121,9 @@ from mosa.environments import policies
 policies.FITTED, policies.DESCENDED = 10, 3  # steps of a policy's model
 """
 LAB = """
+import sys
+from mosa.training import workflow
+workflow.figures_of = lambda *_: sys.exit()  # after the fit, about which its commands are; test_own_script.py runs one to its end
 Path("mylab.py").write_text("import lightning as L\\nclass MyCallback(L.Callback): pass\\n")
 """
 OWN = """
@@ -132,6 +135,10 @@ FIT = ["debug=default", "simulation.courant=1", "simulation.stride=4", "simulati
        "evaluation.assignment=16", "evaluation.video=false"]  # fmt: skip
 """Overrides of a run that does all of a documented run's steps, each at its smallest."""
 BUILT_IN = [*FIT, "scene.name=tiny", "scene.scale=0.5"]
+LOOKED_AT = ["fit.prior.newton_iterations=1", "fit.joint.newton_iterations=1", "identification.grid_error=0",
+             "reconstruction.informed.iterations=0", "evaluation.floor=false", "evaluation.samples=64",
+             "evaluation.assignment=16"]  # fmt: skip
+"""Of the tutorial's run, which other pages take up. As the tutorial has it, test_main_job.py runs it."""
 FILMED = [
     *FIT,
     *ROUGH,
@@ -159,8 +166,8 @@ REALLY = {
     "own_training_script": (
         {"train.py": [*FIT, "adapter=none"], "scene.holdout_cameras=[1]": ["scene.holdout_frames=1", *assembled.ROUGHLY]},
         {"scene.holdout_cameras=[5]": "scene.holdout_cameras=[1]"}),
-    "tutorial": ({}, {}),
-    "notebook": ({}, {}),
+    "tutorial": ({"train.py": LOOKED_AT}, {}),
+    "notebook": ({"train.py": LOOKED_AT}, {}),
 }  # fmt: skip
 """Pages whose commands run: overrides by a word of the command, which make it small, and what stands in for what."""
 MADE = """

@@ -123,7 +123,9 @@ def test_a_hollow_that_no_outline_shows_is_emptied_and_nothing_else(bowl):
 def test_equal_images_give_equal_bits(bowl, monkeypatch):
     monkeypatch.setattr("mosa.reconstruction.geometry.body.FIRST", ((1, 1.0),))
     monkeypatch.setattr("mosa.reconstruction.geometry.body.THEN", ((2, 0.6),))
-    one, other = (found(bowl)[1] for _ in range(2))
+    some = list(range(0, 12, 2))
+    half = replace(bowl, images=bowl.images[some], mattes=bowl.mattes[some], cameras=bowl.cameras.select(some))  # fmt: skip
+    one, other = (found(half)[1] for _ in range(2))
     assert torch.equal(one.body.values, other.body.values) and torch.equal(
         one.deviation, other.deviation
     )

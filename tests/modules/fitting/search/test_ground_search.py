@@ -347,7 +347,7 @@ def learning(truth: Ground) -> LitMosa:
     take.again = None
     body = small_body(E=1.2 * E, nu=0.3, on=False)
     stages = [
-        Stage(name=name, iterations=8, lr=0.1).but(optimizer="gauss_newton")
+        Stage(name=name, iterations=4, lr=0.1).but(optimizer="gauss_newton")
         for name in ("prior", "joint")
     ]
     return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")),
