@@ -139,3 +139,16 @@ def test_a_yield_stress_far_from_the_truth_leads_to_no_wrong_stiffness(monkeypat
     assert error(2e5) < 0.1
     monkeypatch.setattr(backbone_search, "FURTHEST", 1.0)
     assert error(200.0) < 0.1 < 1 < error(2e5)
+
+
+def test_a_law_that_yields_is_calibrated_with_the_substeps_of_its_own_numbers():
+    """With those of another stiffness the motion loses as much more or less as a wrong stiffness explains: with 8 substeps too many
+    it ended at 0.76 of the true one."""
+    truth = yielding("von_mises", E=1e6, nu=0.3, yield_stress=2500.0)
+    take = take_of(truth, start(height=0.09, speed=-1.5), 8)
+    body = yielding("von_mises", E=6e5, nu=0.35, yield_stress=3000.0)
+    found = identification(body, [take], "prior")
+    for _ in range(4):
+        found.iterate()
+    assert float(body.material.physical()["E"].detach()) == pytest.approx(1e6, rel=0.05)
+    assert found.distance() < 5e-5
