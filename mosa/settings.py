@@ -372,7 +372,6 @@ def arguments_of(build: Callable[..., Any], where: str, *given: str) -> type[Set
         if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) and name not in given:
             wanted[name] = hints.get(name, Any), ... if p.default is p.empty else p.default
     # docstrings of fields, of which there are none, would be sought in this file: half a second of a run
-    # there are none, and the search for them in this file took half a second of a run
     silent = {"use_attribute_docstrings": False}
     made: type[Settings] = create_model(  # type: ignore[call-overload]
         build.__name__, __base__=Settings, __cls_kwargs__=silent, **wanted
