@@ -23,7 +23,7 @@ from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.engine.inputs import numbers
 from mosa.rendering.appearance.carried_splats import seen
-from mosa.rendering.cameras import look_at
+from mosa.rendering.cameras import centers, look_at
 from mosa.system.progress import tqdm
 from mosa.system.threads import cores
 from mosa.twin.rollout_file import poses
@@ -48,13 +48,13 @@ def film(
 ) -> Tensor:
     """(T, height, width, 3) images, as `Twin.render` has them. Warns of a solid that the camera is inside of."""
     up = world.up.to(body.rest)
-    cameras, eyes, target = film_cameras(body, up, rollout, solids, size, view, zoom)
+    cameras, target = film_cameras(body, up, rollout, solids, size, view, zoom)
     width, height = cameras.width, cameras.height
     shown = seen(body, rollout.x, rollout.F_tot)
     ends, convex = [len(shown.opacities)], [False]
     for k, solid in enumerate(solids):
         at, turned = (part[:, 0] for part in poses([solid], rollout.times))
-        q = ((eyes.cpu().double() - at)[:, None] @ turned)[:, 0]
+        q = ((centers(cameras).double() - at)[:, None] @ turned)[:, 0]
         if 0 < reach(solid.shape) and float(signed_distance(solid.shape, q).min()) < 0:
             named = solid.name or f"colliders[{k}]"
             warn(f"{named}: the camera is inside of it: not drawn", stacklevel=4)
@@ -97,8 +97,8 @@ def film_cameras(
     size: int | Sequence[int],
     view: Views | None,
     zoom: float | Sequence[float],
-) -> tuple[Cameras, Tensor, Tensor]:
-    """(a camera for each frame, their centres (T, 3) [m], the middle (3,) [m] of what is seen)."""
+) -> tuple[Cameras, Tensor]:
+    """(a camera for each frame, the middle (3,) [m] of what they see)."""
     low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
     # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
     for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
@@ -123,7 +123,7 @@ def film_cameras(
     eyes = aims + far * toward
     w2c = look_at(eyes, aims, up).cpu()
     names = tuple(f"frame {t}" for t in range(frames))
-    return Cameras(K.to(w2c), w2c, width, height, names), eyes, target
+    return Cameras(K.to(w2c), w2c, width, height, names), target
 
 
 def viewed_from(view: Views, up: Tensor, frames: int = 1, name: str = "view") -> Tensor:

@@ -72,8 +72,10 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
     if len(chosen) < 3:
         return
     names = [scene.cameras.names[v] for v in chosen]
-    radii = radii * torch.stack([slenderness(scene.mattes[v, frame]) for v in chosen])
     point, off = misses(origins, directions, radii)
+    if float(off.max()) > AGREEMENT:  # seldom
+        radii = radii * torch.stack([slenderness(scene.mattes[v, frame]) for v in chosen])
+        off = misses(origins, directions, radii)[1]
     if float(off.max()) > AGREEMENT:
         keep = torch.ones(len(chosen), dtype=torch.bool)
         suspects = []
