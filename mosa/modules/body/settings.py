@@ -51,7 +51,7 @@ class PriorSection(Settings):
     candidates: Names | None = None
     """with law=auto: the laws that are calibrated and compared; those that yield or flow only where the body stays deformed"""
     options: Section | None = None
-    """options of the law (below)"""
+    """options of the law (below); their keys begin with + if its file has none"""
 
 
 class WorldSection(Settings):
