@@ -78,7 +78,7 @@ class SceneSection(Settings):
     also_train: Sequences | None = None
     """further sequences to learn from (docs/several_recordings.md)"""
     test: Sequences | None = None
-    """held-out sequences, which results report as test/<name>"""
+    """held-out sequences, which results report as `test/<name>`"""
     cache: Folder | None = None
     """folder of computed files; null: mosa/ in the user's cache folder"""
 
@@ -185,7 +185,7 @@ class EvalSettings(Settings):
     ckpt_path: Text
     """checkpoint of a run"""
     device: Text = "cpu"
-    """cpu, cuda or cuda:<number>"""
+    """cpu, cuda or `cuda:<number>`"""
     deterministic: bool = False
     """as in train.py"""
     cache: Folder | None = None

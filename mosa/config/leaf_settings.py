@@ -89,7 +89,7 @@ class SplatsSettings(LawSections):
     ckpt_path: Text | None = None
     """a run whose law the object gets, in place of `prior`"""
     device: Text = "cpu"
-    """cpu, cuda or cuda:<number>"""
+    """cpu, cuda or `cuda:<number>`"""
     size: Positive | None = None
     """m, of the object's longest side; null: the file is in metres"""
     up: Three = [0, 1, 0]
@@ -166,11 +166,11 @@ class CaptureSettings(Settings):
     mattes: Literal["plates", "masks"] = "plates"
     """plates: empty backgrounds; masks: videos of masks, of any other program"""
     plates: Folder | None = None
-    """folder of <phone>.png, .jpg or .mp4; null: plates beside or in the videos' folder"""
+    """folder of `<phone>.png`, .jpg or .mp4; null: plates beside or in the videos' folder"""
     plate_seconds: Period | None = None
     """[from, to] of each video's clock in which it shows the empty background"""
     masks: Folder | None = None
-    """folder of mask videos <phone>.mp4, white: the object"""
+    """folder of mask videos `<phone>.mp4`, white: the object"""
     fps: Rate | None = None
     """frames per second as they were taken; null: what the videos say (slow motion: set it)"""
     scan: Scan = "auto"
@@ -264,7 +264,7 @@ class EnvironmentsSettings(Settings):
     trials: Count = 100
     """number of tests, in the truth and in the training simulator"""
     device: Text = "cpu"
-    """cpu, cuda or cuda:<number>"""
+    """cpu, cuda or `cuda:<number>`"""
     worlds: Count | Literal["auto"] = "auto"
     """tests that run together; auto: 8 on a CPU, all of them on a GPU"""
     out: Text | None = None

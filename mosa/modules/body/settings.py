@@ -41,7 +41,7 @@ class PriorSection(Settings):
     where: ClassVar[str] = "prior"
 
     law: Text
-    """name of the law, which prior=<law> sets (docs/choosing.md); auto: chosen among `candidates`"""
+    """name of the law, which `prior=<law>` sets (docs/choosing.md); auto: chosen among `candidates`"""
     parameters: Section
     """parameters of the law by name, in SI units: where a fit starts; the material of mosa-splats"""
     frozen: Names | None = None
