@@ -138,7 +138,7 @@ def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
 
 
 def compose(*overrides: str, name: str = "train") -> DictConfig:
-    """conf/<name>.yaml with overrides as on the command line: `compose("scene=rabbit", "prior=neo_hookean")`.
+    """`conf/<name>.yaml` with overrides as on the command line: `compose("scene=rabbit", "prior=neo_hookean")`.
     Imports the modules of `extensions`, as the commands do.
 
     Errors: ConfigError for an override that Hydra does not know, or an extension."""

@@ -173,7 +173,7 @@ class SceneDataModule(L.LightningDataModule):
         return self.scene, [s for s in others if self.held_out or s.sequence in self.taught]
 
     def prefix(self, scene: Scene) -> str:
-        """Of the figures of a sequence beside the training one: train/<name> where it is learned from, else test/<name>."""
+        """Of the figures of a sequence beside the training one: `train/<name>` where it is learned from, else `test/<name>`."""
         return f"{'train' if scene.sequence in self.taught else 'test'}/{scene.sequence}"
 
     @property
@@ -259,7 +259,7 @@ class SceneDataModule(L.LightningDataModule):
     def starts(self) -> dict[str, Start]:
         """Initial states by prefix: `start`, of the others also the pose of their frame 0.
 
-        Prefixes: train, then train/<name> for the sequences that are learned from, test/<name> for the rest, in their order."""
+        Prefixes: train, then `train/<name>` for sequences that are learned from, `test/<name>` for the rest, in their order."""
         found = {"train": self.start}
         for scene in tqdm(self.scenes[1], "poses of the other sequences", leave=False):
             found[self.prefix(scene)] = self._start_of(scene)
