@@ -36,9 +36,8 @@ tables](reproduce.md)).
 - **ours** is the default of this program (`adapter=operator`, [fitted](uncertainty.md) by
   Gauss-Newton): the row *adapted* of a run's `results.md`. **prior only** is its row *prior*.
 - **four networks (paper)** is the paper's adapter (`adapter=mosa`) with alpha = 0.1, as in its
-  text. Two things differ from the paper: the correction of the stress is bounded
-  (`adapter.l_max`) and vanishes at rest (`adapter.rest_free`). It learns for 40 steps. [The other
-  methods](reproduce.md#methods-compared).
+  text, learned for 40 steps. Its choices and its training [differ from the paper's](paper.md).
+  [The other methods](reproduce.md#methods-compared).
 - **rms error** is the root mean square distance of particles from their true positions after
   first contact, on held-out drops unless said otherwise. **PSNR** and **SSIM** are those of a
   window around the body ([all metrics](figures.md), [glossary](glossary.md)).
