@@ -190,7 +190,8 @@ class NewtonSteps:
 
     def settle_parts(self, stage: Stage) -> Identification:
         """The running identification, or that of a law with fewer parts where `search.parts` takes
-        it, which the body then is: without parts, the prior, calibrated once more."""
+        it, which the body then is. Without parts it is the prior, calibrated once more, with what the first cues said of its
+        numbers as their prior: where a law's form is wrong, later cues alone move those that they hardly determine."""
         body, own = self.body, self.identification
         self.parts = own.held_back()
         if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):
@@ -208,20 +209,27 @@ class NewtonSteps:
         if not kept:
             body.thaw("prior")
         fewer = self.identifying(stage if kept else self.stages[0], parts=kept)
+        known = fewer.newton.known
+        if not kept and self.informed:
+            first = self.identifying(self.stages[0], parts=kept, takes=self.first_takes)
+            first.iterate_until_converged(stage.iterations)
+            fewer.newton.known = first.posterior()
         fewer.iterate_until_converged(stage.iterations)
+        fewer.newton.known = known  # the posterior counts no image twice
         return fewer
 
     def identifying(
-        self, stage: Stage, ground: Ground | None = None, parts: Sequence[str] = PARTS, body: Body | None = None
+        self, stage: Stage, ground: Ground | None = None, parts: Sequence[str] = PARTS, body: Body | None = None,
+        takes: Sequence | None = None,
     ) -> Identification:  # fmt: skip
         """A stage's identification on the takes, from where the body stands. ground: another one than the world's; parts: those
-        that the law may have; body: another one than `self.body`."""
+        that the law may have; body, takes: others than this fit's."""
         world = self.world if ground is None else replace(self.world, ground=ground)
         kinds = tuple(
             self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch")
         )
         return Identification(
-            body or self.body, self.takes, world, stage, self.criterion, self.settings, kinds,
+            body or self.body, takes or self.takes, world, stage, self.criterion, self.settings, kinds,
             parts=parts, known=self.known,
         )  # fmt: skip
 

@@ -107,11 +107,17 @@ def test_a_posterior_of_fewer_numbers_is_one_of_all():
     assert float(whole.draws(50)[:, 1].abs().max()) < 1e-5
 
 
-def fitted(monkeypatch, errors: dict[str, float] | None) -> LitMosa:
-    """A fit of an anisotropic body. errors: of held-back frames in place of its own."""
-    numbers = torch.linspace(-0.3, 0.4, 19, dtype=torch.float64)
-    take = take_of(small_body(numbers=numbers), start(turn=0.5, speed=-2.0), 7)
+def fallen(frames: int = 7, **body):
+    """A film of a body's drop."""
+    take = take_of(small_body(**body), start(turn=0.5, speed=-2.0), frames)
     take.again = None
+    return take
+
+
+def fitted(monkeypatch, errors: dict[str, float] | None, take=None) -> LitMosa:
+    """A fit of a film, by default an anisotropic body's. errors: of held-back frames in place of its own."""
+    if take is None:
+        take = fallen(numbers=torch.linspace(-0.3, 0.4, 19, dtype=torch.float64))
     if errors is not None:
         monkeypatch.setattr(Identification, "held_back", lambda self: errors)
     stages = [
@@ -137,6 +143,30 @@ def test_a_law_without_the_operator_is_the_calibrated_prior(monkeypatch):
     assert float(posterior.determined[0]) > 0.5 and not bool(posterior.determined[2:].any())
     moved = float((module.body.material.raw["E"].detach() - module.body.material.begins["E"]).abs())
     assert moved > 0.01
+
+
+def test_an_isotropic_law_is_what_the_cues_of_both_looks_say(monkeypatch):
+    """The mean of the two calibrations by their precisions, which is exact for linear problems; its deviations are those of the
+    later cues alone, so that no image counts twice."""
+    first, later = fallen(), fallen(5, E=1.03 * E)
+
+    def calibrated(take) -> Posterior:
+        alone = Identification(small_body(E=1.1 * E, on=False), [take], WORLD, Stage(name="prior", iterations=6, lr=0.1),
+                               Criterion(name="corrected"), IdentificationSettings(grid_error=0.0))  # fmt: skip
+        alone.iterate_until_converged(6)
+        return alone.posterior()
+
+    def look(self, response: bool = True) -> None:
+        self.takes, self.informed = [later], True
+
+    one, other = calibrated(first), calibrated(later)
+    assert float(other.mean[0] - one.mean[0]) == pytest.approx(math.log(1.03), rel=0.05)
+    told = [torch.linalg.inv(each.covariance) for each in (one, other)]
+    mean = torch.linalg.solve(sum(told), told[0] @ one.mean + told[1] @ other.mean)
+    monkeypatch.setattr(LitMosa, "inform", look)
+    found = fitted(monkeypatch, {"isotropic": 1e-3, "operator": 0.9e-3}, first).posterior
+    assert float(found.mean[0]) == pytest.approx(float(mean[0]), abs=0.05 * math.log(1.03))
+    assert torch.allclose(found.covariance[:2, :2], other.covariance, rtol=0.2)
 
 
 def test_an_operator_that_predicts_held_back_frames_is_kept(monkeypatch):
