@@ -206,7 +206,7 @@ def start_in(
         if (deep := buried(each, world)) > 0:
             said = f"above the ground, found its highest point {deep:.3g} m below it"
             warnings.warn(f"{expected} solid {said}: up is {metres(up)}", stacklevel=4)
-        if isinstance(each.shape, SignedDistanceField) and (size := each.shape.extent) > far:
+        if isinstance(each.shape, SignedDistanceField) and (size := each.shape.longest_side) > far:
             warnings.warn(
                 f"{expected} mesh about as large as the body of {body.size:.3g} m, "
                 f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
