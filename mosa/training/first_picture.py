@@ -9,14 +9,13 @@ from pathlib import Path
 import torch
 from lightning.pytorch.loggers import Logger
 
-from mosa.config.build import measured, plain, world_of
+from mosa.config.build import body_of, measured, plain, world_of
 from mosa.errors import MosaError
 from mosa.evaluation.analysis.comparison import View
 from mosa.evaluation.analysis.figures import write_strip
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.training.datamodule import SceneDataModule
-from mosa.training.lit_mosa import body_of
 from mosa.training.loggers import add_picture
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -30,7 +29,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import build_body, build_stages, fitting, plain, rehearse, world_of
+from mosa.config.build import body_of, build_fit, fitting, plain, rehearse
 from mosa.config.checkpoints import (
     check_plain,
     check_same_data,
@@ -45,7 +44,6 @@ from mosa.config.composition import composed
 from mosa.config.effects import warn_of_idle
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
-from mosa.data.io.forces import forces_from_config
 from mosa.data.observations import Observations
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
@@ -68,7 +66,6 @@ from mosa.modules.fitting.terms import check_terms
 from mosa.modules.fitting.training_sequences import Take, seen_again, with_positions
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
-from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.observer import Views, deformed_covariances, observe
 from mosa.system.limits import return_memory
 from mosa.training.datamodule import SceneDataModule
@@ -83,13 +80,6 @@ KEPT = (
     "steps_done", "stage_over", "misfit", "compared", "grounds", "ground_gains", "law_gains", "parts",
 )  # fmt: skip
 """What a checkpoint has of the fit under the same name (`FitRecord`)."""
-
-
-def body_of(shape: RestShape, record: BodyRecord) -> Body:
-    """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
-    body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
-    body.splats = shape.splats
-    return body.to(shape.rest.device)
 
 
 def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
@@ -109,23 +99,6 @@ def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
             f"trainer.accumulate_grad_batches: expected 1, found {trainer.accumulate_grad_batches}: "
             "fit.views says how many views a step reads"
         )
-
-
-def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
-    """What `LitMosa._begin` takes of a record. Errors: ConfigError naming the key."""
-    settings = TrainSettings.part(record.settings)
-    stages = build_stages(settings.fit, body.heterogeneity, body.adapter)
-    filmed = settings.scene.plain().get("format") != "markers"
-    if not settings.reconstruction.informed.iterations or not filmed:
-        stages = [stage for stage in stages if not stage.looks_again]
-    return {
-        "world": replace(world_of(record), forces=forces_from_config(settings.world.forces)),
-        "stages": stages,
-        "weights": settings.losses.weights(),
-        "clip": settings.fit.clip,
-        "criterion": settings.criterion,
-        "settings": settings.identification,
-    }
 
 
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
@@ -211,7 +184,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """The module that fits `body` in the stages of a run. record: of the run (`mosa.config.build.measured`); takes: what it
         learns from, none where it is only used. Errors: ConfigError naming the key."""
         return cls.of_parts(
-            body, takes=takes, background=background, record=record, **parts_of(record, body)
+            body, takes=takes, background=background, record=record, **build_fit(record, body)
         )
 
     # ---------------------------------------------------------------- data
@@ -263,7 +236,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             record = measured.but(settings=self.cfg | own)
             body = body_of(data.shape, record)
             background = data.scene.background.to(body.rest.device)
-            self._begin(record, body, (), background, **parts_of(record, body))
+            self._begin(record, body, (), background, **build_fit(record, body))
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
             raise self.of_another_body(len(data.shape.rest))
@@ -375,18 +348,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def settle_ground(self, ground: Ground) -> None:
         """What is simulated and written from now on meets this ground."""
         self.world, self.record = replace(self.world, ground=ground), self.record.on(ground)
-
-    def begin_again(self, ground: Ground | None = None, law: str | None = None) -> None:
-        """All stages from the start, on another ground or about another backbone, with the motion that was seen at first: the
-        second look was about the old ones."""
-        if ground is not None:
-            self.settle_ground(ground)
-        if law is not None:
-            self.choose(law)
-        self.body.load_state_dict(self.untouched, strict=self.body.adapter is not None)
-        self.takes, self.informed = list(self.first_takes), False
-        self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
-        self.stage_over, self.columns = False, None
 
     # ---------------------------------------------------------------- one step
     def configure_optimizers(self):
@@ -540,16 +501,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.takes = [seen_again(take, self.body, self.world, response) for take in self.takes]
             self.informed = True
 
-    @torch.no_grad()
-    def measure_misfit(self) -> float:
-        """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
-        misfits, body = [], self.body
-        for take in self.takes:
-            model, seen = body.model().only(adapter=False), take.cues.positions
-            x = body.simulate(take.start, self.world, len(seen), take.frame_dt, model=model).x
-            misfits.append(float(losses.position_loss(x, seen, body.size)))
-        return sum(misfits) / len(misfits)
-
     def finish(self) -> None:
         """Ends the running stage: the next one follows, or all of them again on another ground."""
         stage = self.stage
@@ -572,17 +523,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.retreat, self.stage_over = Retreat(), False
 
     # ---------------------------------------------------------------- logs
-    def figures(self) -> dict[str, float]:
-        """What was searched: distances [m] and gains of backbones and contacts, errors [m] of held-back frames."""
-        found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
-        found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
-        found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}
-        if self.parts:
-            found["held_back/position_weight"] = self.weights.get("position", 0.0)
-        found |= {f"id_prior/ground/{k}_m": v for k, v in self.grounds.items() if math.isfinite(v)}
-        gains = self.ground_gains.items()
-        return found | {f"id_prior/ground/{k}_gain": v for k, v in gains if math.isfinite(v)}
-
     def log_values(self, values: dict[str, Tensor | float]) -> None:
         """These scalars and the parameters, into the logs and `last`."""
         for name, value in self.body.material.physical().items():
@@ -592,14 +532,3 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         tensors = {k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}
         self.log_dict(tensors, on_step=True, on_epoch=False)
         self.last |= {k: float(v) for k, v in values.items()}
-
-    @torch.no_grad()
-    def strip(self, view: int = 0) -> Tensor:
-        """(3, 2 h, T w) strip of one view of the first sequence: real above, rendered below, every frame from left to right."""
-        take, body = self.takes[0], self.body
-        frames = len(take.cues.positions)
-        rollout = body.simulate(take.start, self.world, frames, take.frame_dt)
-        targets = take.observations.select([view], frames)
-        seen = self.shown(rollout.x, rollout.F_tot, targets)
-        rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
-        return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)
