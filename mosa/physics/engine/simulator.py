@@ -420,7 +420,7 @@ class Simulator:
     def material_state(
         self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]
     ) -> MaterialState:
-        """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
+        """Material state that adapters read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(
             *material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation))
