@@ -52,9 +52,9 @@ def folder_name(overrides: str) -> str:
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
-def own_groups(command: str, conf: Path | None = None) -> str:
+def own_groups(command: str) -> str:
     """The groups that conf/<command>.yaml chooses from, with their options: lines of --help."""
-    conf = Path(configuration()) if conf is None else conf
+    conf = Path(configuration())
     chosen = OmegaConf.load(conf / f"{command}.yaml").defaults
     names = sorted(name for each in chosen if not isinstance(each, str) for name in each)
     options = {n: sorted(f.stem for f in (conf / n).glob("*.yaml")) for n in names if n != "hydra"}
