@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mosa.errors import ConfigError
 from mosa.system.console import say_version
-from mosa.system.refused import one_message
+from mosa.system.machine_errors import one_message
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.system.whole_files import made_folder

@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from mosa.config.composition import configuration, said_of
 from mosa.errors import ConfigError, MosaError
 from mosa.system.console import fail, say_version
-from mosa.system.refused import explained, let_go
+from mosa.system.machine_errors import explained, free_gpu_cache
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.training.sweep_table import FAILED, text_of, write_table
@@ -284,7 +284,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)
     keep(message)
-    let_go()
+    free_gpu_cache()
     return float("inf")
 
 
