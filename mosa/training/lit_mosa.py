@@ -41,7 +41,7 @@ from mosa.config.checkpoints import (
 )
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
-from mosa.config.effects import warn_of_idle
+from mosa.config.effects import warn_without_effect
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
 from mosa.data.observations import Observations
@@ -118,7 +118,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             settings = TrainSettings.read(self.cfg)
             if not isinstance(first, dict):  # the command line's, which preflight has seen
                 given = [each for each in (first, *overrides) if isinstance(each, str)]
-                warn_of_idle(settings, rehearse(settings), given)
+                warn_without_effect(settings, rehearse(settings), given)
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
         self._begin(None, None, (), torch.ones(3), (), {})
 
