@@ -111,10 +111,10 @@ def keep(
     return path
 
 
-def make(name: str, folder: Path, seed: int) -> Path:
+def make(name: str, folder: Path, seed: int, device: str = "cpu") -> Path:
     """The true motion of a stand-in."""
     body = object_named(name)
-    return keep(folder / f"{name}.npz", body, body.material, seed)
+    return keep(folder / f"{name}.npz", body, body.material, seed, device=device)
 
 
 def noisy(

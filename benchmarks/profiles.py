@@ -4,9 +4,9 @@
     python benchmarks/profiles.py cat --device cuda --particles 4000        # on the learner's, as in table_identification
 
 Each parameter is held at multiples of its true value, nu and angles at as many steps of their unconstrained number, while
-Gauss-Newton fits all others and the contact height to the true motion, from the true start. The misfit counts 30 data a frame in
-units of the cues' noise, or of what the best law leaves if that is more. A parameter is told where the misfit rises by `RISE`
-on both sides; between these ends is its two-sigma range.
+Gauss-Newton fits all others and the contact height to the true motion, from the true start. The misfit counts `COUNT` data a frame
+in units of the cues' noise, or of what the best law leaves if that is more. A parameter is told where the misfit rises by `RISE`
+on both sides; between these ends is its two-sigma range. A motion that `calibration.py make` has written is read.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from mosa.modules.fitting.residuals import sampled
 MULTIPLES = (0.1, 0.2, 0.32, 0.5, 0.71, 0.84, 0.95, 1.0, 1.05, 1.19, 1.41, 2.0, 3.2, 5.0, 10.0)
 RISE, ENOUGH = 4.0, 40.0
 """Of the misfit, twice minus a logarithm of the likelihood: at two standard deviations; beyond it no further multiple is tried."""
+COUNT = 30.0  # independent data of a frame
 STEPS = 4
 """Of Gauss-Newton at each multiple, with one Jacobian."""
 SAME_GRID = ["simulation.particles_per_cell=8", "simulation.courant=0.3"]
@@ -47,29 +48,23 @@ UNBOUND = 10.0
 class Misfit:
     """Of free rollouts from the true motion after contact, in units of the cues' noise, `sd` [m] a component."""
 
-    def __init__(self, case: SimpleNamespace, sd: float, count: float) -> None:
+    def __init__(self, case: SimpleNamespace, sd: float) -> None:
         self.case, self.body, take = case, case.body, case.take
-        self.chosen, self.first = (
-            sampled(len(self.body.rest), self.body.rest.device),
-            take.first_contact,
-        )
-        # the fall before it is a parabola whatever the law is
+        self.chosen = sampled(len(self.body.rest), self.body.rest.device)
         gravity, begun, skipped = case.world.gravity.to(self.body.rest), take.start, 0
-        while skipped + 2 < self.first:
-            t = (skipped + 2) * take.frame_dt
-            fallen = t * begun.velocity + 0.5 * t**2 * gravity
-            if (
-                float((case.truth[skipped + 2] - case.truth[0] - fallen).abs().max())
-                > 1e-3 * self.body.size
-            ):
-                break
+
+        def fallen(frame: int) -> Tensor:  # before contact: a parabola whatever the law is
+            t = frame * take.frame_dt
+            return t * begun.velocity + 0.5 * t**2 * gravity
+
+        away = lambda k: float((case.truth[k] - case.truth[0] - fallen(k)).abs().max())  # noqa: E731
+        while skipped + 2 < take.first_contact and away(skipped + 2) <= 1e-3 * self.body.size:
             skipped += 1
-        t = skipped * take.frame_dt
-        fallen = begun.center + t * begun.velocity + 0.5 * t**2 * gravity
-        self.start = replace(begun, center=fallen, velocity=begun.velocity + t * gravity)
-        self.first, self.frames = self.first - skipped, len(case.truth) - skipped
+        velocity = begun.velocity + skipped * take.frame_dt * gravity
+        self.start = replace(begun, center=begun.center + fallen(skipped), velocity=velocity)
+        self.first, self.frames = take.first_contact - skipped, len(case.truth) - skipped
         self.true = case.truth[skipped:, self.chosen]
-        self.noise, self.count = 3**0.5 * sd, count
+        self.noise, self.counted = 3**0.5 * sd, COUNT * (self.frames - self.first)
         self.rms_mm = math.nan
         self.least = self.substeps = self.ready().simulator.substeps
 
@@ -78,7 +73,7 @@ class Misfit:
         return self.body.ready(self.start, self.case.world, self.frames, dt, substeps=substeps)
 
     def whitened(self, x: Tensor) -> Tensor:
-        unit = (self.count / len(self.chosen)) ** 0.5 / self.noise
+        unit = (COUNT / len(self.chosen)) ** 0.5 / self.noise
         return unit * (x[:, self.chosen] - self.true)[self.first :].flatten()
 
     @torch.no_grad()
@@ -87,13 +82,13 @@ class Misfit:
 
     def over(self, least: float) -> float:
         """How often a misfit counts the variance of its noise, where the best law leaves more than that: the grid's errors."""
-        return max(1.0, least / (self.count * (self.frames - self.first)))
+        return max(1.0, least / self.counted)
 
     def here(self) -> float:
         """With the substeps of the true law, or what this one asks for: more of them act like another stiffness."""
         self.substeps = max(self.least, self.ready().simulator.substeps)
         found = float(self.residuals().square().sum())
-        self.rms_mm = 1e3 * self.noise * (found / self.count / (self.frames - self.first)) ** 0.5
+        self.rms_mm = 1e3 * self.noise * (found / self.counted) ** 0.5
         return found
 
     @torch.no_grad()
@@ -131,23 +126,13 @@ class Misfit:
 
 def case_of(name: str, options: argparse.Namespace) -> SimpleNamespace:
     """The learner of a stand-in with the true parameters, and its true motion."""
-    body = object_named(name)
-    if options.truth:
-        count = len(
-            calibration.fill(calibration.SHAPES[body.shape], body.spacing, np.random.default_rng(0))
-        )
-        body = replace(body, spacing=body.spacing * (count / options.truth) ** (1 / 3))
-    path = options.out / f"{name}_{options.truth or 'own'}.npz"
+    path, true = options.out / f"{name}.npz", object_named(name).material.values
     if not path.exists():
-        calibration.keep(path, body, body.material, options.seed, device=options.device)
-    same = [] if options.particles else SAME_GRID
-    values = [f"prior.parameters.{key}={value}" for key, value in body.material.values]
-    cfg = calibration.configuration(
-        name, ["simulation.max_substeps=5000", *same, *values, *options.set]
-    )
-    return calibration.learner_of(
-        path, body, cfg, options.particles, options.seed, 0.0, options.device
-    )
+        calibration.make(name, options.out, options.seed, options.device)
+    more = [] if options.particles else SAME_GRID
+    more = ["simulation.max_substeps=5000", *more, *(f"prior.parameters.{k}={v}" for k, v in true)]
+    given = options.particles, [*more, *options.set], options.seed, 0.0, options.device
+    return calibration.case_of(path, *given)
 
 
 def ends(shifts: Sequence[float], rises: Sequence[float]) -> tuple[float, float]:
@@ -207,33 +192,27 @@ def profile(misfit: Misfit, name: str) -> dict[float, tuple[float, str]]:
 def profiles(name: str, options: argparse.Namespace) -> None:
     began = time.perf_counter()
     case = case_of(name, options)
-    height = float(case.body.rest[:, 1].max() - case.body.rest[:, 1].min())
-    misfit, material = Misfit(case, options.noise * height, options.count), case.body.material
-    lift = case.object.meeting.lift * case.object.dx / case.record.dx
-    case.body.contact.cells.fill_(lift)
+    rest, material, dx = case.body.rest, case.body.material, case.record.dx
+    sd = options.noise * float(rest[:, 1].max() - rest[:, 1].min())
+    misfit = Misfit(case, sd)
+    case.body.contact.cells.fill_(case.object.meeting.lift * case.object.dx / dx)
     misfit.here()
-    truly = misfit.rms_mm
-    print(f"\n{name}: {len(case.body.rest)} particles, dx {1e3 * case.record.dx:.2f} mm (truth {1e3 * case.object.dx:.2f}), cues "
-          f"{1e3 * options.noise * height:.2f} mm off, {truly:.2f} mm at the true parameters", flush=True)  # fmt: skip
-    known = [
-        each for each in material.learned if each in (options.only or case.object.material.known)
-    ]
-    found = {each: profile(misfit, each) for each in known}
+    print(f"\n{name}: {len(rest)} particles, dx {1e3 * dx:.2f} mm (truth {1e3 * case.object.dx:.2f}), cues {1e3 * sd:.2f} mm off, "
+          f"{misfit.rms_mm:.2f} mm at the true parameters", flush=True)  # fmt: skip
+    asked = options.only or case.object.material.known
+    found = {each: profile(misfit, each) for each in material.learned if each in asked}
     least = min(value for rows in found.values() for value, _ in rows.values())
     for each, rows in found.items():
-        begins = material.begins[each]
-
-        def physical(shift: float, each: str = each, begins: float = begins) -> float:
-            return float(material.physical_of(each, torch.tensor(begins + shift)))
-
         shifts = list(map(math.log, rows))
         rises = [(value - least) / misfit.over(least) for value, _ in rows.values()]
         sides = ends(shifts, rises)
         told = ("not told", "told on one side", "told")[sum(map(math.isfinite, sides))]
-        low, high = (f"{physical(end):.3g}" if math.isfinite(end) else "beyond" for end in sides)
-        print(f"  {each} = {physical(0.0):.4g}: {told}, two sigma {low} to {high}")
-        for shift, rise, (_, said) in zip(shifts, rises, rows.values()):
-            print(f"    {physical(shift):9.3g}: {rise:7.1f}  {said}")
+        places = torch.tensor([material.begins[each] + shift for shift in (0.0, *sides, *shifts)])
+        true, *values = material.physical_of(each, places).tolist()
+        low, high = (f"{v:.3g}" if math.isfinite(s) else "beyond" for v, s in zip(values, sides))
+        print(f"  {each} = {true:.4g}: {told}, two sigma {low} to {high}")
+        for value, rise, (_, said) in zip(values[2:], rises, rows.values()):
+            print(f"    {value:9.3g}: {rise:7.1f}  {said}")
     print(f"  {time.perf_counter() - began:.0f} s", flush=True)
 
 
@@ -242,25 +221,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+", help="names of stand-ins")
-    parser.add_argument(
-        "--particles", type=int, default=0, help="of the learner; 0: the truth's own, on its grid"
-    )
-    parser.add_argument(
-        "--truth", type=int, default=0, help="particles of the truth; 0: as the scene has them"
-    )
-    parser.add_argument(
-        "--noise", type=float, default=calibration.NOISE, help="of the cues over the body's height"
-    )
-    parser.add_argument("--count", type=float, default=30.0, help="independent data of a frame")
     parser.add_argument("--only", nargs="*", help="parameters; all that are published without it")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--out", type=Path, default=Path("motions"), help="folder of the true motions"
-    )
+    parser.add_argument("--out", type=Path, default="motions", help="folder of the true motions")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument(
-        "--set", nargs="*", default=[], help="overrides of the law and its simulation"
-    )
+    parser.add_argument("--set", nargs="*", default=[], help="overrides of the configuration")
+    calibration.add_options(parser)
+    parser.set_defaults(particles=0)  # the truth's own
     options = parser.parse_args()
     for name in options.scenes:
         profiles(name, options)

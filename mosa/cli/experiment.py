@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mosa.errors import ConfigError
 from mosa.system.console import say_version
-from mosa.system.refused import one_message
+from mosa.system.machine_errors import one_message
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.system.whole_files import made_folder
@@ -120,7 +120,7 @@ def run(options: argparse.Namespace) -> int:
 
     for experiment in experiments:
         page = write_results(experiment, planned[experiment.name], results, command)
-        taken = spec.total_minutes(planned[experiment.name])
+        taken = sum(spec.minutes_taken(job) or 0.0 for job in planned[experiment.name])
         print(f"{experiment.name}: {page}, {taken:.1f} minutes of jobs", flush=True)
     if options.page:
         print(write_the_page(folder, options))

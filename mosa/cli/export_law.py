@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 
 from mosa.system.console import one_line, say_version
-from mosa.system.refused import one_message
+from mosa.system.machine_errors import one_message
 from mosa.system.threads import settle_threads
 
 

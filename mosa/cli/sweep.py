@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from mosa.system.console import say_version
-from mosa.system.refused import one_message
+from mosa.system.machine_errors import one_message
 
 
 def main(words: list[str] | None = None) -> None:

@@ -36,6 +36,7 @@ from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.world import solids_of
+from mosa.reconstruction.rest_shape import RestShape
 from mosa.settings import call
 from mosa.types import AUTO, Ground, Scene
 
@@ -139,6 +140,13 @@ def build_body(record: BodyRecord, tensors: Mapping[str, Tensor]) -> Body:
         settings=settings,
         law_options=options,
     )
+
+
+def body_of(shape: RestShape, record: BodyRecord) -> Body:
+    """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
+    body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
+    body.splats = shape.splats
+    return body.to(shape.rest.device)
 
 
 def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None:
@@ -280,3 +288,20 @@ def build_stages(
             "fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior"
         )
     return stages
+
+
+def build_fit(record: BodyRecord, body: Body) -> dict[str, Any]:
+    """World, stages, loss weights and settings of a fit, as `LitMosa._begin` takes them. Errors: ConfigError naming the key."""
+    settings = TrainSettings.part(record.settings)
+    stages = build_stages(settings.fit, body.heterogeneity, body.adapter)
+    filmed = settings.scene.plain().get("format") != "markers"
+    if not settings.reconstruction.informed.iterations or not filmed:
+        stages = [stage for stage in stages if not stage.looks_again]
+    return {
+        "world": replace(world_of(record), forces=forces_from_config(settings.world.forces)),
+        "stages": stages,
+        "weights": settings.losses.weights(),
+        "clip": settings.fit.clip,
+        "criterion": settings.criterion,
+        "settings": settings.identification,
+    }

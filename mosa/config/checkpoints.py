@@ -278,7 +278,8 @@ def check_tensors(tensors: Mapping[str, Any]) -> None:
             f"{BRIGHTEST:g}, found {low:g} to {high:g} and {most:g}"
         )
     widths = torch.linalg.eigvalsh(covariances.double())
-    low, high, size = float(widths.min()), float(widths.max()), float(extent(rest))
+    low, high = float(widths.min()), float(widths.max())
+    size = float((rest.amax(0) - rest.amin(0)).max())
     uneven = float((covariances - covariances.mT).abs().max())
     if uneven > 1e-3 * float(covariances.abs().max()) or low < -1e-3 * high or high > size**2:
         raise DataError(
@@ -287,11 +288,6 @@ def check_tensors(tensors: Mapping[str, Any]) -> None:
         )
     if not float(volume.min()) > 0:
         raise DataError(f"body.volume: expected volumes above 0 m^3, found {float(volume.min()):g}")
-
-
-def extent(rest: Tensor) -> Tensor:
-    """() longest side [m] of the box about points (N, 3)."""
-    return (rest.amax(0) - rest.amin(0)).max()
 
 
 def check_spacing(record: BodyRecord, tensors: Mapping[str, Tensor]) -> None:

@@ -20,7 +20,7 @@ from mosa.config.extensions import load_extensions
 from mosa.config.leaf_settings import COMMANDS
 from mosa.errors import ConfigError
 from mosa.settings import nearest, node_of
-from mosa.system.refused import causes
+from mosa.system.machine_errors import causes
 
 GROUPED = "scene"  # the group whose option a bare name chooses
 PLUGINS = {"optuna": "sweep", "joblib": "sweep", "submitit_slurm": "sweep", "ray": "ray"}

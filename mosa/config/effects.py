@@ -1,5 +1,5 @@
-"""Keys that a user sets and that do nothing beside the others: said, because a table of runs that differ in one would say that it
-makes no difference. A model says what its fields need (`Settings.needs`)."""
+"""Warnings for keys that a user sets and that have no effect beside the others: a table of runs that differ in one would show no
+difference. A settings model states what its fields need (`Settings.needs`)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def without_effect(settings: Settings, path: Sequence[str], stages: Sequence[Sta
 
 
 def needs_of(model: type[Settings], key: str) -> list[str]:
-    """What the field needs, by its own model and by those that this one derives from; `further`: a key that is no field."""
+    """What the field needs, by its own model and those that it derives from. `further`: a key that is no field."""
     key = key if key in model.model_fields else "further"
     stated = [vars(each).get("needs", {}) for each in model.__mro__]
     return [
@@ -79,7 +79,7 @@ def sentences(
             yield f"{key}: has no effect in this run: {reason}"
 
 
-def warn_of_idle(
+def warn_without_effect(
     settings: TrainSettings, stages: Sequence[Stage], overrides: Iterable[str] = ()
 ) -> None:
     """One warning for each such key of these overrides and those of the command line."""

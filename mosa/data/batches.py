@@ -61,7 +61,7 @@ class SequenceBatch(SimpleNamespace):
 
 
 class MotionBatch(SimpleNamespace):
-    """What one step reads. sequences: all that are learned from, each in the same views (modulo its number of cameras)."""
+    """Data of one step. sequences: all that are learned from, each in the same views (modulo its number of cameras)."""
 
     sequences: tuple[SequenceBatch, ...]
 

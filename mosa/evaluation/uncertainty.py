@@ -22,7 +22,10 @@ from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.system.progress import tqdm
 from mosa.system.threads import apart
 
-DRAWS = 12
+DRAWS, OF_CONE = (
+    12,
+    400,
+)  # of the posterior: that are rolled out, and for the cone about the stiffest direction
 INFLATION = 1.75
 """Factor of the standard deviation of the numbers that are said, and of predictions where a law has no rivals. Frames of a motion
 are less independent than the likelihood takes them to be; chosen on the held-out drops of rabbit, chick1, mandarin and peanut."""
@@ -47,9 +50,6 @@ def predicted_spread(
     posterior: Posterior,
     sequences: Ordered[Sequence],
     world: World,
-    *,
-    draws: int = DRAWS,
-    seed: int = 0,
     known: Mapping[str, Tensor] | None = None,
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """(figures, standard deviation (T, N) [m] of every particle's position by the sequence's prefix).
@@ -61,8 +61,6 @@ def predicted_spread(
     [m] that the law itself predicts, by the sequence's prefix, where they are at hand. Figures: posterior/draws, posterior/rivals,
     posterior/<prefix>/sd_m and, after first contact and where the true motion is known, posterior/<prefix>/coverage: the share of
     the particles' errors within two standard deviations."""
-    generator = torch.Generator().manual_seed(seed)
-
     base: dict[str, Tensor] = dict(known or {})
     for s in sequences:
         try:
@@ -81,7 +79,7 @@ def predicted_spread(
     def positions(own: Body) -> dict[str, Tensor]:
         return {s.prefix: _positions(own, s, world) for s in sequences}
 
-    laws = [(body.material.law, numbers) for numbers in posterior.draws(draws, generator)]
+    laws = [(body.material.law, numbers) for numbers in posterior.draws(DRAWS)]
     drawn = motions_under(body, laws, positions, quiet=False)
     others = motions_under(body, list(posterior.rivals.items()), positions)
     figures: dict[str, float] = {
@@ -191,9 +189,7 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
 
 
 @torch.no_grad()
-def determined(
-    body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1
-) -> dict[str, float]:
+def determined(body: Body, posterior: Posterior) -> dict[str, float]:
     """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli;
     the spread over other forms of the law that explain the data is part of them), how many of the operator's numbers and of the
     stiffness modes they determine, and the 95 % cone about the stiffest direction: of draws about every form of the law that
@@ -220,12 +216,12 @@ def determined(
             figures[f"posterior/{name}_numbers"] = float(len(index))
             figures[f"posterior/{name}_determined"] = float(posterior.determined[index].sum())
     if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(1)
         axis, _ = stiffest(body.adapter.stiffness().cpu())
         stiffnesses = []
         # wider draws than the likelihood's own
-        away = INFLATION * (posterior.draws(draws, generator) - posterior.mean)
-        for _ in each_law(body, forms[torch.arange(draws) % len(forms)] + away):
+        away = INFLATION * (posterior.draws(OF_CONE, generator) - posterior.mean)
+        for _ in each_law(body, forms[torch.arange(OF_CONE) % len(forms)] + away):
             body.adapter.follow(body.material.poisson())
             stiffnesses.append(body.adapter.stiffness().cpu())
         body.adapter.follow(body.material.poisson())

@@ -337,10 +337,6 @@ def commit_of(job: Job) -> str | None:
     return said.read_text(errors="replace").strip() if job.finished and said.is_file() else None
 
 
-def total_minutes(jobs: Sequence[Job]) -> float:
-    return sum(minutes_taken(job) or 0.0 for job in jobs)
-
-
 def in_turn(jobs: Sequence[Job], devices: Sequence[int | None]) -> list[Job]:
     """In the order in which they run: that of their turns, of one turn the longest first, so that none of them is waited for in the
     end; then what runs alone."""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from loky.process_executor import ProcessPoolExecutor
 
-from mosa.system.refused import let_go
+from mosa.system.machine_errors import free_gpu_cache
 
 IDLE_SECONDS = 300.0  # after which a worker process ends; a running job ends first
 
@@ -98,5 +98,5 @@ def work(program: str, words: list[str], screen: str) -> int:
         end_at_a_stop()
         sys.stdout.flush()
         sys.stderr.flush()
-        let_go()
+        free_gpu_cache()
     return 0

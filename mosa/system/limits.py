@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from mosa.errors import ConfigError, MosaError
-from mosa.system.refused import short_of_memory
+from mosa.system.machine_errors import short_of_memory
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 

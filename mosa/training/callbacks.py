@@ -168,8 +168,20 @@ class ImageStrips(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         shown = [each for each in module.loggers if isinstance(each, PICTURED)]
         if shown and self.every > 0 and module.steps_done % self.every == 0:
-            picture = enlarged(module.strip())
+            picture = enlarged(strip(module))
             add_picture(shown, "real_above_rendered_below", picture, module.steps_done)
+
+
+@torch.no_grad()
+def strip(module: Any) -> Tensor:
+    """(3, 2 h, T w) of the first view of the first sequence: real above, rendered below, every frame from left to right."""
+    take, body = module.takes[0], module.body
+    frames = len(take.cues.positions)
+    rollout = body.simulate(take.start, module.world, frames, take.frame_dt)
+    targets = take.observations.select([0], frames)
+    seen = module.shown(rollout.x, rollout.F_tot, targets)
+    rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
+    return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)
 
 
 LEGIBLE = 320  # [px] least height of a strip of two rows

@@ -98,14 +98,14 @@ class SceneDataModule(L.LightningDataModule):
 
     # ---------------------------------------------------------------- Lightning's hooks
     def prepare_data(self) -> None:
-        """Makes the films of a built-in scene where they are not in the cache, or reads those of a folder. Nothing is kept. Under
-        a trainer that is left to what asks for them: a fit first compares the checkpoint that it goes on from."""
+        """Makes the films of a built-in scene that are not in the cache, or reads those of a folder, and keeps nothing in memory.
+        Does nothing under a trainer: a fit first compares the scene with that of the checkpoint that it resumes."""
         if self.trainer is None:
             load_sequences(plain(self.cfg.scene))
 
     def setup(self, stage: str) -> None:
-        """Loads the films, reconstructs and finds the starts, each once, under a trainer when they are asked for.
-        stage: fit | validate | test | predict."""
+        """Loads the films, reconstructs and finds the starts; under a trainer each is done when it is first needed. stage: fit |
+        validate | test | predict."""
         if self.device is None:
             self.device = "cpu" if self.trainer is None else self.trainer.strategy.root_device
         if self.trainer is None:
@@ -114,12 +114,12 @@ class SceneDataModule(L.LightningDataModule):
                 _ = self.epochs
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Batches of one epoch each time it is iterated over (`Epochs`)."""
+        """`MotionBatch` of one epoch each time that it is iterated over (`Epochs`)."""
         return served(self.epochs)
 
     def val_dataloader(self) -> DataLoader[Any]:
-        """Of the training sequence: held-out cameras in the frames that are learned from, and all cameras in the held-out frames.
-        Empty where nothing is held out."""
+        """The held-out cameras in the training frames, and all cameras in the held-out frames, of the training sequence. Empty
+        where nothing is held out."""
         return served(self.held_back)
 
     def test_dataloader(self) -> DataLoader[Any]:
@@ -137,13 +137,13 @@ class SceneDataModule(L.LightningDataModule):
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
     ) -> Any:
-        """Moves a batch of a fit. Sequences and starts stay: the parts that are needed move later."""
+        """Moves a batch of a fit. Sequences and starts stay where they are: the parts that are needed are moved later."""
         return batch.to(device) if isinstance(batch, MotionBatch) else batch
 
     # ---------------------------------------------------------------- films
     @cached_property
     def taught(self) -> list[str]:
-        """Names of the sequences beside the training one that are learned from."""
+        """Names of the further sequences that are learned from."""
         return taught_names(plain(self.cfg.scene))
 
     @cached_property
@@ -157,13 +157,13 @@ class SceneDataModule(L.LightningDataModule):
 
     @property
     def others(self) -> int:
-        """How many sequences there are beside the training one; films of a built-in scene need not be made for it."""
+        """Number of sequences beside the training one; films of a built-in scene need not be made to count them."""
         if self.scene.synthetic:
             return len(held_out_of(plain(self.cfg.scene)))
         return len(self.scenes[1])
 
     def read_ahead(self) -> None:
-        """Makes the films of the other sequences in a thread beside what comes next; who asks for them waits."""
+        """Makes the films of the other sequences in a background thread; `scenes` waits for it."""
         self._ahead = ThreadPoolExecutor(1).submit(self._first[1])
 
     @cached_property
@@ -173,12 +173,12 @@ class SceneDataModule(L.LightningDataModule):
         return self.scene, [s for s in others if self.held_out or s.sequence in self.taught]
 
     def prefix(self, scene: Scene) -> str:
-        """Of the figures of a sequence beside the training one: `train/<name>` where it is learned from, else `test/<name>`."""
+        """Prefix of the figures of a sequence beside the training one: `train/<name>` if it is learned from, else `test/<name>`."""
         return f"{'train' if scene.sequence in self.taught else 'test'}/{scene.sequence}"
 
     @property
     def fingerprints(self) -> dict[str, str]:
-        """Of the films by sequence, without those that this program makes."""
+        """Fingerprints of the recorded films, by sequence; built-in scenes have none."""
         named = {"train": self.scene} | {self.prefix(scene): scene for scene in self.scenes[1]}
         return {name: scene.fingerprint for name, scene in named.items() if not scene.synthetic}
 
@@ -191,7 +191,7 @@ class SceneDataModule(L.LightningDataModule):
 
     @cached_property
     def spacing(self) -> float:
-        """Of the particles [m]."""
+        """Distance between neighbouring particles [m]."""
         settings = self.settings.simulation
         dx, per_cell = settings.dx, settings.particles_per_cell
         particles = None if settings.particles == "auto" else settings.particles
@@ -212,14 +212,14 @@ class SceneDataModule(L.LightningDataModule):
 
     @property
     def _found_with(self) -> dict[str, Any]:
-        """What is the same for the reconstruction of every sequence."""
+        """Arguments that the reconstructions of all sequences share."""
         settings, device = self.settings, self.device or "cpu"
         return {"settings": settings.reconstruction, "cache_dir": self.cache, "seed": settings.seed,
                 "device": device}  # fmt: skip
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
-        """Of the training sequence."""
+        """Reconstruction of the training sequence."""
         if self.scene.markers is not None:
             return reconstruction_of_markers(self.scene, self.spacing)
         return reconstruct(self.scene, spacing=self.spacing, **self._found_with)
@@ -257,7 +257,7 @@ class SceneDataModule(L.LightningDataModule):
 
     @cached_property
     def starts(self) -> dict[str, Start]:
-        """Initial states by prefix: `start`, of the others also the pose of their frame 0.
+        """Initial states by prefix: `start`, and those of the other sequences, whose pose in frame 0 is found too.
 
         Prefixes: train, then `train/<name>` for sequences that are learned from, `test/<name>` for the rest, in their order."""
         found = {"train": self.start}
@@ -267,12 +267,12 @@ class SceneDataModule(L.LightningDataModule):
 
     @property
     def sequences(self) -> list[EvaluatedSequence]:
-        """What a run is evaluated on: every sequence with its start."""
+        """Every sequence with its start, as a run is evaluated on them."""
         return sequences(self.shape, *self.scenes, self.starts)
 
     @property
     def measured(self) -> BodyRecord:
-        """What a checkpoint keeps of the data, beside the settings: world, density, spacing, starts."""
+        """Record of the data in a checkpoint, beside the settings: world, density, spacing, starts."""
         return measured(plain(self.cfg), self.scene, self.dx, self.starts, self.fingerprints)
 
     # ---------------------------------------------------------------- what a fit reads
@@ -285,7 +285,7 @@ class SceneDataModule(L.LightningDataModule):
         return [self.take(scene, self.starts[prefix], found) for prefix, scene, found in seen]
 
     def take(self, scene: Scene, start: Start, reconstruction: Reconstruction) -> Take:
-        """What the fit reads of one sequence, on the device."""
+        """Training data of one sequence, on the device."""
         device, frames = self.device or "cpu", len(scene.training_frames)
         return Take(
             start, training_observations(scene, reconstruction, margin=self.settings.rendering.margin, device=device),
@@ -295,25 +295,25 @@ class SceneDataModule(L.LightningDataModule):
         )  # fmt: skip
 
     def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
-        """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
+        """Finder of the cues of a sequence about a prediction; None unless reconstruction.informed asks for it."""
         settings = self.settings.reconstruction
         if not settings.looks_again or scene.markers is not None:
             return None
         return SecondLook(scene, reconstruction, settings, self.settings.seed, self.device or "cpu")
 
     def further_cues(self, scene: Scene, reconstruction: Reconstruction) -> dict[str, Tensor]:
-        """Tensors by name that batches carry as `extra`, for loss terms of one's own, frames first. A subclass returns them, of
-        `scene.training_frames` and `scene.training_cameras` alone: the others are held out."""
+        """Tensors by name that batches carry as `extra`, frames first, for loss terms of a subclass that overrides this method.
+        They cover `scene.training_frames` and `scene.training_cameras` alone: the others are held out."""
         return {}
 
     @cached_property
     def epochs(self) -> Epochs:
-        """The batches of training; the fit says before each epoch what it is."""
+        """The training batches; the fit sets their order before each epoch."""
         views = max(1, len(self.takes[0].observations.cameras))  # none beside tracked points
         return Epochs(ViewSchedule(views, self.settings.fit.views, self.settings.seed), self.batch)
 
     def batch(self, views: Sequence[int]) -> MotionBatch:
-        """These views of all sequences that are learned from, in all frames that may be read."""
+        """The given views of all sequences that are learned from, in all training frames."""
         own = (self.sequence_batch(i, take, views) for i, take in enumerate(self.takes))
         return MotionBatch(sequences=tuple(own))
 
@@ -328,7 +328,7 @@ class SceneDataModule(L.LightningDataModule):
 
     @cached_property
     def held_back(self) -> list[MotionBatch]:
-        """The batches of validation, named `cameras` and `frames`."""
+        """The validation batches, named `cameras` and `frames`."""
         scene, margin = self.scene, self.settings.rendering.margin
         parts = {"cameras": (scene.holdout_cameras, scene.training_frames),
                  "frames": (range(len(scene.cameras)), scene.holdout_frames)}  # fmt: skip

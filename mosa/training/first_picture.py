@@ -9,19 +9,16 @@ from pathlib import Path
 import torch
 from lightning.pytorch.loggers import Logger
 
-from mosa.config.build import measured, plain, world_of
-from mosa.data.images.reading import read_image
+from mosa.config.build import body_of, measured, plain, world_of
 from mosa.errors import MosaError
 from mosa.evaluation.analysis.comparison import View
 from mosa.evaluation.analysis.figures import write_strip
 from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.appearance.carried_splats import seen
 from mosa.training.datamodule import SceneDataModule
-from mosa.training.lit_mosa import body_of
-from mosa.training.loggers import PICTURED, add_picture
+from mosa.training.loggers import add_picture
 
 log = logging.getLogger(__name__)
-FILE = "first.png"
 
 
 @torch.no_grad()
@@ -44,9 +41,8 @@ def write_first_picture(folder: Path, data: SceneDataModule, loggers: Sequence[L
     rows = {"film": view.finished(view.real[:frames])} | {
         name: view.finished(view.drawn(seen(body, x, F))) for name, x in motions.items()
     }
-    path = write_strip(folder / FILE, rows, notes={"film": view.moments})
+    path = folder / "first.png"
+    picture = write_strip(path, rows, notes={"film": view.moments})
     log.info("first picture, the reconstruction beside the prior: %s", path)
-    if shown := [each for each in loggers if isinstance(each, PICTURED)]:
-        add_picture(
-            shown, "film_reconstruction_prior", torch.from_numpy(read_image(path)).movedim(-1, 0), 0
-        )
+    shown = torch.from_numpy(picture).movedim(-1, 0) / 255
+    add_picture(loggers, "film_reconstruction_prior", shown, 0)

@@ -26,7 +26,7 @@ from mosa.config.composition import searching
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.settings import arguments_of, nearest, untold
-from mosa.system.refused import short_of_memory
+from mosa.system.machine_errors import short_of_memory
 from mosa.training.callbacks import AtomicCheckpointIO
 from mosa.training.datamodule import SceneDataModule
 from mosa.training.lit_mosa import LitMosa, check_trainer

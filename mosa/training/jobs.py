@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from mosa.config.composition import configuration, said_of
 from mosa.errors import ConfigError, MosaError
 from mosa.system.console import fail, say_version
-from mosa.system.refused import explained, let_go
+from mosa.system.machine_errors import explained, free_gpu_cache
 from mosa.system.screen import tolerant_output
 from mosa.system.threads import settle_threads
 from mosa.training.sweep_table import FAILED, text_of, write_table
@@ -52,9 +52,9 @@ def folder_name(overrides: str) -> str:
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
-def own_groups(command: str, conf: Path | None = None) -> str:
+def own_groups(command: str) -> str:
     """The groups that conf/<command>.yaml chooses from, with their options: lines of --help."""
-    conf = Path(configuration()) if conf is None else conf
+    conf = Path(configuration())
     chosen = OmegaConf.load(conf / f"{command}.yaml").defaults
     names = sorted(name for each in chosen if not isinstance(each, str) for name in each)
     options = {n: sorted(f.stem for f in (conf / n).glob("*.yaml")) for n in names if n != "hydra"}
@@ -284,7 +284,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)
     keep(message)
-    let_go()
+    free_gpu_cache()
     return float("inf")
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -30,7 +29,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import build_body, build_stages, fitting, plain, rehearse, world_of
+from mosa.config.build import body_of, build_fit, fitting, plain, rehearse
 from mosa.config.checkpoints import (
     check_plain,
     check_same_data,
@@ -42,10 +41,9 @@ from mosa.config.checkpoints import (
 )
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
-from mosa.config.effects import warn_of_idle
+from mosa.config.effects import warn_without_effect
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
-from mosa.data.io.forces import forces_from_config
 from mosa.data.observations import Observations
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
@@ -68,7 +66,6 @@ from mosa.modules.fitting.terms import check_terms
 from mosa.modules.fitting.training_sequences import Take, seen_again, with_positions
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
-from mosa.reconstruction.rest_shape import RestShape
 from mosa.rendering.observer import Views, deformed_covariances, observe
 from mosa.system.limits import return_memory
 from mosa.training.datamodule import SceneDataModule
@@ -83,13 +80,6 @@ KEPT = (
     "steps_done", "stage_over", "misfit", "compared", "grounds", "ground_gains", "law_gains", "parts",
 )  # fmt: skip
 """What a checkpoint has of the fit under the same name (`FitRecord`)."""
-
-
-def body_of(shape: RestShape, record: BodyRecord) -> Body:
-    """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
-    body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
-    body.splats = shape.splats
-    return body.to(shape.rest.device)
 
 
 def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
@@ -111,23 +101,6 @@ def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
         )
 
 
-def parts_of(record: BodyRecord, body: Body) -> dict[str, Any]:
-    """What `LitMosa._begin` takes of a record. Errors: ConfigError naming the key."""
-    settings = TrainSettings.part(record.settings)
-    stages = build_stages(settings.fit, body.heterogeneity, body.adapter)
-    filmed = settings.scene.plain().get("format") != "markers"
-    if not settings.reconstruction.informed.iterations or not filmed:
-        stages = [stage for stage in stages if not stage.looks_again]
-    return {
-        "world": replace(world_of(record), forces=forces_from_config(settings.world.forces)),
-        "stages": stages,
-        "weights": settings.losses.weights(),
-        "clip": settings.fit.clip,
-        "criterion": settings.criterion,
-        "settings": settings.identification,
-    }
-
-
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     """Fits a body to one or more sequences in stages: the loss is the mean over them.
 
@@ -145,7 +118,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             settings = TrainSettings.read(self.cfg)
             if not isinstance(first, dict):  # the command line's, which preflight has seen
                 given = [each for each in (first, *overrides) if isinstance(each, str)]
-                warn_of_idle(settings, rehearse(settings), given)
+                warn_without_effect(settings, rehearse(settings), given)
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
         self._begin(None, None, (), torch.ones(3), (), {})
 
@@ -194,7 +167,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         cls, body: Body, *, takes: Sequence[Take | None], world: World, background: Tensor, stages: Sequence[Stage],
         weights: Mapping[str, float], record: BodyRecord | None = None, **parts,
     ) -> LitMosa:  # fmt: skip
-        """Of parts that were made elsewhere (see `_begin`). record: what a checkpoint keeps of them, None: what they say."""
+        """A module of parts that were made elsewhere (see `_begin`). record: kept in its checkpoints; None: made of the parts."""
         if record is None:
             frame_dt = takes[0].frame_dt if takes and takes[0] is not None else 1.0
             record = BodyRecord.of(body, world, frame_dt)
@@ -208,16 +181,16 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def from_record(
         cls, record: BodyRecord, body: Body, *, takes: Sequence[Take | None], background: Tensor
     ) -> LitMosa:
-        """The module that fits `body` in the stages of a run. record: of the run (`mosa.config.build.measured`); takes: what it
-        learns from, none where it is only used. Errors: ConfigError naming the key."""
+        """The module that fits `body` in the stages of a run. record: of the run (`mosa.config.build.measured`); takes: training
+        sequences, none where the module is only used. Errors: ConfigError naming the key."""
         return cls.of_parts(
-            body, takes=takes, background=background, record=record, **parts_of(record, body)
+            body, takes=takes, background=background, record=record, **build_fit(record, body)
         )
 
     # ---------------------------------------------------------------- data
     def setup(self, stage: str) -> None:
-        """Asks the trainer's data module for the body's particles and its world; a fit's data wait
-        until the checkpoint that it goes on from is known to be of this scene."""
+        """Takes the body's particles and its world from the trainer's data module; for a fit not before the checkpoint that it
+        resumes is known to be of this scene."""
         data = self.trainer.datamodule
         if isinstance(data, SceneDataModule):
             if stage != "fit":
@@ -234,7 +207,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.trainer.callbacks.sort(key=order)
 
     def configure_callbacks(self) -> list[L.Callback]:
-        """Asked for first of all, before the data take their time."""
+        """Adds `Stages`, and checks trainer and configurations here, as Lightning calls this before any data are loaded."""
         check_trainer(self.trainer)
         data = getattr(self.trainer, "datamodule", None)
         here = plain(data.cfg) if hasattr(data, "cfg") else {}
@@ -248,22 +221,22 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return [] if known else [Stages()]
 
     def attach_trainer(self) -> None:
-        """`attach` the data of the trainer of a fit, if it has some, on its device."""
+        """Attaches the data module of the trainer of a fit, if it has one, on the trainer's device."""
         data = None if self._trainer is None else self.trainer.datamodule
         if isinstance(data, SceneDataModule):
             self.attach(data)
             self.to(self.device)
 
     def attach(self, data: SceneDataModule, fitting: bool = True) -> None:
-        """Makes the body of the particles of `data` where there is none yet; fitting: and takes what a fit reads. A caller may do
-        it where the body is wanted before there is a trainer. Errors: ConfigError for other particles than a checkpoint's."""
+        """Makes the body from the particles of `data` if there is none yet. fitting: also take the training sequences. Call it to
+        have the body before there is a trainer. Errors: ConfigError if a checkpoint has another number of particles."""
         if self.body is None:
             measured = data.measured
             own = {key: measured.settings[key] for key in OF_DATA if key in measured.settings}
             record = measured.but(settings=self.cfg | own)
             body = body_of(data.shape, record)
             background = data.scene.background.to(body.rest.device)
-            self._begin(record, body, (), background, **parts_of(record, body))
+            self._begin(record, body, (), background, **build_fit(record, body))
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
             raise self.of_another_body(len(data.shape.rest))
@@ -284,7 +257,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         )
 
     def is_plastic(self) -> bool:
-        """Whether the law yields, which candidates for it may not agree on."""
+        """Whether the law yields; candidates for it may differ in this."""
         return law_named(self.body.material.law).plastic
 
     # ---------------------------------------------------------------- state
@@ -294,6 +267,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
+        """Adds the record of the run (`RunRecord`)."""
         cues = responses = None
         if self.informed:
             cues = [take.cues.positions.cpu() for take in self.takes]
@@ -315,6 +289,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         checkpoint["mosa"] = record.plain()
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
+        """Resumes the fit of a checkpoint. Errors: ConfigError if that is of another scene or body, or of another program."""
         if "mosa" not in checkpoint:
             raise ConfigError("ckpt_path: the checkpoint was not written by this program")
         record = RunRecord.read(checkpoint["mosa"])
@@ -353,14 +328,14 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             )
 
     def choose(self, law: str) -> None:
-        """This candidate is the run's backbone from now on; without an adapter that it has no use for."""
+        """Makes this candidate the backbone of the run, and drops an adapter that cannot correct it."""
         self.body.choose(law)
         self.record = self.record.but(law=law)
         self.body.adapter = fitting(self.body.adapter, law)
 
     @property
     def known(self) -> Posterior | None:
-        """What another experiment said of the law's numbers (`identification.known`)."""
+        """Posterior of the law's numbers from another experiment (`identification.known`), None without one."""
         path, material = self.settings.known, self.body.material
         if path is not None and material.law not in self._known:
             found = known_numbers(path, material, self.body.adapter, "identification.known")
@@ -369,28 +344,16 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     @property
     def ground_is_sought(self) -> bool:
-        """Whether nobody said how the ground is touched (scene.ground.mode=auto), and it is not found yet."""
+        """Whether the fit has to find the contact with the ground (scene.ground.mode=auto) and has not found it yet."""
         return self.record is not None and self.record.ground_is_sought
 
     def settle_ground(self, ground: Ground) -> None:
-        """What is simulated and written from now on meets this ground."""
+        """Sets the ground of all further simulations and checkpoints."""
         self.world, self.record = replace(self.world, ground=ground), self.record.on(ground)
-
-    def begin_again(self, ground: Ground | None = None, law: str | None = None) -> None:
-        """All stages from the start, on another ground or about another backbone, with the motion that was seen at first: the
-        second look was about the old ones."""
-        if ground is not None:
-            self.settle_ground(ground)
-        if law is not None:
-            self.choose(law)
-        self.body.load_state_dict(self.untouched, strict=self.body.adapter is not None)
-        self.takes, self.informed = list(self.first_takes), False
-        self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
-        self.stage_over, self.columns = False, None
 
     # ---------------------------------------------------------------- one step
     def configure_optimizers(self):
-        """Of the running stage; `Stages` asks again for the next one."""
+        """The optimiser of the running stage, None after the last; `Stages` asks again for that of the next stage."""
         self.attach_trainer()
         stage = self.stage
         if stage is None:  # the fit has ended
@@ -407,12 +370,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return self.running_optimizer
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> int | None:
-        """The rest of an epoch is left out once its stage is over."""
+        """Skips the rest of an epoch once its stage is over."""
         return -1 if self.stage_over or self.stage is None else None
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor | None:
-        """The loss before the step. By Gauss-Newton: minus the logarithm of the posterior; by Adam: the weighted terms of the views
-        of `batch`, None where the step before was taken back."""
+        """The loss before the step. Gauss-Newton: minus the logarithm of the posterior; Adam: the weighted terms of the views of
+        `batch`, None if the previous step was undone."""
         running = self.stage, len(self.losses)
         return (
             self.newton_loss(*running) if self.stage.newton else self.gradient_loss(*running, batch)
@@ -440,8 +403,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     @torch.no_grad()
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Logs how far the law's free rollout is from what was held back of the training sequence: `val/loss`, the weighted terms
-        of images and mattes, `val/psnr` [dB] in the object's windows, and both by part (`val/cameras/...`, `val/frames/...`)."""
+        """Logs errors of the law's free rollout on the held-out part of the training sequence: `val/loss`, the weighted terms of
+        images and mattes, `val/psnr` [dB] in the object's windows, and both by part (`val/cameras/...`, `val/frames/...`)."""
         (part,), take, body = batch.sequences, self.takes[0], self.body
         values = {"loss": float("inf"), "psnr": -float("inf")}  # of a law that cannot be simulated
         try:
@@ -467,14 +430,14 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         )
 
     def test_dataloader(self) -> DataLoader:
-        """Without a data module: the sequences that the run was evaluated on, from the configuration in its checkpoint. Errors:
-        DataError, ConfigError."""
+        """The sequences that the run was evaluated on, from the configuration in its checkpoint, if there is no data module.
+        Errors: DataError, ConfigError."""
         starts = {prefix: start.plain() for prefix, start in self.record.starts.items()}
         found = run_sequences(self.record.settings["scene"], starts, self.body)
         return DataLoader(found, batch_size=None, collate_fn=lambda sequence: sequence)
 
     def test_step(self, batch, batch_idx: int) -> None:
-        """Logs the figures of docs/figures.md of one sequence, of every model. batch: `evaluation.Sequence`."""
+        """Logs the figures of every model on one sequence (docs/figures.md). batch: `evaluation.Sequence`."""
         here = replace(batch, start=type(batch.start).read(batch.start.written(), self.body.rest))
         settings = TrainSettings.part(self.cfg).evaluation
         figures, _ = evaluate(self.body, [here], self.world, settings)
@@ -492,7 +455,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         return self.twin().simulate(**batch)
 
     def twin(self):
-        """The law that has been learned so far, for simulation (`mosa.twin.Twin`)."""
+        """The law as learned so far, for simulation (`mosa.twin.Twin`)."""
         from mosa.twin.twin import Twin
 
         first = Start.read(self.start, self.body.rest)
@@ -502,8 +465,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **unused
     ) -> LitMosa:
-        """The module of a checkpoint, in evaluation mode: body, world, configuration, and how far its fit was. `trainer.fit` with
-        the scene's data module goes on from there.
+        """The module of a checkpoint, in evaluation mode: body, world, configuration and progress of its fit, which `trainer.fit`
+        with the scene's data module resumes.
 
         The file is read as data (docs/safety.md); Lightning's other arguments (`strict`, `hparams_file`, ...) change nothing.
         Errors: DataError naming the file."""
@@ -516,7 +479,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     # ---------------------------------------------------------------- stages
     def begin(self, stage: Stage) -> None:
-        """What a stage starts from."""
+        """Prepares body, ground and cues for a stage."""
         if stage.start is not None:
             self.body.thaw(stage.start)
         if self.ground_is_sought and not stage.newton:
@@ -535,23 +498,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
 
     def inform(self, response: bool = True) -> None:
-        """The cues of the takes once more, about what the calibrated backbone predicts; response: and what they keep of that."""
+        """Finds the cues again, about the prediction of the calibrated backbone. response: also the share of it that they keep."""
         if any(take.again for take in self.takes):
             self.takes = [seen_again(take, self.body, self.world, response) for take in self.takes]
             self.informed = True
 
-    @torch.no_grad()
-    def measure_misfit(self) -> float:
-        """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
-        misfits, body = [], self.body
-        for take in self.takes:
-            model, seen = body.model().only(adapter=False), take.cues.positions
-            x = body.simulate(take.start, self.world, len(seen), take.frame_dt, model=model).x
-            misfits.append(float(losses.position_loss(x, seen, body.size)))
-        return sum(misfits) / len(misfits)
-
     def finish(self) -> None:
-        """Ends the running stage: the next one follows, or all of them again on another ground."""
+        """Ends the running stage: the next one follows, or all of them again on another ground or about another backbone."""
         stage = self.stage
         if stage.newton:
             if self.goes_back(stage):
@@ -562,7 +515,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.end(stage)
 
     def end(self, stage: Stage) -> None:
-        """Keep the stage's result as a backbone and go on to the next."""
+        """Keeps the stage's result as a backbone and goes on to the next stage."""
         compared = not all(law_named(law).elastic for law in self.compared)
         if stage.calibrates and not stage.looks_again and not compared:
             warn_of_yielding(self.body, self.takes, self.world)
@@ -572,19 +525,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.retreat, self.stage_over = Retreat(), False
 
     # ---------------------------------------------------------------- logs
-    def figures(self) -> dict[str, float]:
-        """What was searched: distances [m] and gains of backbones and contacts, errors [m] of held-back frames."""
-        found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
-        found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
-        found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}
-        if self.parts:
-            found["held_back/position_weight"] = self.weights.get("position", 0.0)
-        found |= {f"id_prior/ground/{k}_m": v for k, v in self.grounds.items() if math.isfinite(v)}
-        gains = self.ground_gains.items()
-        return found | {f"id_prior/ground/{k}_gain": v for k, v in gains if math.isfinite(v)}
-
     def log_values(self, values: dict[str, Tensor | float]) -> None:
-        """These scalars and the parameters, into the logs and `last`."""
+        """Logs these scalars and the parameters of the law, and keeps them in `last`."""
         for name, value in self.body.material.physical().items():
             values[f"id/{name}"] = value.detach()
         height = self.body.contact.height(self.world.ground, self.body.settings.dx)
@@ -592,14 +534,3 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         tensors = {k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}
         self.log_dict(tensors, on_step=True, on_epoch=False)
         self.last |= {k: float(v) for k, v in values.items()}
-
-    @torch.no_grad()
-    def strip(self, view: int = 0) -> Tensor:
-        """(3, 2 h, T w) strip of one view of the first sequence: real above, rendered below, every frame from left to right."""
-        take, body = self.takes[0], self.body
-        frames = len(take.cues.positions)
-        rollout = body.simulate(take.start, self.world, frames, take.frame_dt)
-        targets = take.observations.select([view], frames)
-        seen = self.shown(rollout.x, rollout.F_tot, targets)
-        rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
-        return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)

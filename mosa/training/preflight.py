@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
 from mosa.config.command_settings import EvalSettings, TrainSettings
-from mosa.config.effects import warn_of_idle
+from mosa.config.effects import warn_without_effect
 from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import RunRecord
 from mosa.data.io.forces import curves_of, forces_from_config
@@ -51,7 +51,7 @@ def check_configuration(values: Mapping[str, Any]) -> TrainSettings:
     if settings.evaluation.video:
         ffmpeg("evaluation.video")
     stages = rehearse(settings)
-    warn_of_idle(settings, stages)
+    warn_without_effect(settings, stages)
     return settings
 
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from mosa.config.build import plain
 from mosa.config.checkpoints import check_same_run, read_checkpoint, record_of
 from mosa.errors import ConfigError, DataError
-from mosa.system.refused import LAST
+from mosa.system.machine_errors import LAST
 from mosa.system.whole_files import written_whole
 
 log = logging.getLogger(__name__)

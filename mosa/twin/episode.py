@@ -320,7 +320,7 @@ class Episode:
             none = torch.zeros(*self._leading(), 0, 3, 3).double()
             return none[..., 0], none
         found = self._own(moment, 1, self._stepper.clock.dt if dt is None else dt, after)
-        return found.position[0] - self._up(), found.rotation[0]
+        return found.position[0] - self._raised.unsqueeze(-2), found.rotation[0]
 
     def _own(self, moment: Moment, count: int, dt: float, after: int = 0) -> Poses:
         """(S, [B,] K, ...) of the colliders' own motions, where the simulation sees them."""
@@ -332,10 +332,6 @@ class Episode:
             shape = self.worlds
             return Poses(*(part[:, None].expand(-1, shape, *part.shape[1:]) for part in each[0]))
         return Poses(*(torch.stack(parts, 1) for parts in zip(*each)))
-
-    def _up(self) -> Tensor:
-        """The lifts, to be added to positions ([B,] K, 3)."""
-        return self._raised.unsqueeze(-2)
 
     def _along(
         self, commands: dict[int, dict], driven: Tensor, count: int, dt: float

@@ -170,6 +170,7 @@ def start_in(
                 stacklevel=4,
             )
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
+    x = (center + arms).detach()
     if colliders is not None:
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
     if driven is not None:
@@ -178,58 +179,62 @@ def start_in(
         world = replace(world, gravity=vector("gravity", gravity).detach().to(world.gravity))
     if box is not None:
         world = replace(world, box=box_around(box).to(world.box))
-        x, (low, high) = (center + arms).detach(), world.box.to(arms)
+        low, high = world.box.to(arms)
         outside = float(((x < low) | (x > high)).any(1).double().mean())
         if outside > 0:
             raise ConfigError(
                 f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
                 f"{metres(world.box)} m; its centre is at {metres(center)} m"
             )
-    field, whose = "colliders", ""
-    if colliders is None:
-        field, whose = "world.colliders", "it comes with the twin's run: colliders=[] leaves it out"
-    pressed = check_clear(
-        world.colliders, center + arms, "the body", field, body.spacing, hint=whose
-    )
-    if pressed > 0.25 * body.spacing:
-        warnings.warn(
-            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} "
-            "mm deep in a contact, which throws it off at once: contact begins "
-            f"{500 * body.spacing:.3g} mm, half the particles' spacing, outside of a solid",
-            stacklevel=4,
-        )
-    for i, each in enumerate(world.colliders):
-        if isinstance(each.shape, (HalfSpace, Particles)):
-            continue
-        expected, far = f"{field}[{i}]: expected a", LARGE * body.size
-        away = float((pose_at(each.motion)[0] - center.detach().cpu()).norm()) - reach(each.shape)
-        if (deep := buried(each, world)) > 0:
-            said = f"above the ground, found its highest point {deep:.3g} m below it"
-            warnings.warn(f"{expected} solid {said}: up is {metres(up)}", stacklevel=4)
-        if isinstance(each.shape, SignedDistanceField) and (size := each.shape.extent) > far:
-            warnings.warn(
-                f"{expected} mesh about as large as the body of {body.size:.3g} m, "
-                f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
-                stacklevel=4,
-            )
-        elif away > far or half_width(each.shape) > HUGE * body.size:
-            thick = f"one {2 * half_width(each.shape):.3g} m thick"
-            warnings.warn(
-                f"{expected} solid within reach of the body of {body.size:.3g} m, found "
-                f"{f'it {away:.3g} m away' if away > far else thick}: lengths are in metres",
-                stacklevel=4,
-            )
+    warn_of_solids(body, world, x, center.detach().cpu(), own=colliders is None)
     if float(world.gravity @ world.up) > 0:
         warnings.warn(f"gravity: {metres(world.gravity)} m/s^2 points up", stacklevel=4)
     if world.ground is not None:
-        heights = ((center + arms) @ up).detach()
-        below = float((heights < world.ground.height - 0.25 * body.spacing).double().mean())
+        lowest = world.ground.height - 0.25 * body.spacing
+        below = float((x @ up < lowest).double().mean())
         if below > UNDER:
             raise ConfigError(
                 f"position: expected a body that starts above the ground of {world.ground.height:g} m, "
                 f"found {below:.0%} of it below (height is that of its lowest point above the ground)"
             )
     return start, world
+
+
+def warn_of_solids(body: Body, world: World, x: Tensor, center: Tensor, own: bool) -> None:
+    """Warns of solids that press on the body at its start, lie below the ground, or whose lengths can hardly be metres. x: (N, 3),
+    center: (3,) [m] particles and centre at the start; own: whether the run has these solids. Errors: ConfigError for a solid
+    that the body is inside of."""
+    field = "world.colliders" if own else "colliders"
+    hint = "it comes with the twin's run: colliders=[] leaves it out" if own else ""
+    pressed = check_clear(world.colliders, x, "the body", field, body.spacing, hint=hint)
+    if pressed > 0.25 * body.spacing:
+        warnings.warn(
+            f"{field}: expected a solid that the body is clear of, found it {1e3 * pressed:.3g} "
+            "mm deep in a contact, which throws it off at once: contact begins "
+            f"{500 * body.spacing:.3g} mm, half the particles' spacing, outside of a solid",
+            stacklevel=5,
+        )
+    for i, each in enumerate(world.colliders):
+        if isinstance(each.shape, (HalfSpace, Particles)):
+            continue
+        expected, far = f"{field}[{i}]: expected a", LARGE * body.size
+        away = float((pose_at(each.motion)[0] - center).norm()) - reach(each.shape)
+        if (deep := buried(each, world)) > 0:
+            said = f"above the ground, found its highest point {deep:.3g} m below it"
+            warnings.warn(f"{expected} solid {said}: up is {metres(world.up)}", stacklevel=5)
+        if isinstance(each.shape, SignedDistanceField) and (size := each.shape.longest_side) > far:
+            warnings.warn(
+                f"{expected} mesh about as large as the body of {body.size:.3g} m, "
+                f"found {size:.3g} m: set scale (0.001 for a file in mm), or spacing [m] if it is",
+                stacklevel=5,
+            )
+        elif away > far or half_width(each.shape) > HUGE * body.size:
+            thick = f"one {2 * half_width(each.shape):.3g} m thick"
+            warnings.warn(
+                f"{expected} solid within reach of the body of {body.size:.3g} m, found "
+                f"{f'it {away:.3g} m away' if away > far else thick}: lengths are in metres",
+                stacklevel=5,
+            )
 
 
 def warn_of_creep(body: Body, world: World, frame_dt: float, substeps: int | None) -> None:

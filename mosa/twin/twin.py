@@ -91,7 +91,7 @@ class Twin(InMotion):
 
     @property
     def record(self) -> BodyRecord:
-        """What the body was built from; of a body that no run has made, its parts."""
+        """Record of the run that made the body; of a body from elsewhere, of its parts."""
         if self._record is None:
             self._record = BodyRecord.of(self.body, self.world, self.frame_dt, self.training_start)
         return self._record

@@ -160,9 +160,7 @@ def splat_parts(unit: float, means, covariances, colors, opacities) -> tuple[np.
     return (means / unit).astype(np.float32), covariances / unit**2, colors, opacities[:, None]
 
 
-def add_solid(
-    scene: Any, name: str, shape: Shape, color: tuple[int, int, int] = SOLID, **options
-) -> Any | None:
+def add_solid(scene: Any, name: str, shape: Shape, **options) -> Any | None:
     """A node for a collider's shape, of a mesh as points; None for half spaces, which are not drawn."""
     import trimesh  # viser brings it
 
@@ -177,8 +175,8 @@ def add_solid(
         mesh.apply_translation(-mesh.bounds.mean(0))
     elif isinstance(shape, SignedDistanceField):
         points = surface(shape, shape.spacing).numpy()
-        return scene.add_point_cloud(name, points, color, point_size=shape.spacing, **options)
+        return scene.add_point_cloud(name, points, SOLID, point_size=shape.spacing, **options)
     else:
         return None
-    return scene.add_mesh_simple(name, np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), color=color,
+    return scene.add_mesh_simple(name, np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), color=SOLID,
                                  flat_shading=isinstance(shape, Box), **options)  # fmt: skip

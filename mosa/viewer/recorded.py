@@ -21,7 +21,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.marker_figures import MEASURED, PREDICTED
 from mosa.system.console import begin_log
 from mosa.system.limits import named_device
-from mosa.system.refused import one_message
+from mosa.system.machine_errors import one_message
 from mosa.twin.twin import Twin
 from mosa.viewer.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.viewer.live import Live

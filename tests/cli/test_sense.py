@@ -14,7 +14,7 @@ from mosa.environments.arena import simulator_named
 from mosa.environments.tasks import TASKS, task_named
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.system.limits import named_device
-from mosa.system.refused import memory_message
+from mosa.system.machine_errors import memory_message
 from mosa.twin.twin import Twin
 from mosa.viewer.pages import open_server
 from mosa.viewer.recorded import options

@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import torch
 
-from mosa.system import refused
+from mosa.system import machine_errors
 
 TORCH = torch.OutOfMemoryError(
     "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 139.80 GiB"
@@ -105,6 +105,6 @@ def raised(error: Exception):
 
 
 if __name__ == "__main__":
-    with patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)):
+    with patch.object(machine_errors, "gpu_memory", lambda: (0.1e9, 150e9)):
         for one in PLACES:
             tried(*one)

@@ -11,7 +11,7 @@ import pytest
 
 import mosa
 from mosa.system.caches import FOLDERS, cache_home, default_cache, settle_caches
-from mosa.system.refused import disk_message
+from mosa.system.machine_errors import disk_message
 
 ROOT = Path(mosa.__file__).parents[1]
 ELSEWHERE = ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR")

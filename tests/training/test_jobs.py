@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 
 from mosa.cli.train import train
 from mosa.errors import ConfigError
-from mosa.system import refused
+from mosa.system import machine_errors
 from mosa.system.npz import write_npz
 from mosa.training import jobs
 from mosa.training.jobs import (
@@ -184,16 +184,16 @@ def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alo
         Exception("Failed to load CUDA module 'p2g'"),
         RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED"),
     ):
-        monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+        monkeypatch.setattr(machine_errors, "gpu_memory", lambda: (0.2e9, 150e9))
         HydraConfig.get().mode = RunMode.MULTIRUN
         attempt(fail(error), None)
         assert "the GPU has no memory left" in capsys.readouterr().err
         HydraConfig.get().mode = RunMode.RUN
         for room in (None, (60e9, 150e9)):
-            monkeypatch.setattr(refused, "gpu_memory", lambda r=room: r)
+            monkeypatch.setattr(machine_errors, "gpu_memory", lambda r=room: r)
             with pytest.raises(type(error)):
                 attempt(fail(error), None)
-    monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+    monkeypatch.setattr(machine_errors, "gpu_memory", lambda: (0.2e9, 150e9))
     with pytest.raises(
         ZeroDivisionError
     ):  # a mistake of the program stays one, full as the GPU may be
@@ -211,14 +211,16 @@ def test_a_warning_that_was_made_an_error_is_one_message(sweep, capsys):
 
 
 def test_a_message_about_memory_names_the_checkpoint_that_is_kept(tmp_path):
-    assert refused.explained(MemoryError(), tmp_path) == refused.explained(MemoryError())
-    (tmp_path / refused.LAST).parent.mkdir()
-    (tmp_path / refused.LAST).write_text("")
-    assert f"the fit is kept in {tmp_path / refused.LAST}" in refused.explained(
+    assert machine_errors.explained(MemoryError(), tmp_path) == machine_errors.explained(
+        MemoryError()
+    )
+    (tmp_path / machine_errors.LAST).parent.mkdir()
+    (tmp_path / machine_errors.LAST).write_text("")
+    assert f"the fit is kept in {tmp_path / machine_errors.LAST}" in machine_errors.explained(
         MemoryError(), tmp_path
     )
-    assert refused.explained(ValueError("x"), tmp_path) is None
-    assert "simulation.particles" in refused.explained(
+    assert machine_errors.explained(ValueError("x"), tmp_path) is None
+    assert "simulation.particles" in machine_errors.explained(
         OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
     )
 
@@ -489,7 +491,7 @@ def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkey
 LAUNCHED = """
     import sys
     import warp as wp
-    from mosa.system import refused
+    from mosa.system import machine_errors
     wp.config.kernel_cache_dir = sys.argv[1]
 
     @wp.kernel
@@ -499,7 +501,7 @@ LAUNCHED = """
     try:
         wp.launch(twice, 1, inputs=[wp.ones(1, dtype=float, device="cpu")], device="cpu")
     except Exception as error:
-        print(refused.explained(error))
+        print(machine_errors.explained(error))
     else:
         print("ran")
 """
@@ -538,5 +540,5 @@ def test_damaged_kernels_are_one_message(tmp_path, launched, ending, damage):
 def test_what_a_compiler_refuses_is_no_damaged_kernel():
     """A mistake of the program keeps its traceback."""
     assert (
-        refused.explained(RuntimeError("Failed to load CPU module 'm'")) is None
+        machine_errors.explained(RuntimeError("Failed to load CPU module 'm'")) is None
     )  # not from where Warp loads

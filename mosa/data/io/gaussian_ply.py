@@ -90,25 +90,7 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
     Errors: DataError naming the file and the field: missing, of another number of harmonics, not finite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path}: file not found; expected a PLY file of 3D Gaussians")
-    check_ply(path)
-    try:
-        head, end, body = path.read_bytes().partition(b"end_header")
-        plain = head.decode("ascii", "replace").replace("\ufffd", "?").encode()  # of comments
-        document = PlyData.read(io.BytesIO(plain + end + body))
-        vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
-    except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
-        found = f"a damaged or other one ({error})"
-        raise DataError(
-            f"{path}: expected a PLY file with an element vertex, found {found}"
-        ) from error
-    if any(name.startswith("scalar_") for name in vertices):  # as CloudCompare writes them
-        vertices = {name.removeprefix("scalar_"): column for name, column in vertices.items()}
-    if "packed_position" in vertices:
-        raise DataError(
-            f"{path}: expected a 3DGS PLY, found a compressed one; export it uncompressed"
-        )
+    vertices, comments = vertices_of(path)
     rest = [name for name in vertices if name.startswith("f_rest_")]
     per_channel, left = divmod(len(rest), 3)
     if left or per_channel + 1 not in DEGREES:
@@ -172,9 +154,33 @@ def read_ply(path: str | Path, centred: bool = False) -> tuple[Splats, Tensor, T
             "colours as bytes?"
         )
     colors = mean_colors(coefficients)
-    said = " ".join(document.comments).lower().partition("vertical axis:")[2].split()[:1]
+    said = " ".join(comments).lower().partition("vertical axis:")[2].split()[:1]
     splats = Splats(means, scales, rotations / length, opacities, colors)
     return splats, coefficients, offset, "".join(said)
+
+
+def vertices_of(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns of the vertices by field, and the comments of the header. Errors: DataError naming the file."""
+    if not path.is_file():
+        raise DataError(f"{path}: file not found; expected a PLY file of 3D Gaussians")
+    check_ply(path)
+    try:
+        head, end, body = path.read_bytes().partition(b"end_header")
+        plain = head.decode("ascii", "replace").replace("\ufffd", "?").encode()  # of comments
+        document = PlyData.read(io.BytesIO(plain + end + body))
+        vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
+    except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
+        found = f"a damaged or other one ({error})"
+        raise DataError(
+            f"{path}: expected a PLY file with an element vertex, found {found}"
+        ) from error
+    if any(name.startswith("scalar_") for name in vertices):  # as CloudCompare writes them
+        vertices = {name.removeprefix("scalar_"): column for name, column in vertices.items()}
+    if "packed_position" in vertices:
+        raise DataError(
+            f"{path}: expected a 3DGS PLY, found a compressed one; export it uncompressed"
+        )
+    return vertices, document.comments
 
 
 def _finite(column: np.ndarray, name: str, path: Path, verb: str) -> np.ndarray:

@@ -125,10 +125,10 @@ def write_strip(
     frames: int = 6,
     *,
     notes: Mapping[str, list[str]] | None = None,
-) -> Path:
+) -> np.ndarray:
     """PNG of about `frames` frames from left to right, one captioned row per entry of `columns`, whose sizes may differ. notes: of
-    some rows, a text over each frame."""
-    path, notes = Path(path), notes or {}
+    some rows, a text over each frame. Returns its pixels (H, W, 3) uint8."""
+    notes = notes or {}
     count = min(len(c) for c in columns.values())
     chosen = np.unique(np.linspace(0, count - 1, frames).round().astype(int))
     rows = []
@@ -140,6 +140,7 @@ def write_strip(
     width = max(row.shape[1] for row in rows)
     room = (((0, 0), (0, width - row.shape[1]), (0, 0)) for row in rows)
     rows = [np.pad(row, each, constant_values=255) for row, each in zip(rows, room)]
+    picture = np.concatenate(rows)
     with written_whole(path) as partial:
-        imageio.imwrite(partial, np.concatenate(rows), format="PNG", compress_level=3)
-    return path
+        imageio.imwrite(partial, picture, format="PNG", compress_level=3)
+    return picture

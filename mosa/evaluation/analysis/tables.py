@@ -39,6 +39,7 @@ UNITS = {
     "psnr_crop": ("PSNR crop", 1, 2),
     "ssim_crop": ("SSIM crop", 1, 4),
 }
+METRICS = ("rms_m", "cd_m", "psnr_crop", "ssim_crop")
 FIGURES = (
     "*rms*: root mean square distance of particles from their true places after contact; "
     "*CD*: mean distance to the nearest true particle, plus that in the other direction; "
@@ -46,16 +47,14 @@ FIGURES = (
 )
 
 
-def results_table(
-    figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_crop", "ssim_crop")
-) -> str:
-    """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence, of these metrics and
-    those that were registered."""
+def results_table(figures: Mapping[str, float]) -> str:
+    """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence, of `METRICS` and those
+    that were registered."""
     sequences = _sequences(figures)
     rows = []
     units = UNITS | {name: own[1:] for name, own in MOTION_METRICS.items()}
     units |= {f"{name}_crop": own[1:] for name, own in IMAGE_METRICS.items()}
-    for metric in (*metrics, *(name for name in units if name not in UNITS)):
+    for metric in (*METRICS, *(name for name in units if name not in UNITS)):
         label, scale, digits = units[metric]
         for name, prefix in MODELS:
             values = [figures.get(f"{prefix}{s}/{metric}") for s in sequences]

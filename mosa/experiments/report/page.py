@@ -99,7 +99,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         if provenance:
             parts.append(f"[Tables, seeds, machine and command]({results.name}/{name}.md)")
     beside = [
-        f"[{read_title(page)}]({results.name}/{page.name})"
+        f"[{page.read_text().splitlines()[0].lstrip('# ')}]({results.name}/{page.name})"
         for page in sorted(results.glob("*_from_motion.md"))
     ]
     if beside:
@@ -128,10 +128,6 @@ def ranges(experiment: Experiment, tables: Tables) -> str:
             axes = f"{experiment.rows}, {experiment.columns}"
             lines.append(f"- {figure.label} ({axes}): {min(cells)[1]} to {max(cells)[1]}")
     return "\n".join(lines)
-
-
-def read_title(page: Path) -> str:
-    return page.read_text().partition("\n")[0].lstrip("# ")
 
 
 def state_of(lines: Sequence[str]) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from mosa.data.batches import MotionBatch, SequenceBatch
 from mosa.errors import SimulationDiverged
 from mosa.modules.adapters.penalties import pool
+from mosa.modules.fitting.losses import position_loss
 from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.terms import Extra, Step, evaluate_terms
 from mosa.modules.fitting.training_sequences import Take
@@ -157,6 +158,16 @@ class GradientSteps:
             for name, value in values.items():
                 figures[name] = figures.get(name, 0.0) + value / len(gains)
         return figures
+
+    @torch.no_grad()
+    def measure_misfit(self) -> float:
+        """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
+        misfits, body = [], self.body
+        for take in self.takes:
+            model, seen = body.model().only(adapter=False), take.cues.positions
+            x = body.simulate(take.start, self.world, len(seen), take.frame_dt, model=model).x
+            misfits.append(float(position_loss(x, seen, body.size)))
+        return sum(misfits) / len(misfits)
 
     def active_frames(self, stage: Stage, iteration: int, take: Take) -> int:
         length = len(take.cues.positions)

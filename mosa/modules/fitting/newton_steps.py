@@ -148,12 +148,20 @@ class NewtonSteps:
         return best
 
     def goes_back(self, stage: Stage) -> bool:
-        """Begins all stages again where another ground or backbone explains the motion better at the end of `stage`."""
+        """Begins all stages again where another ground or backbone explains the motion better at the end of `stage`, with the cues
+        as they were found first: the second look was about the old ones."""
         ground = self.better_ground(stage)
         law = self.better_law(stage) if ground is None else None
-        if ground is None and law is None:
+        if ground is not None:
+            self.settle_ground(ground)
+        elif law is not None:
+            self.choose(law)
+        else:
             return False
-        self.begin_again(ground, law)
+        self.body.load_state_dict(self.untouched, strict=self.body.adapter is not None)
+        self.takes, self.informed = list(self.first_takes), False
+        self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
+        self.stage_over, self.columns = False, None
         return True
 
     def go_to(self, ground: Ground, fit: Identification) -> None:
@@ -266,3 +274,14 @@ class NewtonSteps:
         }
         values["fit/distance_m"] = self.identification.distance()
         self.log_values(values)
+
+    def figures(self) -> dict[str, float]:
+        """What was searched: distances [m] and gains of backbones and contacts, errors [m] of held-back frames."""
+        found = {f"id_prior/compared/{law}_m": each for law, each in self.compared.items()}
+        found |= {f"id_prior/gain/{law}": gain for law, gain in self.law_gains.items()}
+        found |= {f"held_back/{name}_m": error for name, error in self.parts.items()}
+        if self.parts:
+            found["held_back/position_weight"] = self.weights.get("position", 0.0)
+        found |= {f"id_prior/ground/{k}_m": v for k, v in self.grounds.items() if math.isfinite(v)}
+        gains = self.ground_gains.items()
+        return found | {f"id_prior/ground/{k}_gain": v for k, v in gains if math.isfinite(v)}

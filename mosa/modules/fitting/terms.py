@@ -33,7 +33,7 @@ class Extra(dict[str, Tensor]):
 
 @dataclass(frozen=True)
 class Step:
-    """What a step sees of one sequence, its first `frames` frames, `frame_dt` [s] apart. rollout: of the body from `start`;
+    """Data of one sequence in a step: its first `frames` frames, `frame_dt` [s] apart. rollout: of the body from `start`;
     targets: real images of the step's views (`targets.cameras.names`); cues: the reconstruction's motion; operator: statistics
     of the adapter's evaluations, pooled over the rollout, None where it has none; misfit: of the model the joint stage starts
     from, over the object's size; views: the step's, as indices into the training cameras; extra: the batch's own, which spans

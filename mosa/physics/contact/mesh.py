@@ -32,8 +32,8 @@ class SignedDistanceField:
     margin: float
 
     @property
-    def extent(self) -> float:
-        """Longest extent of the mesh [m], to a spacing or two."""
+    def longest_side(self) -> float:
+        """Of the box about the mesh [m], to a spacing or two."""
         return self.spacing * (max(self.values.shape) - 1) - 2 * self.margin
 
 

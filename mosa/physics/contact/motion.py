@@ -182,7 +182,7 @@ class Motion:
     def sample(
         self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
     ) -> Pose:
-        """At S = frames * substeps substeps of dt [s] from the `first` one after time `start`.
+        """Poses and velocities at S = frames * substeps substeps of dt [s], from the `first` one after time `start` [s] on.
         Errors: ConfigError naming the field."""
         position = _vectors("position", self.position).cpu()
         attitudes = [rotation_matrices(self.rotation).cpu()]

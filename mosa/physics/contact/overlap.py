@@ -72,7 +72,9 @@ def _hint(collider: Collider, size: float) -> str:
     if isinstance(collider.shape, HalfSpace):
         return "a plane fills all below its xy plane (normal: towards the free side)"
     if isinstance(collider.shape, SignedDistanceField):
-        return f"its mesh is {collider.shape.extent:.3g} m long (scale: 0.001 for a file in mm)"
+        return (
+            f"its mesh is {collider.shape.longest_side:.3g} m long (scale: 0.001 for a file in mm)"
+        )
     if (far := reach(collider.shape)) > HUGE * size:
         return f"it reaches {far:.3g} m from its origin (lengths are in metres)"
     return ""

@@ -99,26 +99,21 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
     return turn
 
 
-def ends_of(x: Tensor) -> np.ndarray:
-    """(2, ..., 3) float64 [m]: lowest and highest coordinates of particles at x (..., N, 3), in one look at the device."""
-    return torch.stack(torch.aminmax(x.detach(), dim=-2)).double().cpu().numpy()
-
-
 def shift_to(
-    ends: np.ndarray, dtype: torch.dtype, turn: Tensor | None, dx: float
+    bounds: np.ndarray, dtype: torch.dtype, turn: Tensor | None, dx: float
 ) -> tuple[float, ...] | None:
-    """`Axes.shift` for particles between `ends` (`ends_of`), of positions of a type, on a grid of dx [m], None where they are near
-    the origin. Errors: ConfigError where the type has no digits for the place, or where worlds are too far from each other."""
-    far = float(np.abs(ends).max())
+    """`Axes.shift` for particles of `extent` bounds (6,) or (B, 6) and positions of a type, on a grid of dx [m], None where they
+    are near the origin. Errors: ConfigError where the type has no digits for the place, or where worlds are too far apart."""
+    far = float(np.abs(bounds).max())
     if not 2 * far >= 0.5 * PERIOD * dx or far == float("inf"):
         return None  # near enough in any axes; or the first substep names the particle
-    low, high = ends.reshape(2, -1, 3)[0].min(0), ends.reshape(2, -1, 3)[1].max(0)
+    low, high = bounds[..., :3].reshape(-1, 3).min(0), bounds[..., 3:].reshape(-1, 3).max(0)
     if far * torch.finfo(dtype).eps > COARSE * dx:
         raise ConfigError(
             f"x: particles are {far:.3g} m from the origin, where {dtype} has no digits for a grid of {dx:.3g} m: "
             "give x in float64, or place body, ground and solids nearer to the origin"
         )
-    if ends.ndim == 3 and (wide := float((high - low).max())) > SPREAD * PERIOD * dx:
+    if bounds.ndim == 2 and (wide := float((high - low).max())) > SPREAD * PERIOD * dx:
         raise ConfigError(
             f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
             "meet, and may be in one place"

@@ -116,16 +116,16 @@ def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> Non
             )
 
 
-def check_above(planes: np.ndarray, ends: np.ndarray, x: Tensor) -> None:
-    """planes: (P, 4) normals and offsets; ends: `ends_of` x (..., N, 3), all in one frame. Errors: ConfigError for a body that lies
-    wholly behind the ground or another plane, which would hold it for ever."""
+def check_above(planes: np.ndarray, bounds: np.ndarray, x: Tensor) -> None:
+    """planes: (P, 4) normals and offsets; bounds: (..., 6) `extent` of x (..., N, 3), all in one frame. Errors: ConfigError for a
+    body that lies wholly behind the ground or another plane, which would hold it for ever."""
     normals, offsets = planes[:, None, :3], planes[:, 3, None]
-    boxes = ends.reshape(2, -1, 3)
-    highest = np.maximum(normals * boxes[0], normals * boxes[1]).sum(-1) - offsets
+    boxes = bounds.reshape(-1, 6)
+    highest = np.maximum(normals * boxes[:, :3], normals * boxes[:, 3:]).sum(-1) - offsets
     askew = np.abs(normals[:, 0]).max(-1) < 1  # there a box reaches farther than the body in it
     if askew.any():
         there = x.detach() @ torch.from_numpy(normals[askew, 0]).to(x).T
-        highest[askew] = there.amax(-2).reshape(len(boxes[0]), -1).T.cpu().numpy() - offsets[askew]
+        highest[askew] = there.amax(-2).reshape(len(boxes), -1).T.cpu().numpy() - offsets[askew]
     if (highest < 0).any():
         raise ConfigError(
             "x: expected a body above the ground and in front of the other planes, found all of it "

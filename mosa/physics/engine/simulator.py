@@ -27,7 +27,7 @@ from mosa.physics.contact.driven import Held, hold, stack_held
 from mosa.physics.contact.motion import Points
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine import inputs
-from mosa.physics.engine.axes import Axes, ends_of, shift_to, turn_along
+from mosa.physics.engine.axes import Axes, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
@@ -286,15 +286,14 @@ class Simulator:
         each = inputs.motions_of_worlds(asked.motions, self.colliders, worlds)
         if self.numerics.driven:
             held = self._held(held, state.x, each, asked.start_time)
-        known = extent(state.x.detach(), state.v.detach()).double().numpy(force=True)
-        ends = known[..., :6].reshape(-1, 2, 3).swapaxes(0, 1)  # of x, (2, 1 or B, 3)
-        ends = ends[:, 0] if worlds is None else ends
-        if (shift := self._origin(state.x, ends, held)) != self._axes.shift:
+        known = extent(state.x, state.v).double().numpy(force=True)
+        if (shift := self._origin(state.x, known[..., :6], held)) != self._axes.shift:
             self._move(shift)
         axes, given = self._axes, state
         state = axes.state(state, self.dtype)
         if not asked.started:
-            inputs.check_above(self._walls, ends if axes == Axes() else ends_of(state.x), state.x)
+            own = known[..., :6] if axes == Axes() else extent(state.x).numpy(force=True)
+            inputs.check_above(self._walls, own, state.x)
         gravities = None
         if worlds is not None:
             gravities = inputs.gravity_of_worlds(gravity, worlds, self.numerics.gravity)
@@ -371,13 +370,13 @@ class Simulator:
             self.numerics, self._ask, lanes, packed, adapter, stride, asked.collect, self.gathers
         )
 
-    def _origin(self, x: Tensor, ends: np.ndarray, held: Held | None) -> tuple[float, ...] | None:
+    def _origin(self, x: Tensor, bounds: np.ndarray, held: Held | None) -> tuple[float, ...] | None:
         """Of the axes for particles at x. In float32 it is near driven particles: what they give
         way by under load is little more than the last digit of a place far away, and what is
         rounded off would let them creep."""
         axes, dx = self._axes, self.numerics.dx
         if held is None or not self.numerics.driven or self.dtype == torch.float64:
-            return shift_to(ends, x.dtype, axes.turn, dx)
+            return shift_to(bounds, x.dtype, axes.turn, dx)
         center = Axes(axes.turn).vectors(x.detach()[held.sets >= 0].double().mean(0).cpu())
         now = torch.tensor(axes.shift or (0.0, 0.0, 0.0), dtype=torch.float64)
         if float((center - now).abs().max()) <= NEAR * dx:
@@ -421,7 +420,7 @@ class Simulator:
     def material_state(
         self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]
     ) -> MaterialState:
-        """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
+        """Material state that adapters read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(
             *material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation))

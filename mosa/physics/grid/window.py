@@ -24,9 +24,9 @@ _OUTWARDS = np.repeat([-1.0, 1.0], 3)
 """Of lowest and highest velocities: what moves a body's lower and its upper ends away from it."""
 
 
-def extent(x: Tensor, v: Tensor) -> Tensor:
-    """(..., 12): lowest and highest x (..., N, 3), lowest and highest v (..., N, 3). NaN stays."""
-    return torch.cat([*torch.aminmax(x, dim=-2), *torch.aminmax(v, dim=-2)], -1)
+def extent(*vectors: Tensor) -> Tensor:
+    """(..., 6) of x (..., N, 3), its lowest and highest coordinates; (..., 12) of x and v, those of x first. NaN stays."""
+    return torch.cat([end for each in vectors for end in torch.aminmax(each, dim=-2)], -1)
 
 
 def fallen(bounds: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:

@@ -11,8 +11,9 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion, rotation_matrices
 from mosa.physics.contact.planes import Plane
-from mosa.physics.engine.axes import PERIOD, Axes, ends_of, shift_to, turn_along
+from mosa.physics.engine.axes import PERIOD, Axes, shift_to, turn_along
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.grid.window import extent
 from mosa.physics.time.adaptive_steps import StepControl
 from mosa.physics.time.clock import Adaptive
 from mosa.types import Ground, ParticleState
@@ -235,7 +236,7 @@ def test_one_simulator_serves_places_that_are_far_from_each_other(make_block):
 
 def test_along_the_grid_and_near_the_origin_nothing_is_computed():
     x = torch.tensor([[0.49 * PERIOD * DX, -0.49 * PERIOD * DX, 0.0]])
-    near, far = (shift_to(ends_of(at), x.dtype, None, DX) for at in (x, x + 1.0))
+    near, far = (shift_to(extent(at).numpy(), x.dtype, None, DX) for at in (x, x + 1.0))
     assert near is None and far is not None
     for normal in ((0, 2, 0), (0, 0, -1), (1, 1e-8, 0)):
         assert turn_along([Plane((0, 0, 0), normal)]) is None

@@ -1,4 +1,4 @@
-"""What the machine refused, in one sentence: a disk, a folder's rights, its memory or that of a GPU. Imports nothing heavy."""
+"""Errors of the machine in one sentence: of a disk, a folder's rights, its memory or that of a GPU. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -141,8 +141,8 @@ def one_message() -> Iterator[None]:
         sys.exit(2)
 
 
-def let_go() -> None:
-    """What torch holds of a GPU's memory and does not use, for the next job of a sweep."""
+def free_gpu_cache() -> None:
+    """Frees the GPU memory that torch holds and does not use, for the next job of a sweep."""
     gc.collect()
     torch = sys.modules.get("torch")
     try:
