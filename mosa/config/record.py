@@ -249,13 +249,14 @@ class FitRecord(Settings):
 
     compared, grounds: mean distances [m] of the candidates for law and contact; ground_gains,
     law_gains: of other contacts and backbones about what was learned, of the logarithm of the
-    likelihood; parts: errors [m] of held-back frames by `search.parts`; cues, responses: of the
-    motion that was found once more."""
+    likelihood; parts: errors [m] of held-back frames by `search.parts`; moves: of the looks of
+    a calibration [m]; cues, responses: of the motion that was found once more."""
 
     stage: Whole
     steps_done: Whole
     losses: Annotated[list[float], Expected("numbers")]
     stage_over: bool = False
+    moves: Annotated[list[float], Expected("numbers")] = []
     particles: Annotated[int, Interval(ge=1)]
     misfit: Positive
     compared: Distances = {}

@@ -85,7 +85,7 @@ def test_a_section_that_is_given_in_part_keeps_the_defaults_of_its_place():
     }
     settings = TrainSettings.read(given)
     assert (settings.fit.joint.lr, settings.fit.joint.start) == (1.0, "prior")
-    assert (settings.fit.prior.looks, settings.reconstruction.appearance.keep) == (3, 1.0)
+    assert (settings.fit.prior.looks, settings.reconstruction.appearance.keep) == (8, 1.0)
 
 
 def test_a_deleted_key_has_its_default():

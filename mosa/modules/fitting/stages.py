@@ -25,7 +25,8 @@ class StageSettings(Settings):
     newton_iterations: Count = 8
     """iterations of Gauss-Newton, at most, each with a Jacobian of its own"""
     looks: Whole = 0
-    """stage `prior` by Gauss-Newton: further calibrations, each after a second fit of the motion"""
+    """stage `prior` by Gauss-Newton: further calibrations at most, each after a second fit of the motion, until that
+    settles"""
     iterations: Whole
     """steps of Adam; 0 leaves the stage out, also by Gauss-Newton"""
     lr: Weight
@@ -136,7 +137,7 @@ class FitSection(Settings):
     clip: Positive = 1.0
     """Adam: bound of the gradient norm of the networks"""
     prior: StageSettings = StageSettings(
-        newton_iterations=8, looks=3, iterations=40, lr=0.1, lr_contact=0.03, converged=1e-3
+        newton_iterations=8, looks=8, iterations=40, lr=0.1, lr_contact=0.03, converged=1e-3
     )
     """first stage: the calibrated prior"""
     prior_eta: StageSettings = StageSettings(

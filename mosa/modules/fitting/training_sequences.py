@@ -42,12 +42,13 @@ CORRECTING = 0.5
 """Share of its distance from what was seen that the second prediction closes in a frame (`ready.corrected_rollout`)."""
 
 
-def seen_again(take: Take, body: Body, world: World, response: bool = True) -> Take:
-    """With the cues about what the backbone of `body`, as it stands, predicts; as it is where it has no second look.
+def seen_again(take: Take, body: Body, world: World, response: bool = True) -> tuple[Take, float]:
+    """With the cues about what the backbone of `body`, as it stands, predicts, and how far that moved them [m], rms; as it is where
+    it has no second look.
 
     response: whether it shall be found what the cues keep of the prediction."""
     if take.again is None:
-        return take
+        return take, 0.0
     model, seen = body.model().only(heterogeneity=False, adapter=False), take.cues.positions
 
     @torch.no_grad()
@@ -73,7 +74,7 @@ def seen_again(take: Take, body: Body, world: World, response: bool = True) -> T
         "motion of %s fitted again, from the calibrated law's prediction: changed by %.2g mm (rms)"
     )
     log.info(told, name, 1e3 * moved)
-    return replace(take, cues=cues, response=found)
+    return replace(take, cues=cues, response=found), moved
 
 
 def with_positions(

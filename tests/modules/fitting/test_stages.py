@@ -1,9 +1,12 @@
 import pytest
 import torch
+from small_bodies import WORLD, small_body, start, take_of
+from without_trainer import identify
 
 from mosa.data.batches import Epochs, ViewSchedule
 from mosa.errors import ConfigError
-from mosa.modules.fitting.stages import Stage
+from mosa.modules.fitting.stages import Stage, recalibrations
+from mosa.training.lit_mosa import LitMosa
 
 
 def test_prior_stage_brings_frames_in_progressively_and_reaches_all():
@@ -72,3 +75,16 @@ def test_a_stage_says_what_it_learns_and_what_its_result_is_kept_as():
         {"prior_eta"},
         set(),
     ]
+
+
+@pytest.mark.parametrize("moves", [[1e-2, 9e-3], [1e-2, 5e-3, 2e-3], [1e-3, 2e-4, 2e-4]])
+def test_a_calibration_looks_again_until_the_motion_settles(monkeypatch, moves):
+    """moves: how far [m] each look moves the motion; three are the most."""
+    left = list(moves)
+    monkeypatch.setattr(LitMosa, "inform", lambda self, response: left.pop(0))
+    begun = Stage(name="prior", iterations=1, lr=0.1, optimizer="gauss_newton", looks=3)
+    take = take_of(small_body(adapter=False), start(turn=0.5, speed=-2.0), 4)
+    module = LitMosa.of_parts(small_body(adapter=False), takes=[take], world=WORLD, background=torch.ones(3),
+                              weights={"position": 1.0}, stages=recalibrations([begun]))  # fmt: skip
+    identify(module)
+    assert left == [] and module.posterior is not None
