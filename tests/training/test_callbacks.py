@@ -96,8 +96,8 @@ def test_a_state_that_a_checkpoint_could_not_be_read_with_is_named(value):
 
 
 @pytest.mark.parametrize("override, message", [
-    ("+trainer.precision=64-true", r"trainer\.precision: expected 32-true, found '64-true'"),
-    ("+trainer.precision=16-mixed", r"trainer\.precision: .*found '16-mixed'"),
+    ("trainer.precision=64-true", r"trainer\.precision: expected 32-true, found '64-true'"),
+    ("trainer.precision=16-mixed", r"trainer\.precision: .*found '16-mixed'"),
     ("trainer.max_epochs=many", r"trainer\.max_epochs: expected a whole number, or null, found 'many'"),
     ("+trainer.accumulate_grad_batches=2", r"trainer\.accumulate_grad_batches: expected 1, found 2"),
     ("+trainer.maxtime=1", r"trainer\.maxtime: unknown key; .*nearest is trainer\.max_time"),
