@@ -495,7 +495,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             self.settle_ground(self.world.ground)
         if stage.looks_again or not (stage.calibrates or self.informed):
             moved = self.inform(response=stage.newton and not stage.calibrates)
-            self.moves = [*self.moves, moved] if stage.looks_again else []
+            # a look that a stop cut short is made again, about cues that have moved already
+            if stage.looks_again and len(self.moves) < self.stage_index:
+                self.moves = [*self.moves, moved]
         return_memory()
         if stage.learns_adapter and self.body.adapter is not None:
             self.body.switch_on()

@@ -87,4 +87,17 @@ def test_a_calibration_looks_again_until_the_motion_settles(monkeypatch, moves):
     module = LitMosa.of_parts(small_body(adapter=False), takes=[take], world=WORLD, background=torch.ones(3),
                               weights={"position": 1.0}, stages=recalibrations([begun]))  # fmt: skip
     identify(module)
-    assert left == [] and module.posterior is not None
+    assert left == [] and module.posterior is not None and module.moves == moves
+
+
+def test_a_look_that_is_made_again_after_a_stop_counts_once(monkeypatch):
+    """The cues have moved already, and hardly move again: that would say that they have settled, or that they never do."""
+    moves = iter([1e-2, 1e-5])
+    monkeypatch.setattr(LitMosa, "inform", lambda self, response: next(moves))
+    begun = Stage(name="prior", iterations=1, lr=0.1, optimizer="gauss_newton", looks=3)
+    module = LitMosa.of_parts(small_body(adapter=False), takes=[], world=WORLD, background=torch.ones(3),
+                              weights={"position": 1.0}, stages=recalibrations([begun]))  # fmt: skip
+    module.stage_index = 1
+    for _ in range(2):
+        module.begin(module.stage)
+    assert module.moves == [1e-2] and next(moves, None) is None
