@@ -22,10 +22,8 @@ from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.system.progress import tqdm
 from mosa.system.threads import apart
 
-DRAWS, OF_CONE = (
-    12,
-    400,
-)  # of the posterior: that are rolled out, and for the cone about the stiffest direction
+DRAWS, OF_CONE = 12, 400
+"""Of the posterior: those that are rolled out, and those for the cone about the stiffest direction."""
 INFLATION = 1.75
 """Factor of the standard deviation of the numbers that are said, and of predictions where a law has no rivals. Frames of a motion
 are less independent than the likelihood takes them to be; chosen on the held-out drops of rabbit, chick1, mandarin and peanut."""

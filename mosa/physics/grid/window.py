@@ -26,7 +26,7 @@ _OUTWARDS = np.repeat([-1.0, 1.0], 3)
 
 def extent(*vectors: Tensor) -> Tensor:
     """(..., 6) of x (..., N, 3), its lowest and highest coordinates; (..., 12) of x and v, those of x first. NaN stays."""
-    return torch.cat([end for each in vectors for end in torch.aminmax(each, dim=-2)], -1)
+    return torch.cat([end for x in vectors for end in torch.aminmax(x.detach(), dim=-2)], -1)
 
 
 def fallen(bounds: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
