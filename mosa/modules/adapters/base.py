@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.modules.adapters import microplane
 from mosa.modules.adapters.penalties import (
     PENALTIES,
     OperatorStatistics,
@@ -161,7 +160,4 @@ class Adapter(nn.Module):
             raise ConfigError("adapter: statistics are of the last evaluation, and there was none")
         if isinstance(self._last, Tensor):
             return statistics_of(self._last)
-        C, pre, post = self._last
-        if C.shape[-1] == 12:  # the fused kernels leave the numbers that the matrices are made of
-            C = microplane.correction(C)
-        return statistics(C, pre, post)
+        return statistics(*self._last)

@@ -13,6 +13,8 @@ from torch.utils.checkpoint import checkpoint
 from mosa.errors import ConfigError
 from mosa.modules.adapters.base import Adapter
 from mosa.modules.adapters.fused.selection import chosen, weights_of
+from mosa.modules.adapters.microplane import OFFSET
+from mosa.modules.adapters.penalties import OperatorStatistics, statistics
 from mosa.modules.adapters.progressive import Correction, ProgressiveOperator, apply
 from mosa.modules.adapters.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
 from mosa.modules.adapters.warm_start import warm_start
@@ -122,6 +124,13 @@ class StressAdapter(Adapter):
             plastic_G, plastic_h = plastic_G.to(outer), plastic_h.to(outer)
         return AdapterOperator(G.to(outer), h.to(outer), plastic_G, plastic_h)
 
+    def statistics(self) -> OperatorStatistics:
+        """As `Adapter.statistics`; the fused kernels leave the numbers that the matrices are made of."""
+        if self._last is None or self._last[0].shape[-1] != 12:
+            return super().statistics()
+        numbers, pre, post = self._last
+        return statistics(self.operator.correction(numbers), pre, post)
+
     def _evaluate(
         self, operator: ProgressiveOperator, w: Tensor, s: Tensor, unit: Tensor
     ) -> tuple[Tensor, Tensor, Correction]:
@@ -130,7 +139,15 @@ class StressAdapter(Adapter):
             from mosa.modules.adapters.fused.operation import Settings, fused_operator
 
             scale = float(operator.scale)
-            settings = Settings(operator.alpha, operator.l_max, scale, self.rest_free)
+            diagonal = 1.0 if operator.factors == "residual" else OFFSET
+            settings = Settings(
+                operator.alpha,
+                operator.alpha_normal,
+                diagonal,
+                operator.l_max,
+                scale,
+                self.rest_free,
+            )
             found = fused_operator(w, s, unit.reshape(1), settings, weights_of(operator))
             G, h, numbers, pre, post = found
             return G, h, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))

@@ -3,8 +3,9 @@
 Plane p has the components (p, c1, c2) of vech: (xx, xy, zx), (yy, yz, xy), (zz, zx, yz). Each shear is the second component of one
 plane and the third of the next, and their mean; so with planes in cyclic order all three are treated alike.
 t: (48, M) bounded numbers, 12 a matrix, C_x, C_y, C_z, C_xyz; s1, pre: (6, M). The 6x6 operator G = A - I and its action on s1 and
-on pre are made in one pass. `finish` turns b (6, M), row N the state at rest, into h = unit (b - b at rest); gh (N, 6): adjoint of
-h, rest (6,): its sum over the particles.
+on pre are made in one pass. D: the diagonal that both factors of a matrix start from, 1 where C = (I + L)(I + U) - I, the offset e
+where C is (e I + L)(e I + U) itself. `finish` turns b (6, M), row N the state at rest, into h = unit (b - b at rest); gh (N, 6):
+adjoint of h, rest (6,): its sum over the particles.
 """
 
 import os
@@ -26,34 +27,36 @@ def numbers(t, r, M, first: tl.constexpr):
 
 
 @triton.jit
-def correction(t, r, M, first: tl.constexpr):
-    """The nine entries of C = (I + L)(I + U) - I, row by row."""
+def correction(t, r, M, first: tl.constexpr, D: tl.constexpr):
+    """The nine entries of C, row by row."""
+    own: tl.constexpr = 0.0 if D == 1.0 else D * D
     u00, u01, u02, u11, u12, u22, l00, l10, l11, l20, l21, l22 = numbers(t, r, M, first)
     return (
-        l00 + u00 + l00 * u00, u01 + l00 * u01, u02 + l00 * u02,
-        l10 + l10 * u00, l11 + u11 + l10 * u01 + l11 * u11, u12 + l10 * u02 + l11 * u12,
-        l20 + l20 * u00, l21 + l20 * u01 + l21 * u11, l22 + u22 + l20 * u02 + l21 * u12 + l22 * u22,
+        own + D * (l00 + u00) + l00 * u00, D * u01 + l00 * u01, D * u02 + l00 * u02,
+        D * l10 + l10 * u00, own + D * (l11 + u11) + l10 * u01 + l11 * u11, D * u12 + l10 * u02 + l11 * u12,
+        D * l20 + l20 * u00, D * l21 + l20 * u01 + l21 * u11, own + D * (l22 + u22) + l20 * u02 + l21 * u12 + l22 * u22,
     )  # fmt: skip
 
 
 @triton.jit
 def correction_adjoint(
-    t, gt, extra, r, N, M, first: tl.constexpr, EXTRA: tl.constexpr, a00, a01, a02, a10, a11, a12, a20, a21, a22,
+    t, gt, extra, r, N, M, first: tl.constexpr, EXTRA: tl.constexpr, D: tl.constexpr,
+    a00, a01, a02, a10, a11, a12, a20, a21, a22,
 ):  # fmt: skip
     """Store the adjoints of the 12 numbers of a matrix, from those of its entries; extra: (N, 48) adjoints from elsewhere."""
     u00, u01, u02, u11, u12, u22, l00, l10, l11, l20, l21, l22 = numbers(t, r, M, first)
-    adjoint(gt, extra, r, N, M, first, EXTRA, a00 * (1.0 + l00) + a10 * l10 + a20 * l20)
-    adjoint(gt, extra, r, N, M, first + 1, EXTRA, a01 * (1.0 + l00) + a11 * l10 + a21 * l20)
-    adjoint(gt, extra, r, N, M, first + 2, EXTRA, a02 * (1.0 + l00) + a12 * l10 + a22 * l20)
-    adjoint(gt, extra, r, N, M, first + 3, EXTRA, a11 * (1.0 + l11) + a21 * l21)
-    adjoint(gt, extra, r, N, M, first + 4, EXTRA, a12 * (1.0 + l11) + a22 * l21)
-    adjoint(gt, extra, r, N, M, first + 5, EXTRA, a22 * (1.0 + l22))
-    adjoint(gt, extra, r, N, M, first + 6, EXTRA, a00 * (1.0 + u00) + a01 * u01 + a02 * u02)
-    adjoint(gt, extra, r, N, M, first + 7, EXTRA, a10 * (1.0 + u00) + a11 * u01 + a12 * u02)
-    adjoint(gt, extra, r, N, M, first + 8, EXTRA, a11 * (1.0 + u11) + a12 * u12)
-    adjoint(gt, extra, r, N, M, first + 9, EXTRA, a20 * (1.0 + u00) + a21 * u01 + a22 * u02)
-    adjoint(gt, extra, r, N, M, first + 10, EXTRA, a21 * (1.0 + u11) + a22 * u12)
-    adjoint(gt, extra, r, N, M, first + 11, EXTRA, a22 * (1.0 + u22))
+    adjoint(gt, extra, r, N, M, first, EXTRA, a00 * (D + l00) + a10 * l10 + a20 * l20)
+    adjoint(gt, extra, r, N, M, first + 1, EXTRA, a01 * (D + l00) + a11 * l10 + a21 * l20)
+    adjoint(gt, extra, r, N, M, first + 2, EXTRA, a02 * (D + l00) + a12 * l10 + a22 * l20)
+    adjoint(gt, extra, r, N, M, first + 3, EXTRA, a11 * (D + l11) + a21 * l21)
+    adjoint(gt, extra, r, N, M, first + 4, EXTRA, a12 * (D + l11) + a22 * l21)
+    adjoint(gt, extra, r, N, M, first + 5, EXTRA, a22 * (D + l22))
+    adjoint(gt, extra, r, N, M, first + 6, EXTRA, a00 * (D + u00) + a01 * u01 + a02 * u02)
+    adjoint(gt, extra, r, N, M, first + 7, EXTRA, a10 * (D + u00) + a11 * u01 + a12 * u02)
+    adjoint(gt, extra, r, N, M, first + 8, EXTRA, a11 * (D + u11) + a12 * u12)
+    adjoint(gt, extra, r, N, M, first + 9, EXTRA, a20 * (D + u00) + a21 * u01 + a22 * u02)
+    adjoint(gt, extra, r, N, M, first + 10, EXTRA, a21 * (D + u11) + a22 * u12)
+    adjoint(gt, extra, r, N, M, first + 11, EXTRA, a22 * (D + u22))
 
 
 @triton.jit
@@ -162,21 +165,23 @@ def store_operator(G, r, X, Y, Z, K, mine, others):
 
 
 @triton.jit
-def corrections(t, r, M):
+def corrections(t, r, M, D: tl.constexpr):
     """Entries of C_x, C_y, C_z and C_xyz."""
     return (
-        correction(t, r, M, 0),
-        correction(t, r, M, 12),
-        correction(t, r, M, 24),
-        correction(t, r, M, 36),
+        correction(t, r, M, 0, D),
+        correction(t, r, M, 12, D),
+        correction(t, r, M, 24, D),
+        correction(t, r, M, 36, D),
     )
 
 
 @triton.jit(do_not_specialize=["N"])
-def assemble(t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, BLOCK: tl.constexpr):
+def assemble(
+    t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, D: tl.constexpr, BLOCK: tl.constexpr
+):
     """s2 = (I + G) s1 (6, M); OPERATOR: also moved = (I + G) pre (6, M), and G (N, 6, 6)."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    X, Y, Z, K = corrections(t, r, M)
+    X, Y, Z, K = corrections(t, r, M, D)
     store_moved(s1, s2, r, M, X, Y, Z, K, r < M)
     if OPERATOR:
         store_moved(pre, moved, r, M, X, Y, Z, K, r < M)
@@ -185,8 +190,8 @@ def assemble(t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, BLOCK: tl.c
 
 @triton.jit
 def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
-    """(v0, v1, v2, u00, u01, u02, l00) of n = (1 + l00) ((1 + u00) v0 + u01 v1 + u02 v2), the normal traction on a plane after its
-    correction: row 0 of (I + L)(I + U) on its components v of s1."""
+    """(v0, v1, v2, u00, u01, u02, l00) of n = (D + l00) ((D + u00) v0 + u01 v1 + u02 v2), beside v0 itself where D is not 1: the
+    normal traction on a plane after its correction, row 0 of I + C on its components v of s1."""
     first = t + 12 * plane * M + r
     v0, v1, v2 = components(s1, r, M, plane, c1, c2)
     u00, u01, u02 = tl.load(first), tl.load(first + M), tl.load(first + 2 * M)
@@ -194,22 +199,25 @@ def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr)
 
 
 @triton.jit
-def store_normal(t, s1, out, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
+def store_normal(
+    t, s1, out, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, D: tl.constexpr
+):  # fmt: skip
     v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
-    tl.store(out + plane * M + r, scale * (1.0 + l00) * (v0 + u00 * v0 + u01 * v1 + u02 * v2))
+    n = (D + l00) * (D * v0 + u00 * v0 + u01 * v1 + u02 * v2)
+    tl.store(out + plane * M + r, scale * (n if D == 1.0 else v0 + n))
 
 
 @triton.jit
-def store_normals(t, s1, out, r, M, scale):
+def store_normals(t, s1, out, r, M, scale, D: tl.constexpr):
     """Rows r of the last three inputs of Psi2 (3, M): scaled normal tractions on the corrected planes."""
-    store_normal(t, s1, out, r, M, scale, 0, 5, 4)
-    store_normal(t, s1, out, r, M, scale, 1, 3, 5)
-    store_normal(t, s1, out, r, M, scale, 2, 4, 3)
+    store_normal(t, s1, out, r, M, scale, 0, 5, 4, D)
+    store_normal(t, s1, out, r, M, scale, 1, 3, 5, D)
+    store_normal(t, s1, out, r, M, scale, 2, 4, 3, D)
 
 
 @triton.jit
-def normals(t, s1, out, M, scale, BLOCK: tl.constexpr):
-    store_normals(t, s1, out, tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), M, scale)
+def normals(t, s1, out, M, scale, D: tl.constexpr, BLOCK: tl.constexpr):
+    store_normals(t, s1, out, tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), M, scale, D)
 
 
 @triton.jit
@@ -219,27 +227,28 @@ def add(p, value):
 
 @triton.jit
 def normal_adjoint(
-    t, s1, gn, gt, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr
-):
+    t, s1, gn, gt, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, D: tl.constexpr
+):  # fmt: skip
     """Adds to gt; returns the adjoints of the three components of s1."""
     v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
     g = scale * tl.load(gn + plane * M + r)
-    k = g * (1.0 + l00)
+    k = g * (D + l00)
     first = gt + 12 * plane * M + r
     add(first, k * v0)
     add(first + M, k * v1)
     add(first + 2 * M, k * v2)
-    add(first + 6 * M, g * (v0 + u00 * v0 + u01 * v1 + u02 * v2))
-    return k * (1.0 + u00), k * u01, k * u02
+    add(first + 6 * M, g * (D * v0 + u00 * v0 + u01 * v1 + u02 * v2))
+    own = k * (D + u00)
+    return own if D == 1.0 else g + own, k * u01, k * u02
 
 
 @triton.jit
-def normals_adjoint(t, s1, gn, gt, gs1, M, scale, BLOCK: tl.constexpr):
+def normals_adjoint(t, s1, gn, gt, gs1, M, scale, D: tl.constexpr, BLOCK: tl.constexpr):
     """Adds the adjoints from those of the scaled normals, gn (3, M), to gt (48, M) and gs1 (6, M)."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    xa, xb, xc = normal_adjoint(t, s1, gn, gt, r, M, scale, 0, 5, 4)
-    ya, yb, yc = normal_adjoint(t, s1, gn, gt, r, M, scale, 1, 3, 5)
-    za, zb, zc = normal_adjoint(t, s1, gn, gt, r, M, scale, 2, 4, 3)
+    xa, xb, xc = normal_adjoint(t, s1, gn, gt, r, M, scale, 0, 5, 4, D)
+    ya, yb, yc = normal_adjoint(t, s1, gn, gt, r, M, scale, 1, 3, 5, D)
+    za, zb, zc = normal_adjoint(t, s1, gn, gt, r, M, scale, 2, 4, 3, D)
     add(gs1 + r, xa)
     add(gs1 + M + r, ya)
     add(gs1 + 2 * M + r, za)
@@ -304,11 +313,11 @@ def seed_of(gG, r, N, row: tl.constexpr, column: tl.constexpr):
 @triton.jit
 def plane_adjoint(
     t, s1, pre, gG, S, B, gt, extra, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, k0, k1, k2,
-    EXTRA: tl.constexpr,
+    EXTRA: tl.constexpr, D: tl.constexpr,
 ):  # fmt: skip
     """Stores the adjoints of the plane's numbers; returns those of column p of C_xyz (3), of the plane's components of s1 (3) and
     of pre (3). S, B: adjoints of s2 and moved (6)."""
-    C = correction(t, r, M, 12 * p)
+    C = correction(t, r, M, 12 * p, D)
     n, y0, y1, y2, a, b, c, v0, v1, v2 = moved_adjoint(s1, r, M, p, c1, c2, C, k0, k1, k2, S)
     j, x0, x1, x2, d, e, f, p0, p1, p2 = moved_adjoint(pre, r, M, p, c1, c2, C, k0, k1, k2, B)
     q00, q01, q02 = seed_of(gG, r, N, 0, p), seed_of(gG, r, N, 0, c1), seed_of(gG, r, N, 0, c2)
@@ -321,7 +330,7 @@ def plane_adjoint(
     o1 = q01 if p == 0 else (q11 if p == 1 else q21)
     o2 = q02 if p == 0 else (q12 if p == 1 else q22)
     correction_adjoint(
-        t, gt, extra, r, N, M, 12 * p, EXTRA,
+        t, gt, extra, r, N, M, 12 * p, EXTRA, D,
         y0 * a + x0 * d + o0 + k0 * q00 + k1 * q10 + k2 * q20,
         y0 * b + x0 * e + o1 + k0 * q01 + k1 * q11 + k2 * q21,
         y0 * c + x0 * f + o2 + k0 * q02 + k1 * q12 + k2 * q22,
@@ -348,11 +357,11 @@ def store_six(out, r, M, a, b, c, d, e, f):
 @triton.jit(do_not_specialize=["N"])
 def assemble_adjoint(
     t, s1, pre, gG, gh, rest, unit, gs2, extra, gt, gs1, gpre, N, M,
-    RESTED: tl.constexpr, EXTRA: tl.constexpr, BLOCK: tl.constexpr,
+    RESTED: tl.constexpr, EXTRA: tl.constexpr, D: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """From the adjoints gG (N, 6, 6) of G, gh (N, 6) of h and gs2 (6, M) of s2: gt (48, M), gs1 and gpre (6, M)."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    K = correction(t, r, M, 36)
+    K = correction(t, r, M, 36, D)
     S = six(gs2, r, M)
     B = (
         seed_of_b(gh, rest, unit, r, N, 0, RESTED), seed_of_b(gh, rest, unit, r, N, 1, RESTED),
@@ -360,14 +369,14 @@ def assemble_adjoint(
         seed_of_b(gh, rest, unit, r, N, 4, RESTED), seed_of_b(gh, rest, unit, r, N, 5, RESTED),
     )  # fmt: skip
     x0, x1, x2, xa, xb, xc, xd, xe, xf = plane_adjoint(
-        t, s1, pre, gG, S, B, gt, extra, r, N, M, 0, 5, 4, K[0], K[3], K[6], EXTRA
+        t, s1, pre, gG, S, B, gt, extra, r, N, M, 0, 5, 4, K[0], K[3], K[6], EXTRA, D
     )
     y0, y1, y2, ya, yb, yc, yd, ye, yf = plane_adjoint(
-        t, s1, pre, gG, S, B, gt, extra, r, N, M, 1, 3, 5, K[1], K[4], K[7], EXTRA
+        t, s1, pre, gG, S, B, gt, extra, r, N, M, 1, 3, 5, K[1], K[4], K[7], EXTRA, D
     )
     z0, z1, z2, za, zb, zc, zd, ze, zf = plane_adjoint(
-        t, s1, pre, gG, S, B, gt, extra, r, N, M, 2, 4, 3, K[2], K[5], K[8], EXTRA
+        t, s1, pre, gG, S, B, gt, extra, r, N, M, 2, 4, 3, K[2], K[5], K[8], EXTRA, D
     )
-    correction_adjoint(t, gt, extra, r, N, M, 36, EXTRA, x0, y0, z0, x1, y1, z1, x2, y2, z2)
+    correction_adjoint(t, gt, extra, r, N, M, 36, EXTRA, D, x0, y0, z0, x1, y1, z1, x2, y2, z2)
     store_six(gs1, r, M, xa, ya, za, yb + zc, zb + xc, xb + yc)
     store_six(gpre, r, M, xd, yd, zd, ye + zf, ze + xf, xe + yf)

@@ -27,9 +27,12 @@ REGISTERS = 168
 
 
 class Settings(NamedTuple):
-    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`."""
+    """alpha, alpha_normal, l_max, scale: as `ProgressiveOperator`; diagonal: what both factors of its matrices start from (D of
+    assembly_kernels.py); rest_free: as `StressAdapter`."""
 
     alpha: float
+    alpha_normal: float
+    diagonal: float
     l_max: float | None
     scale: float
     rest_free: bool
@@ -77,18 +80,20 @@ def _evaluate(
     """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
     n, m, hidden = launch.n, launch.rows, launch.hidden
     b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
-    bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
+    bound, scale, D = settings.l_max or 0.0, settings.scale, settings.diagonal
     grid, size = launch.grid, launch.forward
     network_kernels.phi_forward[grid](
         w, s, unit, *weights[:6], b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size
     )  # fmt: skip
     network_kernels.psi1_forward[grid](
-        w, b.s1, *weights[6:14], b.l1, b.t, n, m, scale, alpha, **size
+        w, b.s1, *weights[6:14], b.l1, b.t, n, m, scale, settings.alpha, **size
     )
-    assembly_kernels.normals[launch.lanes](b.t, b.s1, b.l1[hidden:], m, scale, BLOCK=LANES)
-    network_kernels.psi2_forward[grid](b.l1, *weights[14:20], b.t, b.l2, n, m, alpha, **size)
+    assembly_kernels.normals[launch.lanes](b.t, b.s1, b.l1[hidden:], m, scale, D=D, BLOCK=LANES)
+    network_kernels.psi2_forward[grid](
+        b.l1, *weights[14:20], b.t, b.l2, n, m, settings.alpha_normal, **size
+    )
     assembly_kernels.assemble[launch.lanes](
-        b.t, b.s1, b.pre, b.t if G is None else G, b.s2, b.moved, n, m, OPERATOR=G is not None, BLOCK=LANES
+        b.t, b.s1, b.pre, b.t if G is None else G, b.s2, b.moved, n, m, OPERATOR=G is not None, D=D, BLOCK=LANES
     )  # fmt: skip
     return b
 
@@ -151,7 +156,7 @@ def _backward(
     grid, size = launch.grid, launch.size | {"WANTED": wanted}
     # of one network after the other
     h1, h2, g1, g2 = (w.new_empty(hidden if wanted else 0, m) for _ in range(4))
-    scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
+    scale, bound, D = settings.scale, settings.l_max or 0.0, settings.diagonal
     flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
     partial = w.new_empty(launch.programs, sum(p.numel() for p in weights) if wanted else 0)
     first = [sum(p.numel() for p in weights[:k]) for k in range(len(weights))]
@@ -179,23 +184,23 @@ def _backward(
     gt, gs1, gmoved = torch.empty_like(b.t), empty(6), empty(6)
     assembly_kernels.assemble_adjoint[launch.lanes](
         b.t, b.s1, b.pre, seeds["G"], seeds["h"], rest, unit, gs2, seeds["t"], gt, gs1, gmoved, n, m, RESTED=settings.rest_free,
-        EXTRA=extra, BLOCK=LANES,
+        EXTRA=extra, D=D, BLOCK=LANES,
     )  # fmt: skip
     gl1, out = empty(hidden + 3), empty(12 + hidden)
     adjoint_kernels.psi2_backward[grid](
-        b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, gl1, n, m, alpha, **size,
+        b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, gl1, n, m, settings.alpha_normal, **size,
     )  # fmt: skip
     if wanted:
         sums(14, b.l1, out)
     del gl2  # what the rest needs goes where this was
     assembly_kernels.normals_adjoint[launch.lanes](
-        b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES
+        b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, D=D, BLOCK=LANES
     )
     x, gplanes, out = (empty(rows if wanted else 0) for rows in (12, 36, hidden))
     gw_psi, gs_psi = empty(6), empty(6)
     adjoint_kernels.psi1_backward[grid](
         w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, gw_psi, gs_psi,
-        n, m, scale, alpha, **size,
+        n, m, scale, settings.alpha, **size,
     )  # fmt: skip
     if wanted:
         sums(6, x, out, (gplanes, b.l1))

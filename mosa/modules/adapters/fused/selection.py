@@ -23,10 +23,6 @@ def why_not(operator: ProgressiveOperator, w: Tensor) -> str | None:
     ablations = "constant", "no_C", "no_pre", "no_post", "no_prior_stress"
     if any(getattr(operator, name) for name in ablations):
         return "the kernels have all four networks, and no ablation of them"
-    if operator.alpha_normal != operator.alpha:
-        return "the kernels have one alpha for all four matrices"
-    if operator.factors != "residual":
-        return "the kernels have factors=residual"
     if operator.major_symmetry:
         return "the kernels have no major_symmetry"
     if hidden not in (16, 32, 64, 128):

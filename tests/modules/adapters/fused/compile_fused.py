@@ -18,7 +18,7 @@ from mosa.modules.adapters.fused.operation import LANES, _Launch
 FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
 BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
 BETWEEN = ("assemble", "assemble_adjoint", "normals", "normals_adjoint", "finish")
-FLAGS = {"BOUNDED": True, "EXTRA": False, "RESTED": True, "OPERATOR": True}
+FLAGS = {"BOUNDED": True, "EXTRA": False, "RESTED": True, "OPERATOR": True, "D": 1.0}
 INTEGERS, FLOATS = ("N", "M", "start", "size"), ("scale", "bound", "alpha")
 
 

@@ -19,7 +19,12 @@ ACCURATE = 1e-5
 """Relative to the norm of the result: the modules in float64 are what is compared with."""
 OPTIONS = {
     "paper's form": {},
-    "literal": {"l_max": None, "rest_free": False},
+    "printed, two alphas": {
+        "factors": "printed",
+        "alpha_normal": 0.3,
+        "l_max": None,
+        "rest_free": False,
+    },
     "plastic, narrow": {"plastic": True, "hidden": 16},
 }
 
