@@ -118,7 +118,7 @@ class DynamicSettings(Settings):
     where: ClassVar[str] = "reconstruction.dynamic"
     needs: ClassVar[dict[str, str]] = {
         "modes": "model=modes",
-        "bases hidden basis_layers coefficient_layers *_frequencies lr_network": "model=network",
+        "bases hidden basis_layers coefficient_layers *_frequencies lr_network frames": "model=network",
     }
 
     model: Literal["modes", "network"] = "modes"
@@ -169,6 +169,8 @@ class DynamicSettings(Settings):
     """network: sines and cosines of the time; GIC: 6"""
     lr_network: Weight = 5e-4
     """network: learning rate"""
+    frames: Count | None = None
+    """network: frames in a step of the refinement, drawn at random; null: all; GIC: 1"""
 
 
 class ReconstructionSettings(Settings):

@@ -66,14 +66,14 @@ def elastic_energy(deformation: Tensor, poisson: float) -> Tensor:
 
 def _round_robin(
     windows: Windows, frames: list[int], generator: torch.Generator
-) -> Callable[[int], Tensor]:
-    """draw(n): indices of n windows of every frame in `frames`; all views of a frame are seen before one repeats."""
+) -> Callable[[int, list[int]], Tensor]:
+    """draw(n, some): indices of n windows of every frame in `some`; all views of a frame are seen before one repeats."""
     by_frame = {t: (windows.frame == t).nonzero()[:, 0].cpu() for t in frames}
     queue = {t: torch.empty(0, dtype=torch.long) for t in frames}
 
-    def draw(count: int) -> Tensor:
+    def draw(count: int, some: list[int]) -> Tensor:
         chosen = []
-        for t in frames:
+        for t in some:
             while len(queue[t]) < count:
                 order = torch.randperm(len(by_frame[t]), generator=generator)
                 queue[t] = torch.cat([queue[t], by_frame[t][order]])
@@ -167,18 +167,22 @@ class Objective:
 
     def minimise(
         self, optimizer: torch.optim.Optimizer, frames: list[int], steps: int, views: int, generator: torch.Generator,
-        progress: Callable[[int], None] | None,
+        progress: Callable[[int], None] | None, at_once: int | None = None,
     ) -> None:  # fmt: skip
-        """`steps` steps, each on `views` random windows of every frame in `frames`, from the optimizer's rate on."""
+        """`steps` steps from the optimizer's rate on, each on `views` random windows of every frame in `frames`, or of `at_once` of
+        these."""
         windows, rate = self.target.windows, optimizer.param_groups[0]["lr"]
         draw = _round_robin(windows, frames, generator)
         device = windows.images.device
-        every = torch.tensor(frames, device=device)
-        state = torch.arange(len(frames), device=device).repeat_interleave(views)
+        some, every = frames, torch.tensor(frames, device=device)
+        state = torch.arange(at_once or len(frames), device=device).repeat_interleave(views)
         for step in range(steps):
             factor = 0.51 + 0.49 * math.cos(math.pi * step / steps)
             optimizer.param_groups[0]["lr"] = rate * factor
-            loss = self(every, windows.select(draw(views)), state)
+            if at_once is not None:
+                chosen = torch.randperm(len(frames), generator=generator)[:at_once]
+                some, every = [frames[i] for i in chosen], torch.tensor(frames)[chosen].to(device)
+            loss = self(every, windows.select(draw(views, some)), state)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
@@ -217,5 +221,6 @@ def fit_motion(
         objective, rate = Objective(motion, target, settings), settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws)
+    at_once = None if settings.frames is None else min(settings.frames, len(moving))
+    objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws, at_once)
     return motion

@@ -169,7 +169,8 @@ def rendered_windows(scaffold, truth, frames):
             DynamicSettings(
                 model="network",
                 carriers="particles",
-                iterations=400,
+                iterations=800,
+                frames=1,
                 hidden=48,
                 basis_layers=2,
                 lr_network=3e-3,
