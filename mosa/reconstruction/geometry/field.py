@@ -81,6 +81,11 @@ def span(volume: Volume) -> tuple[Tensor, float]:
     return volume.origin + size / 2, float(size.norm()) / 2
 
 
+def at_once(like: Tensor) -> int:
+    """Steps of a ray that are looked at together: a call, and on a GPU a launch, costs more than points that turn out needless."""
+    return 32 if like.is_cuda else 8
+
+
 def first_crossing(
     distance: Volume, origin: Tensor, direction: Tensor, start: Tensor | None = None
 ) -> Tensor:
@@ -94,16 +99,22 @@ def first_crossing(
     hit = torch.full_like(way, float("inf"))
     before = torch.full_like(way, float("inf"))
     left = torch.arange(len(way), device=way.device)
-    step = 0.7 * distance.pitch
-    for _ in range(int(2 * radius / step) + 2):
-        now = at(distance, origin[left] + way[left, None] * direction[left])
-        inside = now < 0
-        passed = before[left] / (before[left] - now).clamp(min=1e-9)
-        share = torch.where(before[left].isinf(), 1.0, passed)
-        hit[left[inside]] = (way[left] + (share - 1) * step)[inside]
-        before[left] = now
+    step, count = 0.7 * distance.pitch, at_once(way)
+    ahead = step * torch.arange(count, device=way.device)
+    for _ in range(0, int(2 * radius / step) + 2, count):
+        ways = way[left, None] + ahead
+        found = at(distance, origin[left, None] + ways[..., None] * direction[left, None])
+        inside = found < 0
+        first = inside.to(torch.uint8).argmax(1, keepdim=True)
+        earlier = torch.cat([before[left, None], found[:, :-1]], 1)
+        last, now, here = (t.gather(1, first)[:, 0] for t in (earlier, found, ways))
+        passed = last / (last - now).clamp(min=1e-9)
+        share = torch.where(last.isinf(), 1.0, passed)
+        inside = inside.any(1)
+        hit[left[inside]] = (here + (share - 1) * step)[inside]
+        before[left] = found[:, -1]
         left = left[~inside]
-        way[left] = way[left] + step
+        way[left] = way[left] + count * step
         left = left[way[left] < (middle + radius)[left]]
         if len(left) == 0:
             break
@@ -115,9 +126,12 @@ def nearest_passing(distance: Volume, origin: Tensor, direction: Tensor) -> tupl
     centre, radius = span(distance)
     middle = ((centre - origin) * direction).sum(-1)
     best, way = torch.full_like(middle, float("inf")), middle.clone()
-    for k in range(int(2 * radius / distance.pitch) + 1):
-        here = middle - radius + k * distance.pitch
-        found = at(distance, origin + here[:, None] * direction)
+    steps = torch.arange(int(2 * radius / distance.pitch) + 1, device=middle.device)
+    for ahead in steps.split(at_once(middle)):
+        ways = (middle - radius)[:, None] + ahead * distance.pitch
+        found = at(distance, origin[:, None] + ways[..., None] * direction[:, None])
+        found, nearest = found.min(1)
+        here = ways.gather(1, nearest[:, None])[:, 0]
         nearer = found < best
         best, way = torch.where(nearer, found, best), torch.where(nearer, here, way)
     return best, way

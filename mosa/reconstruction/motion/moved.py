@@ -61,8 +61,9 @@ class MovingParts:
         if self.place is not None:
             return known_centres(scene, self.place).to(self.splats.means)
         views, frames = scene.training_cameras, scene.training_frames
-        cameras = scene.cameras.select(views)
-        of_frame = lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box)  # noqa: E731
+        device = self.splats.means.device
+        cameras = scene.cameras.select(views).to(device)
+        of_frame = lambda t: hull_centroid(scene.mattes[views, t].to(device), cameras, scene.box)  # noqa: E731
         return torch.stack(list(threaded(of_frame, frames))).to(self.splats.means)
 
     @cached_property
