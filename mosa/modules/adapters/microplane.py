@@ -21,13 +21,13 @@ LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 
 @lru_cache(maxsize=16)
 @torch.inference_mode(False)  # who asks first may not want gradients, and others do
-def _triangles(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(2, 6, 9) maps from the entries of the upper and the lower triangle to a flat 3x3 matrix."""
-    result = torch.zeros(2, 6, 9, dtype=dtype)
-    for which, places in enumerate((UPPER, LOWER)):
+def _entries(device: torch.device) -> Tensor:
+    """(18,) which of the 12 numbers, or of a zero after them, the entries of the flat lower and upper triangle are."""
+    found = torch.full((2, 9), 12)
+    for which, places in enumerate((LOWER, UPPER)):
         for k, (i, j) in enumerate(places):
-            result[which, k, 3 * i + j] = 1
-    return result.to(device)
+            found[which, 3 * i + j] = k + 6 * (1 - which)
+    return found.flatten().to(device)
 
 
 @lru_cache(maxsize=16)
@@ -46,10 +46,9 @@ def _placement(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def lu_factors(numbers: Tensor) -> tuple[Tensor, Tensor]:
     """Entries of the factors, (L, U), each (..., 3, 3), from (..., 12): upper triangle row by row, then lower."""
-    upper, lower = _triangles(numbers.dtype, numbers.device)
-    return (numbers[..., 6:] @ lower).unflatten(-1, (3, 3)), (numbers[..., :6] @ upper).unflatten(
-        -1, (3, 3)
-    )
+    padded = torch.nn.functional.pad(numbers, (0, 1))
+    entries = padded.index_select(-1, _entries(numbers.device)).unflatten(-1, (2, 3, 3))
+    return entries[..., 0, :, :], entries[..., 1, :, :]
 
 
 def correction(numbers: Tensor) -> Tensor:

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from mosa.modules.adapters.hyperelastic import anisotropic_basis
-from mosa.modules.adapters.microplane import _constants, _placement, _triangles
+from mosa.modules.adapters.microplane import _constants, _entries, _placement
 from mosa.rendering.appearance.spherical_harmonics import _projections
 
 CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize("made, arguments", [
-    (anisotropic_basis, (torch.float64, CPU)), (_triangles, (torch.float64, CPU)), (_placement, (torch.float64, CPU)),
+    (anisotropic_basis, (torch.float64, CPU)), (_entries, (CPU,)), (_placement, (torch.float64, CPU)),
     (_constants, (torch.float64, CPU)), (_projections, ()),
 ])  # fmt: skip
 def test_what_an_evaluation_made_can_be_differentiated_through(made, arguments):
@@ -22,6 +22,6 @@ def test_what_an_evaluation_made_can_be_differentiated_through(made, arguments):
         found = made(*arguments)
     first = found[0] if isinstance(found, tuple) else found
     assert not first.is_inference()
-    weight = torch.ones(first.shape[-1], dtype=first.dtype, requires_grad=True)
+    weight = torch.ones(first.shape[-1], dtype=torch.float64, requires_grad=True)
     torch.autograd.grad((first * weight).sum(), weight)
     assert made(*arguments) is found  # kept
