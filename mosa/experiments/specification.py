@@ -251,12 +251,13 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
 
     A run's folder is named after its overrides, so that other experiments share it too."""
     for axis, each in experiment.axes.items():
-        for key in (word.partition("=")[0].lstrip("+") for word in more):
-            told = {tuple(w for w in o.overrides if w.startswith(f"{key}=")) for o in each}
-            if len(told) > 1:
+        told = {w.partition("=")[0] for option in each for w in option.overrides}
+        for key, _, value in (word.lstrip("+").partition("=") for word in more):
+            # a mapping sets the keys below it too
+            if key in told or any(k.startswith(f"{key}.") and value.startswith("{") for k in told):
                 raise ConfigError(
-                    f"--set {key}: expected a key that tells no options of an axis apart, found one of {axis}, whose "
-                    "rows would all be the same: --only chooses some of them, --specifications adds one (docs/reproduce.md)"
+                    f"--set {key}: expected a key that no option of an axis sets, found one of {axis}, whose rows would not be "
+                    "what they are called: --only chooses some of them, --specifications adds one (docs/reproduce.md)"
                 )
     found: dict[Path, Job] = {}
     for options in itertools.product(*experiment.axes.values()):

@@ -188,11 +188,20 @@ def test_a_key_that_two_axes_set_is_named(tmp_path):
     jobs_of(experiment(axes={"law": laws[1:], "scene": scenes}), tmp_path)  # the same value
 
 
-def test_what_is_set_for_all_jobs_is_nothing_that_tells_rows_apart(tmp_path):
-    """The rows of two methods would both hold the figures of the one that is set."""
-    with pytest.raises(ConfigError, match=r"--set adapter: .* found one of method, whose rows"):
-        jobs_of(experiment(), tmp_path, ["adapter=mine"])
-    jobs_of(narrowed(experiment(), {"method": ["ours"]}, None), tmp_path, ["adapter=mine"])
+def test_what_is_set_for_all_jobs_is_nothing_that_makes_a_row(tmp_path):
+    """The rows of two methods would both hold the figures of the one that is set, and a single row those of another one."""
+    alone = narrowed(experiment(), {"method": ["ours"]}, None)
+    below = experiment(axes={"bound": (Option("small", ("adapter.alpha=0.1",)),)})
+    for given, word in (
+        (experiment(), "adapter=mine"),
+        (alone, "adapter=mine"),
+        (below, "+adapter={alpha:0.2}"),
+    ):
+        with pytest.raises(
+            ConfigError, match=r"--set adapter: .* found one of (method|bound), whose"
+        ):
+            jobs_of(given, tmp_path, [word])
+    jobs_of(below, tmp_path, ["adapter=mine", "adapter.hidden=16"])
 
 
 def test_a_folder_s_name_does_not_depend_on_the_order_of_different_keys():
