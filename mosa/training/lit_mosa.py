@@ -493,7 +493,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 stacklevel=1,
             )
             self.settle_ground(self.world.ground)
-        if stage.looks_again or not (stage.calibrates or self.informed):
+        if not stage.silhouettes and (stage.looks_again or not (stage.calibrates or self.informed)):
             moved = self.inform(response=stage.newton and not stage.calibrates)
             # a look that a stop cut short is made again, about cues that have moved already
             if stage.looks_again and len(self.moves) < self.stage_index:
@@ -532,9 +532,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         for name in stage.keeps:
             self.body.freeze(name)
         settled = len(self.moves) > 1 and self.moves[-1] > SETTLED * self.moves[-2]
-        # the looks are the last stages
-        following = len(self.stages) if settled else self.stage_index + 1
-        self.stage_index, self.losses, self.identification = following, [], None
+        # the looks are the last stages but for the one by silhouettes, which elastic bodies are without: of a bounce free rollouts
+        # say more about the grid than about the law
+        following = max(self.stage_index + 1, len(self.stages) - 1 if settled else 0)
+        by_silhouettes = following < len(self.stages) and self.stages[following].silhouettes
+        self.stage_index = following + (by_silhouettes and not self.is_plastic())
+        self.losses, self.identification = [], None
         self.retreat, self.stage_over = Retreat(), False
 
     # ---------------------------------------------------------------- logs

@@ -147,7 +147,7 @@ def test_laws_are_compared_where_none_is_named(overrides, law):
     assert composed(*overrides.split())["prior"]["law"] == law
 
 
-@pytest.mark.parametrize("override, adapter, expected", [(None, None, 8), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
+@pytest.mark.parametrize("override, adapter, expected", [(None, None, 9), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
                                                          (None, "hyperelastic", 0)])  # fmt: skip
 def test_a_calibration_looks_again_where_it_is_all_there_is(override, adapter, expected):
     fit = composed(*([override] if override else []))["fit"]

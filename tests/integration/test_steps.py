@@ -67,7 +67,7 @@ def test_without_a_step_to_take_back_the_fit_stops(cache):
 def test_a_calibration_alone_looks_again_and_goes_on_from_there(cache):
     run = made(cache, "adapter=none", "heterogeneity.enabled=false", "fit.prior.looks=2")
     module = run.module
-    assert [stage.looks_again for stage in module.stages] == [False, True, True]
+    assert [stage.looks_again for stage in module.stages] == [False, True, True, True]
     first, loss, seen = module.takes[0].cues.positions, module.newton_loss, {}
 
     def noted(stage, iteration):

@@ -105,6 +105,7 @@ class Identification:
         self._free, self.follows = free and not body.settings.adaptive, False
         cues = [take.cues for take in self.takes if take is not None]
         self.few = residuals.fewer(cues)
+        self.silhouettes = stage.silhouettes
         alone = (self.calibrating or marked or any(each.single for each in cues)) and kinds[0]
         self.kinds = (True, False, False) if alone else kinds
         if not any(self.kinds) and not world.forces:
@@ -119,6 +120,7 @@ class Identification:
             body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings, ground=world.ground,
             free=not any(self.gains), calibrating=self.calibrating,
         )  # fmt: skip
+        self.gains = (0.0,) if self.silhouettes else self.gains
         seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
         bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
         self.iteration, self.noise, self.substeps = 0, None, None
@@ -276,6 +278,8 @@ class Identification:
     def _differences(self, rollout: Rollout, index: int) -> residuals.Fields:
         """Of a rollout from what was seen of take `index`, and from the forces measured there."""
         take = self.takes[index]
+        if self.silhouettes:
+            return residuals.silhouettes(rollout.x, self.body.spacing, take.observations)
         curves, turn = curves_of(self.world.forces, take.name, index == 0), take.start.rotation
         found = residuals.fields(rollout, take.cues, turn, self.chosen, take.response)
         if not curves:
@@ -416,7 +420,7 @@ class Identification:
         self._hold_substeps()
         if self.iteration < NOISE_ITERATIONS or self.noise is None:
             self._measure_noise()
-        if self.calibrating and self.newton.known is not None:
+        if self.calibrating and not self.silhouettes and self.newton.known is not None:
             self.newton.borne = self.independent()
         self._flown = self._flights()
         seat = self.newton.seats[0]

@@ -238,7 +238,7 @@ class NewtonSteps:
         )
         return Identification(
             body or self.body, takes or self.takes, world, stage, self.criterion, self.settings, kinds,
-            parts=parts, known=self.known,
+            parts=parts, known=self.posterior if stage.silhouettes else self.known,
         )  # fmt: skip
 
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:

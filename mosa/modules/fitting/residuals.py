@@ -11,10 +11,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
 
+from mosa.data.observations import Observations
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.physics.rotations import axial
 from mosa.reconstruction.motion.response import Response
+from mosa.rendering.observer import repeat_cameras
+from mosa.rendering.rasterizer import rasterize
 from mosa.types import MarkerCues, MotionCues, Rollout
 
 CUE_ERRORS = (0.5e-3, 0.01, 0.015)
@@ -27,6 +31,11 @@ MODEL_ERRORS = (1.0, 0.3, 0.15)
 """Rotations and singular values that a grid gets wrong where it gets positions wrong by a cell."""
 SAMPLES = 2000
 """Particles compared at most: far more than a frame has independent data."""
+
+BALL, OPACITY = 0.37, 0.6
+"""Standard deviation [spacings] and opacity of a particle in a silhouette, with which bodies at rest have their area."""
+EDGE, PIXELS = 5, 4
+"""Width [px] of an outline, and of the blocks of pixels that are compared."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,27 @@ def fields(
     return Fields(
         away, 0.5 * axial(relative) * weight, (S - cues.stretch[1:frames, chosen]) * weight
     )
+
+
+@torch.no_grad()
+def silhouettes(x: Tensor, spacing: float, observations: Observations) -> Fields:
+    """Of particles at x (T, N, 3) [m], `spacing` [m] apart at rest, from the mattes: position (T - 1, P, 1) over blocks of pixels.
+
+    Particles are drawn as balls, since splats that are carried by a flow have fins. How far an outline is from them is not known:
+    in each frame the part of the difference that a wider or narrower outline in all views would make is left out."""
+    frames, n = x.shape[:2]
+    shapes = ((BALL * spacing) ** 2 * torch.eye(3).to(x)).expand(frames, n, 3, 3).contiguous()
+    opacities, index, found = x.new_full((n,), OPACITY), torch.arange(frames).to(x.device), []
+    for view, mattes in enumerate(observations.mattes[:, :frames].to(x)):
+        cameras = repeat_cameras(observations.cameras.select([view]), frames)
+        alpha = rasterize(x, shapes, opacities, x.new_ones(1, n, 1), cameras, index)[1]
+        edge = max_pool2d(mattes, EDGE, 1, EDGE // 2) + max_pool2d(-mattes, EDGE, 1, EDGE // 2)
+        found.append(avg_pool2d(torch.stack((alpha - mattes, edge), 1), PIXELS, ceil_mode=True))
+    away, edge = torch.stack(found, 2)[1:].flatten(3).transpose(0, 1).flatten(2)
+    share = (away * edge).sum(1) / edge.square().sum(1).clamp(min=1e-12)
+    away = (away - share[:, None] * edge)[..., None]
+    none = away.new_zeros(len(away), 1, 1)
+    return Fields(away, none, none)
 
 
 def unseen(

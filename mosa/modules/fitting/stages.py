@@ -26,7 +26,7 @@ class StageSettings(Settings):
     """iterations of Gauss-Newton, at most, each with a Jacobian of its own"""
     looks: Whole = 0
     """stage `prior` by Gauss-Newton: further calibrations at most, each after a second fit of the motion, until that
-    settles"""
+    settles; laws that yield or flow are then calibrated on the mattes once. 0: neither"""
     iterations: Whole
     """steps of Adam; 0 leaves the stage out, also by Gauss-Newton"""
     lr: Weight
@@ -51,6 +51,8 @@ class Stage(StageSettings):
     looks_again: bool = False
     """Whether it is a calibration that goes on from the one before, with the motion found once more about that one's result. What
     flows or yields is seen too poorly by a reconstruction that knows no mechanics: the calibrated law says what images do not."""
+    silhouettes: bool = False
+    """Whether it is the last of these, and compares outlines in place of cues, which are not found again but are its prior."""
 
     @property
     def calibrates(self) -> bool:
@@ -120,10 +122,11 @@ class Stage(StageSettings):
 
 
 def recalibrations(stages: list[Stage]) -> list[Stage]:
-    """With those that follow a calibration which is all there is, as many as it asks for."""
-    if len(stages) != 1 or not stages[0].newton:
+    """With those that follow a calibration which is all there is, as many as it asks for, and a last one by silhouettes."""
+    if len(stages) != 1 or not stages[0].newton or not stages[0].looks:
         return stages
-    return stages + [stages[0].but(looks_again=True)] * stages[0].looks
+    looks = [stages[0].but(looks_again=True)] * stages[0].looks
+    return [*stages, *looks, stages[0].but(looks_again=True, silhouettes=True)]
 
 
 class FitSection(Settings):

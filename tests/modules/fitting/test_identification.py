@@ -8,11 +8,14 @@ import pytest
 import torch
 from small_bodies import DX, FRAME_DT, NU, WORLD, E, cues_of, small_body, start, take_of
 
+from mosa.data.observations import Observations
+from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation.analysis.anisotropy import dyads
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.modules.adapters.hyperelastic import anisotropic_basis
 from mosa.modules.fitting import identification as identification_module
+from mosa.modules.fitting import residuals
 from mosa.modules.fitting.gauss_newton import Posterior, Seat
 from mosa.modules.fitting.identification import (
     COARSER,
@@ -54,6 +57,29 @@ def run(found: Identification, most: int = 12) -> int:
         if found.converged:
             return i + 1
     return most
+
+
+def test_outlines_tell_the_stiffness_where_cues_are_wrong(monkeypatch):
+    """The cues are those of a body that is three times as stiff."""
+    seen_from = {"distance": 0.6, "elevations": (0.1, 0.5), "field": 0.15, "turn": 0.2}
+    cameras = ring_of_cameras(4, 96, target=(0.0, 0.06, 0.0), **seen_from)
+    body, true, begins = (
+        small_body(adapter=False, E=3 * E),
+        small_body(adapter=False),
+        start(speed=-2.0),
+    )
+    x = true.simulate(begins, WORLD, FRAMES, FRAME_DT).x.detach()
+    film = Observations(None, torch.zeros(4, FRAMES, 96, 96).double(), None, cameras, 96)
+    with monkeypatch.context() as whole:
+        whole.setattr(residuals, "PIXELS", 1)
+        seen = residuals.silhouettes(x, true.spacing, film).position  # nothing was filmed yet
+    film.mattes[:, 1:] = seen.reshape(FRAMES - 1, 4, 96, 96).transpose(0, 1)
+    take = take_of(body, begins, FRAMES)
+    take.observations = film
+    stage = Stage(name="prior", iterations=8, lr=0.1, silhouettes=True)
+    found = Identification(body, [take], WORLD, stage, Criterion(), IdentificationSettings())
+    found.iterate_until_converged(8)
+    assert float(body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.03)
 
 
 @pytest.mark.parametrize("lowered, stops", [(0.4, 6), (0.6, None)])

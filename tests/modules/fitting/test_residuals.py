@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from small_bodies import FRAME_DT, WORLD, cues_of, small_body, start
+from small_bodies import FRAME_DT, WORLD, cues_of, lattice, small_body, start
 
+from mosa.data.observations import Observations
+from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.modules.fitting import residuals
 from mosa.types import MotionCues
 
@@ -35,6 +37,28 @@ def test_a_rollout_has_no_distance_from_its_own_cues():
     assert other.rotation.norm(dim=-1).min() == pytest.approx(
         math.sin(1.1), rel=1e-9
     )  # the pose at the start left out
+
+
+def test_of_outlines_the_width_does_not_count_and_the_place_does(monkeypatch):
+    """Mattes of the same particles, drawn a fifth wider or a third of their distance beside where they are."""
+    monkeypatch.setattr(residuals, "PIXELS", 1)
+    cameras = ring_of_cameras(3, 64, target=(0.0, 0.0, 0.0), distance=0.6, elevations=(0.2,), field=0.1, turn=0.2)  # fmt: skip
+    x, spacing = lattice().expand(2, -1, 3), 0.02
+
+    def away(x: torch.Tensor, mattes: torch.Tensor) -> torch.Tensor:
+        mattes = mattes.reshape(1, 3, 64, 64).transpose(0, 1).expand(-1, 2, -1, -1)
+        seen = Observations(None, mattes, None, cameras, 64)
+        return residuals.silhouettes(x, spacing, seen).position.flatten()
+
+    nothing = torch.zeros(3 * 64 * 64).double()
+    own, ball = away(x, nothing), residuals.BALL
+    beside = away(x + torch.tensor([0.3, 0.1, 0.0]) * spacing, nothing)
+    monkeypatch.setattr(residuals, "BALL", 1.2 * ball)
+    wider = away(x, nothing)
+    monkeypatch.setattr(residuals, "BALL", ball)
+    assert away(x, wider).norm() < 0.5 * (wider - own).norm()
+    assert away(x, beside).norm() > 0.9 * (beside - own).norm()
+    assert away(x, own).norm() < 1e-6
 
 
 def test_known_turns_stretches_and_shifts_are_found():

@@ -5,6 +5,7 @@ from without_trainer import identify
 
 from mosa.data.batches import Epochs, ViewSchedule
 from mosa.errors import ConfigError
+from mosa.modules.body.material import Material
 from mosa.modules.fitting.stages import Stage, recalibrations
 from mosa.training.lit_mosa import LitMosa
 
@@ -101,3 +102,22 @@ def test_a_look_that_is_made_again_after_a_stop_counts_once(monkeypatch):
     for _ in range(2):
         module.begin(module.stage)
     assert module.moves == [1e-2] and next(moves, None) is None
+
+
+@pytest.mark.parametrize("law, outlines", [("corotated", False), ("newtonian", True)])
+def test_outlines_end_the_calibration_of_what_yields_or_flows(law, outlines):
+    """Once its looks have settled, or after the last one."""
+    parameters = {"E": 3e4, "nu": 0.3} if law == "corotated" else {"mu": 10.0, "kappa": 1e4}
+    body = small_body(adapter=False)
+    body.material = Material(law, parameters)
+    begun = Stage(name="prior", iterations=1, lr=0.1, optimizer="gauss_newton", looks=3)
+    for moves in ([1e-2, 9e-3], [1e-2, 5e-3, 2e-3]):
+        module = LitMosa.of_parts(body, takes=[], world=WORLD, background=torch.ones(3), weights={"position": 1.0},
+                                  stages=recalibrations([begun]))  # fmt: skip
+        module.moves, module.stage_index = moves, len(moves)
+        module.body.freeze = lambda name: None
+        module.end(module.stage)
+        assert (module.stage is not None and module.stage.silhouettes) == outlines
+        if outlines:
+            module.end(module.stage)
+        assert module.stage is None
