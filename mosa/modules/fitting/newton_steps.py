@@ -197,9 +197,10 @@ class NewtonSteps:
             self.posterior = self.identification.posterior()
 
     def settle_parts(self, stage: Stage) -> Identification:
-        """The running identification, or that of a law with fewer parts where `search.parts` takes
-        it, which the body then is. Without parts it is the prior, calibrated once more, with what the first cues said of its
-        numbers as their prior: where a law's form is wrong, later cues alone move those that they hardly determine."""
+        """The running identification, or that of a law with fewer parts where `search.parts` takes it, which the body then is.
+        Without parts it is the prior, calibrated once more. What the first cues said of its numbers is then their prior, unless
+        the law yields, of which they say too little: where a law's form is wrong, later cues alone move those that they hardly
+        determine."""
         body, own = self.body, self.identification
         self.parts = own.held_back()
         if not self.parts or (best := chosen(self.parts)) == named_parts(own.parts):
@@ -218,7 +219,7 @@ class NewtonSteps:
             body.thaw("prior")
         fewer = self.identifying(stage if kept else self.stages[0], parts=kept)
         known = fewer.newton.known
-        if not kept and self.informed:
+        if not kept and self.informed and not self.is_plastic():
             first = self.identifying(self.stages[0], parts=kept, takes=self.first_takes)
             first.iterate_until_converged(stage.iterations)
             fewer.newton.known = first.posterior()

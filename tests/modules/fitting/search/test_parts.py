@@ -147,7 +147,7 @@ def test_a_law_without_the_operator_is_the_calibrated_prior(monkeypatch):
 
 def test_an_isotropic_law_is_what_the_cues_of_both_looks_say(monkeypatch):
     """The mean of the two calibrations by their precisions, which is exact for linear problems; its deviations are those of the
-    later cues alone, so that no image counts twice."""
+    later cues alone, so that no image counts twice. A law that yields is what the later ones say."""
     first, later = fallen(), fallen(5, E=1.03 * E)
 
     def calibrated(take) -> Posterior:
@@ -167,6 +167,9 @@ def test_an_isotropic_law_is_what_the_cues_of_both_looks_say(monkeypatch):
     found = fitted(monkeypatch, {"isotropic": 1e-3, "operator": 0.9e-3}, first).posterior
     assert float(found.mean[0]) == pytest.approx(float(mean[0]), abs=0.05 * math.log(1.03))
     assert torch.allclose(found.covariance[:2, :2], other.covariance, rtol=0.2)
+    monkeypatch.setattr(LitMosa, "is_plastic", lambda self: True)
+    found = fitted(monkeypatch, {"isotropic": 1e-3, "operator": 0.9e-3}, first).posterior
+    assert float(found.mean[0]) == pytest.approx(float(other.mean[0]), abs=0.05 * math.log(1.03))
 
 
 def test_an_operator_that_predicts_held_back_frames_is_kept(monkeypatch):
