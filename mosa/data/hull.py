@@ -127,19 +127,21 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
     return bounds
 
 
-def visual_hull(mattes: Tensor, cameras: Cameras, box: Tensor, *, pitch: float) -> Volume:
-    """Occupancy in [0, 1] on a grid of the given pitch around the object. mattes: (V, H, W); box: (2, 3) [m]."""
+def visual_hull(
+    mattes: Tensor, cameras: Cameras, box: Tensor, *, pitch: float = 0.0, resolution: int = 40
+) -> Volume:
+    """Occupancy in [0, 1] on a grid around the object. mattes: (V, H, W); box: (2, 3) [m]; pitch [m], without which the longest
+    side has `resolution` voxels."""
     bounds = hull_bounds(mattes, cameras, box)
+    pitch = pitch or float((bounds[1] - bounds[0]).max()) / resolution
     counts = voxel_counts(((bounds[1] - bounds[0]) / pitch).ceil() + 1)
     grid = Volume(torch.empty(counts, device=mattes.device), bounds[0], pitch)
     return Volume(occupancy(grid.points(), mattes, cameras), bounds[0], pitch)
 
 
-def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: int = 40) -> Tensor:
+def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor) -> Tensor:
     """Centre of mass of the visual hull, (3,) [m]."""
-    bounds = hull_bounds(mattes, cameras, box)
-    pitch = float((bounds[1] - bounds[0]).max()) / resolution
-    hull = visual_hull(mattes, cameras, box, pitch=pitch)
+    hull = visual_hull(mattes, cameras, box)
     return hull.points()[hull.values > 0.5].mean(0)
 
 

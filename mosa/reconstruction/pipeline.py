@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mosa.data.checks.silhouettes import uncovered_and_islands, whole_views
-from mosa.data.hull import Volume, hull_bounds, occupancy, visual_hull
+from mosa.data.hull import Volume, occupancy, visual_hull
 from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.cache import StageCache
@@ -53,9 +53,7 @@ def _first_frame(scene: Scene) -> tuple[Tensor, Any]:
 def object_hull(scene: Scene, settings: ReconstructionSettings) -> Volume:
     """Visual hull of the first frame, occupancy in [0, 1]; training cameras only."""
     mattes, cameras = _first_frame(scene)
-    bounds = hull_bounds(mattes, cameras, scene.box)
-    pitch = float((bounds[1] - bounds[0]).max()) / settings.resolution
-    return visual_hull(mattes, cameras, scene.box, pitch=pitch)
+    return visual_hull(mattes, cameras, scene.box, resolution=settings.resolution)
 
 
 def object_geometry(

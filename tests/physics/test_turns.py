@@ -130,6 +130,7 @@ def test_many_threads_never_launch_into_a_capture():
 def test_of_threads_that_come_to_a_kernel_at_once_the_first_compiles_it(tmp_path, monkeypatch):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(wp.config, "optimization_level", 0)
+    monkeypatch.setattr(wp.config, "use_precompiled_headers", False)
     made, compiled, together = wp.Module._compile, [], threading.Barrier(2)
     monkeypatch.setattr(wp.Module, "_compile", lambda *a, **k: compiled.append(made(*a, **k)))
 

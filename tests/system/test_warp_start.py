@@ -1,4 +1,4 @@
-"""Threads that make kernels at once."""
+"""Threads that make and compile kernels."""
 
 import ast
 import gc
@@ -7,8 +7,10 @@ import sys
 import threading
 
 import pytest
+import warp as wp
 
 from mosa.physics.grid import transfer_kernels
+from mosa.physics.launching import launch
 from mosa.system.warp_start import ONE_PARSER
 
 
@@ -48,3 +50,27 @@ def test_threads_parse_at_once():
         gc.set_threshold(*threshold)
         sys.setswitchinterval(interval)
     assert not failed
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def one(a: wp.array(dtype=int)):
+    a[0] = 1
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def two(a: wp.array(dtype=int)):
+    a[1] = 2
+
+
+def test_headers_are_precompiled_once_for_all_threads(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(wp.config, "optimization_level", 0)
+    numbers, made = wp.zeros(2, dtype=int, device="cpu"), []
+    for kernel in (one, two):
+        words = (kernel, 1, [numbers], wp.get_device("cpu"))
+        thread = threading.Thread(target=launch, args=words)
+        thread.start()
+        thread.join()
+        (header,) = tmp_path.glob("wp_headers_*/*.pch")
+        made.append(header.stat().st_mtime_ns)
+    assert made[0] == made[1] and numbers.list() == [1, 2]

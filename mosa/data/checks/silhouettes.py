@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mosa.data.checks.free_fall import track_of
-from mosa.data.hull import at_border, hull_bounds, visual_hull
+from mosa.data.hull import at_border, visual_hull
 from mosa.errors import DataError
 from mosa.rendering.cameras import project
 from mosa.types import Cameras, Scene
@@ -61,10 +61,8 @@ def check_particles(scene: Scene, label: str) -> None:
 
 def hull_points(mattes: Tensor, cameras: Cameras, box: Tensor) -> tuple[Tensor, float]:
     """Points (M, 3) [m] of the visual hull of mattes (V, H, W), and their distance [m]. Errors: DataError where there are none."""
-    bounds = hull_bounds(mattes, cameras, box, resolution=32)
-    pitch = float((bounds[1] - bounds[0]).max()) / RESOLUTION
-    hull = visual_hull(mattes, cameras, box, pitch=pitch)
-    return hull.points()[hull.values > 0.5], pitch
+    hull = visual_hull(mattes, cameras, box, resolution=RESOLUTION)
+    return hull.points()[hull.values > 0.5], hull.pitch
 
 
 def uncovered_and_islands(
