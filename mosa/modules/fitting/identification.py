@@ -107,7 +107,7 @@ class Identification:
         self.few = residuals.fewer(cues)
         self.silhouettes = stage.silhouettes
         alone = (self.calibrating or marked or any(each.single for each in cues)) and kinds[0]
-        self.kinds = (True, False, False) if alone else kinds
+        self.kinds = (True, False, False) if alone or stage.silhouettes else kinds
         if not any(self.kinds) and not world.forces:
             raise ConfigError(
                 "losses: identification compares motion cues, and the weights of position, rotation and stretch are "
