@@ -264,6 +264,12 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """Whether the law yields; candidates for it may differ in this."""
         return law_named(self.body.material.law).plastic
 
+    def shows_outlines(self) -> bool:
+        """Whether outlines say more on the law than cues do: it yields or flows (of a bounce free rollouts say more about the
+        grid), cameras see it, no solid can hide a part of it, and no force is measured, which would count for nothing."""
+        seen = all(len(take.observations.cameras) for take in self.takes)
+        return self.is_plastic() and seen and not (self.world.colliders or self.world.forces)
+
     # ---------------------------------------------------------------- state
     @property
     def stage(self) -> Stage | None:
@@ -532,11 +538,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         for name in stage.keeps:
             self.body.freeze(name)
         settled = len(self.moves) > 1 and self.moves[-1] > SETTLED * self.moves[-2]
-        # the looks are the last stages but for the one by silhouettes, which elastic bodies are without: of a bounce free rollouts
-        # say more about the grid than about the law
+        # the looks are the last stages but for the one by silhouettes
         following = max(self.stage_index + 1, len(self.stages) - 1 if settled else 0)
         by_silhouettes = following < len(self.stages) and self.stages[following].silhouettes
-        self.stage_index = following + (by_silhouettes and not self.is_plastic())
+        self.stage_index = following + (by_silhouettes and not self.shows_outlines())
         self.losses, self.identification = [], None
         self.retreat, self.stage_over = Retreat(), False
 

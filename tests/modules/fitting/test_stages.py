@@ -1,3 +1,6 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 from small_bodies import WORLD, small_body, start, take_of
@@ -104,9 +107,12 @@ def test_a_look_that_is_made_again_after_a_stop_counts_once(monkeypatch):
     assert module.moves == [1e-2] and next(moves, None) is None
 
 
-@pytest.mark.parametrize("law, outlines", [("corotated", False), ("newtonian", True)])
-def test_outlines_end_the_calibration_of_what_yields_or_flows(law, outlines):
-    """Once its looks have settled, or after the last one."""
+@pytest.mark.parametrize("law, unseen, outlines", [
+    ("corotated", None, False), ("newtonian", None, True), ("newtonian", "markers", False), ("newtonian", "forces", False),
+    ("newtonian", "colliders", False),
+])  # fmt: skip
+def test_outlines_end_the_calibration_of_what_yields_or_flows(law, unseen, outlines):
+    """Once its looks have settled, or after the last one; not where no camera sees it, something hides it or forces count."""
     parameters = {"E": 3e4, "nu": 0.3} if law == "corotated" else {"mu": 10.0, "kappa": 1e4}
     body = small_body(adapter=False)
     body.material = Material(law, parameters)
@@ -116,6 +122,10 @@ def test_outlines_end_the_calibration_of_what_yields_or_flows(law, outlines):
                                   stages=recalibrations([begun]))  # fmt: skip
         module.moves, module.stage_index = moves, len(moves)
         module.body.freeze = lambda name: None
+        if unseen == "markers":
+            module.takes = [SimpleNamespace(observations=SimpleNamespace(cameras=()))]
+        elif unseen:
+            module.world = replace(WORLD, **{unseen: (None,)})
         module.end(module.stage)
         assert (module.stage is not None and module.stage.silhouettes) == outlines
         if outlines:
