@@ -267,8 +267,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def shows_outlines(self) -> bool:
         """Whether outlines say more on the law than cues do: it yields or flows (of a bounce free rollouts say more about the
         grid), cameras see it, no solid can hide a part of it, and no force is measured, which would count for nothing."""
-        seen = all(len(take.observations.cameras) for take in self.takes)
-        return self.is_plastic() and seen and not (self.world.colliders or self.world.forces)
+        if not self.is_plastic() or self.world.colliders or self.world.forces:
+            return False
+        return all(len(take.observations.cameras) for take in self.takes)
 
     # ---------------------------------------------------------------- state
     @property
