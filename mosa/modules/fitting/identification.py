@@ -106,6 +106,9 @@ class Identification:
         cues = [take.cues for take in self.takes if take is not None]
         self.few = residuals.fewer(cues)
         self.silhouettes = stage.silhouettes
+        self.edges = [
+            residuals.outlines(t.observations.mattes) for t in self.takes if stage.silhouettes
+        ]
         alone = (self.calibrating or marked or any(each.single for each in cues)) and kinds[0]
         self.kinds = (True, False, False) if alone or stage.silhouettes else kinds
         if not any(self.kinds) and not world.forces:
@@ -279,7 +282,9 @@ class Identification:
         """Of a rollout from what was seen of take `index`, and from the forces measured there."""
         take = self.takes[index]
         if self.silhouettes:
-            return residuals.silhouettes(rollout.x, self.body.spacing, take.observations)
+            return residuals.silhouettes(
+                rollout.x, self.body.spacing, take.observations, self.edges[index]
+            )
         curves, turn = curves_of(self.world.forces, take.name, index == 0), take.start.rotation
         found = residuals.fields(rollout, take.cues, turn, self.chosen, take.response)
         if not curves:

@@ -84,9 +84,16 @@ def fields(
     )
 
 
+def outlines(mattes: Tensor) -> Tensor:
+    """(V, T, h, w) how much a wider outline would change blocks of pixels of mattes (V, T, H, W): the same for all rollouts."""
+    edge = max_pool2d(mattes, EDGE, 1, EDGE // 2) + max_pool2d(-mattes, EDGE, 1, EDGE // 2)
+    return avg_pool2d(edge, PIXELS, ceil_mode=True)
+
+
 @torch.no_grad()
-def silhouettes(x: Tensor, spacing: float, observations: Observations) -> Fields:
+def silhouettes(x: Tensor, spacing: float, observations: Observations, edge: Tensor) -> Fields:
     """Of particles at x (T, N, 3) [m], `spacing` [m] apart at rest, from the mattes: position (T - 1, P, 1) over blocks of pixels.
+    edge: `outlines` of the mattes.
 
     Particles are drawn as balls, since splats that are carried by a flow have fins. How far an outline is from them is not known:
     in each frame the part of the difference that a wider or narrower outline in all views would make is left out."""
@@ -96,9 +103,10 @@ def silhouettes(x: Tensor, spacing: float, observations: Observations) -> Fields
     for view, mattes in enumerate(observations.mattes[:, :frames].to(x)):
         cameras = repeat_cameras(observations.cameras.select([view]), frames)
         alpha = rasterize(x, shapes, opacities, x.new_ones(1, n, 1), cameras, index)[1]
-        edge = max_pool2d(mattes, EDGE, 1, EDGE // 2) + max_pool2d(-mattes, EDGE, 1, EDGE // 2)
-        found.append(avg_pool2d(torch.stack((alpha - mattes, edge), 1), PIXELS, ceil_mode=True))
-    away, edge = torch.stack(found, 2)[1:].flatten(3).transpose(0, 1).flatten(2)
+        found.append(avg_pool2d(alpha - mattes, PIXELS, ceil_mode=True))
+    away, edge = (
+        t.transpose(0, 1)[1:].flatten(1) for t in (torch.stack(found), edge[:, :frames].to(x))
+    )
     share = (away * edge).sum(1) / edge.square().sum(1).clamp(min=1e-12)
     away = (away - share[:, None] * edge)[..., None]
     none = away.new_zeros(len(away), 1, 1)

@@ -5,6 +5,8 @@ Plain torch on any device; sums are made in integers, so that equal arguments gi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -121,15 +123,21 @@ def first_crossing(
     return hit
 
 
+def marched(distance: Volume, origin: Tensor, direction: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Ways (M, k) [m] along rays (M, 3) from one border of the grid to the other, a cell apart, some at once, and the distances
+    (M, k) there."""
+    centre, radius = span(distance)
+    begin = ((centre - origin) * direction).sum(-1) - radius
+    steps = torch.arange(int(2 * radius / distance.pitch) + 1, device=begin.device)
+    for ahead in steps.split(at_once(begin)):
+        ways = begin[:, None] + ahead * distance.pitch
+        yield ways, at(distance, origin[:, None] + ways[..., None] * direction[:, None])
+
+
 def nearest_passing(distance: Volume, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest distance (M,) that rays (M, 3) meet inside the grid, and the way (M,) [m] to it."""
-    centre, radius = span(distance)
-    middle = ((centre - origin) * direction).sum(-1)
-    best, way = torch.full_like(middle, float("inf")), middle.clone()
-    steps = torch.arange(int(2 * radius / distance.pitch) + 1, device=middle.device)
-    for ahead in steps.split(at_once(middle)):
-        ways = (middle - radius)[:, None] + ahead * distance.pitch
-        found = at(distance, origin[:, None] + ways[..., None] * direction[:, None])
+    best, way = torch.full_like(origin[:, 0], float("inf")), torch.zeros_like(origin[:, 0])
+    for ways, found in marched(distance, origin, direction):
         found, nearest = found.min(1)
         here = ways.gather(1, nearest[:, None])[:, 0]
         nearer = found < best

@@ -251,11 +251,8 @@ def _touching(
     distance: Volume, origin: Tensor, direction: Tensor, nearest: Tensor, within: float
 ) -> Tensor:
     """Length [m] of rays (M, 3) on which the distance is less than `within` [m] above the one at their nearest points (M, 3)."""
-    centre, radius = field.span(distance)
     limit = field.at(distance, nearest) + within
-    middle = ((centre - origin) * direction).sum(-1)
     count = torch.zeros_like(limit)
-    for k in range(int(2 * radius / distance.pitch) + 1):
-        here = middle - radius + k * distance.pitch
-        count += field.at(distance, origin + here[:, None] * direction) < limit
+    for _, found in field.marched(distance, origin, direction):
+        count += (found < limit[:, None]).sum(1)
     return count * distance.pitch

@@ -175,13 +175,14 @@ class Objective:
         draw = _round_robin(windows, frames, generator)
         device = windows.images.device
         some, every = frames, torch.tensor(frames, device=device)
-        state = torch.arange(at_once or len(frames), device=device).repeat_interleave(views)
+        shown = len(frames) if at_once is None else min(at_once, len(frames))
+        state = torch.arange(shown, device=device).repeat_interleave(views)
         for step in range(steps):
             factor = 0.51 + 0.49 * math.cos(math.pi * step / steps)
             optimizer.param_groups[0]["lr"] = rate * factor
             if at_once is not None:
-                chosen = torch.randperm(len(frames), generator=generator)[:at_once]
-                some, every = [frames[i] for i in chosen], torch.tensor(frames)[chosen].to(device)
+                some = [frames[i] for i in torch.randperm(len(frames), generator=generator)[:shown]]
+                every = torch.tensor(some, device=device)
             loss = self(every, windows.select(draw(views, some)), state)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -221,6 +222,6 @@ def fit_motion(
         objective, rate = Objective(motion, target, settings), settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    at_once = None if settings.frames is None else min(settings.frames, len(moving))
-    objective.minimise(optimizer, moving, settings.iterations, settings.views, *draws, at_once)
+    sizes = settings.iterations, settings.views
+    objective.minimise(optimizer, moving, *sizes, *draws, settings.frames)
     return motion

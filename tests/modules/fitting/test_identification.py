@@ -72,7 +72,8 @@ def test_outlines_tell_the_stiffness_where_cues_are_wrong(monkeypatch):
     film = Observations(None, torch.zeros(4, FRAMES, 96, 96).double(), None, cameras, 96)
     with monkeypatch.context() as whole:
         whole.setattr(residuals, "PIXELS", 1)
-        seen = residuals.silhouettes(x, true.spacing, film).position  # nothing was filmed yet
+        edge = residuals.outlines(film.mattes)
+        seen = residuals.silhouettes(x, true.spacing, film, edge).position  # nothing was filmed yet
     film.mattes[:, 1:] = seen.reshape(FRAMES - 1, 4, 96, 96).transpose(0, 1)
     take = take_of(body, begins, FRAMES)
     take.observations = film

@@ -48,7 +48,8 @@ def test_of_outlines_the_width_does_not_count_and_the_place_does(monkeypatch):
     def away(x: torch.Tensor, mattes: torch.Tensor) -> torch.Tensor:
         mattes = mattes.reshape(1, 3, 64, 64).transpose(0, 1).expand(-1, 2, -1, -1)
         seen = Observations(None, mattes, None, cameras, 64)
-        return residuals.silhouettes(x, spacing, seen).position.flatten()
+        edge = residuals.outlines(mattes)
+        return residuals.silhouettes(x, spacing, seen, edge).position.flatten()
 
     nothing = torch.zeros(3 * 64 * 64).double()
     own, ball = away(x, nothing), residuals.BALL
