@@ -51,8 +51,16 @@ class KeepLast(Checkpoint):
         self.path = Path(trainer.default_root_dir, "checkpoints", "last.ckpt")
 
     def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
-        """The figures of an earlier run in this folder go: they would say that this one is complete."""
-        (Path(trainer.default_root_dir) / "metrics.json").unlink(missing_ok=True)
+        """The figures of an earlier run in this folder go: they would say that this one is complete. The checkpoint of one that did
+        not end is kept."""
+        figures = Path(trainer.default_root_dir, "metrics.json")
+        if self.path.is_file() and not figures.is_file() and trainer.ckpt_path is None:
+            earlier = self.path.replace(self.path.with_name("earlier.ckpt"))
+            log.warning(
+                "a run in this folder did not end, and this one begins anew; ckpt_path=%s goes on with it",
+                earlier,
+            )
+        figures.unlink(missing_ok=True)
         if module.stage is None:
             log.info("the fit was complete: no further step")
 

@@ -163,12 +163,29 @@ def test_what_does_not_say_what_is_learned_may_differ(tmp_path, changed):
     )
 
 
+def begin(folder, checkpoint=None):
+    last, trainer = KeepLast(), SimpleNamespace(default_root_dir=str(folder), ckpt_path=checkpoint)
+    last.setup(trainer, None, "fit")
+    last.on_fit_start(trainer, SimpleNamespace(stage=None))
+
+
 def test_a_fit_that_begins_takes_away_the_figures_of_the_run_before(tmp_path):
     """They would say that it is complete, were it killed."""
     write_figures(tmp_path, {"test/rms_m": 0.5})
-    fit = SimpleNamespace(stage=None)
-    KeepLast().on_fit_start(SimpleNamespace(default_root_dir=str(tmp_path)), fit)
+    begin(tmp_path)
     assert not (tmp_path / "metrics.json").exists()
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_fit_that_begins_anew_keeps_the_checkpoint_of_one_that_did_not_end(
+    tmp_path, caplog, goes_on
+):
+    last, earlier = (tmp_path / "checkpoints" / name for name in ("last.ckpt", "earlier.ckpt"))
+    last.parent.mkdir()
+    last.write_text("step 179 of 200")
+    begin(tmp_path, str(last) if goes_on else None)
+    assert (last if goes_on else earlier).read_text() == "step 179 of 200"
+    assert (f"ckpt_path={earlier} goes on with it" in caplog.text) != goes_on
 
 
 def test_a_checkpoint_that_is_removed_before_the_fit_reads_it_is_named(tmp_path, monkeypatch):
