@@ -238,7 +238,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
         inflation = INFLATION
     if record is None:
         raise DataError(f"{where}: {path}: expected the checkpoint of an ended fit, found none")
-    count = 0 if adapter is None or not adapter.few_numbers else len(adapter.numbers)
+    count = 0 if adapter is None or not adapter.few_numbers else adapter.numbers.numel()
     learned = [*material.learned, *(f"operator[{k}]" for k in range(count))]
     posterior = Posterior.read(record.plain()).only(learned)
     if law.split("~")[0] != material.law.split("~")[0] or not posterior.names:

@@ -117,12 +117,16 @@ def test_a_mistake_in_a_stage_names_its_key():
         )
 
 
-@pytest.mark.parametrize(
-    "adapter, expected", [("hyperelastic", "gauss_newton"), (None, None), ("stress", "adam")]
-)
+CONSTANT = {"name": "stress", "state_dependence": "constant"}
+
+
+@pytest.mark.parametrize("adapter, expected", [
+    ({"name": "hyperelastic"}, "gauss_newton"), ({"name": None}, None), ({"name": "stress"}, "adam"),
+    (CONSTANT, "adam"), (CONSTANT | {"no_pre": True, "no_post": True}, "gauss_newton"),
+])  # fmt: skip
 def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter, expected):
-    fit = composed()["fit"]
-    stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    fit, built = composed()["fit"], build_adapter(adapter)
+    stages = build_stages(fit, heterogeneity=None, adapter=built)
     found = {stage.name: stage.optimizer for stage in stages}
     assert (
         found.get("joint") == expected and found["prior"] == "gauss_newton"
@@ -132,12 +136,9 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
         with pytest.raises(
             ConfigError, match=r"fit\.joint\.optimizer: gauss_newton learns few numbers"
         ):
-            build_stages(asked, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+            build_stages(asked, heterogeneity=None, adapter=built)
     adam = composed("fit=adam")["fit"]
-    assert {
-        s.optimizer
-        for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))
-    } == {"adam"}
+    assert {s.optimizer for s in build_stages(adam, heterogeneity=None, adapter=built)} == {"adam"}
 
 
 @pytest.mark.parametrize("overrides, law", [("", "auto"), ("fit=adam", "corotated"), ("fit=paper", "corotated"),

@@ -106,20 +106,20 @@ def test_networks_in_place_of_the_law_start_near_the_prior_and_hold_its_paramete
     assert [g["name"] for g in module.groups(module.stages[-1])] == ["contact", "adapter"]
 
 
-LINEAR = "adapter=linear"
+LINEAR = "adapter=linear", "losses.operator=0.2"
 """It has a penalty of its size; that of the default adapter is the prior of its numbers."""
 
 
 def test_without_the_adapter_there_is_no_penalty_of_it(first_step):
-    full, _ = first_step("full", LINEAR)
-    terms, _ = first_step("no_stress", LINEAR)
+    full, _ = first_step("full", *LINEAR)
+    terms, _ = first_step("no_stress", *LINEAR)
     assert full.keys() - terms.keys() == {"operator"}
     assert terms == {k: v for k, v in full.items() if k != "operator"}
 
 
 def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexplained(first_step):
-    terms, _ = first_step("full", LINEAR)
-    module = first_step.modules["full", LINEAR]
+    terms, _ = first_step("full", *LINEAR)
+    module = first_step.modules["full", *LINEAR]
     assert module.misfit == pytest.approx(
         terms["position"], rel=1e-6
     )  # the adapter has not moved: the prior's own
@@ -135,7 +135,7 @@ def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexp
 
 @pytest.mark.parametrize("kind", ["modes", "network"])
 def test_a_stage_that_starts_from_the_prior_forgets_eta(first_step, kind):
-    overrides = () if kind == "modes" else ("heterogeneity.kind=network", LINEAR)
+    overrides = () if kind == "modes" else ("heterogeneity.kind=network", *LINEAR)
     first_step("full", *overrides)
     body = first_step.modules["full", *overrides].body
     body.freeze("prior")

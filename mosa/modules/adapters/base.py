@@ -39,10 +39,11 @@ class Adapter(nn.Module):
 
     E_ref: Tensor
     poisson: Tensor
+    numbers: Any
     energetic = False
     """Whether G is a stiffness, of an energy in Green's strain; else it acts on the prior's stress."""
     few_numbers = False
-    """Whether all that it learns is one parameter, `numbers`, of so few numbers that Gauss-Newton can learn them."""
+    """Whether all that it learns is one parameter, `numbers`, so few numbers that Gauss-Newton can learn them; 0 is the prior."""
     replaces_law = False
     """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
     own_dynamics = False
@@ -136,7 +137,7 @@ class Adapter(nn.Module):
     def corrects(self) -> bool:
         """Whether the law is another than the prior's: not before `switch_on`, nor where its
         `few_numbers` are all 0, as a fit leaves them that drops this part."""
-        return self.is_on and not (self.few_numbers and not any(map(torch.any, self.parameters())))
+        return self.is_on and not (self.few_numbers and not self.numbers.any())
 
     def check_on(self) -> None:
         if self.E_ref.is_cuda and torch.cuda.is_current_stream_capturing():

@@ -61,6 +61,9 @@ class StressAdapter(Adapter):
         )
         # C0 is a stiffness: it has no meaning for the strain in the yield function
         self.plastic_operator = ProgressiveOperator(l_max=l_max, **shape) if plastic else None
+        # (4, 12), what a constant operator is made of
+        self.numbers = self.operator.free
+        self.few_numbers = self.steady and not (no_C or plastic)
 
     @property
     def steady(self) -> bool:

@@ -21,7 +21,7 @@ class StageSettings(Settings):
     }
 
     optimizer: Literal["auto", "gauss_newton", "adam"] = "auto"
-    """auto: Gauss-Newton if the stage learns no network (adapter=operator or none, heterogeneity.kind=modes), else Adam"""
+    """auto: Gauss-Newton if the stage learns no network (adapter=operator, linear or none, heterogeneity.kind=modes), else Adam"""
     newton_iterations: Count = 8
     """iterations of Gauss-Newton, at most, each with a Jacobian of its own"""
     looks: Whole = 0
@@ -90,7 +90,7 @@ class Stage(StageSettings):
         Errors: ConfigError where it is asked for and cannot."""
         if self.optimizer == "gauss_newton" and not few:
             raise ConfigError(
-                f"fit.{self.name}.optimizer: gauss_newton learns few numbers (adapter=operator or none, "
+                f"fit.{self.name}.optimizer: gauss_newton learns few numbers (adapter=operator, linear or none, "
                 "heterogeneity.kind=modes), not networks; expected adam or auto"
             )
         chosen = "adam" if self.optimizer == "adam" or not few else "gauss_newton"

@@ -14,6 +14,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation.analysis.anisotropy import dyads
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.modules.adapters.hyperelastic import anisotropic_basis
+from mosa.modules.adapters.stress import StressAdapter
 from mosa.modules.fitting import identification as identification_module
 from mosa.modules.fitting import residuals
 from mosa.modules.fitting.gauss_newton import Posterior, Seat
@@ -342,6 +343,22 @@ def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
     assert values(body)["E"] == pytest.approx(E, rel=0.03)
     assert found.distance() < 0.4 * missed
     assert len(found.posterior().names) == 2 + 19
+
+
+def test_the_papers_operator_without_its_networks_explains_what_no_isotropic_law_does():
+    body, small = (
+        small_body(adapter=False, counts=(4, 3, 3)),
+        {"numbers": fibres(0.6), "counts": (4, 3, 3)},
+    )
+    body.adapter = StressAdapter(
+        alpha=0.2, major_symmetry=True, state_dependence="constant", no_pre=True, no_post=True
+    ).double()
+    body.adapter.switch_on(E, NU)
+    found = identification(body, [take_and_turn(small_body(**small), 0.5)])
+    missed = found.distance()
+    run(found, 3)
+    assert found.distance() < 0.4 * missed
+    assert len(found.posterior().names) == 2 + 48
 
 
 def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
