@@ -113,7 +113,7 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
     body, drop = objects.OBJECTS[name], drop_named(name, sequence)
     film = body.footage
     surface, particles, skin = built(body.shape, body.pitch, body.spacing, seed)
-    label = f"{name}/{sequence} (synthetic, {material})"
+    label = f"{name}/{sequence} (synthetic)"
     how = {"unit": "frame", "disable": not progress, "dynamic_ncols": True}
     with tqdm(total=film.frames - 1, desc=f"{label}: simulate", **how) as bar:
         fall = simulate(
