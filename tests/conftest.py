@@ -10,6 +10,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pytest
 import torch
 import warp as wp
+from composed_once import compose_once
 
 torch.set_num_threads(1)
 if not torch.cuda.is_available():
@@ -38,6 +39,7 @@ def unoptimised(path: Path) -> bool:
 
 
 def pytest_configure(config):
+    compose_once()
     # xdist would begin with the files of most tests: the last ones, of one long test each, would keep one process alone
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from composed_once import compose_once
 from starts_once import start_once
 
 ROOT = Path(__file__).parents[2]
@@ -83,6 +84,7 @@ def serve() -> None:
     from mosa.training import datamodule
 
     datamodule.sequence_start = start_once
+    compose_once()
     gc.freeze()  # what is looked through by no fork
     while line := sys.stdin.readline():
         process = os.fork()
