@@ -51,7 +51,7 @@ def identification(
                           IdentificationSettings(**settings), kinds, seats=seats, known=known)  # fmt: skip
 
 
-def run(found: Identification, most: int = 12) -> int:
+def run(found: Identification, most: int = 8) -> int:
     for i in range(most):
         report = found.iterate()
         assert report["after"] <= report["before"]
