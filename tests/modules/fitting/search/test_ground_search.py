@@ -347,7 +347,7 @@ def learning(truth: Ground) -> LitMosa:
     take.again = None
     body = small_body(E=1.2 * E, nu=0.3, on=False)
     stages = [
-        Stage(name=name, iterations=4, lr=0.1).but(optimizer="gauss_newton")
+        Stage(name=name, iterations=3, lr=0.1).but(optimizer="gauss_newton")
         for name in ("prior", "joint")
     ]
     return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")),
@@ -373,6 +373,7 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
     friction with which the isotropic law is nearest."""
     monkeypatch.setattr(ground_search, "NEARER", 0.0)
+    monkeypatch.setattr(ground_search, "FRICTIONS", (0.3, 1.2))
     module = learning(truth)
     begun = stages_begun(module, monkeypatch)
     identify(module)
