@@ -18,13 +18,14 @@ PAGE = ROOT / "docs" / "extending.md"
 QUICK = ["debug=default", "scene.holdout_frames=0", "fit=adam", "fit.prior.iterations=2", "fit.joint.iterations=2",
          "fit.prior_eta.iterations=0", "heterogeneity.enabled=false", "simulation.particles=100", "reconstruction.resolution=40",
          "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30", "reconstruction.carried.iterations=10",
+         "reconstruction.geometry.source=hull",
          "reconstruction.dynamic.iterations=10", "reconstruction.dynamic.track_iterations=10", "logger=csv",
          "evaluation.video=false", "evaluation.samples=64", "evaluation.assignment=32"]  # fmt: skip
 
 
 def recorded(folder: Path, cache: Path) -> Path:
     """The tiny scene in the page's format."""
-    scene = load_scene(format="builtin", name="tiny", cache=cache)
+    scene = load_scene(format="builtin", name="tiny", scale=0.5, cache=cache)
     kept = {
         "images": scene.images,
         "mattes": scene.mattes,

@@ -20,7 +20,7 @@ from mosa.twin.twin import Twin
 ROOT = Path(__file__).parents[2]
 QUICK = ["debug=default", "scene=transforms", "scene.scale=1", "scene.box=[[-0.7,-0.1,-0.7],[0.7,1,0.7]]",
          "fit.prior.newton_iterations=1", "adapter=none", "heterogeneity.enabled=false",
-         "reconstruction.static.iterations=40", "reconstruction.resolution=40",
+         "reconstruction.static.iterations=40", "reconstruction.resolution=40", "reconstruction.geometry.source=hull",
          "reconstruction.appearance.iterations=40", "reconstruction.dynamic.iterations=20",
          "reconstruction.dynamic.track_iterations=10", "logger=none", "evaluation.samples=256", "evaluation.assignment=64",
          "evaluation.video=false"]  # fmt: skip
@@ -71,7 +71,9 @@ def capture(scene, folder, camera=0, margin=4):
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("folders")
     for sequence in ("train", "test_60", "test_40"):
-        scene = load_scene(format="builtin", name="tiny", sequence=sequence, cache=cache)
+        scene = load_scene(
+            format="builtin", name="tiny", sequence=sequence, scale=0.5, cache=cache
+        )
         capture(scene, folder / "data" / sequence)
         if sequence == "train":
             export_particles(scene.truth.positions, folder / "data" / "ply")
