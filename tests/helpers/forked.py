@@ -79,6 +79,7 @@ def call(script: str, *words: str, environment: Mapping[str, str] | None = None,
 
 def serve() -> None:
     """A line for each script: its number as a process, and, once it has ended, its exit code."""
+    gc.disable()
     for name in IMPORTED:
         importlib.import_module(name)
     from mosa.training import datamodule
@@ -86,6 +87,7 @@ def serve() -> None:
     datamodule.sequence_start = start_once
     compose_once()
     gc.freeze()  # what is looked through by no fork
+    gc.enable()
     while line := sys.stdin.readline():
         process = os.fork()
         if process == 0:
