@@ -19,7 +19,8 @@ from mosa.training.lit_mosa import LitMosa
 ROOT = Path(__file__).parents[2]
 ROUGHLY = ["reconstruction.resolution=40", "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30",
            "reconstruction.dynamic.iterations=20", "reconstruction.carried.iterations=10",
-           "reconstruction.informed.iterations=1"]  # fmt: skip
+           "reconstruction.informed.iterations=1", "reconstruction.dynamic.track_iterations=5",
+           "reconstruction.geometry.source=hull"]  # fmt: skip
 """Overrides of a reconstruction in a third of the time, for tests that ask nothing of its accuracy."""
 
 

@@ -24,11 +24,6 @@ PAGES = [
     if path.name != "CHANGELOG.md" and any(block.language not in run_page.NO_CODE for block in run_page.blocks(path))
 ]  # fmt: skip
 
-ROUGH = [
-    *assembled.ROUGHLY,
-    "reconstruction.dynamic.track_iterations=5",
-    "reconstruction.geometry.source=hull",
-]
 ROUGHLY = """
 from pathlib import Path
 import mosa
@@ -112,7 +107,7 @@ swings(*(f"beams/beam_{name}.csv" for name in ("gravity_V2_a", "gravity_V2_b", "
 """
 PHONES = """
 from filming import filmed, write_films
-write_films(filmed(count=4, size=(80, 60)), Path("data/drop_1"))
+write_films(filmed(count=3, size=(80, 60)), Path("data/drop_1"))
 Path("data/sparse").mkdir()
 Path("data/sparse/0").symlink_to(Path("data/drop_1/sparse").absolute())
 """
@@ -141,7 +136,7 @@ LOOKED_AT = ["fit.prior.newton_iterations=1", "fit.joint.newton_iterations=1", "
 """Of the tutorial's run, which other pages take up. As the tutorial has it, test_main_job.py runs it."""
 FILMED = [
     *FIT,
-    *ROUGH,
+    *assembled.ROUGHLY,
     "adapter=none",
     "simulation.courant=0.4",
     "scene.scale=1",
@@ -162,7 +157,7 @@ REALLY = {
               ".c3d": ".csv"}),
     "splats": ({"mosa.splats": FALLS}, {}),
     "environments": ({"train.py": BUILT_IN, "mosa.environments": TRIALS, "task=hanging": ["films=0"]},
-                     {"checkpoint=...": f"checkpoint={run_page.RUN}/checkpoints/last.ckpt"}),
+                     {"truth.spacing=0.0125": "truth.spacing=0.02", "checkpoint=...": f"checkpoint={run_page.RUN}/checkpoints/last.ckpt"}),
     "own_training_script": (
         {"train.py": [*FIT, "adapter=none"], "scene.holdout_cameras=[1]": ["scene.holdout_frames=1", *assembled.ROUGHLY]},
         {"scene.holdout_cameras=[5]": "scene.holdout_cameras=[1]"}),
