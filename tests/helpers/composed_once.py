@@ -9,7 +9,7 @@ from pathlib import Path
 from hydra._internal import config_loader_impl
 from hydra._internal.defaults_list import DefaultsList, Overrides
 
-CONF = f"file://{Path(__file__).parents[2] / 'conf'}"
+CONF = str(Path(__file__).parents[2] / "conf")
 made = config_loader_impl.create_defaults_list
 files = config_loader_impl.ConfigLoaderImpl._compose_config_from_defaults_list
 known: dict[tuple, object] = {}
@@ -17,9 +17,10 @@ known: dict[tuple, object] = {}
 
 def once(repo, words: tuple, make: Callable[[], object]) -> object:
     """What `make` returns, which nobody changes, or what it returned before of the same files."""
-    places = tuple(source.path for source in repo.get_sources())
-    if any(place.startswith("file:") and place != CONF for place in places):
+    sources = repo.get_sources()
+    if any(source.scheme() == "file" and source.path != CONF for source in sources):
         return make()
+    places = tuple(source.path for source in sources)
     return known[key] if (key := (places, *words)) in known else known.setdefault(key, make())
 
 

@@ -82,10 +82,12 @@ def serve() -> None:
     gc.disable()
     for name in IMPORTED:
         importlib.import_module(name)
+    from mosa import compose
     from mosa.training import datamodule
 
     datamodule.sequence_start = start_once
     compose_once()
+    compose("debug=default")  # which most scripts are given
     gc.freeze()  # what is looked through by no fork
     gc.enable()
     while line := sys.stdin.readline():
