@@ -15,7 +15,7 @@ from mosa.data.synthetic.bodies.objects import object_named
 from mosa.data.synthetic.drop import simulate
 from mosa.data.synthetic.films import built
 from mosa.environments import arena as arenas
-from mosa.environments import command, study
+from mosa.environments import command, policies, study
 from mosa.environments.arena import (
     LOST,
     Arena,
@@ -295,7 +295,9 @@ def test_the_jaws_of_the_tower_close_about_what_is_between_them():
     assert np.abs(shots[0] - shots[1]).mean() > 0.5  # pictures show them where they are
 
 
-def test_a_model_of_what_was_tried_leads():
+def test_a_model_of_what_was_tried_leads(monkeypatch):
+    monkeypatch.setattr(policies, "FITTED", 150)
+    monkeypatch.setattr(policies, "DESCENDED", 100)
     search = Search(iterations=2, batch=6, every=2, validation=4, candidates=4, spread=0.5)
     train, check = arena("hanging", 24), arena("hanging", 4)
     found = by_model(train, check, search, seed=0)
