@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-gc.disable()  # until all is imported and collected, of which little is garbage
 
 import pytest
 import torch
@@ -41,6 +40,7 @@ def unoptimised(path: Path) -> bool:
 
 def pytest_configure(config):
     compose_once()
+    gc.disable()  # until all is imported and collected, of which little is garbage
     # xdist would begin with the files of most tests: the last ones, of one long test each, would keep one process alone
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False

@@ -1,5 +1,5 @@
-"""Hydra's composition of files once for each choice of groups, of the program's own conf/: it takes a tenth of a second, and most
-compositions of the tests differ in overrides of values, which are applied after it. What is composed of other folders is not kept."""
+"""Hydra's composition of the files of conf/ once for each choice of groups: it takes a tenth of a second, and most compositions
+of the tests differ in overrides of values, which are applied after it. What is composed of other folders is not kept."""
 
 import copy
 from collections.abc import Callable
@@ -33,7 +33,9 @@ def defaults_once(repo, config_name, overrides_list, **how) -> DefaultsList:
 
 
 def files_once(self, defaults, repo):
-    return copy.deepcopy(once(repo, tuple(map(astuple, defaults)), lambda: files(self, defaults, repo)))
+    return copy.deepcopy(
+        once(repo, tuple(map(astuple, defaults)), lambda: files(self, defaults, repo))
+    )
 
 
 def compose_once() -> None:

@@ -75,9 +75,7 @@ def capture(scene, folder, camera=0, margin=4):
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("folders")
     for sequence in ("train", "test_60", "test_40"):
-        scene = load_scene(
-            format="builtin", name="tiny", sequence=sequence, scale=0.5, cache=cache
-        )
+        scene = load_scene(format="builtin", name="tiny", sequence=sequence, scale=0.5, cache=cache)
         seen = {"images": scene.images[SOME], "mattes": scene.mattes[SOME]}
         scene = replace(scene, cameras=scene.cameras.select(SOME), **seen)
         capture(scene, folder / "data" / sequence)

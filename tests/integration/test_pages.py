@@ -157,7 +157,8 @@ REALLY = {
               ".c3d": ".csv"}),
     "splats": ({"mosa.splats": FALLS}, {}),
     "environments": ({"train.py": BUILT_IN, "mosa.environments": TRIALS, "task=hanging": ["films=0"]},
-                     {"truth.spacing=0.0125": "truth.spacing=0.02", "checkpoint=...": f"checkpoint={run_page.RUN}/checkpoints/last.ckpt"}),
+                     {"truth.spacing=0.0125": "truth.spacing=0.02",
+                      "checkpoint=...": f"checkpoint={run_page.RUN}/checkpoints/last.ckpt"}),
     "own_training_script": (
         {"train.py": [*FIT, "adapter=none"], "scene.holdout_cameras=[1]": ["scene.holdout_frames=1", *assembled.ROUGHLY]},
         {"scene.holdout_cameras=[5]": "scene.holdout_cameras=[1]"}),
