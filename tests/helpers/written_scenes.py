@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import pickle
 import struct
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -15,6 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from mosa.data.formats.footage import OPENGL_TO_OPENCV
 from mosa.types import Cameras, Scene
+
+
+def seen_by(scene: Scene, some: Sequence[int]) -> Scene:
+    """As these of its cameras see it."""
+    cameras = scene.cameras.select(list(some))
+    return replace(
+        scene, images=scene.images[list(some)], mattes=scene.mattes[list(some)], cameras=cameras
+    )
 
 
 def opengl_pose(w2c: torch.Tensor) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from written_scenes import export_particles, export_transforms
+from written_scenes import export_particles, export_transforms, seen_by
 
 from mosa.data.scene import load_scene
 from mosa.evaluation.evaluate import run_sequences
@@ -24,10 +24,6 @@ QUICK = ["debug=default", "scene=transforms", "scene.scale=1", "scene.box=[[-0.7
          "reconstruction.appearance.iterations=40", "reconstruction.dynamic.iterations=20",
          "reconstruction.dynamic.track_iterations=10", "simulation.courant=1", "simulation.contact_offset=false", "logger=none",
          "evaluation.samples=256", "evaluation.assignment=64", "evaluation.video=false"]  # fmt: skip
-
-
-SOME = [0, 2, 4]
-"""Of six cameras."""
 
 
 def call(script, folder, *overrides):
@@ -76,8 +72,7 @@ def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("folders")
     for sequence in ("train", "test_60", "test_40"):
         scene = load_scene(format="builtin", name="tiny", sequence=sequence, scale=0.5, cache=cache)
-        seen = {"images": scene.images[SOME], "mattes": scene.mattes[SOME]}
-        scene = replace(scene, cameras=scene.cameras.select(SOME), **seen)
+        scene = seen_by(scene, (0, 2, 4))
         capture(scene, folder / "data" / sequence)
         if sequence == "train":
             export_particles(scene.truth.positions, folder / "data" / "ply")

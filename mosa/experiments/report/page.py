@@ -306,8 +306,8 @@ def within(experiment: Experiment, claim: Claim, rows: Rows, tables: Tables) -> 
     open_ = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
     unit = match[1] if (match := re.search(r"\[(.+)\]$", claim.figure)) else ""
     text = f"{'holds' if not above else 'does not hold' if wrong else open_}, "
-    ordered = sorted({limits[row] for row in known})
-    most = " to ".join(f"{each:g}" for each in (ordered[0], *ordered[1:][-1:]))
+    bounds = [limits[row] for row in known]
+    most = " to ".join(dict.fromkeys(f"{end(bounds):g}" for end in (min, max)))
     text += f"{len(known) - len(above)} of {len(known)} within {most} {unit}".rstrip()
     for which, said in ((unsure, "not determined"), (wrong, "beyond it")):
         listed = ", ".join(f"{row} ({above[row].text(1)})" for row in which)

@@ -346,15 +346,13 @@ def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
 
 
 def test_the_papers_operator_without_its_networks_explains_what_no_isotropic_law_does():
-    body, small = (
-        small_body(adapter=False, counts=(4, 3, 3)),
-        {"numbers": fibres(0.6), "counts": (4, 3, 3)},
-    )
+    body = small_body(adapter=False, counts=(4, 3, 3))
+    truth = small_body(numbers=fibres(0.6), counts=(4, 3, 3))
     body.adapter = StressAdapter(
         alpha=0.2, major_symmetry=True, state_dependence="constant", no_pre=True, no_post=True
     ).double()
     body.adapter.switch_on(E, NU)
-    found = identification(body, [take_and_turn(small_body(**small), 0.5)])
+    found = identification(body, [take_and_turn(truth, 0.5)])
     missed = found.distance()
     run(found, 3)
     assert found.distance() < 0.4 * missed

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import squashed_body
 import torch
+from written_scenes import seen_by
 
 from mosa.data.hull import Volume, visual_hull
 from mosa.data.synthetic.bodies.parts import Shape, coat, ellipsoid
@@ -120,16 +121,14 @@ def test_a_hollow_that_no_outline_shows_is_emptied_and_nothing_else(bowl):
     assert figures["geometry/uncertain_share"] < 0.03
 
 
-def by_half(scene: Scene) -> Scene:
-    """As every second camera sees it."""
-    some = list(range(0, 12, 2))
-    return replace(scene, images=scene.images[some], mattes=scene.mattes[some], cameras=scene.cameras.select(some))  # fmt: skip
+EVERY_SECOND = range(0, 12, 2)
+"""Of the bowl's cameras."""
 
 
 def test_equal_images_give_equal_bits(bowl, monkeypatch):
     monkeypatch.setattr("mosa.reconstruction.geometry.body.FIRST", ((1, 1.0),))
     monkeypatch.setattr("mosa.reconstruction.geometry.body.THEN", ((2, 0.6),))
-    one, other = (found(by_half(bowl))[1] for _ in range(2))
+    one, other = (found(seen_by(bowl, EVERY_SECOND))[1] for _ in range(2))
     assert torch.equal(one.body.values, other.body.values) and torch.equal(
         one.deviation, other.deviation
     )
@@ -143,7 +142,7 @@ def test_where_colours_say_nothing_no_matter_is_carved(bowl, kind):
         scene = replace(bowl, images=1 - (1 - bowl.images * gain) * bowl.mattes[..., None])
     else:
         scene = replace(bowl, images=torch.ones_like(bowl.images))
-    _, geometry = found(by_half(scene))
+    _, geometry = found(seen_by(scene, EVERY_SECOND))
     _, lost = compared(geometry.body)
     assert lost < 0.002
     assert geometry.body.occupied_volume() > 0.92 * geometry.hull_volume
