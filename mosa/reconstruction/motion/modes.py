@@ -22,7 +22,7 @@ from mosa.reconstruction.motion.softest import softest_vectors
 NEAREST = 8
 """Particles from which modes are continued to another point."""
 FILTERED_FROM = 6000
-"""Number of particles above which the modes are found by filtering: 31,000 take 17 CPU-seconds, and 84 by a factorisation."""
+"""Number of particles above which a CPU finds the modes by filtering: 31,000 take 17 CPU-seconds, and 84 by a factorisation."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ def _bending_modes(
     matrix: sparse.csr_matrix, rest: Tensor, affine: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Energies (count,) and orthonormal patterns (N, count) of the softest modes that are not affine, the softest first."""
-    if len(affine) >= FILTERED_FROM:
+    # a factorisation runs on the host alone: 4 s of a GPU's run of 4000 particles
+    if len(affine) >= FILTERED_FROM or rest.is_cuda:
         known = torch.as_tensor(affine, device=rest.device)
         found = softest_vectors(matrix, rest.detach(), known, count)
         if found is not None:
