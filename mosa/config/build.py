@@ -279,6 +279,9 @@ def build_stages(
     learns = {name: any(part is not None for part in parts) for name, parts in learned.items()}
     wanted = [s for s in stages if s.iterations > 0 and (s.calibrates or learns[s.name])]
     stages = recalibrations([s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted])
+    if adapter is not None and adapter.later:
+        again = [s.but(name="networks", optimizer="adam", start=None) for s in wanted if s.learns_adapter]  # fmt: skip
+        stages += [stage.resolved(few=False) for stage in again]
     if searching and stages and not stages[0].newton:
         raise ConfigError(
             "prior=auto: expected fit.prior.optimizer=auto or gauss_newton, which compares candidates; found adam"

@@ -46,7 +46,7 @@ def needs_of(model: type[Settings], key: str) -> list[str]:
 def unmet(settings: Settings, need: str, where: list[str], stages: Sequence[Stage]) -> str | None:
     if need in ("newton", "adam"):
         own = where[-1] if where[:1] == ["fit"] and where[-1] in STAGES else None
-        running = [stage.newton for stage in stages if own in (None, stage.name)]
+        running = [stage.newton for stage in stages if own in (None, stage.section)]
         if not running or (need == "newton") in running:
             return None
         if own is not None:

@@ -507,7 +507,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 self.moves = [*self.moves, moved]
         return_memory()
         if stage.learns_adapter and self.body.adapter is not None:
-            self.body.switch_on()
+            if stage.name != "networks":  # whose adapter the stage before has left on
+                self.body.switch_on()
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
 
@@ -545,6 +546,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.stage_index = following + (by_silhouettes and not self.shows_outlines())
         self.losses, self.identification = [], None
         self.retreat, self.stage_over = Retreat(), False
+        if self.stage is not None and self.stage.name == "networks":  # before it has an optimiser
+            self.body.adapter.vary()
+            self.posterior, self.parts = None, {}  # both are of the numbers that they begin at
 
     # ---------------------------------------------------------------- logs
     def log_values(self, values: dict[str, Tensor | float]) -> None:

@@ -123,6 +123,7 @@ CONSTANT = {"name": "stress", "state_dependence": "constant"}
 @pytest.mark.parametrize("adapter, expected", [
     ({"name": "hyperelastic"}, "gauss_newton"), ({"name": None}, None), ({"name": "stress"}, "adam"),
     (CONSTANT, "adam"), (CONSTANT | {"no_pre": True, "no_post": True}, "gauss_newton"),
+    (CONSTANT | {"state_dependence": "later"}, "gauss_newton"),
 ])  # fmt: skip
 def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter, expected):
     fit, built = composed()["fit"], build_adapter(adapter)
@@ -131,6 +132,7 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
     assert (
         found.get("joint") == expected and found["prior"] == "gauss_newton"
     )  # without an adapter there is nothing to join
+    assert found.get("networks") == ("adam" if adapter.get("state_dependence") == "later" else None)
     asked = fit | {"joint": fit["joint"] | {"optimizer": "gauss_newton"}}
     if expected == "adam":
         with pytest.raises(

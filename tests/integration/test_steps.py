@@ -6,6 +6,7 @@ from assembled import made, trainer
 
 from mosa.errors import SimulationDiverged
 from mosa.training.fitting import fit
+from mosa.training.lit_mosa import LitMosa
 
 
 def test_a_step_that_cannot_be_simulated_is_taken_back_and_the_fit_goes_on(cache):
@@ -49,6 +50,27 @@ def test_a_step_that_cannot_be_simulated_is_taken_back_and_the_fit_goes_on(cache
     assert len(losses[-1]) == 4 and losses[-1][1] == losses[-1][0]
     assert module.stage is None  # the last step was taken back too
     assert all(torch.equal(a, b.detach()) for a, b in zip(weights[3], adapter.parameters()))
+
+
+def test_networks_begin_where_the_constant_operator_ends(cache, tmp_path):
+    run = made(cache, "adapter=mosa_from_linear", "heterogeneity.enabled=false")
+    module, starts = run.module, []
+    assert [stage.name for stage in module.stages] == ["prior", "joint", "networks"]
+    adapter, loss = module.body.adapter, module.gradient_loss
+
+    def noted(stage, iteration, batch):
+        starts.append((module.posterior, adapter.operator.planes.weight.abs().max()))
+        return loss(stage, iteration, batch)
+
+    module.gradient_loss = noted
+    fitter = trainer(enable_checkpointing=True, default_root_dir=tmp_path)
+    fitter.fit(module, datamodule=run.data)
+    assert starts[0] == (None, 0.0) and adapter.operator.planes.weight.abs().max() > 0
+    fitter.save_checkpoint(tmp_path / "end.ckpt")
+    loaded = LitMosa.load_from_checkpoint(tmp_path / "end.ckpt")
+    assert not loaded.body.adapter.steady and loaded.posterior is None
+    for ours, theirs in zip(adapter.parameters(), loaded.body.adapter.parameters()):
+        assert torch.equal(ours, theirs)
 
 
 def test_a_fit_that_its_trainer_cuts_short_says_so(cache):

@@ -44,6 +44,8 @@ class Adapter(nn.Module):
     """Whether G is a stiffness, of an energy in Green's strain; else it acts on the prior's stress."""
     few_numbers = False
     """Whether all that it learns is one parameter, `numbers`, so few numbers that Gauss-Newton can learn them; 0 is the prior."""
+    later = False
+    """Whether it has networks that begin where `numbers` end: their stage, `networks`, calls `vary` first."""
     replaces_law = False
     """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
     own_dynamics = False
@@ -73,6 +75,9 @@ class Adapter(nn.Module):
     def unsuited(self, law: Law) -> str | None:
         """Why it can correct nothing of a body of this law: it is left out then, with this as a warning. None where it can."""
         return None
+
+    def vary(self) -> None:
+        """From now on networks are learned, not `numbers`; where `later`."""
 
     def settle(self, rest: Tensor, volume: Tensor) -> None:
         """Told once about the body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError."""

@@ -31,7 +31,8 @@ class ProgressiveOperator(nn.Module):
     alpha: bound of the entries of the LU factors; alpha_normal: of those of C_xyz and of l2, None: alpha;
     l_max: of L_pre and L_post, None leaves them linear (the paper's form);
     factors: residual | printed, see `microplane.CORRECTIONS`;
-    state_dependence: full | constant (the four matrices are learned numbers, not functions of the state);
+    state_dependence: full | constant (the four matrices are learned numbers, not functions of the state) | later (the same, and
+    without L_pre and L_post, until `vary`);
     major_symmetry: (A + C0 A^T C0^-1)/2 in place of A, needs `poisson` of C0;
     no_prior_stress: s1 = L_pre instead of s + L_pre.
     The output is exactly 0 at initialisation; with printed factors it is 1e-4 of the stress there."""
@@ -46,8 +47,8 @@ class ProgressiveOperator(nn.Module):
         self.factors, self.correction = factors, microplane.CORRECTIONS[factors]
         self.alpha_normal = alpha if alpha_normal is None else alpha_normal
         self.no_C, self.no_prior_stress = no_C, no_prior_stress
-        self.no_pre, self.no_post = no_pre, no_post
-        self.constant, self.major_symmetry = state_dependence == "constant", major_symmetry
+        self.major_symmetry, self.later = major_symmetry, state_dependence == "later"
+        self.left_out = no_pre, no_post
         self.phi = TwoHiddenLayers(12, 6, hidden)
         self.psi1 = TwoHiddenLayers(12, hidden, hidden)
         self.planes = nn.Linear(hidden, 36)
@@ -56,13 +57,38 @@ class ProgressiveOperator(nn.Module):
         for layer in (self.phi[-1], self.planes, self.theta[-1]):
             zero_outputs(layer)
         zero_outputs(self.psi2[-1], 12)
-        self.free = nn.Parameter(torch.zeros(4, 12)) if self.constant and not no_C else None
-        self.adaptive = not (no_C or self.constant)
+        constant = state_dependence != "full"
+        self.free = nn.Parameter(torch.zeros(4, 12)) if constant and not no_C else None
+        if self.later:
+            self.register_buffer("varies", torch.tensor(False))
+            # a hook of a method would keep a copied operator's original
+            self.register_load_state_dict_post_hook(
+                lambda module, _: module.settle(not bool(module.varies))
+            )
+        self.settle(constant)
+
+    def settle(self, constant: bool) -> None:
+        """Which networks there are: with matrices that are learned numbers, or with functions of the state."""
+        waits = self.later and constant
+        self.constant = constant
+        self.no_pre, self.no_post = (out or waits for out in self.left_out)
+        self.adaptive = not (self.no_C or constant)
         for module, used in (
-            (self.phi, not no_pre), (self.psi1, self.adaptive or not no_post), (self.planes, self.adaptive),
-            (self.psi2, self.adaptive or not no_post), (self.theta, not no_post),
+            (self.phi, not self.no_pre), (self.psi1, self.adaptive or not self.no_post), (self.planes, self.adaptive),
+            (self.psi2, self.adaptive or not self.no_post), (self.theta, not self.no_post),
         ):  # fmt: skip
             module.requires_grad_(used)
+        if self.free is not None:
+            self.free.requires_grad_(constant)
+
+    @torch.no_grad()
+    def vary(self) -> None:
+        """From now on all are functions of the state that begin as the learned numbers: these become biases of the last layers."""
+        raw = self.scale * self.free
+        self.planes.bias.copy_(raw[:3].flatten())
+        self.psi2[-1].bias[:12].copy_(raw[3])
+        self.varies.fill_(True)
+        self.settle(False)
 
     def residual(self, network: nn.Module, *inputs: Tensor) -> Tensor:
         """L_pre, L_post: (N, 6), within l_max."""

@@ -33,7 +33,8 @@ class StressAdapter(Adapter):
     alpha, alpha_normal, l_max (dimensionless): bounds, see `ProgressiveOperator`; input_scale: factor of what the networks read;
     rest_free: an undeformed body stays stress-free, exactly (the paper's literal form: false);
     plastic: a second set of networks corrects the strain in the yield function;
-    major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
+    major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant | later (constant
+    until the last stage);
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
     factors: residual | printed, how the 12 numbers make a matrix (`microplane.CORRECTIONS`);
@@ -42,13 +43,18 @@ class StressAdapter(Adapter):
     def __init__(
         self, *, alpha: Bound = 0.1, alpha_normal: NormalBound = None, l_max: Positive | None = 0.1, input_scale: Positive = 10.0,
         hidden: Width = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
-        state_dependence: Literal["full", "constant"] = "full", recompute: bool = False, fused: Fused = "auto",
+        state_dependence: Literal["full", "constant", "later"] = "full", recompute: bool = False, fused: Fused = "auto",
         factors: Literal["residual", "printed"] = "residual",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if no_prior_stress and no_pre:
             raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false)")
+        if state_dependence == "later" and (no_C or no_prior_stress or plastic):
+            raise ConfigError(
+                "adapter.state_dependence: later begins with the matrices C alone: expected no_C=false, "
+                "no_prior_stress=false and plastic=false, or full"
+            )
         self.rest_free, self.recompute, self.fused = rest_free, recompute, fused
         shape: dict[str, Any] = {
             "alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden,
@@ -63,7 +69,18 @@ class StressAdapter(Adapter):
         self.plastic_operator = ProgressiveOperator(l_max=l_max, **shape) if plastic else None
         # (4, 12), what a constant operator is made of
         self.numbers = self.operator.free
-        self.few_numbers = self.steady and not (no_C or plastic)
+
+    @property
+    def few_numbers(self) -> bool:
+        part = self.operator
+        return self.steady and not part.no_C and self.plastic_operator is None
+
+    @property
+    def later(self) -> bool:
+        return self.operator.later
+
+    def vary(self) -> None:
+        self.operator.vary()
 
     @property
     def steady(self) -> bool:

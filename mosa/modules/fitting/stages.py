@@ -47,7 +47,7 @@ class StageSettings(Settings):
 class Stage(StageSettings):
     """One stage of the fit, as it runs."""
 
-    name: Literal["prior", "prior_eta", "joint"]
+    name: Literal["prior", "prior_eta", "joint", "networks"]
     looks_again: bool = False
     """Whether it is a calibration that goes on from the one before, with the motion found once more about that one's result. What
     flows or yields is seen too poorly by a reconstruction that knows no mechanics: the calibrated law says what images do not."""
@@ -60,12 +60,17 @@ class Stage(StageSettings):
         return self.name == "prior"
 
     @property
+    def section(self) -> str:
+        """The section of `fit` that it is read from."""
+        return "joint" if self.name == "networks" else self.name
+
+    @property
     def learns_heterogeneity(self) -> bool:
         return not self.calibrates
 
     @property
     def learns_adapter(self) -> bool:
-        return self.name == "joint"
+        return self.name in ("joint", "networks")
 
     @property
     def keeps(self) -> tuple[str, ...]:
@@ -155,7 +160,8 @@ class FitSection(Settings):
         lr_adapter=5e-3,
         start="prior",
     )
-    """last stage: with the adapter"""
+    """last stage: with the adapter; twice for networks that begin at learned numbers
+    (adapter=mosa_from_linear), the second time by Adam"""
 
     def stage(self, name: str) -> Stage:
         """Of this name. Errors: ConfigError."""

@@ -207,6 +207,31 @@ def test_a_constant_operator_is_one_for_all_states_and_learns_at_the_rate_of_a_n
     assert fresh(material_state(w, s)).G[0, 0, 0] > 0.3  # of about 0.46 that alpha = 0.1 allows
 
 
+def test_networks_that_come_later_begin_at_the_learned_numbers():
+    adapter = StressAdapter(state_dependence="later", major_symmetry=True).double()
+    adapter.switch_on(E_REF, 0.3)
+    numbers = 0.02 * torch.randn(4, 12, generator=torch.Generator().manual_seed(0))
+    adapter.operator.free.data.copy_(numbers)
+    state = material_state(*drawn_states(10))
+    constant, learned = adapter(state), copy.deepcopy(adapter)
+    assert adapter.steady and adapter.few_numbers and constant.G.abs().max() > 1e-2
+    assert [n for n, p in adapter.named_parameters() if p.requires_grad] == ["numbers"]
+    adapter.vary()
+    begun = adapter(state)
+    # the numbers' bound is a float32
+    assert torch.allclose(begun.G, constant.G, rtol=0, atol=1e-8) and not begun.h.any()
+    assert (
+        not adapter.steady and not adapter.few_numbers and not adapter.operator.free.requires_grad
+    )
+    with torch.no_grad():
+        adapter.operator.planes.weight.fill_(0.01)
+    assert (adapter(state).G - constant.G).abs().max() > 1e-4
+    # what is loaded says by itself whether its networks have begun
+    for each, of in ((copy.deepcopy(learned), adapter), (copy.deepcopy(adapter), learned)):
+        each.load_state_dict(of.state_dict())
+        assert torch.equal(each(state).G, of(state).G) and each.steady == of.steady
+
+
 def test_plastic_part_corrects_the_strain_and_is_bounded_too():
     adapter = drawn_adapter(plastic=True)
     w, s = drawn_states(20)
@@ -310,7 +335,8 @@ def test_it_can_be_copied_and_pickled_while_a_graph_is_alive(kind):
     [
         ({"alpha": 0.0}, "adapter.alpha"), ({"alpha": 1.0}, "adapter.alpha"), ({"l_max": 0.0}, "adapter.l_max"),
         ({"input_scale": -1.0}, "adapter.input_scale"), ({"hidden": 0}, "adapter.hidden"),
-        ({"state_dependence": "some"}, "expected full or constant"),
+        ({"state_dependence": "some"}, "expected full or constant or later"),
+        ({"state_dependence": "later", "no_C": True}, "later begins with the matrices C"),
         ({"no_prior_stress": True, "no_pre": True}, "no_pre=false"),
     ],
 )  # fmt: skip
