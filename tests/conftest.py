@@ -1,5 +1,6 @@
 """Shared fixtures: the reference data's place, one thread, CUDA gate, Triton's interpreter."""
 
+import atexit
 import gc
 import os
 from collections import Counter
@@ -73,11 +74,9 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.enable()
-
-
-def pytest_sessionfinish():
-    """So that what is in cycles is freed: libraries count what is left at the end, and complain."""
-    gc.unfreeze()
+    # at the interpreter's end what is in cycles is freed: libraries count what is left, and complain. Not before pytest's own five
+    # passes at the end of its session
+    atexit.register(gc.unfreeze)
 
 
 @pytest.fixture(autouse=True, scope="module")
