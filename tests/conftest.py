@@ -1,6 +1,5 @@
 """Shared fixtures: the reference data's place, one thread, CUDA gate, Triton's interpreter."""
 
-import atexit
 import gc
 import os
 from collections import Counter
@@ -74,9 +73,11 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.enable()
-    # at the interpreter's end what is in cycles is freed: libraries count what is left, and complain. Not before pytest's own five
-    # passes at the end of its session
-    atexit.register(gc.unfreeze)
+
+
+def pytest_sessionfinish():
+    """So that what is in cycles is freed: libraries count what is left at the end, and complain."""
+    gc.unfreeze()
 
 
 @pytest.fixture(autouse=True, scope="module")
