@@ -29,7 +29,7 @@ FIRST = ("test_main_job.py", "test_closed_systems.py")
 LAST = ("test_rollout_gradients.py", "test_stress.py")
 """By then their kernels are in the cache, compiled for other files: beside those, both processes would compile them."""
 
-UNOPTIMISED = ("constitutive",)
+UNOPTIMISED = ("constitutive", "export")
 """Folders and files whose tests launch each of their many kernels a few times. Clang's -O0 gives the same bits
 and compiles in a third of the time of -O2. They come last: a process keeps a kernel as compiled."""
 

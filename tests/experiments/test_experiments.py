@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked_workers import fork
 from hydra import compose, initialize_config_dir
 from made_up import CONF, NAMES, PAPER, experiment, made_up, write_metrics
 from omegaconf import OmegaConf
@@ -609,6 +610,7 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(
 ):
     monkeypatch.setattr(specimens, "ANGLES", 4)
     monkeypatch.setattr(running, "PROGRAM", "starts_once:train")
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", fork())
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
              "--only", "method=ours"]  # fmt: skip
     more = [f"scene.cache={cache}", "evaluation.samples=500", "evaluation.assignment=100", "evaluation.floor=false",

@@ -14,6 +14,7 @@ from run_page import written
 from mosa.data.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
+HELPERS = ROOT / "tests" / "helpers"
 PAGE = ROOT / "docs" / "extending.md"
 QUICK = ["debug=default", "scene.holdout_frames=0", "fit=adam", "fit.prior.iterations=2", "fit.joint.iterations=2",
          "fit.prior_eta.iterations=0", "heterogeneity.enabled=false", "simulation.particles=100", "reconstruction.resolution=40",
@@ -38,7 +39,10 @@ def recorded(folder: Path, cache: Path) -> Path:
 
 
 TABLES = """
+from forked_workers import fork
 from mosa.cli.experiment import main
+from mosa.experiments import workers
+workers.ProcessPoolExecutor = fork()
 if __name__ == "__main__":
     main()
 """
@@ -66,7 +70,7 @@ def run(tmp_path_factory, cache):
     (folder / "tables.py").write_text(TABLES)
     result = forked.call(str(folder / "tables.py"), "mine", "--specifications", f"{folder}/tables", "--runs", f"{folder}/runs",
                          "--results", f"{folder}/results",
-                         environment=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"})  # fmt: skip
+                         environment=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (folder, ROOT, HELPERS)))})  # fmt: skip
     assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-3000:]
     (job,) = (path for path in (folder / "runs").iterdir() if path.is_dir())
     (folder / "run").symlink_to(job)
@@ -166,7 +170,7 @@ print(float((one - other).abs().max()), float((one - softer).abs().max()), slope
 
 def test_the_baseline_stands_in_for_the_law(tmp_path):
     written(PAGE, tmp_path)
-    path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "helpers")))
+    path = os.pathsep.join(map(str, (tmp_path, ROOT, HELPERS)))
     (tmp_path / "baseline.py").write_text(BASELINE)
     result = forked.call(
         str(tmp_path / "baseline.py"), environment=os.environ | {"PYTHONPATH": path}

@@ -12,10 +12,12 @@ from assembled import ROUGHLY
 from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 from run_page import written
+from starts_once import start_once
 
 from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
 from mosa.modules.fitting import newton_steps
+from mosa.training import datamodule
 
 ROOT = Path(__file__).parents[2]
 HELD = [
@@ -30,6 +32,14 @@ QUIET = {
     "enable_model_summary": False,
     "accelerator": "cpu",
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def starts(cache):
+    """Found once for the scripts here and for the command."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(datamodule, "sequence_start", start_once)
+        yield
 
 
 @pytest.fixture(scope="module")

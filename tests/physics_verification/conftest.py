@@ -18,6 +18,10 @@ FORWARD = (
 ADAPTED = {"stress_kernel": 3, "return_kernel": 2}
 """Place among the arguments of a maker of kernels: whether an adapter acts."""
 
+SELDOM = ("state_kernel",)
+"""Launched once for ten or more substeps: what Clang's -O0 (the same bits) saves of their compilation is more than they then
+take longer. Of the kernels of every substep it is not."""
+
 
 def forward(name: str):
     """In place of a maker of `material_kernels`. What an adapter needs in float64 test_rollout_gradients.py compiles for every
@@ -28,7 +32,8 @@ def forward(name: str):
     def kernel(*words):
         if wp.float64 in words and (name not in ADAPTED or words[ADAPTED[name]]):
             return made(*words)
-        with patch.object(wp, "kernel", partial(wp.kernel, enable_backward=False)):
+        options = {"module_options": {"optimization_level": 0}} if name in SELDOM else {}
+        with patch.object(wp, "kernel", partial(wp.kernel, enable_backward=False, **options)):
             return alone(*words)
 
     return kernel

@@ -333,7 +333,7 @@ def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
     body = small_body()
     found = identification(body, takes, criterion=Criterion(name=criterion))
     missed = found.distance()
-    run(found)
+    run(found, 5)
     true_axis, true_ratio = stiffest(truth.adapter.stiffness().detach())
     axis, ratio = stiffest(body.adapter.stiffness().detach())
     assert float(angle_between(true_axis, AXIS)) < 1.5 and float(true_ratio) > 1.6
@@ -367,7 +367,7 @@ def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
     found = identification(
         body, [take_of(truth, start(turn=0.5, axis=(0.3, 0.5, 0.8), speed=-1.5), FRAMES)]
     )
-    run(found)
+    run(found, 3)
     posterior, here = found.posterior(), read_numbers(body)
     assert set(posterior.rivals) == {"neo_hookean", "stvk"} and body.material.law == "corotated"
     costs = {}
@@ -567,7 +567,7 @@ def test_what_a_grid_gets_wrong_is_not_taken_for_the_law():
         found = identification(
             body, [seen_on_a_coarser_grid(small_body(adapter=False))], grid_error=known
         )
-        run(found)
+        run(found, 3)
         wrong[known] = abs(values(body)["E"] / E - 1) + float(body.adapter.numbers.detach().norm())
         assert (
             found.grid_share() == pytest.approx(-1.0, abs=0.1)
