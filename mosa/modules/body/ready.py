@@ -136,32 +136,16 @@ def corrected_rollout(
     error method (Ljung, System Identification, chapter 3) asks less: from what was seen up to a frame, predict the next. Here the
     observer is Luenberger's with a fixed gain on the velocities; positions and deformation gradients stay the simulation's."""
 
-    def corrected(there, frame: int):
-        away = observed[frame] - there.x
+    def corrected(there, number: int):
+        away = observed[first + number] - there.x
         if unseen is not None:
-            away = away + unseen(there.x, frame)
+            away = away + unseen(there.x, first + number)
         return replace(there, v=there.v + ((gain / frame_dt) * away).to(there.v))
 
-    parts: list[Rollout] = []
-    current = state if first == 0 else corrected(state, first)
-    for frame in range(first + 1, len(observed)):
-        part = roll(current, frames=2, started=frame > 1, start_time=(frame - 1) * frame_dt)
-        parts.append(part)
-        current = corrected(part.final, frame)
-    if not parts:
-        return roll(state, frames=1)
-    stacked = {
-        name: torch.cat([getattr(parts[0], name), *(getattr(part, name)[1:] for part in parts[1:])])
-        for name in ("x", "v", "F", "F_tot")
-    }
-    reactions = (
-        None if parts[0].reactions is None else torch.cat([part.reactions for part in parts])
+    begun = state if first == 0 else corrected(state, 0)
+    frames = len(observed) - first
+    rollout = roll(
+        begun, frames=frames, started=first > 0, start_time=first * frame_dt, after=corrected
     )
-    times = frame_dt * torch.arange(
-        first, len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device
-    )
-    return Rollout(
-        **stacked, times=times, final=parts[-1].final, reactions=reactions,
-        inverted=sum(part.inverted for part in parts),
-        counts=tuple(count for part in parts for count in part.counts),
-    )  # fmt: skip
+    times = torch.arange(first, len(observed), dtype=rollout.times.dtype)
+    return replace(rollout, times=frame_dt * times.to(rollout.times.device))

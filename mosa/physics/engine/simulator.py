@@ -182,6 +182,7 @@ class Simulator:
         motions: Motions | None = None, start_time: Number = 0.0, timing: Timing | None = None,
         collect: Callable[[Any], None] | None = None, gravity: Tensor | Sequence | None = None,
         together: int | None = None, held: Handed | None = None,
+        after: Callable[[ParticleState, int], ParticleState] | None = None,
     ) -> Rollout:  # fmt: skip
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated), of a body, or of B worlds at once.
 
@@ -198,6 +199,8 @@ class Simulator:
         timing: substeps that are chosen for each frame, instead of `substeps` in all (see `clock`).
         held: particles that the last colliders, sets of `Particles`, drive; None: their own
         indices, from where they are in `state`.
+        after: called with the state after each frame but the last, (N, 3) or (B, N, 3) and so on, and the frame's number; the
+        next frame begins from the state that it returns, and the result keeps the one that it was given.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
 
         Worlds: copies of the body that never meet, with the fixed time step. state: x (B, N, 3) and so on; parameters: the same in
@@ -221,7 +224,8 @@ class Simulator:
         for number in range(1, frames):
             if number > 1:
                 current, frame = stepper.enter(moment, False)
-            alike = 0 if varies or self.colliders else frames - 1 - number
+            alone = varies or self.colliders or after is not None
+            alike = 0 if alone else frames - 1 - number
             moment, forces, count = stepper.through(
                 moment, current, frame, poses(number - 1, frame), pace, alike
             )
@@ -229,6 +233,8 @@ class Simulator:
             if forces is not None:
                 reactions.append(forces)
             recorded.append(moment.state)
+            if after is not None and number < frames - 1:
+                moment = stepper.replaced(moment, partial(after, number=number))
             if progress is not None:
                 progress(number)
         names = ("x", "v", "F", "F_tot") if self.law.plastic else ("x", "v", "F")

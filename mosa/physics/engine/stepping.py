@@ -268,6 +268,11 @@ class Stepper:
         (forces,) = self.apart([self.axes.world.vectors(forces)], 1)
         return Step(after._replace(state=ParticleState(*self.apart(after.state))), forces, count)
 
+    def replaced(self, moment: Moment, by: Callable[[ParticleState], ParticleState]) -> Moment:
+        """The moment with the state that `by` makes of its own, both in the world."""
+        state = by(self.axes.world.state(ParticleState(*self.apart(moment.state))))
+        return moment._replace(state=self.axes.state(state, self.prepared.numerics.dtype))
+
     def enter(
         self, moment: Moment, begins: bool, speed: float | None = None
     ) -> tuple[State, Frame]:
