@@ -278,8 +278,11 @@ def build_stages(
     learned = {s.name: s.learns(heterogeneity, adapter) for s in stages}
     learns = {name: any(part is not None for part in parts) for name, parts in learned.items()}
     wanted = [s for s in stages if s.iterations > 0 and (s.calibrates or learns[s.name])]
-    stages = recalibrations([s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted])
-    if adapter is not None and adapter.later:
+    later = adapter is not None and adapter.later
+    # of networks that come later the stage before has few numbers, also where they have come
+    few = {s.name: all(few_numbers(p) or (later and p is adapter) for p in learned[s.name]) for s in wanted}  # fmt: skip
+    stages = recalibrations([s.resolved(few[s.name]) for s in wanted])
+    if later:
         again = [s.but(name="networks", optimizer="adam", start=None) for s in wanted if s.learns_adapter]  # fmt: skip
         stages += [stage.resolved(few=False) for stage in again]
     if searching and stages and not stages[0].newton:

@@ -228,17 +228,19 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
                 f"{where}: {path}: expected a material.json of mosa-material with its posterior "
                 f"({type(error).__name__}: {error})"
             ) from error
-        inflation = 1.0
+        inflation, alike = 1.0, adapter is not None and adapter.energetic
     else:
         try:
             run = record_of(read_checkpoint(path), path)
         except DataError as error:
             raise DataError(f"{where}{str(error).removeprefix('ckpt_path')}") from error
         law, record = run.law or run.sections.prior.law, run.posterior
-        inflation = INFLATION
+        # numbers of another kind of operator have the same names
+        build = adapter_class(run.sections.adapter.plain())
+        inflation, alike = INFLATION, build is not None and build is type(adapter)
     if record is None:
         raise DataError(f"{where}: {path}: expected the checkpoint of an ended fit, found none")
-    count = 0 if adapter is None or not adapter.few_numbers else adapter.numbers.numel()
+    count = adapter.numbers.numel() if alike and adapter.few_numbers else 0
     learned = [*material.learned, *(f"operator[{k}]" for k in range(count))]
     posterior = Posterior.read(record.plain()).only(learned)
     if law.split("~")[0] != material.law.split("~")[0] or not posterior.names:

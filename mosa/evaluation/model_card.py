@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from collections.abc import Sequence as Ordered
 
 import torch
+from torch import Tensor
 
 from mosa.evaluation.analysis import tables
 from mosa.evaluation.evaluate import SAME, Sequence
@@ -33,9 +34,9 @@ def filmed(sequences: Ordered[Sequence]) -> list[str]:
     return lines
 
 
-def stretches(rollouts: Ordered[Rollout]) -> tuple[float, float]:
-    """Smallest and largest principal stretch of the motions, but for `SHARE` at each end."""
-    found = torch.cat([torch.linalg.svdvals(r.F_tot.detach().double()).flatten() for r in rollouts])
+def stretches(motions: Ordered[Tensor]) -> tuple[float, float]:
+    """Smallest and largest principal stretch of F_tot (T, N, 3, 3) of the motions, but for `SHARE` at each end."""
+    found = torch.cat([torch.linalg.svdvals(F.detach().double()).flatten() for F in motions])
     ordered = found[found.isfinite()].sort().values
     skipped = int(SHARE * len(ordered))
     return float(ordered[skipped]), float(ordered[len(ordered) - 1 - skipped])
@@ -46,15 +47,16 @@ Kept = Mapping[str, Mapping[str, Rollout]]  # by prefix and variant
 
 def valid(sequences: Ordered[Sequence], kept: Kept, body: Body, world: World) -> list[str]:
     """What the motions covered that the law was learned from."""
-    trained = [kept.get(s.prefix, {}) for s in sequences if s.prefix.startswith("train")]
-    seen = [motions["adapted"] for motions in trained if "adapted" in motions]
+    trained = [s for s in sequences if s.prefix.startswith("train")]
+    # without the frames that are held out
+    seen = [(kept[s.prefix]["adapted"], s.frames) for s in trained if "adapted" in kept.get(s.prefix, {})]  # fmt: skip
     lines = []
     if seen:
-        low, high = stretches(seen)
+        low, high = stretches([r.F_tot[frames] for r, frames in seen])
         lines += [
             f"- Principal stretches from {low:.3g} to {high:.3g} occurred in the motions that were "
             "learned from. Beyond them the law is extrapolated.",
-            f"- The motions last {max(float(r.times[-1]) for r in seen):.3g} s. Creep, relaxation "
+            f"- The motions last {max(float(r.times[frames[-1]]) for r, frames in seen):.3g} s. Creep, relaxation "
             "and wear over longer times were not seen.",
         ]
     if (ground := world.ground) is not None:

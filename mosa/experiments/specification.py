@@ -93,7 +93,7 @@ class Experiment:
     note: str = ""
     minutes: dict[str, float] = field(default_factory=lambda: {"cpu": 10.0, "gpu": 2.0})
     plot: Literal["bars", "lines", "map"] | None = "bars"
-    analysis: str | None = None
+    analysis: Literal["long_term", "directions", "heterogeneity", "compression", "parameters"] | None = None  # fmt: skip
     mean: bool = True
     alone: bool = False
     claims: tuple[Claim, ...] = ()
@@ -165,6 +165,14 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     for key in ("axes", "figures"):
         if key not in keys:
             raise ConfigError(f"{name}.{key}: expected this key, found none")
+    kinds = {"seeds": int, "common": str, "figures": Mapping, "claims": Mapping}
+    for key in kinds.keys() & keys.keys():
+        check_list(f"{name}.{key}", keys[key], kinds[key])
+    for key, wanted in (("axes", set()), ("minutes", {"cpu", "gpu"})):
+        found = keys.get(key, dict.fromkeys(wanted))
+        if not isinstance(found, Mapping) or not wanted <= found.keys():
+            said = f"keys {' and '.join(sorted(wanted))}" if wanted else "a section"
+            raise ConfigError(f"{name}.{key}: expected {said}, found {str(found)[:80]}")
     axes, claims = keys["axes"].items(), enumerate(keys.get("claims", ()))
     keys["axes"] = {axis: options_of(f"{name}: axes.{axis}", each, shared) for axis, each in axes}
     keys["figures"] = figures = tuple(call(f"{name}.figures", Figure, f) for f in keys["figures"])
@@ -178,9 +186,17 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     return found
 
 
+def check_list(where: str, found: Any, kind: type) -> None:
+    """Errors: ConfigError where it is no list of these: a text would be one of letters."""
+    if not isinstance(found, (list, tuple)) or not all(isinstance(each, kind) for each in found):
+        said = {int: "whole numbers", str: "texts", Mapping: "sections"}[kind]
+        raise ConfigError(f"{where}: expected a list of {said}, found {str(found)[:80]!r}")
+
+
 def claim_of(where: str, found: Any, figures: Sequence[Figure]) -> Claim:
     """Errors: ConfigError naming the key."""
-    claim = call(where, Claim, found | {"against": tuple(found.get("against", ()))})
+    check_list(f"{where}.against", found.get("against", ()), str)
+    claim = call(where, Claim, {**found, "against": tuple(found.get("against", ()))})
     labels = [figure.label for figure in figures]
     for key in ("figure", "unless"):
         if (label := getattr(claim, key)) is not None and label not in labels:
@@ -207,7 +223,8 @@ def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Optio
     options = []
     for name, content in found.items():
         keys = dict(content) if isinstance(content, Mapping) else {"overrides": content}
-        keys["overrides"] = tuple(str(each) for each in keys.get("overrides") or ())
+        check_list(f"{where}.{name}", keys.get("overrides") or (), str)
+        keys["overrides"] = tuple(keys.get("overrides") or ())
         options.append(call(f"{where}.{name}", Option, keys, name=str(name)))
     return chosen(where, options, only)
 

@@ -29,8 +29,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from mosa.config.build import body_of, build_fit, fitting, plain, rehearse
+from mosa.config.build import body_of, build_body, build_fit, fitting, plain, rehearse
 from mosa.config.checkpoints import (
+    TENSORS,
     check_plain,
     check_same_data,
     check_same_scene,
@@ -344,6 +345,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.record = self.record.but(law=law)
         self.body.adapter = fitting(self.body.adapter, law)
 
+    def unfitted(self) -> dict[str, Tensor]:
+        """State of the body before its first step; made again where the module came from a checkpoint of a later one."""
+        if self.untouched is not None:
+            return self.untouched
+        tensors = {name: getattr(self.body, name).cpu() for name in TENSORS}
+        return build_body(self.record, tensors).state_dict()
+
     @property
     def known(self) -> Posterior | None:
         """Posterior of the law's numbers from another experiment (`identification.known`), None without one."""
@@ -525,6 +533,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """Ends the running stage: the next one follows, or all of them again on another ground or about another backbone."""
         stage = self.stage
         if stage.newton:
+            if self.identification is None:  # of a checkpoint from before this end
+                self.take_up(stage)
             if self.goes_back(stage):
                 return
             self.keep_posterior(stage)
@@ -547,6 +557,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.losses, self.identification = [], None
         self.retreat, self.stage_over = Retreat(), False
         if self.stage is not None and self.stage.name == "networks":  # before it has an optimiser
+            if not self.body.adapter.numbers.any():  # `settle_parts`
+                told = "the choice by held-back frames left the constant operator out: the networks begin at the prior"
+                warnings.warn(f"adapter: {told}", stacklevel=1)
             self.body.adapter.vary()
             self.posterior, self.parts = None, {}  # both are of the numbers that they begin at
 

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mosa.errors import ConfigError, SimulationDiverged
+from mosa.errors import ConfigError, MosaError
 from mosa.modules.fitting.parameters import each_law
 from mosa.system.progress import tqdm
 from mosa.twin.start import rotation_matrix
@@ -87,14 +87,14 @@ def plan(
 
     Errors: ConfigError where the run kept no posterior, or no start can be simulated."""
     if twin.posterior is None:
-        way = "a fit by Gauss-Newton does (fit.joint.optimizer=auto)"
+        way = "a fit that ends by Gauss-Newton does (adapter=operator, linear or none)"
         raise ConfigError(f"plan: this run kept no posterior; {way}")
     speed = tuple(float(v) for v in twin.training_start.velocity)
     up, ground = twin.world.up, twin.world.ground
     lowest = float((twin.body.rest.cpu() @ up).min())
     height = max(0.02, lowest - (ground.height if ground is not None else 0.0))
     numbers = twin.posterior.draws(draws, torch.Generator().manual_seed(seed))
-    ranked = []
+    ranked, why = [], ""
     for rotation in tqdm(drawn_starts(count, seed), "candidates"):
         ways: list[tuple[Any, ...]] = [(height, speed, 0.0, {})]
         if presses and ground is not None:
@@ -105,13 +105,12 @@ def plan(
             for _ in each_law(twin.body, numbers):
                 try:
                     motions.append(twin.simulate(**start, frames=frames, **more).x.cpu())
-                except SimulationDiverged:
-                    continue
+                except MosaError as error:  # a turned body may also begin inside of a solid
+                    why = str(error)
             if len(motions) >= LEAST_DRAWS:
                 gain = information(torch.stack(motions), max(twin.posterior.model_error, 1e-3))
                 ranked.append(Candidate(**start, gain=gain, plate=plate))
     if not ranked:
-        why = "the body leaves the box of the scene"
         raise ConfigError(f"plan: none of the candidate starts can be simulated: {why}")
     return sorted(ranked, key=lambda each: -each.gain)
 

@@ -133,7 +133,8 @@ class Twin(InMotion):
         if self.posterior is None:
             raise ConfigError(
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
-                "again), or its run kept none (a fit by Gauss-Newton does: fit.joint.optimizer=auto)"
+                "again), or its run kept none (a fit that ends by Gauss-Newton does: adapter=operator, "
+                "linear or none)"
             )
         rollout = self.simulate(**start)
         drawn = self.posterior.draws(draws, torch.Generator().manual_seed(seed))

@@ -134,6 +134,10 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
     )  # without an adapter there is nothing to join
     assert found.get("networks") == ("adam" if adapter.get("state_dependence") == "later" else None)
     asked = fit | {"joint": fit["joint"] | {"optimizer": "gauss_newton"}}
+    if built is not None and built.later:  # as of a checkpoint of an ended fit
+        built.vary()
+        stages = [(s.name, s.optimizer) for s in build_stages(asked, None, built)]
+        assert stages[-2:] == [("joint", "gauss_newton"), ("networks", "adam")]
     if expected == "adam":
         with pytest.raises(
             ConfigError, match=r"fit\.joint\.optimizer: gauss_newton learns few numbers"

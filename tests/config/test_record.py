@@ -10,6 +10,8 @@ from mosa.config.record import BodyRecord, PosteriorRecord, RunRecord
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.uncertainty import INFLATION
 from mosa.export.source import read_source
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.adapters.stress import StressAdapter
 from mosa.modules.body.material import Material
 from mosa.modules.fitting.identification_settings import IdentificationSettings
 from mosa.modules.fitting.parameters import blocks_of, tensors_of
@@ -77,6 +79,11 @@ def test_what_a_fit_said_is_read_from_its_checkpoint(tmp_path):
     found = known_numbers(str(path), Material(law, {"E": 1e5, "nu": 0.3}), None, "known")
     assert found.names == ["E"] and float(found.mean) == 11.0
     assert float(found.covariance) == pytest.approx(INFLATION**2 * 0.04)
+    # its operator's numbers are those of a stiffness, and of nothing else of this name
+    constant = StressAdapter(state_dependence="constant", no_pre=True, no_post=True)
+    for adapter, more in ((HyperelasticAdapter(), ["operator[0]"]), (constant, [])):
+        own = Material(law, {"E": 1e5, "nu": 0.3})
+        assert known_numbers(str(path), own, adapter, "known").names == ["E", *more]
     for key, value, message in (
         (
             "covariance",

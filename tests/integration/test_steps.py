@@ -3,6 +3,7 @@
 import pytest
 import torch
 from assembled import made, trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from mosa.errors import SimulationDiverged
 from mosa.training.fitting import fit
@@ -108,3 +109,18 @@ def test_it_does_not_where_there_is_no_look(cache):
         cache, "adapter=none", "heterogeneity.enabled=false", "reconstruction.informed.iterations=0"
     )
     assert not any(stage.looks_again for stage in run.module.stages)
+
+
+def test_a_fit_goes_on_from_the_last_step_of_a_stage(cache, tmp_path):
+    """As a ModelCheckpoint of every step saves it, and one at an exception amid what follows that step."""
+    run, again = (made(cache, "adapter=operator") for _ in range(2))
+    every = ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, every_n_train_steps=1)
+    trainer(enable_checkpointing=True, callbacks=[every]).fit(run.module, datamodule=run.data)
+    last = max(tmp_path.glob("*.ckpt"), key=lambda path: path.stat().st_mtime)
+    saved = torch.load(last, weights_only=True)["mosa"]
+    assert saved["fit"]["stage_over"] and saved["posterior"] is None
+    trainer().fit(again.module, datamodule=again.data, ckpt_path=last, weights_only=True)
+    assert again.module.stage is None and again.module.steps_done == run.module.steps_done
+    for ours, theirs in zip(run.module.body.parameters(), again.module.body.parameters()):
+        assert torch.equal(ours, theirs)
+    assert again.module.posterior.names == run.module.posterior.names

@@ -309,7 +309,8 @@ def worse_text(figures: Mapping[str, float]) -> str:
         if own > least * prior if least > 1 else own < least * prior:
             return (
                 f"**The learned law predicts held-out recordings worse than its prior** ({label}: {own * scale:.{digits}f} "
-                f"against {prior * scale:.{digits}f}): use the prior (adapter=none), or learn from more recordings."
+                f"against {prior * scale:.{digits}f}): use the prior "
+                "(adapter=none heterogeneity.enabled=false), or learn from more recordings."
             )
     return ""
 

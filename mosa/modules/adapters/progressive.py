@@ -62,9 +62,7 @@ class ProgressiveOperator(nn.Module):
         if self.later:
             self.register_buffer("varies", torch.tensor(False))
             # a hook of a method would keep a copied operator's original
-            self.register_load_state_dict_post_hook(
-                lambda module, _: module.settle(not bool(module.varies))
-            )
+            self.register_load_state_dict_post_hook(settle_as_loaded)
         self.settle(constant)
 
     def settle(self, constant: bool) -> None:
@@ -155,6 +153,11 @@ class ProgressiveOperator(nn.Module):
             G = microplane.major_symmetric(G, poisson)
         post = self.last(l2, kw, s1 + apply(G, s1)) if not self.no_post else torch.zeros_like(s)
         return Correction(G, pre, post, torch.cat([planes, normal[:, None]], 1))
+
+
+def settle_as_loaded(operator: ProgressiveOperator, _: object) -> None:
+    """A hook: what is loaded says by itself whether its networks have begun."""
+    operator.settle(not bool(operator.varies))
 
 
 def apply(G: Tensor, s: Tensor) -> Tensor:

@@ -82,6 +82,14 @@ class NewtonSteps:
             self.share_columns(stage, identification)
         return identification
 
+    def take_up(self, stage: Stage) -> None:
+        """The identification of a stage whose last iteration another process made: what the end of a stage asks of it comes with
+        an iteration, whose step is not taken."""
+        self.identification = found = self.begun(stage, self.saved_identification)
+        numbers = found.newton.seats[0].read()
+        found.iterate()
+        found.newton.seats[0].write(numbers)
+
     def share_columns(self, stage: Stage, identification: Identification) -> None:
         """Where the stages `prior_eta` and `joint` begin at the same numbers, the first Jacobian of the joint stage contains the
         other one's: it is made once, in `prior_eta`. A fit that is resumed between them makes it again."""
@@ -158,7 +166,7 @@ class NewtonSteps:
             self.choose(law)
         else:
             return False
-        self.body.load_state_dict(self.untouched, strict=self.body.adapter is not None)
+        self.body.load_state_dict(self.unfitted(), strict=self.body.adapter is not None)
         self.takes, self.informed = list(self.first_takes), False
         self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
         self.stage_over, self.columns = False, None

@@ -17,7 +17,7 @@ class StageSettings(Settings):
     where: ClassVar[str] = "fit.*"
     needs: ClassVar[dict[str, str]] = {
         "newton_iterations": "newton",
-        "iterations lr lr_networks lr_adapter lr_contact": "adam",
+        "iterations lr lr_networks lr_adapter lr_contact converged": "adam",
     }
 
     optimizer: Literal["auto", "gauss_newton", "adam"] = "auto"

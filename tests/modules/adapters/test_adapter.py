@@ -227,7 +227,8 @@ def test_networks_that_come_later_begin_at_the_learned_numbers():
         adapter.operator.planes.weight.fill_(0.01)
     assert (adapter(state).G - constant.G).abs().max() > 1e-4
     # what is loaded says by itself whether its networks have begun
-    for each, of in ((copy.deepcopy(learned), adapter), (copy.deepcopy(adapter), learned)):
+    pickled = pickle.loads(pickle.dumps(learned))
+    for each, of in ((pickled, adapter), (copy.deepcopy(learned), adapter), (copy.deepcopy(adapter), learned)):  # fmt: skip
         each.load_state_dict(of.state_dict())
         assert torch.equal(each(state).G, of(state).G) and each.steady == of.steady
 
