@@ -30,7 +30,7 @@ def test_the_card_says_what_was_filmed_what_is_known_and_where_it_holds():
     for part in ("footage; 2 cameras, 4 frames at 60 a second", "simulated by this program, no capture; 3 cameras, 6 frames",
                  "speed at the start 1.5 m/s", "E = 3e+04 Pa, with a standard deviation of 4.0%", "determine 4.2;",
                  f"stretches from {low:.3g} to {high:.3g}", f"last {3 * FRAME_DT:.3g} s", "met as `sticky`",
-                "1000 kg/m^3 was given", "Twin.load",
+                 "1000 kg/m^3 was given", "Twin.load",
                  "## Licence", "| rms [mm]"):  # fmt: skip
         assert part in said, part
     assert "nan" not in model_card({"id/E": 3e4}, body, evaluated, {}, STICKY, "1")
