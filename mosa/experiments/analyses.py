@@ -27,7 +27,7 @@ from mosa.experiments.parameters import parameters
 from mosa.experiments.report import drawing
 from mosa.experiments.report.drawing import WIDTH, legend, save, say_cut, style_of
 from mosa.experiments.run_folders import label, loaded, prefix
-from mosa.experiments.specification import Experiment
+from mosa.experiments.specification import Analysis, Experiment
 from mosa.experiments.specimens import compression, parameters_at_origin
 from mosa.modules.body.body import Body
 from mosa.modules.body.material import material_states
@@ -251,7 +251,7 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
     return "Stiffness over the body:\n\n" + text, [picture]
 
 
-ANALYSES: dict[str, Callable[[Experiment, Sequence[Record], Path], Analysed]] = {
+ANALYSES: dict[Analysis, Callable[[Experiment, Sequence[Record], Path], Analysed]] = {
     "long_term": long_term, "directions": directions, "heterogeneity": heterogeneity,
     "compression": compression, "parameters": parameters,
 }  # fmt: skip

@@ -23,6 +23,9 @@ COMMIT = "commit.txt"  # commit that a job's run was last begun with
 FAILED = "failed.txt"  # file of a job's folder with the reason why its run failed
 PRESSED = "pressed.json"  # file of a job's folder with what `specimens` has measured of its laws
 
+Analysis = Literal["long_term", "directions", "heterogeneity", "compression", "parameters"]
+"""The keys of `analyses.ANALYSES`, which imports more than a specification needs."""
+
 
 @dataclass(frozen=True)
 class Option:
@@ -93,7 +96,7 @@ class Experiment:
     note: str = ""
     minutes: dict[str, float] = field(default_factory=lambda: {"cpu": 10.0, "gpu": 2.0})
     plot: Literal["bars", "lines", "map"] | None = "bars"
-    analysis: Literal["long_term", "directions", "heterogeneity", "compression", "parameters"] | None = None  # fmt: skip
+    analysis: Analysis | None = None
     mean: bool = True
     alone: bool = False
     claims: tuple[Claim, ...] = ()
@@ -168,11 +171,11 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
     kinds = {"seeds": int, "common": str, "figures": Mapping, "claims": Mapping}
     for key in kinds.keys() & keys.keys():
         check_list(f"{name}.{key}", keys[key], kinds[key])
-    for key, wanted in (("axes", set()), ("minutes", {"cpu", "gpu"})):
-        found = keys.get(key, dict.fromkeys(wanted))
-        if not isinstance(found, Mapping) or not wanted <= found.keys():
-            said = f"keys {' and '.join(sorted(wanted))}" if wanted else "a section"
-            raise ConfigError(f"{name}.{key}: expected {said}, found {str(found)[:80]}")
+    if not isinstance(keys["axes"], Mapping):
+        raise ConfigError(f"{name}.axes: expected a section, found {str(keys['axes'])[:80]}")
+    minutes = keys.get("minutes", {"cpu": 0, "gpu": 0})
+    if not isinstance(minutes, Mapping) or not {"cpu", "gpu"} <= minutes.keys():
+        raise ConfigError(f"{name}.minutes: expected keys cpu and gpu, found {str(minutes)[:80]}")
     axes, claims = keys["axes"].items(), enumerate(keys.get("claims", ()))
     keys["axes"] = {axis: options_of(f"{name}: axes.{axis}", each, shared) for axis, each in axes}
     keys["figures"] = figures = tuple(call(f"{name}.figures", Figure, f) for f in keys["figures"])

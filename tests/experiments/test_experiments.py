@@ -9,6 +9,7 @@ import re
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from mosa.experiments.report.printed import printed_table
 from mosa.experiments.report.writing import write_results
 from mosa.experiments.specification import (
     MINUTES,
+    Analysis,
     Figure,
     Option,
     claim_of,
@@ -73,6 +75,7 @@ def test_every_entry_of_the_paper_that_is_named_exists():
         assert found.analysis is None or found.analysis in ANALYSES
         if found.printed is not None:
             assert "The paper prints" in printed_table(found.printed)
+    assert set(get_args(Analysis)) == set(ANALYSES)
 
 
 @pytest.mark.parametrize("quick", [False, True], ids=["whole", "quick"])

@@ -56,6 +56,7 @@ class StressAdapter(Adapter):
                 "no_prior_stress=false and plastic=false, or full"
             )
         self.rest_free, self.recompute, self.fused = rest_free, recompute, fused
+        self.later = state_dependence == "later"
         shape: dict[str, Any] = {
             "alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden,
             "factors": factors, "state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post,
@@ -74,10 +75,6 @@ class StressAdapter(Adapter):
     def few_numbers(self) -> bool:
         part = self.operator
         return self.steady and not part.no_C and self.plastic_operator is None
-
-    @property
-    def later(self) -> bool:
-        return self.operator.later
 
     def vary(self) -> None:
         self.operator.vary()

@@ -69,6 +69,7 @@ class Ready:
         }
         fields["x"] = fields["x"] - lift
         if begun is not None:
+            fields["times"] = rollout.times + first * simulator.frame_dt
             parts = {name: (getattr(begun, name), field[1:]) for name, field in fields.items()}
             fields = {name: torch.cat(both) for name, both in parts.items()}
         return replace(rollout, **fields)
@@ -144,8 +145,5 @@ def corrected_rollout(
 
     begun = state if first == 0 else corrected(state, 0)
     frames = len(observed) - first
-    rollout = roll(
-        begun, frames=frames, started=first > 0, start_time=first * frame_dt, after=corrected
-    )
-    times = torch.arange(first, len(observed), dtype=rollout.times.dtype)
-    return replace(rollout, times=frame_dt * times.to(rollout.times.device))
+    start_time = first * frame_dt
+    return roll(begun, frames=frames, started=first > 0, start_time=start_time, after=corrected)
