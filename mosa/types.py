@@ -78,12 +78,9 @@ class Cameras:
 
     def select(self, indices: list[int]) -> Cameras:
         """The cameras at `indices`, in that order."""
-        return replace(
-            self,
-            K=self.K[indices],
-            w2c=self.w2c[indices],
-            names=tuple(self.names[i] for i in indices),
-        )
+        at = torch.tensor(indices, dtype=torch.long, device=self.K.device)
+        names = tuple(self.names[i] for i in indices)
+        return replace(self, K=self.K[at], w2c=self.w2c[at], names=names)
 
     def to(self, device: torch.device | str) -> Cameras:
         return moved(self, device)

@@ -1,14 +1,13 @@
 """Passes that are captured as graphs once they have run. Anything else that the thread does meanwhile may break a capture."""
 
-import gc
 import warnings
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable
 
 import torch
 import warp as wp
 
 from mosa.physics.launching import NOTHING, ON_CPU
+from mosa.system.cuda_graphs import uninterrupted
 
 ATTEMPTS = 3
 """Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
@@ -16,18 +15,6 @@ MAX_GRAPHS = 64
 """Graphs, and passes that wait to become one, of one owner: one for each pass and time step."""
 
 Body = Callable[[], None]
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """No garbage collection inside: it may find an earlier simulator's graphs and buffers, and freeing those breaks the capture."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 class WarpCapture:

@@ -24,6 +24,7 @@ from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_ba
 from mosa.rendering.cameras import centers
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
+from mosa.system.cuda_graphs import Graphed
 from mosa.types import Appearance, Splats
 
 CONSTANT_RATE, HIGHER_RATE, LIGHT_RATE = 0.03, 0.005, 0.02
@@ -54,7 +55,9 @@ class RestGaussians:
             {"params": [getattr(self, name).requires_grad_(True)], "start": rate}
             for name, rate in rates.items()
         ]
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+        fused = splats.means.is_cuda
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=fused)
+        self._drawn = Graphed(self._as_drawn)
         scale = splats.scales.mean(1, keepdim=True)
         self.lower, self.upper = (SMALLEST * scale).log(), (settings.largest * scale).log()
 
@@ -62,18 +65,34 @@ class RestGaussians:
     def harmonics(self) -> Tensor:
         return torch.cat((self.constant, self.higher), 1)
 
-    @property
-    def covariances(self) -> Tensor:
-        return covariance_from(self.log_scale.exp(), self.quaternion)
+    def drawn(self, *moved: Tensor) -> tuple[Tensor, ...]:
+        """Of B windows: means (B, M, 3) [m], covariances (B, M, 3, 3) [m^2], opacities (M,), colours (B, M, 3), and `change`.
 
-    def change(self) -> Tensor:
+        moved: where the centres at rest are (B, M, 3) [m], the motion's gradients and rotations there (B, M, 3, 3), its
+        `turned_basis` (B, M, LIGHT), and the eyes (B, 3) [m]."""
+        numbers = "shift", "log_scale", "quaternion", "logit", "constant", "higher", "light"
+        return self._drawn(*moved, *(getattr(self, name) for name in numbers))
+
+    def _as_drawn(
+        self, middle: Tensor, A: Tensor, R: Tensor, turned: Tensor, eyes: Tensor, shift: Tensor, log_scale: Tensor,
+        quaternion: Tensor, logit: Tensor, constant: Tensor, higher: Tensor, light: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        means = middle + (A @ shift[..., None])[..., 0]
+        # seen from the body: R^T d
+        directions = (means.detach() - eyes[:, None])[..., None, :] @ R
+        harmonics = torch.cat((constant, higher), 1)
+        colors = spherical_harmonics.colors_in(harmonics, directions[..., 0, :])
+        shapes = A @ covariance_from(log_scale.exp(), quaternion) @ A.mT
+        shades = (turned @ light).exp()[..., None]
+        change = self.change(constant, higher)
+        return means, shapes, torch.sigmoid(logit), colors * shades, change
+
+    def change(self, constant: Tensor, higher: Tensor) -> Tensor:
         """Sum over the splats of the squares by which their colours, in the mean over directions and channels, left the first ones,
         each weighted by what it counts for."""
-        both = self.constant - self.first, self.higher
-        constant, higher = (
-            (spherical_harmonics.Y0 * moved).square().mean(2).sum() for moved in both
-        )
-        return self.settings.keep * constant + self.settings.keep_harmonics * higher
+        both = constant - self.first, higher
+        means = [(spherical_harmonics.Y0 * moved).square().mean(2).sum() for moved in both]
+        return self.settings.keep * means[0] + self.settings.keep_harmonics * means[1]
 
     def step(self, loss: Tensor, factor: float) -> None:
         """One of Adam's, at `factor` of the first; scales back between their bounds, as those of the static stage."""
@@ -118,24 +137,18 @@ def fit_carried(
     gaussians = RestGaussians(static, surface_normals(static.means, particles), settings)
     carried, eyes = bind(static.means, particles).carry(positions), centers(windows.cameras)
     turns = turned_basis(gaussians.normals, carried.rotations)
-    draw = windows.draws(settings.views, generator)
+    draw, off = windows.draws(settings.views, generator), image_loss(settings.ssim, settings.matte)
     for step in range(settings.iterations):
         chosen = next(draw)
-        batch = windows.select(chosen.to(windows.frame.device))
-        A, turn = carried.gradients[batch.frame], carried.rotations[batch.frame]
-        means = carried.means[batch.frame] + (A @ gaussians.shift[..., None])[..., 0]
-        # seen from the body: R^T d
-        directions = (means.detach() - eyes[chosen][:, None])[..., None, :] @ turn
-        shades = (turns[batch.frame] @ gaussians.light).exp()[..., None]
-        colors = spherical_harmonics.colors_in(gaussians.harmonics, directions[..., 0, :]) * shades
-        image, alpha = rasterize(
-            means, A @ gaussians.covariances @ A.mT, torch.sigmoid(gaussians.logit), colors, batch.cameras,
-            torch.arange(len(batch), device=means.device), background,
+        batch = windows.select(chosen)
+        frames = batch.frame
+        means, shapes, opacities, colors, change = gaussians.drawn(
+            carried.means[frames], carried.gradients[frames], carried.rotations[frames],
+            turns[frames], eyes[chosen],
         )  # fmt: skip
-        loss = image_loss(
-            image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
-        )
-        loss = loss + gaussians.change() / alpha.numel()
+        shown = torch.arange(len(batch), device=means.device)
+        image, alpha = rasterize(means, shapes, opacities, colors, batch.cameras, shown, background)
+        loss = off(image, alpha, batch.images, batch.mattes) + change / alpha.numel()
         cosine = math.cos(math.pi * step / settings.iterations)
         gaussians.step(loss, 0.03 + 0.97 * 0.5 * (1 + cosine))
         if progress is not None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mosa.reconstruction.settings import FitSettings
 from mosa.rendering.covariance import covariance_from
+from mosa.system.cuda_graphs import Graphed
 from mosa.types import Splats
 
 SMALLEST = 0.25
@@ -46,7 +47,9 @@ class FreeGaussians:
         self.anisotropic, self.axis_ratio = anisotropic, settings.axis_ratio
         groups = [{"params": [p.requires_grad_(True)], "start": rates[name], "name": name}
                   for name, p in self.parameters.items() if move or name != "means"]  # fmt: skip
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+        fused = splats.means.is_cuda
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=fused)
+        self._drawn = Graphed(self._as_drawn)
 
     def __len__(self) -> int:
         return len(self.parameters["opacity"])
@@ -65,12 +68,19 @@ class FreeGaussians:
         scale = self.parameters["log_scale"].exp()
         return scale if self.anisotropic else scale[:, None].repeat(1, 3)
 
-    def covariances(self) -> Tensor:
-        """(N, 3, 3) [m^2]."""
-        scale = self.parameters["log_scale"].exp()
-        if not self.anisotropic:
-            return isotropic_covariances(scale)
-        return covariance_from(scale, self.parameters["rotation"])
+    def drawn(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Covariances (N, 3, 3) [m^2], opacities (N,) and colours (N, 3)."""
+        return self._drawn(*(p for name, p in self.parameters.items() if name != "means"))
+
+    @staticmethod
+    def _as_drawn(
+        log_scale: Tensor, opacity: Tensor, color: Tensor, rotation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        scale = log_scale.exp()
+        shapes = (
+            isotropic_covariances(scale) if rotation is None else covariance_from(scale, rotation)
+        )
+        return shapes, torch.sigmoid(opacity), torch.sigmoid(color)
 
     def anneal(self, factor: float) -> None:
         """Steps at `factor` of their start."""

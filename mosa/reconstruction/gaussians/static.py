@@ -28,18 +28,17 @@ def fit_splats(
     generator = torch.Generator().manual_seed(seed)
     every = settings.relocate_every if move and isinstance(settings, StaticSettings) else 0
     gaussians = FreeGaussians(splats, settings, move=move)
+    off = image_loss(settings.ssim, settings.matte)
     draw = windows.draws(settings.views, generator)
     for step in range(settings.iterations):
         batch = windows.select(next(draw))
         gaussians.anneal(0.55 + 0.45 * math.cos(math.pi * step / settings.iterations))
-        means, shapes = gaussians.parameters["means"][None], gaussians.covariances()[None]
-        colors, state = gaussians.colors[None], torch.zeros_like(batch.frame)
+        means, state = gaussians.parameters["means"][None], torch.zeros_like(batch.frame)
+        shapes, opacities, colors = gaussians.drawn()
         image, alpha = rasterize(
-            means, shapes, gaussians.opacities, colors, batch.cameras, state, background
+            means, shapes[None], opacities, colors[None], batch.cameras, state, background
         )
-        loss = image_loss(
-            image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
-        )
+        loss = off(image, alpha, batch.images, batch.mattes)
         if settings.keep > 0:
             # Adam moves a Gaussian of a hundredth of a pixel as fast as one of ten: hardly seen ones drift to any colour, which
             # shows when the object turns

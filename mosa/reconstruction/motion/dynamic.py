@@ -12,7 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 
 from mosa.reconstruction.gaussians.photometric import image_loss
 from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
@@ -23,6 +24,7 @@ from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import DynamicSettings
 from mosa.rendering.appearance.lighting import moved_shading
 from mosa.rendering.rasterizer import rasterize
+from mosa.system.cuda_graphs import Graphed
 from mosa.types import Splats
 
 Motion = ModalMotion | MotionBasisNetwork
@@ -112,39 +114,29 @@ class Predicted:
     inverse: Tensor
 
 
-class Objective:
-    """Loss of a batch: images of the carriers, elastic energy of the scaffold, bending energy of the amplitudes.
-
-    predicted: a motion in which neither energy is stored; None: the body at rest."""
+class Shown(nn.Module):
+    """Of frames: positions (S, M, 3) [m], covariances (S, M, 3, 3) [m^2] and colours of the carriers, and what is added to the loss
+    of their images: elastic energy of the scaffold, bending energy of the amplitudes."""
 
     def __init__(
-        self,
-        motion: Motion,
-        target: Target,
-        settings: DynamicSettings,
-        predicted: Predicted | None = None,
-    ):
+        self, motion: Motion, target: Target, settings: DynamicSettings, predicted: Predicted | None, refining: bool,
+    ) -> None:  # fmt: skip
+        super().__init__()
         self.motion, self.target, self.settings = motion, target, settings
-        self.predicted, self.refining = predicted, False
+        self.predicted, self.refining = predicted, refining
 
-    def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
-        """frames: (S,) long; state: (B,) which of them each window shows."""
+    def forward(self, frames: Tensor, state: Tensor) -> tuple[Tensor, ...]:
+        """Arguments as of `Objective`; colours are (1, M, 3) where all windows share them, else (B, M, 3)."""
         carried, settings = self.target.carried, self.settings
-        splats = carried.splats
         deforms = settings.elastic > 0 or carried.light is not None
         around = carried.around if deforms else None
-        sample = self.motion(frames, splats, carried.modes, around)
+        sample = self.motion(frames, carried.splats, carried.modes, around)
         colors = carried.colors(sample.deformation)
-        shown = colors if len(colors) == 1 else colors[state]
-        image, alpha = rasterize(
-            sample.positions, sample.covariances, splats.opacities, shown, batch.cameras, state, self.target.background,
-        )  # fmt: skip
-        loss = image_loss(
-            image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte
-        )
+        colors = colors if len(colors) == 1 else colors[state]
+        added = sample.positions.new_zeros(())
         if settings.elastic > 0:
             energy = elastic_energy(self._deformation(frames, sample), settings.poisson)
-            loss = loss + settings.elastic * energy
+            added = added + settings.elastic * energy
         if settings.bending > 0 and isinstance(self.motion, ModalMotion):
             c = self.motion.coefficients(frames)
             c = c if self.predicted is None else c - self.predicted.coefficients[frames]
@@ -153,8 +145,8 @@ class Objective:
             # what a frame shows sets its own weight
             if self.refining and settings.bending_scale > 0:
                 curvature = settings.bending_scale * torch.log1p(curvature / settings.bending_scale)
-            loss = loss + settings.bending * curvature.mean()
-        return loss
+            added = added + settings.bending * curvature.mean()
+        return sample.positions, sample.covariances, colors, added
 
     def _deformation(self, frames: Tensor, sample: MotionSample) -> Tensor:
         scaffold = self.target.scaffold
@@ -164,6 +156,33 @@ class Objective:
             return self.motion(frames, scaffold.splats, None, scaffold.around).deformation
         found = self.motion.displacement(frames, scaffold.modes)[1]
         return found if self.predicted is None else found @ self.predicted.inverse[frames]
+
+
+class Objective:
+    """Loss of a batch: that of the carriers' images, and energies (`Shown`).
+
+    predicted: a motion in which neither energy is stored; None: the body at rest; refining: all frames together."""
+
+    def __init__(
+        self, motion: Motion, target: Target, settings: DynamicSettings, predicted: Predicted | None = None,
+        refining: bool = False,
+    ):  # fmt: skip
+        self.target = target
+        self._off = image_loss(settings.ssim, settings.matte)
+        shown = Shown(motion, target, settings, predicted, refining)
+        names = [name for name, _ in shown.named_parameters()]
+
+        def of(frames: Tensor, state: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+            return functional_call(shown, dict(zip(names, numbers)), (frames, state))
+
+        self._shown, self._of = shown, Graphed(of)
+
+    def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
+        """frames: (S,) long; state: (B,) which of them each window shows."""
+        positions, shapes, colors, added = self._of(frames, state, *self._shown.parameters())
+        seen = positions, shapes, self.target.carried.splats.opacities, colors, batch.cameras, state
+        image, alpha = rasterize(*seen, self.target.background)
+        return self._off(image, alpha, batch.images, batch.mattes) + added
 
     def minimise(
         self, optimizer: torch.optim.Optimizer, frames: list[int], steps: int, views: int, generator: torch.Generator,
@@ -219,9 +238,10 @@ def fit_motion(
             sizes = settings.model_dump(include=NETWORK)
             motion = MotionBasisNetwork(target.offsets, centre=centre, reach=target.reach, **sizes)
         motion = motion.to(target.background.device)
-        objective, rate = Objective(motion, target, settings), settings.lr_network
-        optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
-    objective.refining = True
+        rate, fused = settings.lr_network, target.background.is_cuda
+        numbers, betas = motion.parameters(), (0.9, 0.99)
+        optimizer = torch.optim.Adam(numbers, lr=rate, betas=betas, eps=1e-12, fused=fused)
+    objective = Objective(motion, target, settings, refining=True)
     sizes = settings.iterations, settings.views
     objective.minimise(optimizer, moving, *sizes, *draws, settings.frames)
     return motion

@@ -66,7 +66,8 @@ class ModalMotion(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The same under other coefficients (S, K, 3) [m], of frames (S,), or (1,) for all of them."""
         shift, gradient = modes.displacement(coefficients)
-        return shift + self.offsets[frames][:, None], gradient + torch.eye(3).to(gradient)
+        identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        return shift + self.offsets[frames][:, None], gradient + identity
 
     def forward(
         self, frames: Tensor, splats: Splats, modes: Modes, around: Neighbourhood | None = None
@@ -168,7 +169,7 @@ class MotionBasisNetwork(nn.Module):
         raw = self._raw(torch.cat([torch.zeros_like(time[:1]), time]), points)
         raw = raw[1:] - raw[:1]
         positions = splats.means + self.reach * raw[..., :3] + self.offsets[frames][:, None]
-        change = raw[..., 3:7] + raw.new_tensor([1.0, 0.0, 0.0, 0.0])
+        change = raw[..., 3:7] + torch.eye(1, 4, dtype=raw.dtype, device=raw.device)
         rotations = quaternion_multiply(
             nn.functional.normalize(change, dim=-1), splats.rotations.expand(len(frames), -1, -1)
         )

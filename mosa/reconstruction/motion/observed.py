@@ -29,7 +29,8 @@ class Windows:
     def select(self, chosen: Tensor) -> Windows:
         """The windows at `chosen`, a long tensor of indices."""
         parts = self.images, self.mattes, self.view, self.frame
-        images, mattes, view, frame = (part[chosen] for part in parts)
+        at = chosen.to(self.images.device)
+        images, mattes, view, frame = (part[at] for part in parts)
         return Windows(images, mattes, self.cameras.select(chosen.tolist()), view, frame)
 
     def draws(self, count: int, generator: torch.Generator) -> Iterator[Tensor]:

@@ -42,7 +42,7 @@ def _on(matrix: sparse.csr_matrix, like: Tensor, dtype: torch.dtype) -> Tensor:
     parts = (torch.as_tensor(a.astype(np.int64), device=like.device) for a in places)
     values = torch.as_tensor(matrix.data, dtype=dtype, device=like.device)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        warnings.filterwarnings("ignore", message="Sparse (CSR tensor support|invariant checks)")
         return torch.sparse_csr_tensor(*parts, values, size=matrix.shape, check_invariants=False)
 
 
