@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Ordered
@@ -16,7 +17,9 @@ from mosa.evaluation.evaluate import Sequence, true_motion
 from mosa.modules.body.body import Body, World
 from mosa.modules.body.material import FORMS as RANGES
 from mosa.modules.body.material import RELATIVE, STIFFNESS, Form, Material
+from mosa.modules.body.ready import Ready
 from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.modules.fitting.identification import PARTICLES_TOGETHER
 from mosa.modules.fitting.parameters import as_rival, each_law, limits_of
 from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.system.progress import tqdm
@@ -77,8 +80,15 @@ def predicted_spread(
     def positions(own: Body) -> dict[str, Tensor]:
         return {s.prefix: _positions(own, s, world) for s in sequences}
 
-    laws = [(body.material.law, numbers) for numbers in posterior.draws(DRAWS)]
-    drawn = motions_under(body, laws, positions, quiet=False)
+    numbers, drawn = posterior.draws(DRAWS), None
+    if body.rest.is_cuda:
+        try:
+            drawn = side_by_side(body, numbers, sequences, world)
+        except MosaError:  # of one of them, which is left out below
+            pass
+    if drawn is None:
+        laws = [(body.material.law, each) for each in numbers]
+        drawn = motions_under(body, laws, positions, quiet=False)
     others = motions_under(body, list(posterior.rivals.items()), positions)
     figures: dict[str, float] = {
         "posterior/draws": float(len(drawn)),
@@ -138,6 +148,27 @@ def motions_under(
         disable=quiet,
     )
     return [found for found in bar if found is not None]
+
+
+@torch.no_grad()
+def side_by_side(
+    body: Body, numbers: Tensor, sequences: Ordered[Sequence], world: World
+) -> list[dict[str, Tensor]]:
+    """Positions (T, N, 3) [m] in each sequence, by its prefix, under laws of the body's form with numbers (K, D): so many worlds,
+    which all take the substeps of the stiffest. Errors: MosaError where one of them cannot be simulated, or not as a world."""
+    found: list[dict[str, Tensor]] = [{} for _ in numbers]
+    for s in sequences:
+        frames, frame_dt = s.scene.frames, float(s.scene.times[1] - s.scene.times[0])
+        ready = functools.partial(body.ready, s.start, world, frames, frame_dt)
+        substeps = max(ready().simulator.substeps for _ in each_law(body, numbers))
+        together = max(1, PARTICLES_TOGETHER // len(body.rest))
+        for first in range(0, len(numbers), together):
+            some = each_law(body, numbers[first : first + together])
+            worlds = Ready.stack([ready(substeps=substeps).answered() for _ in some])
+            each = worlds.simulate(frames, world.solids).worlds()
+            for own, rollout in zip(found[first:], each):
+                own[s.prefix] = rollout.x
+    return found
 
 
 def among_forms(base: Tensor, others: Ordered[Tensor]) -> Tensor | None:

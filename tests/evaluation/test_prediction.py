@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -117,6 +119,27 @@ def test_a_law_that_can_be_simulated_nowhere_has_no_draws_that_can(monkeypatch):
     sequences = [Sequence("train", None, start(height=0.05, speed=-1.0), 2)]
     figures, spreads = prediction.predicted_spread(body, posterior_of(body, 0.05), sequences, WORLD)
     assert figures["posterior/draws"] == figures["posterior/rivals"] == 0 and spreads == {}
+
+
+def test_draws_side_by_side_move_as_one_by_one(monkeypatch):
+    """As worlds of one simulation, two at a time and all together, and none of them as another."""
+    body = small_body(numbers=0.1 * torch.ones(19))
+    scene = SimpleNamespace(frames=6, times=0.01 * torch.arange(6))
+    drop = partial(Sequence, scene=scene, contact=2)
+    sequences = [drop(name, start=start(height=0.05, speed=v)) for name, v in (("train", -1.0), ("test", -2.0))]  # fmt: skip
+    numbers = posterior_of(body, 0.02).draws(3)
+    one_by_one = prediction.motions_under(
+        body,
+        [("corotated", each) for each in numbers],
+        lambda own: {s.prefix: prediction._positions(own, s, WORLD) for s in sequences},
+    )
+    for particles in (10**6, 2 * len(body.rest)):
+        monkeypatch.setattr(prediction, "PARTICLES_TOGETHER", particles)
+        found = prediction.side_by_side(body, numbers, sequences, WORLD)
+        for own, alone, other in zip(found, one_by_one, one_by_one[1:] + one_by_one[:1]):
+            for name in ("train", "test"):
+                assert torch.equal(own[name], alone[name])
+                assert not torch.equal(own[name], other[name])
 
 
 def said_of_nu(nu: float, sd: float) -> float:
