@@ -44,8 +44,16 @@ class Graphed:
             samples = tuple(
                 t.detach().clone().requires_grad_(needs) for t, needs in zip(tensors, needed)
             )
+            self._replayed[kind] = self._captured(samples)
+        return self._replayed[kind](*tensors)
+
+    def _captured(self, samples: tuple[Tensor, ...]) -> Callable[..., Any]:
+        try:
             with uninterrupted(), warnings.catch_warnings():
                 # torch warms up on one stream and captures on another, and warns of what it does itself
                 warnings.filterwarnings("ignore", "The AccumulateGrad node's stream")
-                self._replayed[kind] = torch.cuda.make_graphed_callables(self.function, samples)
-        return self._replayed[kind](*tensors)
+                return torch.cuda.make_graphed_callables(self.function, samples)
+        except RuntimeError as error:  # as where memory or a driver does not suffice
+            said = str(error).partition("\n")[0]
+            warnings.warn(f"no CUDA graph, steps on the GPU take longer ({said})", stacklevel=3)
+            return self.function

@@ -37,3 +37,12 @@ def test_on_a_gpu_every_call_has_its_own_values_and_gradients():
             assert torch.equal(got, expected)
     with torch.no_grad():
         assert torch.equal(graphed(x, y)[0], parts(scale)(x, y)[0])
+
+
+@pytest.mark.gpu
+def test_what_cannot_be_captured_runs_as_it_is():
+    x = torch.rand(3, device="cuda", requires_grad=True)
+    graphed = Graphed(lambda x: x * float(x.detach().sum()))  # waits for the GPU
+    with pytest.warns(UserWarning, match="no CUDA graph"):
+        first = graphed(x)
+    assert torch.equal(first, graphed(x)) and torch.equal(first, x * float(x.detach().sum()))
