@@ -13,6 +13,7 @@ from warnings import warn
 import torch
 from torch import Tensor
 
+from mosa.data.io.tables import read_table
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.world import World
@@ -118,9 +119,7 @@ def curves_of(curves: Sequence[ForceCurve], recording: str, first: bool) -> list
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     """Errors: DataError naming the file, what was expected and found."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file, skipinitialspace=True) if "".join(row).strip()]
-        names, *rows = [[cell.strip() for cell in row] for row in rows if row[0][:1] != "#"] or [[]]
+        names, rows = read_table(path)
         known = [name for name in names if name in COLUMNS]
         if len(set(known)) < max(2, len(known)) or "time" not in known:
             raise ValueError(f"the columns {', '.join(names)}")
