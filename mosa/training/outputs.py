@@ -70,7 +70,7 @@ def figures_of(
     Writes uncertainty.npz into `folder` where there is a posterior."""
     scene = evaluated[0].scene
     figures, kept = evaluate(body, evaluated, world, settings)
-    figures |= identification(body, scene) | law_figures(body)
+    figures |= identification(body, scene, world) | law_figures(body)
     known = {prefix: each["adapted"].x for prefix, each in kept.items() if "adapted" in each}
     figures |= hidden_figures(body, scene, figures) | posterior_figures(
         body, posterior, evaluated, world, folder, known
