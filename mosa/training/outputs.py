@@ -56,6 +56,18 @@ from mosa.types import Rollout
 
 log = logging.getLogger(__name__)
 
+WRITTEN = [
+    "results.md", "video.mp4", "strip.png", "markers.png", "splats.ply", f"checkpoints/{FILE}",
+    *(f"{name}.npz" for name in ("rollout", "prior", "observed", "truth", "uncertainty", "markers")),
+]  # fmt: skip
+"""What a run may write beside metrics.json when its fit has ended; which of them depends on the scene and on the fit."""
+
+
+def clear(folder: Path) -> None:
+    """Removes what an earlier run in this folder wrote: the viewer would show it as this one's."""
+    for name in WRITTEN:
+        (folder / name).unlink(missing_ok=True)
+
 
 def figures_of(
     settings: EvaluationSettings,
