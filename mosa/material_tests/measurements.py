@@ -74,9 +74,9 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
     missing = [name for name in NEEDED if name not in header]
     strange = [name for name in header if name not in COLUMNS]
     twice = [name for name in header if header.count(name) > 1]
-    if wrong := missing or strange or twice:
+    if names := missing or strange or twice:
         kind = "no" if missing else "an unknown column" if strange else "two columns"
-        wrong = f"{kind} {wrong[0]!r}"
+        wrong = f"{kind} {names[0]!r}"
         if {";", "\t"}.intersection("".join(header)):
             wrong += ": separate columns by commas, and write numbers with a decimal point"
         raise DataError(

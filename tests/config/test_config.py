@@ -367,3 +367,8 @@ def test_bodies_of_one_data_module_share_no_module(monkeypatch):
     one, other = (build.body_of(shape, None) for _ in range(2))
     one.eval()
     assert other.splats.training and other.splats.weight is not one.splats.weight
+
+
+def test_one_solid_in_place_of_a_list_of_them_is_named():
+    with pytest.raises(ConfigError, match=r"world\.colliders.*\n?.*expected a list, as \[\{"):
+        mosa.compose("world.colliders={type: plane}")
