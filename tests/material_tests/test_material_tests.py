@@ -345,6 +345,9 @@ def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
         read_tests(path, "kPa")
     path.write_text(path.read_text()[:-2])
     data = read_tests(path, "kPa")
+    named = tmp_path / "named.csv"
+    named.write_text(path.read_text().replace("a, uniaxial", "#1, uniaxial"))
+    assert read_tests(named, "kPa").names == ("#1",)
     assert data.value.tolist() == [3000.0] and data.kind.tolist() == ["uniaxial"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

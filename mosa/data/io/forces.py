@@ -123,6 +123,7 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
         known = [name for name in names if name in COLUMNS]
         if len(set(known)) < max(2, len(known)) or "time" not in known:
             raise ValueError(f"the columns {', '.join(names)}")
+        rows = [row for row in rows if row[0][:1] != "#"]
         found = {name: [float(row[names.index(name)] or "nan") for row in rows] for name in known}
     except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(
