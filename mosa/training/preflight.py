@@ -18,7 +18,7 @@ from mosa.config.command_settings import EvalSettings, TrainSettings
 from mosa.config.effects import warn_without_effect
 from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import RunRecord
-from mosa.data.io.forces import curves_of, forces_from_config
+from mosa.data.io.forces import curves_of, forces_from_config, warn_of_clock
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
@@ -136,7 +136,9 @@ def check_curves(cfg: DictConfig, scenes: Sequence[Scene]) -> None:
     curves = forces_from_config(plain(cfg.world).get("forces"))
     for scene in scenes:
         for curve in curves_of(curves, scene.sequence, scene is scenes[0]):
-            curve.means(len(scene.training_frames), float(scene.times[1] - scene.times[0]))
+            film = len(scene.training_frames), float(scene.times[1] - scene.times[0])
+            curve.means(*film)
+            warn_of_clock(curve, *film)
 
 
 def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:

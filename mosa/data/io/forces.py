@@ -142,6 +142,20 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     return ForceCurve(of, times, forces, sd)
 
 
+def warn_of_clock(curve: ForceCurve, frames: int, frame_dt: float) -> None:
+    """A warning where a force changes between samples that are farther apart than the film is long: joined by a straight line they
+    are a curve of any clock, here one that hardly begins to rise."""
+    end = frame_dt * (frames - 1)
+    before, after = int((curve.times <= 0).sum()) - 1, int((curve.times < end).sum())
+    if after <= before + 1 and curve.forces[[before, after]].diff(dim=0).nan_to_num().any():
+        first, then = map(float, curve.times[[before, after]])
+        warn(
+            f"world.forces: {curve.name}: expected samples within the {end:.3g} s of the film, found none between {first:.6g} "
+            f"and {then:.6g} s: a clock that counts in milliseconds? (time: seconds from frame 0 on)",
+            stacklevel=2,
+        )
+
+
 def columns_of(curves: Sequence[ForceCurve], solids: Sequence[Collider]) -> list[int]:
     """The reactions' columns that the curves are of. solids: `World.solids`. Errors: ConfigError
     naming a curve of nothing that is there."""
