@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
-from mosa.config.command_settings import EvalSettings, TrainSettings
+from mosa.config.command_settings import EvalSettings, SimulateSection, TrainSettings
 from mosa.config.effects import warn_without_effect
 from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import RunRecord
@@ -60,7 +60,26 @@ def check_evaluation(values: Mapping[str, Any]) -> EvalSettings:
     settings = EvalSettings.read(values)
     if settings.evaluation.video:
         ffmpeg("evaluation.video")
+    warn_of_idle(settings)
     return settings
+
+
+def warn_of_idle(settings: EvalSettings) -> None:
+    """A warning that names keys of eval.py which have no effect on what it is asked for."""
+    own, usual, plans = settings.simulate, SimulateSection(), settings.plan is not None
+    given = [
+        name for name in SimulateSection.model_fields if getattr(own, name) != getattr(usual, name)
+    ]
+    start = [name for name in SimulateSection.model_fields if getattr(usual, name) is None]
+    simulates = not plans and not set(start).isdisjoint(given)
+    idle = [f"simulate.{name}" for name in given if not simulates]
+    idle += ["scene"] * (settings.scene is not None and (plans or simulates))
+    if idle:
+        warnings.warn(
+            f"{', '.join(idle)}: no effect here. eval.py ranks drops where plan is given; else it simulates a new start where "
+            f"one of simulate.{{{', '.join(start)}}} is; else it evaluates the scene",
+            stacklevel=2,
+        )
 
 
 def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> SplatsSettings:
