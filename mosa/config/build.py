@@ -145,7 +145,8 @@ def build_body(record: BodyRecord, tensors: Mapping[str, Tensor]) -> Body:
 def body_of(shape: RestShape, record: BodyRecord) -> Body:
     """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
     body = build_body(record, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
-    body.splats = shape.splats
+    # a copy: a module moves and switches what it holds, and several may be made of one data module
+    body.splats = copy.deepcopy(shape.splats)
     return body.to(shape.rest.device)
 
 

@@ -113,6 +113,10 @@ def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
     """What Hydra says of an override that it cannot take, and the options or the nearest key, where
     it does not name those. given: the overrides."""
     said = "\n".join(dict.fromkeys(str(e).split("\n    full_key")[0] for e in causes(error)))
+    said = said.replace(
+        "Cannot merge DictConfig with ListConfig",
+        "expected a list, as [{...}], found a section, as {...}",
+    )
     if found := re.search(r"Could not (?:load|find) '([\w/]+)/([^/']+)'", said):
         options = list(options_of(found[1]))
         if listed := re.search(r"Available options in '.*':((?:\s+\w+$)+)", said, re.MULTILINE):

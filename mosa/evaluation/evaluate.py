@@ -331,8 +331,9 @@ def floor_figures(
     return figures
 
 
-def identification(body: Body, scene: Scene) -> dict[str, float]:
-    """Identified parameters after calibration (`id_prior/`) and after the joint stage (`id/`), with errors where truth is known."""
+def identification(body: Body, scene: Scene, world: World) -> dict[str, float]:
+    """Identified parameters after calibration (`id_prior/`) and after the joint stage (`id/`), with errors where truth is known.
+    world: with the contact that the fit found."""
     figures = {}
     for prefix, variant in (("id_prior", "prior"), ("id", "adapted")):
         model = body.model(variant)
@@ -343,7 +344,7 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
             if (true := scene.known_parameters.get(name)) is not None:
                 errors = metrics.identification_errors(name, found, true)
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
-        height = model.contact.height(scene.ground, body.settings.dx)
+        height = model.contact.height(world.ground, body.settings.dx)
         figures[f"{prefix}/contact_offset_m"] = float(height.detach())
     return figures
 

@@ -8,6 +8,7 @@ from mosa.export.checking import check_all
 from mosa.export.source import as_json, read_source
 from mosa.export.texts import ufl_text, umat, warp_text
 from mosa.settings import Whole, typed
+from mosa.system.whole_files import made_folder
 
 LARGEST = {"stress": 1e-10, "energy": 1e-10, "tangent": 1e-6}
 """Relative difference that a text may have."""
@@ -27,8 +28,7 @@ def export(
         "law_warp.py": warp_text(found),
         "law.json": as_json(found),
     }
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = made_folder(folder)
     for name, text in texts.items():
         (folder / name).write_text(text)
     return check_all(found, texts, check) if check else {}

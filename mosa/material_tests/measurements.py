@@ -18,11 +18,13 @@ import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from warnings import warn
 
 import numpy as np
 
+from mosa.data.io.tables import read_table
 from mosa.errors import DataError
 from mosa.settings import LARGEST
 
@@ -66,15 +68,16 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
     """The tests of a csv file. unit: of its stresses, a name of `UNITS`. Errors: DataError naming file, line and column."""
     path = Path(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            header, rows = tuple(reader.fieldnames or ()), list(reader)
+        header, rows = read_table(path)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"tests: {path}: expected a csv file of tests, found {error}") from error
-    missing = [name for name in NEEDED if header.count(name) != 1]
-    if missing or (strange := [name for name in header if name not in COLUMNS]):
-        wrong = f"no {missing[0]}" if missing else f"an unknown column {strange[0]!r}"
-        if ";" in "".join(header):
+    missing = [name for name in NEEDED if name not in header]
+    strange = [name for name in header if name not in COLUMNS]
+    twice = [name for name in header if header.count(name) > 1]
+    if names := missing or strange or twice:
+        kind = "no" if missing else "an unknown column" if strange else "two columns"
+        wrong = f"{kind} {names[0]!r}"
+        if {";", "\t"}.intersection("".join(header)):
             wrong += ": separate columns by commas, and write numbers with a decimal point"
         raise DataError(
             f"tests: {path}: expected the columns {', '.join(NEEDED)}, and if wanted "
@@ -82,7 +85,8 @@ def read_tests(path: str | Path, unit: str) -> Measurements:
         )
     if not rows:
         raise DataError(f"tests: {path}: expected rows below the header, found none")
-    found = measurements(rows, unit, str(path))
+    # a cell too many has the key None, one too few the value None
+    found = measurements([dict(zip_longest(header, row)) for row in rows], unit, str(path))
     if not found.value.any():
         raise DataError(f"tests: {path}: stress_1: expected stresses, found 0 in every row")
     return found
@@ -95,7 +99,9 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
     for i, row in enumerate(rows):
         line = f"tests: {where}: row {i + 1}"
         if None in row:  # more cells than columns: as of decimal commas
-            raise DataError(f"{line}: expected a cell for each column, found more: {row[None]}")
+            raise DataError(
+                f"{line}: expected a cell for each column, found {row[None]!r} too much"
+            )
         kind, _, axes = str(row["mode"]).strip().partition(" ")
         fits = KINDS.get(kind) == len(axes) == len(set(axes)) and set(axes) <= set(AXES)
         if not fits:
@@ -117,13 +123,21 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
 
         first, second = cell("first"), cell("second")
         if kind != "biaxial":
+            for unread in ("second", "stress_2", "sd_2"):
+                if not math.isnan(cell(unread)):
+                    raise DataError(
+                        f"{line}: {unread}: expected an empty cell in a {kind} test, found {row[unread]!r}; a strip whose "
+                        "width is held is biaxial, its second stretch 1"
+                    )
             second = 1.0 if kind == "uniaxial" else 0.0
         if math.isnan(first) or math.isnan(second) or (kind != "shear" and min(first, second) <= 0):
             raise DataError(
                 f"{line}: first, second: expected {'a shear' if kind == 'shear' else 'positive stretches'}, "
                 f"found {row.get('first')!r}, {row.get('second')!r}"
             )
-        name = str(row["test"]).strip()
+        name = str(row["test"] or "").strip()
+        if not name:
+            raise DataError(f"{line}: test: expected a name, found an empty cell")
         if name not in names:
             names.append(name)
         places = [AXES.index(a) for a in axes] + [-1] * (2 - len(axes))
@@ -132,10 +146,6 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         measured = [(k, cell(f"stress_{k + 1}"), cell(f"sd_{k + 1}")) for k in (0, 1)]
         if math.isnan(measured[0][1]) and math.isnan(measured[1][1]):
             raise DataError(f"{line}: stress_1: expected a number, found none")
-        if kind != "biaxial" and not math.isnan(measured[1][1]):
-            raise DataError(
-                f"{line}: stress_2: expected an empty cell in a {kind} test, found a number"
-            )
         states.append((names.index(name), kind, places, angle, (first, second)))
         stresses += [(i, k, v, sd) for k, v, sd in measured if not math.isnan(v)]
     test, kinds, axis, angles, given = (np.array(part) for part in zip(*states))

@@ -50,6 +50,12 @@ def explained(value: np.ndarray, found: np.ndarray) -> float:
     return float(1 - ((found - value) ** 2).sum() / spread) if spread > 0 else math.nan
 
 
+def mean_explained(data: Measurements, found: np.ndarray) -> float:
+    """Mean of R2 over the curves that have one; NaN where none has."""
+    each = [explained(data.value[c], found[c]) for c in curves(data).values()]
+    return float(np.mean([value for value in each if not math.isnan(value)] or [math.nan]))
+
+
 def figures(
     data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray]
 ) -> dict[str, float | str]:
@@ -61,7 +67,7 @@ def figures(
     found: dict[str, float | str] = {
         "rms": rms(away),
         "rms_curves": float(np.mean([rms(away[c]) for c in parts])),
-        "R2": float(np.nanmean([explained(data.value[c], fit.predicted[c]) for c in parts])),
+        "R2": mean_explained(data, fit.predicted),
         "numbers": len(fit.names),
         "numbers_determined": fit.effective,
         "noise": fit.noise,

@@ -270,7 +270,12 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
             return job(cfg)
     except KeyboardInterrupt:
         last = Path(folder or ".", "checkpoints", "last.ckpt")
-        message = "stopped" + f"; resume with ckpt_path={last}" * last.is_file()
+        again = f"ckpt_path={last}"
+        if (
+            OmegaConf.select(hydra, "mode") == RunMode.MULTIRUN
+        ):  # a checkpoint would begin every job
+            again = f"resume=auto hydra.sweep.dir={hydra.sweep.dir}"
+        message = "stopped" + f"; resume with {again}" * last.is_file()
         leave(message, 143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"

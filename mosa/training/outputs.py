@@ -56,6 +56,18 @@ from mosa.types import Rollout
 
 log = logging.getLogger(__name__)
 
+WRITTEN = [
+    "results.md", "video.mp4", "strip.png", "markers.png", "splats.ply", f"checkpoints/{FILE}",
+    *(f"{name}.npz" for name in ("rollout", "prior", "observed", "truth", "uncertainty", "markers")),
+]  # fmt: skip
+"""What a run may write beside metrics.json when its fit has ended; which of them depends on the scene and on the fit."""
+
+
+def clear(folder: Path) -> None:
+    """Removes what an earlier run in this folder wrote: the viewer would show it as this one's."""
+    for name in WRITTEN:
+        (folder / name).unlink(missing_ok=True)
+
 
 def figures_of(
     settings: EvaluationSettings,
@@ -70,7 +82,7 @@ def figures_of(
     Writes uncertainty.npz into `folder` where there is a posterior."""
     scene = evaluated[0].scene
     figures, kept = evaluate(body, evaluated, world, settings)
-    figures |= identification(body, scene) | law_figures(body)
+    figures |= identification(body, scene, world) | law_figures(body)
     known = {prefix: each["adapted"].x for prefix, each in kept.items() if "adapted" in each}
     figures |= hidden_figures(body, scene, figures) | posterior_figures(
         body, posterior, evaluated, world, folder, known

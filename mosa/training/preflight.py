@@ -14,11 +14,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_world, plain, rehearse, world_config
 from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
-from mosa.config.command_settings import EvalSettings, TrainSettings
+from mosa.config.command_settings import EvalSettings, SimulateSection, TrainSettings
 from mosa.config.effects import warn_without_effect
 from mosa.config.leaf_settings import SplatsSettings
 from mosa.config.record import RunRecord
-from mosa.data.io.forces import curves_of, forces_from_config
+from mosa.data.io.forces import curves_of, forces_from_config, warn_of_clock
 from mosa.data.io.splat_formats import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.figures import ffmpeg
@@ -60,7 +60,26 @@ def check_evaluation(values: Mapping[str, Any]) -> EvalSettings:
     settings = EvalSettings.read(values)
     if settings.evaluation.video:
         ffmpeg("evaluation.video")
+    warn_of_idle(settings)
     return settings
+
+
+def warn_of_idle(settings: EvalSettings) -> None:
+    """A warning that names keys of eval.py which have no effect on what it is asked for."""
+    own, usual, plans = settings.simulate, SimulateSection(), settings.plan is not None
+    given = [
+        name for name in SimulateSection.model_fields if getattr(own, name) != getattr(usual, name)
+    ]
+    start = [name for name in SimulateSection.model_fields if getattr(usual, name) is None]
+    simulates = not plans and not set(start).isdisjoint(given)
+    idle = [f"simulate.{name}" for name in given if not simulates]
+    idle += ["scene"] * (settings.scene is not None and (plans or simulates))
+    if idle:
+        warnings.warn(
+            f"{', '.join(idle)}: no effect here. eval.py ranks drops where plan is given; else it simulates a new start where "
+            f"one of simulate.{{{', '.join(start)}}} is; else it evaluates the scene",
+            stacklevel=2,
+        )
 
 
 def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> SplatsSettings:
@@ -136,7 +155,9 @@ def check_curves(cfg: DictConfig, scenes: Sequence[Scene]) -> None:
     curves = forces_from_config(plain(cfg.world).get("forces"))
     for scene in scenes:
         for curve in curves_of(curves, scene.sequence, scene is scenes[0]):
-            curve.means(len(scene.training_frames), float(scene.times[1] - scene.times[0]))
+            film = len(scene.training_frames), float(scene.times[1] - scene.times[0])
+            curve.means(*film)
+            warn_of_clock(curve, *film)
 
 
 def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import lightning as L
 from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import LambdaCallback
 from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__
@@ -37,7 +38,7 @@ from mosa.training.fitting import build_trainer, fit
 from mosa.training.lit_mosa import LitMosa
 from mosa.training.loggers import log_outcome
 from mosa.training.memory import check_before_data, check_with_data
-from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
+from mosa.training.outputs import clear, figures_of, optimized, start_figures, write_outputs
 from mosa.training.preflight import (
     check_begin,
     check_configuration,
@@ -141,6 +142,7 @@ def train(cfg: DictConfig) -> float | None:
     with timed(times, "fit"):
         module = LitMosa(plain(cfg))
         module.attach(data)
+        trainer.callbacks.append(LambdaCallback(on_fit_start=lambda *_: clear(folder)))
         cut = learn(module, data, trainer, cfg.ckpt_path)
     body, world = module.body, module.world  # with the contact that was found
     learned_from = [prefix for prefix in starts if prefix.startswith("train")]

@@ -4,6 +4,7 @@ import functools
 import inspect
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
 import mosa
+from mosa.config import build
 from mosa.config.build import build_adapter, build_stages, rehearse
 from mosa.config.command_settings import TrainSettings
 from mosa.errors import ConfigError, DataError
@@ -356,3 +358,17 @@ def test_arguments_are_read_without_their_source(monkeypatch):
         unread.setattr("inspect.findsource", lambda _: pytest.fail("a source was read"))
         arguments = arguments_of(asked, "")
     assert arguments.read({"length": 4}).length == 4
+
+
+def test_bodies_of_one_data_module_share_no_module(monkeypatch):
+    """One Trainer's module, in evaluation mode or on its device, took the Gaussians of another's along."""
+    shape = SimpleNamespace(tensors=lambda: {}, splats=torch.nn.Linear(1, 1), rest=torch.zeros(1))
+    monkeypatch.setattr(build, "build_body", lambda *_: torch.nn.Module())
+    one, other = (build.body_of(shape, None) for _ in range(2))
+    one.eval()
+    assert other.splats.training and other.splats.weight is not one.splats.weight
+
+
+def test_one_solid_in_place_of_a_list_of_them_is_named():
+    with pytest.raises(ConfigError, match=r"world\.colliders.*\n?.*expected a list, as \[\{"):
+        mosa.compose("world.colliders={type: plane}")

@@ -1,10 +1,11 @@
 """The floor is measured as the models are, and what cannot be simulated has the worst figures."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
-from small_bodies import small_body
+from small_bodies import DX, STICKY, small_body
 
 from mosa.errors import SimulationDiverged
 from mosa.evaluation import evaluate as evaluation
@@ -17,7 +18,7 @@ from mosa.evaluation.evaluate import (
     motion_metrics,
 )
 from mosa.evaluation.settings import EvaluationSettings
-from mosa.types import Truth
+from mosa.types import Ground, Truth
 
 
 def test_the_floor_has_the_frames_and_samples_of_the_models(monkeypatch):
@@ -94,3 +95,15 @@ def test_a_law_without_a_stiffest_direction_has_no_angle_to_the_fibres(monkeypat
     assert hidden_figures(body, scene, law | {"id/stiffness_ratio": 1 + 1e-12}) == {}
     found = hidden_figures(body, scene, law | {"id/stiffness_ratio": 1.3})
     assert found == {"id/fibre_angle_deg": pytest.approx(90.0)}
+
+
+@pytest.mark.parametrize("mode, cells", [("sticky", 0.3), ("touch", 0.0)])
+def test_the_contact_offset_is_that_of_the_ground_which_was_found(mode, cells):
+    """With scene.ground.mode=auto it was that of the ground from which the search begins: 0.3 cells too high of one that particles
+    meet."""
+    scene = SimpleNamespace(known_parameters={}, ground=Ground(0.0, "auto"))
+    world = replace(STICKY, ground=Ground(0.0, mode))
+    body = small_body(contact=True)
+    found = evaluation.identification(body, scene, world)
+    assert found["id/contact_offset_m"] == pytest.approx(cells * DX, abs=1e-9)
+    assert found["id_prior/contact_offset_m"] == found["id/contact_offset_m"]

@@ -148,6 +148,9 @@ def test_the_command_writes_reads_and_checks(tmp_path, capsys):
         "umat.f90",
     ]
     assert json.loads((tmp_path / "law" / "law.json").read_text())["values"]["kept"] < 1
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / "material.json"), str(tmp_path / "law" / "law.json"), "--check", "0"])
+    assert "export: expected a folder that can be written" in capsys.readouterr().err
 
 
 def test_a_law_is_exported_as_nearly_incompressible():

@@ -309,11 +309,15 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_path):
     checkpoint = tmp_path / "killed" / "checkpoints" / "last.ckpt"
     (tmp_path / "killed.py").write_text(KILLED)
+    stale = tmp_path / "killed" / "markers.npz"  # of another run, which the viewer would show
+    stale.parent.mkdir()
+    stale.touch()
     words = command("train.py", tmp_path / "killed", cache)[1:]
     killed = forked.call(str(tmp_path / "killed.py"), str(checkpoint), *words)
     assert killed.returncode == -signal.SIGKILL, (
         "the run ended before it could be killed: make the scene's fit longer"
     )
+    assert not stale.exists()
     begun = [
         call("train.py", tmp_path / "killed", cache, "resume=auto", *FEW_FIGURES) for _ in range(2)
     ]

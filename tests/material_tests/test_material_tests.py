@@ -2,6 +2,8 @@
 
 import csv
 import json
+import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +17,15 @@ from mosa.evaluation.analysis.law_stress import in_double, kirchhoff, tangent
 from mosa.export.source import read_source
 from mosa.material_tests.fitting import Fitting, Law
 from mosa.material_tests.measurements import measurements, read_tests
-from mosa.material_tests.report import doubts, figures, reading, rms, uncertain, written
+from mosa.material_tests.report import (
+    doubts,
+    figures,
+    mean_explained,
+    reading,
+    rms,
+    uncertain,
+    written,
+)
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
@@ -27,8 +37,16 @@ MU = E / 2 / (1 + NU)
 
 def rows(mode, first, second=None, **more):
     seconds = first if second is None else np.broadcast_to(second, first.shape)
+    told = mode.startswith("biaxial")
     return [
-        {"test": mode, "mode": mode, "first": a, "second": b, "stress_1": 0.0, **more}
+        {
+            "test": mode,
+            "mode": mode,
+            "first": a,
+            "second": b if told else None,
+            "stress_1": 0.0,
+            **more,
+        }
         for a, b in zip(first, seconds)
     ]
 
@@ -299,10 +317,14 @@ HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
         (HEADER + "a,biaxial xy,1.1,,1,,\n", "positive stretches"),
         (HEADER + "a,uniaxial x,1,,,,\n", "stress_1: expected a number, found none"),
         (HEADER + "a,shear xy,1,,1,2,\n", "stress_2: expected an empty cell"),
+        (HEADER + "a,uniaxial x,1.2,1,1,,\n", "second: expected an empty cell .* strip .* biaxial"),
+        (HEADER + "a,shear xy,0.2,1.2,1,,\n", "second: expected an empty cell in a shear test"),
+        (HEADER + ",uniaxial x,1.2,,1,,\n", "test: expected a name"),
+        (HEADER.strip() + ",angle,angle\na,uniaxial x,1.2,,1,,,0,90\n", "two columns 'angle'"),
         (HEADER + "a,uniaxial x,1.1,,1e300,,\n", "stress_1: expected a number, found '1e300'"),
         (HEADER + "a,uniaxial x,1.1,,0,,\n", "expected stresses, found 0"),
         (HEADER + "a,uniaxial x,1.1,,1,,1e-300\n", "sd_1, sd_2: expected a positive number"),
-        (HEADER + "a,uniaxial x,1,1,,1,,,5\n", "a cell for each column, found more"),
+        (HEADER + "a,uniaxial x,1,1,,1,,,5\n", "a cell for each column, found '5' too much"),
         (HEADER.replace("second", "first") + "a,uniaxial x,1,,1,,\n", "expected the columns"),
         (HEADER + "a,uniaxial x,0.1,,1,,\na,uniaxial x,0.2,,2,,\n", "found 2 of 2 .*strains"),
         (HEADER + "a,uniaxial x,1,,1,,0.1\nb,uniaxial x,1,,1,,\n", "beside every stress"),
@@ -313,6 +335,23 @@ def test_a_mistake_in_the_file_is_named(tmp_path, text, match):
     path.write_text(text)
     with pytest.raises(DataError, match=match):
         read_tests(path, "Pa")
+
+
+def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
+    """Spaces behind commas, rows of empty cells, a remark above; an R2 of one state is no number, without a warning of numpy's."""
+    path = tmp_path / "tests.csv"
+    path.write_text("# of Monday\ntest, mode, first, stress_1\na, uniaxial x, 1.2, 3.0\n,,,\n\na\n")
+    with pytest.raises(DataError, match="row 2: mode: expected"):
+        read_tests(path, "kPa")
+    path.write_text(path.read_text()[:-2])
+    data = read_tests(path, "kPa")
+    named = tmp_path / "named.csv"
+    named.write_text(path.read_text().replace("a, uniaxial", "#1, uniaxial"))
+    assert read_tests(named, "kPa").names == ("#1",)
+    assert data.value.tolist() == [3000.0] and data.kind.tolist() == ["uniaxial"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert math.isnan(mean_explained(data, data.value))
 
 
 def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):

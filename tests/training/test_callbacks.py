@@ -9,6 +9,7 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
 
 from mosa import compose
 from mosa.config.checkpoints import check_plain
@@ -134,3 +135,13 @@ def test_a_complete_fit_leaves_its_checkpoint_in_a_new_folder(tmp_path, caplog):
     trainer.fit(Ended(), torch.utils.data.DataLoader([0]))
     assert (tmp_path / "checkpoints" / "last.ckpt").is_file()
     assert "the fit was complete: no further step" in caplog.text
+
+
+def test_the_best_checkpoint_has_its_name_in_a_folder_of_an_earlier_run_too(tmp_path):
+    """That run's best.ckpt was kept under the name that the documentation gives, and the new one written as best-v1.ckpt."""
+    entry = compose("callbacks=[default,model_checkpoint]")["callbacks"]["model_checkpoint"]
+    callback = instantiate(entry, dirpath=str(tmp_path))
+    (tmp_path / "best.ckpt").touch()
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False)
+    found = callback._get_metric_interpolated_filepath_name({}, trainer)
+    assert Path(found) == tmp_path / "best.ckpt"

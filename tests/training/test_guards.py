@@ -5,6 +5,7 @@ import math
 import os
 import struct
 import sys
+import warnings
 import zlib
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,6 +30,7 @@ from mosa.training.preflight import (
     check_begin,
     check_configuration,
     check_curves,
+    check_evaluation,
     check_held,
     check_particles,
     check_seen,
@@ -341,3 +343,16 @@ def test_a_ply_has_a_byte_for_each_property_of_its_elements(tmp_path):
 def test_a_mistake_costs_no_reconstruction(overrides, message):
     with pytest.raises(ConfigError, match=message):
         rehearse(composed(*overrides))
+
+
+@pytest.mark.parametrize(("more", "idle"), [
+    ({}, None), ({"simulate": {"frames": 60}}, "simulate.frames"), ({"simulate": {"frames": 60, "height": 0.2}}, None),
+    ({"simulate": {"height": 0.2, "variant": "prior"}, "plan": 8}, "simulate.height, simulate.variant"),
+    ({"simulate": {"height": 0.2}, "scene": {"name": "tiny"}}, "scene"), ({"scene": {"name": "tiny"}}, None),
+])  # fmt: skip
+def test_a_key_of_eval_without_an_effect_is_named(more, idle):
+    """simulate.frames=60 alone evaluated the run, without a word."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_evaluation({"ckpt_path": "last.ckpt", "evaluation": {"video": False}} | more)
+    assert [str(each.message).partition(":")[0] for each in said] == [idle] * (idle is not None)

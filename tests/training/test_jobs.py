@@ -318,6 +318,19 @@ def test_yaml_that_cannot_be_read_is_one_message(tmp_path, refused_command, text
     assert re.search(message, refused_command(f"--config-dir={tmp_path}", "experiment=mine"))
 
 
+def test_a_stop_of_a_sweep_names_the_sweep(sweep, tmp_path, monkeypatch):
+    """With the checkpoint of one job as ckpt_path every job would have begun from it."""
+    config, said = HydraConfig.get(), []
+    config.runtime = {"output_dir": str(tmp_path / "3")}
+    (tmp_path / "3" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "3" / "checkpoints" / "last.ckpt").touch()
+    monkeypatch.setattr(HydraConfig, "initialized", staticmethod(lambda: True))
+    monkeypatch.setattr(jobs, "leave", lambda *message: said.append(message[0]) or sys.exit(130))
+    with pytest.raises(SystemExit):
+        attempt(fail(KeyboardInterrupt()), None)
+    assert said == [f"stopped; resume with resume=auto hydra.sweep.dir={tmp_path}"]
+
+
 PROGRAM = """
     import os, signal, sys
     from mosa.training.jobs import attempt

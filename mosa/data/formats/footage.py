@@ -21,7 +21,11 @@ WHITE = np.ones(3, np.float32)
 # columns 1 and 2 of a pose with OpenGL axes (y up, looks along -z) point against those of OpenCV (y down, z forward)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
-FirstLast = Annotated[list[int], Expected("[first, last]"), such(lambda v: len(v) == 2)]
+FirstLast = Annotated[
+    list[int],
+    Expected("[first, last], in this order"),
+    such(lambda v: len(v) == 2 and v[0] <= v[1]),
+]
 LARGEST = 1e30  # of a number in a file: single precision holds it
 
 # relative jitter of frame times that still counts as a constant frame rate

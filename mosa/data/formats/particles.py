@@ -44,7 +44,7 @@ def kept_cloud(points: np.ndarray, cache: str | Path | None) -> str:
     """File of points (M, 3) in the cache folder, for `scene.body.shape`: equal points, equal file."""
     rows = np.ascontiguousarray(points, "<f4")
     name = f"{hashlib.sha256(rows.tobytes()).hexdigest()[:16]}.ply"
-    file = made_folder(Path(cache or default_cache()) / "shapes") / name
+    file = made_folder(Path(cache or default_cache()) / "shapes", "scene.cache") / name
     if not file.is_file():
         vertices = rows.view([(axis, "<f4") for axis in "xyz"])[:, 0]
         with written_whole(file) as partial:

@@ -13,6 +13,7 @@ from warnings import warn
 import torch
 from torch import Tensor
 
+from mosa.data.io.tables import read_table
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.world import World
@@ -118,12 +119,11 @@ def curves_of(curves: Sequence[ForceCurve], recording: str, first: bool) -> list
 def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     """Errors: DataError naming the file, what was expected and found."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file, skipinitialspace=True) if "".join(row).strip()]
-        names, *rows = [[cell.strip() for cell in row] for row in rows if row[0][:1] != "#"] or [[]]
+        names, rows = read_table(path)
         known = [name for name in names if name in COLUMNS]
         if len(set(known)) < max(2, len(known)) or "time" not in known:
             raise ValueError(f"the columns {', '.join(names)}")
+        rows = [row for row in rows if row[0][:1] != "#"]
         found = {name: [float(row[names.index(name)] or "nan") for row in rows] for name in known}
     except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(
@@ -140,6 +140,20 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
     if not len(there) or not 1 / LARGEST < float(there.abs().max()) <= LARGEST:
         raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")
     return ForceCurve(of, times, forces, sd)
+
+
+def warn_of_clock(curve: ForceCurve, frames: int, frame_dt: float) -> None:
+    """A warning where a force changes between samples that are farther apart than the film is long: joined by a straight line they
+    are a curve of any clock, here one that hardly begins to rise."""
+    end = frame_dt * (frames - 1)
+    before, after = int((curve.times <= 0).sum()) - 1, int((curve.times < end).sum())
+    if after <= before + 1 and curve.forces[[before, after]].diff(dim=0).nan_to_num().any():
+        first, then = map(float, curve.times[[before, after]])
+        warn(
+            f"world.forces: {curve.name}: expected samples within the {end:.3g} s of the film, found none between {first:.6g} "
+            f"and {then:.6g} s: a clock that counts in milliseconds? (time: seconds from frame 0 on)",
+            stacklevel=2,
+        )
 
 
 def columns_of(curves: Sequence[ForceCurve], solids: Sequence[Collider]) -> list[int]:

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from mosa.data.io.tables import read_table
 from mosa.errors import ConfigError, DataError
 
 COLUMNS = ("time", "name", "x", "y", "z")
@@ -79,7 +80,7 @@ def read_markers(path: Path) -> Recording:
     """A recording of a .c3d file, or of a .csv file with the columns time [s], name, x, y, z [m]:
     one row for each point in each frame; a row that is missing, or has no numbers, was not seen.
 
-    Errors: DataError naming the file and, of a csv, its line; ConfigError without the package."""
+    Errors: DataError naming the file and, of a csv, its row; ConfigError without the package."""
     readers = {".c3d": _read_c3d, ".csv": _read_csv}
     if path.suffix.lower() not in readers:
         raise DataError(f"{path}: expected a recording .c3d or .csv")
@@ -175,20 +176,19 @@ def _read_c3d(path: Path) -> Recording:
 def _read_csv(path: Path) -> Recording:
     rows: dict[tuple[float, str], list[float]] = {}
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            table = csv.DictReader(file, skipinitialspace=True)
-            if missing := [key for key in COLUMNS if key not in (table.fieldnames or ())]:
-                raise DataError(
-                    f"{path}: expected the columns {', '.join(COLUMNS)}, found no {missing[0]}"
-                )
-            for row in table:
-                key = float(row["time"]), str(row["name"])
-                if key in rows:
-                    raise DataError(
-                        f"{path}, line {table.line_num}: {key[1]!r} at {key[0]} s for a second time"
-                    )
-                rows[key] = [float(row[axis] or "nan") for axis in "xyz"]
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
+        header, table = read_table(path)
+        if any(header.count(key) != 1 for key in COLUMNS):
+            found = ", ".join(header)
+            raise DataError(
+                f"{path}: expected the columns {', '.join(COLUMNS)}, each once, found {found}"
+            )
+        for number, row in enumerate(table, 1):
+            cells = dict(zip(header, row + [""] * (len(header) - len(row))))
+            key = float(cells["time"]), cells["name"]
+            if key in rows:
+                raise DataError(f"{path}, row {number}: {key[1]!r} at {key[0]} s for a second time")
+            rows[key] = [float(cells[axis] or "nan") for axis in "xyz"]
+    except (OSError, csv.Error, ValueError) as error:
         raise DataError(f"{path}: expected rows of {', '.join(COLUMNS)} ({error})") from error
     times = np.array(sorted({time for time, _ in rows}))
     names = tuple(dict.fromkeys(name for _, name in rows))

@@ -93,7 +93,8 @@ def make(
         file.parent.mkdir(parents=True, exist_ok=True)
         write_npz(file, vars(take))
     except OSError as error:
-        found = f"cannot write {file} ({error.strerror}); set XDG_CACHE_HOME to another folder"
+        way = "set XDG_CACHE_HOME to" if cache is None else "give it"
+        found = f"cannot write {file} ({error.strerror}); {way} another folder"
         raise ConfigError(f"scene.cache: {found}") from error
     return take
 

@@ -231,6 +231,9 @@ def test_an_object_that_the_border_cuts_is_named(scene):
         left = scene.mattes.clone()
         left[..., :12, :] = left.amax(-2, keepdim=True)[..., :12, :]  # up to the upper border
         validate(replace(scene, mattes=left))
+    with pytest.raises(DataError, match=r"white, opaque.* where the object is: are these inverted"):
+        images = scene.mattes[..., None] + 0.5 * (1 - scene.mattes[..., None])
+        validate(replace(scene, images=images.expand_as(scene.images), mattes=1 - scene.mattes))
 
 
 def test_what_is_pressed_may_move_in_any_way(scene):

@@ -252,6 +252,7 @@ KEYS = [
     ({"ground": {"height": 0.0, "friction": -1.0}}, "scene.ground.friction"),
     ({"frames": [0, 9]}, "scene.frames: .* has no frame 9, only 0 to 4"),
     ({"frames": 3}, r"scene.frames: expected \[first, last\]"),
+    ({"frames": [4, 0]}, r"scene.frames: expected \[first, last\], in this order, found \[4, 0\]"),
     ({"last_free_frame": 9}, "scene.last_free_frame: no frame 9"),
     ({"up": [0, 0, 1]}, "scene.gravity: expected a pull towards the ground, against scene.up"),
     ({"ground": 0.0}, "scene.ground: expected a section of keys"),

@@ -190,6 +190,18 @@ def test_up_has_unit_length(tmp_path):
     assert scene.up.tolist() == [0.0, 1.0, 0.0]
 
 
+def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
+    """Of two columns x the second was taken without a word; rows of empty cells, and remarks, were refused."""
+    path, rows = tmp_path / "a.csv", "0, a, 1, 2, 3\n0.1, a, 1, 2, 4\n,,,,\n0.2, a\n"
+    path.write_text(f"# camera 3\ntime, name, x, y, z\n{rows}")
+    found = read_markers(path)
+    assert found.names == ("a",) and found.times.tolist() == [0, 0.1, 0.2]
+    assert found.positions[1, 0].tolist() == [1, 2, 4] and np.isnan(found.positions[2]).all()
+    path.write_text(f"time,name,x,y,z,x\n{rows}")
+    with pytest.raises(DataError, match="each once, found time, name, x, y, z, x"):
+        read_markers(path)
+
+
 def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
     times, positions = let_go()
     with pytest.raises(DataError, match="expected times in seconds, found samples 10 s apart"):

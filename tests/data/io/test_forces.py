@@ -1,6 +1,7 @@
 """Measured forces in a fit: what a curve says of a frame interval, and the stiffness of a block
 from a press alone."""
 
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from mosa.data.io.forces import (
     force_residuals,
     forces_from_config,
     read_forces,
+    warn_of_clock,
 )
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.tables import force_lines
@@ -160,6 +162,20 @@ def test_an_empty_cell_was_not_measured_and_notes_are_passed_over(tmp_path):
     curve = read_forces(path, "clamp")
     assert curve.times.tolist() == [0.1, 0.2, 0.3] and curve.forces[::2, 2].tolist() == [1.5, 2.5]
     assert torch.isnan(curve.forces).sum() == 7
+
+
+def test_a_clock_of_a_force_in_milliseconds_is_asked_about(tmp_path):
+    """The fit read a force of nearly 0, and what was said after it asked for sign, axes and unit. A constant load has no clock."""
+    path = tmp_path / "a.csv"
+    for rows, count in (
+        ("0,0\n33,1\n67,2\n100,3", 1), ("0,0\n0.033,1\n0.067,2\n0.1,3", 0), ("0,2\n100,2", 0), ("0.033,1\n0.1,3", 0),
+    ):  # fmt: skip
+        path.write_text(f"time,fy\n{rows}\n")
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            warn_of_clock(read_forces(path, "clamp"), 4, 1 / 30)
+        assert len(said) == count
+        assert all("found none between 0 and 33 s: a clock" in str(each.message) for each in said)
 
 
 def test_a_force_of_nothing_is_refused(tmp_path):
