@@ -28,10 +28,12 @@ MOST = 5.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """cells: across the thinnest tenth of the body, at most `MOST`; particles: that `ENOUGH` cells there would take."""
+    """cells: across the thinnest tenth of the body, at most `MOST`; particles: that `ENOUGH` cells there would take; pieces:
+    that do not touch."""
 
     cells: float
     particles: int
+    pieces: int
 
     @property
     def enough(self) -> bool:
@@ -64,7 +66,8 @@ def resolution(rest: Tensor, spacing: float, dx: float) -> Resolution:
     layers = thickness[tuple(2 * index.T)]
     cells = float(np.quantile(layers, THIN)) * spacing / dx
     needed = len(points) * max(1.0, ENOUGH / max(cells, 0.5)) ** 3
-    return Resolution(cells, int(needed))
+    pieces = ndimage.label(solid, np.ones((3, 3, 3)))[1]
+    return Resolution(cells, int(needed), pieces)
 
 
 def particles_for(

@@ -132,6 +132,11 @@ def train(cfg: DictConfig) -> float | None:
     )  # fmt: skip
     if thin:
         warnings.warn(thin, stacklevel=1)
+    if resolved.pieces > 1:
+        warnings.warn(
+            f"scene: expected one body, found {resolved.pieces} pieces that do not touch: they are learned as one material, and "
+            f"closer than {2 * dx:.2g} m (two grid cells) they move as one; film each by itself", stacklevel=1,
+        )  # fmt: skip
     with timed(times, "starts"):
         if filmed:
             write_first_picture(folder, data, trainer.loggers)

@@ -44,6 +44,19 @@ def test_the_particles_asked_for_resolve_the_slab():
     )  # so many more layers, two to a cell
 
 
+def test_pieces_that_do_not_touch_are_counted():
+    ball = block(6, 6, 6)
+    for gap, pieces in (
+        (0.06, 1),
+        (0.07, 1),
+        (0.1, 2),
+    ):  # next to each other, a layer apart, four apart
+        apart = torch.cat([ball, ball + torch.tensor([gap, 0.0, 0.0])])
+        assert resolution(apart, SPACING, 2 * SPACING).pieces == pieces
+    corner = torch.cat([ball, ball + 6 * SPACING])
+    assert resolution(corner, SPACING, 2 * SPACING).pieces == 1
+
+
 def test_a_grid_of_that_spacing_has_as_many_particles_to_a_cell():
     assert grid_spacing(SPACING, 8) == pytest.approx(2 * SPACING, rel=1e-12)
     assert grid_spacing(SPACING, 4) ** 3 / SPACING**3 == pytest.approx(4, rel=1e-12)
