@@ -10,6 +10,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pytest
 import torch
 import warp as wp
+from compiled_sooner import compile_sooner
 from composed_once import compose_once
 
 torch.set_num_threads(1)
@@ -40,6 +41,7 @@ def unoptimised(path: Path) -> bool:
 
 def pytest_configure(config):
     compose_once()
+    compile_sooner()
     gc.disable()  # until all is imported and collected, of which little is garbage
     # xdist would begin with the files of most tests: the last ones, of one long test each, would keep one process alone
     if hasattr(config.option, "loadscopereorder"):

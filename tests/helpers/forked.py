@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from compiled_sooner import compile_sooner
 from composed_once import compose_once
 from starts_once import start_once
 
@@ -87,6 +88,7 @@ def serve() -> None:
 
     datamodule.sequence_start = start_once
     compose_once()
+    compile_sooner()
     compose("debug=default")  # which most scripts are given
     gc.freeze()  # what is looked through by no fork
     gc.enable()
