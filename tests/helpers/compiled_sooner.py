@@ -1,6 +1,6 @@
 """Kernels for a CPU compile in three quarters of the time where Clang inlines less than Warp asks of it. Their bits are the same
-(they are in the order of the source either way); adjoints that decompose matrices take a tenth longer, one a fifth, which bodies of a
-hundred particles do not notice and those of the program would."""
+(they are in the order of the source either way); adjoints that decompose matrices take a tenth longer, one a fifth, which bodies
+of a hundred particles do not notice and those of the program would."""
 
 import re
 
