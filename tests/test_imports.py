@@ -93,7 +93,7 @@ def test_there_is_no_import_circle():
 def test_the_physics_knows_nothing_of_learning():
     everything = imports("mosa.physics.")
     # ply, npz: which files of points are safe to read; settings: models of what a user may set; threads, limits: of the
-    # machine; exact_sums: of kernels
+    # machine; cuda_graphs: of captures; exact_sums: of kernels
     allowed = (
         "mosa.physics",
         "mosa.errors",
@@ -103,6 +103,7 @@ def test_the_physics_knows_nothing_of_learning():
         "mosa.settings",
         "mosa.system.threads",
         "mosa.system.limits",
+        "mosa.system.cuda_graphs",
         "mosa.physics.exact_sums",
     )
     outside = {
