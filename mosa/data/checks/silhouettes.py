@@ -27,8 +27,8 @@ OPEN, SUSPECT = 0.2, 0.04
 ISLAND = 4  # pixels of a matte apart from the hull that are warned of, above noise
 SUNK = 0.25  # share of the hull below ground in frame 0 that means a wrong height
 MAX_GROUND_GAP = 0.35
-"""Distance between the ground and the lowest point of the hull at the turning point, in radii, above which a warning is given.
-In correct films it is below 0.15."""
+"""Distance between the ground and the lowest point of the hull at the turning point, in radii, above which a warning is given if
+the outlines and what happens between frames leave no other place. In correct films of many cameras and frames it is below 0.15."""
 STRAY, LOST = 0.3, 0.6
 """Radii from the middle of the true particles to where the cameras see the object, from which on they are warned of, and refused.
 Of the built-in films it is at most 0.1."""
@@ -136,7 +136,9 @@ def check_outlines(scene: Scene, label: str) -> None:
                 f"it, or scene.up (now {[round(float(x), 3) for x in scene.up]}), or the axes of the poses"
             )
         if 0 < frame < scene.frames - 1:
-            check_landing(float(heights.min()), track.radius, frame, label)
+            most = lowest_at_most(points, heights, pitch, cameras)
+            step = float((track.points @ scene.up.double()).diff().abs().max())
+            check_landing(float(heights.min()), most, step, track.radius, frame, label)
     if worst[0] > OPEN:
         raise DataError(worst[1])
     if worst[0] > SUSPECT:
@@ -157,10 +159,30 @@ def worst_uncovered(
     )
 
 
-def check_landing(height: float, radius: float, frame: int, label: str) -> None:
-    """A warning where the object turns round far from the ground."""
-    if abs(height) > MAX_GROUND_GAP * radius:
-        where = "above" if height > 0 else "below"
-        warnings.warn(f"{label}: the object turns round in frame {frame} with its lowest point {abs(height):.3g} m {where} the "
-                      "ground: expected it there; check scene.ground.height and scene.up (what else it lands on "
+def lowest_at_most(points: Tensor, heights: Tensor, pitch: float, cameras: Cameras) -> float:
+    """Height [m] that the lowest point of an object of these outlines has at most. Each line of sight through a matte meets the
+    object, somewhere within the hull, whose points (M, 3) [m] have these heights (M,) [m]."""
+    found = math.inf
+    for K, pixels, depth in zip(cameras.K, *project(points, cameras)):
+        focal = float(K[[0, 1], [0, 1]].max())
+        place = (pixels / (0.75 * pitch * focal / depth.mean())).floor().long()  # as `shave_ridges`
+        cells = tuple((place - place.amin(0)).T.numpy())
+        top = np.full([int(c.max()) + 1 for c in cells], -np.inf, np.float32)
+        np.maximum.at(top, cells, heights.numpy())
+        # of neighbours as well: at a matte's rim the hull is thinner than a voxel, and has no point where the object is
+        found = min(found, float(cv2.dilate(top, np.ones((3, 3)))[cells].min()))
+    return found
+
+
+def check_landing(
+    least: float, most: float, step: float, radius: float, frame: int, label: str
+) -> None:
+    """A warning where the object turns round far from the ground. least, most: heights [m] between which its lowest point is: the
+    hull of a few cameras, or of steep ones, reaches far below an object that touches the ground. step: by which it rises or falls
+    [m] from frame to frame at most, so that it may turn by half of it below this frame."""
+    far = MAX_GROUND_GAP * radius
+    if least > far + 0.5 * step or (least < -far and most < 0):
+        where = "above" if least > 0 else "below"
+        warnings.warn(f"{label}: the object turns round in frame {frame} with its lowest point at least {max(least, -most):.3g} m "
+                      f"{where} the ground: expected it there; check scene.ground.height and scene.up (what else it lands on "
                       "is one of world.colliders)", stacklevel=4)  # fmt: skip

@@ -1,5 +1,6 @@
 """A film that no thrown object could have made is refused; every film that one could have made passes."""
 
+import sys
 import warnings
 from dataclasses import replace
 from itertools import combinations
@@ -10,6 +11,7 @@ import torch
 
 from mosa.data.checks.cameras import check_agreement
 from mosa.data.checks.free_fall import check_direction, check_fall, parabola, track_of
+from mosa.data.checks.silhouettes import check_outlines
 from mosa.data.checks.validation import validate
 from mosa.data.scene import load_scene
 from mosa.data.synthetic.renderer import ring_of_cameras
@@ -30,10 +32,10 @@ def height(t: float) -> float:
     )
 
 
-def ball(views: int = 4, size: int = 64, shift=(0.0, 0.0)) -> Scene:
+def ball(views: int = 4, size: int = 64, shift=(0.0, 0.0), elevations=(0.2, 0.6)) -> Scene:
     """shift [m]: of the object's path, sideways."""
     rig = ring_of_cameras(
-        views, size, target=(0, 0.3, 0), distance=1.5, elevations=(0.2, 0.6), field=0.7, turn=0.4
+        views, size, target=(0, 0.3, 0), distance=1.5, elevations=elevations, field=0.7, turn=0.4
     )
     origins, directions = rays(rig)
     mattes = []
@@ -282,3 +284,24 @@ def test_the_bird_passes(reference_data):
     assert np.allclose(a, [0, -9.8, 0], atol=error) and error < 3
     with pytest.raises(DataError, match=r"scene\.fps"):
         validate(replace(scene, times=torch.arange(scene.frames) / 240))
+
+
+def test_an_object_that_three_steep_cameras_see_touch_the_ground_is_above_it():
+    """Their hull reaches 1.3 radii below the ball that made the film, which was said to turn round there. Under a ground of 1.5
+    radii the outlines themselves leave it no place above."""
+    steep = ball(3, 48, elevations=(1.0, 1.2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_outlines(steep, "film")
+    with pytest.warns(UserWarning, match="turns round .* lowest point at least .* m below the"):
+        check_outlines(replace(steep, ground=Ground(1.5 * RADIUS)), "film")
+
+
+def test_a_small_object_that_meets_the_ground_between_two_frames_is_not_above_it(monkeypatch):
+    """A ball that falls by five of its radii from frame to frame, and is seen nowhere nearer to the ground than 0.4 radii."""
+    monkeypatch.setattr(sys.modules[__name__], "RADIUS", 0.02)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_outlines(small := ball(6), "film")
+    with pytest.warns(UserWarning, match="turns round .* lowest point at least .* m above the"):
+        check_outlines(replace(small, ground=Ground(-0.1)), "film")
