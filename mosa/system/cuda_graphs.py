@@ -48,8 +48,10 @@ class Graphed:
         return self._replayed[kind](*tensors)
 
     def _captured(self, samples: tuple[Tensor, ...]) -> Callable[..., Any]:
+        # torch leaves its own stream the current one where a capture fails
+        here = torch.cuda.stream(torch.cuda.current_stream())
         try:
-            with uninterrupted(), warnings.catch_warnings():
+            with here, uninterrupted(), warnings.catch_warnings():
                 # torch warms up on one stream and captures on another, and warns of what it does itself
                 warnings.filterwarnings("ignore", "The AccumulateGrad node's stream")
                 return torch.cuda.make_graphed_callables(self.function, samples)

@@ -43,6 +43,8 @@ def test_on_a_gpu_every_call_has_its_own_values_and_gradients():
 def test_what_cannot_be_captured_runs_as_it_is():
     x = torch.rand(3, device="cuda", requires_grad=True)
     graphed = Graphed(lambda x: x * float(x.detach().sum()))  # waits for the GPU
+    stream = torch.cuda.current_stream()
     with pytest.warns(UserWarning, match="no CUDA graph"):
         first = graphed(x)
+    assert torch.cuda.current_stream() == stream
     assert torch.equal(first, graphed(x)) and torch.equal(first, x * float(x.detach().sum()))
