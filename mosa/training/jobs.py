@@ -271,9 +271,8 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
     except KeyboardInterrupt:
         last = Path(folder or ".", "checkpoints", "last.ckpt")
         again = f"ckpt_path={last}"
-        if (
-            OmegaConf.select(hydra, "mode") == RunMode.MULTIRUN
-        ):  # a checkpoint would begin every job
+        # a checkpoint would begin every job of a sweep
+        if OmegaConf.select(hydra, "mode") == RunMode.MULTIRUN:
             again = f"resume=auto hydra.sweep.dir={hydra.sweep.dir}"
         message = "stopped" + f"; resume with {again}" * last.is_file()
         leave(message, 143 if signal.SIGTERM in signals else 130)

@@ -345,9 +345,8 @@ def check_borders(scene: Scene, label: str) -> None:
     fewest = 2 if scene.body is None else 1
     if len(scene.training_cameras) - len(names) < fewest:
         way = "film from farther away, or start with another frame (scene.frames)"
-        if (
-            float(scene.mattes[cut, 0][:, [0, 0, -1, -1], [0, -1, 0, -1]].median()) > 0.5
-        ):  # in the corners of most of them
+        # of most of them the corners show the object
+        if float(scene.mattes[cut, 0][:, [0, 0, -1, -1], [0, -1, 0, -1]].median()) > 0.5:
             way = "a matte is 1 (white, opaque) where the object is: are these inverted?"
         raise DataError(
             f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected {fewest} "
