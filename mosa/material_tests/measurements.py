@@ -125,9 +125,10 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         if kind != "biaxial":
             for unread in ("second", "stress_2", "sd_2"):
                 if not math.isnan(cell(unread)):
+                    held = "; a strip whose width is held is biaxial, its second stretch 1"
                     raise DataError(
-                        f"{line}: {unread}: expected an empty cell in a {kind} test, found {row[unread]!r}; a strip whose "
-                        "width is held is biaxial, its second stretch 1"
+                        f"{line}: {unread}: expected an empty cell in a {kind} test, found {row[unread]!r}"
+                        + held * (kind == "uniaxial")
                     )
             second = 1.0 if kind == "uniaxial" else 0.0
         if math.isnan(first) or math.isnan(second) or (kind != "shear" and min(first, second) <= 0):
@@ -154,16 +155,20 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         raise DataError(
             f"tests: {where}: sd_1, sd_2: expected a positive number beside every stress, or none at all"
         )
-    pulled = (kinds == "uniaxial")[row_of] & (np.abs(value) > 0.05 * np.abs(value).max())
-    against = pulled & ((given[row_of, 0] - 1) * value < 0)
+    # where both stretches are above 1, or both below, each has the sign of its stress; one alone may be against its own
+    strain = given - 1
+    told = (kinds != "shear") & (strain.prod(1) >= 0)
+    along = strain[row_of, component] * value * told[row_of]
+    pulled = (along != 0) & (np.abs(value) > 0.05 * np.abs(value).max())
+    against = pulled & (along < 0)
     if 2 * against.sum() > pulled.sum():
         raise DataError(
-            f"tests: {where}: first: expected stretches above 1 under tension, below 1 under pressure, "
+            f"tests: {where}: first, second: expected stretches above 1 under tension, below 1 under pressure, "
             f"found {against.sum()} of {pulled.sum()} otherwise: strains, or the other sign of stresses?"
         )
     if against.any():
         warn(
-            f"tests: {where}: first: {against.sum()} of the stresses pull at a stretch below 1, or press above 1: strains?",
+            f"tests: {where}: first, second: {against.sum()} of the stresses pull at a stretch below 1, or press above 1: strains?",
             stacklevel=2,
         )
     scale = UNITS[unit]

@@ -318,7 +318,10 @@ HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
         (HEADER + "a,uniaxial x,1,,,,\n", "stress_1: expected a number, found none"),
         (HEADER + "a,shear xy,1,,1,2,\n", "stress_2: expected an empty cell"),
         (HEADER + "a,uniaxial x,1.2,1,1,,\n", "second: expected an empty cell .* strip .* biaxial"),
-        (HEADER + "a,shear xy,0.2,1.2,1,,\n", "second: expected an empty cell in a shear test"),
+        (
+            HEADER + "a,shear xy,0.2,1.2,1,,\n",
+            "second: expected an empty cell in a shear test, found '1.2'$",
+        ),
         (HEADER + ",uniaxial x,1.2,,1,,\n", "test: expected a name"),
         (HEADER.strip() + ",angle,angle\na,uniaxial x,1.2,,1,,,0,90\n", "two columns 'angle'"),
         (HEADER + "a,uniaxial x,1.1,,1e300,,\n", "stress_1: expected a number, found '1e300'"),
@@ -327,6 +330,7 @@ HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
         (HEADER + "a,uniaxial x,1,1,,1,,,5\n", "a cell for each column, found '5' too much"),
         (HEADER.replace("second", "first") + "a,uniaxial x,1,,1,,\n", "expected the columns"),
         (HEADER + "a,uniaxial x,0.1,,1,,\na,uniaxial x,0.2,,2,,\n", "found 2 of 2 .*strains"),
+        (HEADER + "a,biaxial xy,1.2,1,-2,-1,\na,biaxial xy,0.8,1,2,1,\n", "found 2 of 2 .*sign"),
         (HEADER + "a,uniaxial x,1,,1,,0.1\nb,uniaxial x,1,,1,,\n", "beside every stress"),
     ],
 )
@@ -335,6 +339,19 @@ def test_a_mistake_in_the_file_is_named(tmp_path, text, match):
     path.write_text(text)
     with pytest.raises(DataError, match=match):
         read_tests(path, "Pa")
+
+
+def test_a_biaxial_test_that_holds_its_second_stretch_below_1_may_push_or_pull_there():
+    """Its sides would be narrower by themselves where it is pulled far, and wider where it is not: no sign is wrong."""
+    l = np.linspace(1.05, 2.0, 8)
+    states = rows("biaxial xy", l, 0.8)
+    own = predicted("neo_hookean", {"E": E, "nu": 0.45}, [dict(r, stress_2=0.0) for r in states])
+    both = [dict(r, stress_1=a, stress_2=b) for r, a, b in zip(states, own[::2], own[1::2])]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        measurements(both, "Pa", "here")
+    with pytest.raises(DataError, match="the other sign of stresses"):
+        measurements([dict(r, stress_1=-1.0) for r in rows("biaxial xy", l)], "Pa", "here")
 
 
 def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
