@@ -43,12 +43,20 @@ def disk_message(error: OSError) -> str | None:
     named = isinstance(error.filename, (str, os.PathLike))
     if error.errno == errno.ENOENT and named and not Path(error.filename).parent.is_dir():
         return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile"
-    if error.errno not in DISK:
+    if error.errno not in DISK and not unmade(error):
         return None
     cached = str(error.filename).startswith(cache_home())
-    keys = "XDG_CACHE_HOME" if cached else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
+    own = "hydra.run.dir= (of a sweep hydra.sweep.dir=) and scene.cache= (eval.py: cache=)"
+    keys = "XDG_CACHE_HOME" if cached else own
     refused = f"{error.filename or 'a file'}: cannot be written or read ({error.strerror})"
     return f"{refused}; free space, or choose other folders with {keys}"
+
+
+def unmade(error: OSError) -> bool:
+    """Whether a folder could not be made, as in /proc, which takes none. A file that is not there to be read is a mistake of the
+    program."""
+    names = {frame.f_code.co_name for frame, _ in traceback.walk_tb(error.__traceback__)}
+    return error.errno == errno.ENOENT and not names.isdisjoint(("mkdir", "makedirs"))
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -88,7 +88,7 @@ def test_a_full_cache_names_the_variable_that_helps(environment, tmp_path):
     assert (
         "choose other folders with XDG_CACHE_HOME" in refused[0] and "scene.cache" not in refused[0]
     )
-    assert refused[1].endswith("hydra.run.dir= and scene.cache= (eval.py: cache=)")
+    assert refused[1].endswith("hydra.sweep.dir=) and scene.cache= (eval.py: cache=)")
 
 
 def test_a_program_keeps_no_kernels_where_it_is_started(tmp_path):

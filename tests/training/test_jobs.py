@@ -23,6 +23,7 @@ from omegaconf import OmegaConf
 
 from mosa.cli.train import train
 from mosa.errors import ConfigError
+from mosa.reconstruction.cache import StageCache
 from mosa.system import machine_errors
 from mosa.system.npz import write_npz
 from mosa.training import jobs
@@ -145,6 +146,9 @@ def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, cap
         "observed.npz" in (said := capsys.readouterr().err)
         and "its folder has been removed meanwhile" in said
     )
+    attempt(lambda _: StageCache(Path("/proc/nowhere"), {"scene": "a"}), None)
+    assert "/proc/nowhere: cannot be written" in (said := capsys.readouterr().err)
+    assert "choose other folders with hydra.run.dir=" in said and "scene.cache=" in said
     HydraConfig.get().mode = RunMode.RUN
     with pytest.raises(FileNotFoundError):  # a file that is not there is the program's
         attempt(lambda _: (tmp_path / "none").read_text(), None)
