@@ -27,7 +27,7 @@ import torch
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, default_collate
 
 from mosa.config.build import body_of, build_body, build_fit, fitting, plain, rehearse
 from mosa.config.checkpoints import (
@@ -470,6 +470,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                 f"predict: expected starts as mappings like {{'height': 0.2}}, found "
                 f"{batch!r:.80}; data.predict = [{{'height': 0.2}}] and "
                 "trainer.predict(module, datamodule=data)"
+            )
+        loader = None if self._trainer is None else self.trainer.predict_dataloaders
+        if getattr(loader, "collate_fn", None) is default_collate:
+            raise ConfigError(
+                "predict: expected starts one by one, DataLoader(starts, batch_size=None), found batches, whose numbers are tensors"
             )
         return self.twin().simulate(**batch)
 

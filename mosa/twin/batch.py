@@ -102,7 +102,7 @@ class TwinWorlds(InMotion):
             )
         if len(each) != len(which):
             raise ConfigError(
-                f"starts: expected one, or {len(which)}, one a world, found {len(each)}"
+                f"starts: expected one mapping for all worlds, or a list of {len(which)}, one a world, found a list of {len(each)}"
             )
         found: list[tuple[Start, World]] = []
         for i, (b, given) in enumerate(zip(which, each)):

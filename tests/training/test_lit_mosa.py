@@ -6,6 +6,7 @@ import lightning as L
 import pytest
 import torch
 from strangers import checkpoint, saved
+from torch.utils.data import DataLoader
 
 from mosa import SceneDataModule
 from mosa.errors import ConfigError
@@ -60,3 +61,14 @@ def test_module_and_data_have_one_configuration(monkeypatch, other):
     monkeypatch.setattr(datamodule, "load_sequences", lambda _: pytest.fail("the films were made"))
     with pytest.raises(ConfigError, match=f"one configuration for both.*{other.split('=')[0]}"):
         trainer.fit(LitMosa("debug=default", other), datamodule=data)
+
+
+def test_a_loader_that_makes_batches_of_starts_is_named(tmp_path):
+    """A height became a tensor of one number, which ended in an error of torch's."""
+    module = LitMosa.load_from_checkpoint(checkpoint(tmp_path / "tiny.ckpt"))
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)  # fmt: skip
+    starts = [{"height": 0.2, "frames": 2}]
+    with pytest.raises(ConfigError, match=r"^predict: expected .*batch_size=None.* found batches"):
+        trainer.predict(module, dataloaders=DataLoader(starts))
+    (found,) = trainer.predict(module, dataloaders=DataLoader(starts, batch_size=None))
+    assert len(found.x) == 2

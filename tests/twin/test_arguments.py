@@ -59,6 +59,12 @@ def test_an_unknown_part_of_a_start_is_named_with_the_nearest():
         TWIN().worlds(2).reset([{}, {"heigth": 1.0}])
 
 
+def test_a_list_of_one_start_for_two_worlds_is_told_from_a_start_for_all():
+    """A list of one was told to be "one, or 2", and found to be 1."""
+    with pytest.raises(ConfigError, match=r"expected one mapping .*list of 2.* found a list of 1$"):
+        TWIN().worlds(2).reset([{"height": 1.0}])
+
+
 def test_a_state_that_is_inside_out_is_refused_where_the_law_has_no_such():
     made = twin()
     made.body.law_options = made.body.law_options.but(on_inversion="error")
