@@ -355,9 +355,11 @@ def test_a_biaxial_test_that_holds_its_second_stretch_below_1_may_push_or_pull_t
 
 
 def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
-    """Spaces behind commas, rows of empty cells, a remark above; an R2 of one state is no number, without a warning of numpy's."""
+    """Spaces and nothing behind commas, empty rows, a remark above; R2 of one state is no number, without a word of numpy's."""
     path = tmp_path / "tests.csv"
-    path.write_text("# of Monday\ntest, mode, first, stress_1\na, uniaxial x, 1.2, 3.0\n,,,\n\na\n")
+    path.write_text(
+        "# of Monday\ntest, mode, first, stress_1,\na, uniaxial x, 1.2, 3.0,,\n,,,\n\na\n"
+    )
     with pytest.raises(DataError, match="row 2: mode: expected"):
         read_tests(path, "kPa")
     path.write_text(path.read_text()[:-2])
