@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import torch
@@ -22,6 +22,11 @@ def uninterrupted() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+def stream_kept() -> AbstractContextManager[None]:
+    """Torch's current stream is afterwards what it was: where a capture fails, torch leaves that of the capture the current one."""
+    return torch.cuda.stream(torch.cuda.current_stream())
 
 
 class Graphed:
@@ -48,10 +53,8 @@ class Graphed:
         return self._replayed[kind](*tensors)
 
     def _captured(self, samples: tuple[Tensor, ...]) -> Callable[..., Any]:
-        # torch leaves its own stream the current one where a capture fails
-        here = torch.cuda.stream(torch.cuda.current_stream())
         try:
-            with here, uninterrupted(), warnings.catch_warnings():
+            with stream_kept(), uninterrupted(), warnings.catch_warnings():
                 # torch warms up on one stream and captures on another, and warns of what it does itself
                 warnings.filterwarnings("ignore", "The AccumulateGrad node's stream")
                 return torch.cuda.make_graphed_callables(self.function, samples)

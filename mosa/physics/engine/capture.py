@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from mosa.physics.launching import NOTHING, ON_CPU
-from mosa.system.cuda_graphs import uninterrupted
+from mosa.system.cuda_graphs import stream_kept, uninterrupted
 
 ATTEMPTS = 3
 """Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
@@ -63,7 +63,8 @@ class TorchCapture:
 
     def capture(self, body: Body) -> Body:
         graph = torch.cuda.CUDAGraph()
-        with uninterrupted(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        whole = torch.cuda.graph(graph, capture_error_mode="thread_local")
+        with stream_kept(), uninterrupted(), whole:
             body()
         return graph.replay
 
