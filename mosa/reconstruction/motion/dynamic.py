@@ -166,20 +166,20 @@ class Objective:
     def __init__(
         self, motion: Motion, target: Target, settings: DynamicSettings, predicted: Predicted | None = None,
         refining: bool = False,
-    ):  # fmt: skip
+    ) -> None:  # fmt: skip
         self.target = target
         self._off = image_loss(settings.ssim, settings.matte)
         shown = Shown(motion, target, settings, predicted, refining)
         names = [name for name, _ in shown.named_parameters()]
 
-        def of(frames: Tensor, state: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+        def evaluated(frames: Tensor, state: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
             return functional_call(shown, dict(zip(names, numbers)), (frames, state))
 
-        self._shown, self._of = shown, Graphed(of)
+        self._shown, self._evaluated = shown, Graphed(evaluated)
 
     def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
         """frames: (S,) long; state: (B,) which of them each window shows."""
-        positions, shapes, colors, added = self._of(frames, state, *self._shown.parameters())
+        positions, shapes, colors, added = self._evaluated(frames, state, *self._shown.parameters())
         seen = positions, shapes, self.target.carried.splats.opacities, colors, batch.cameras, state
         image, alpha = rasterize(*seen, self.target.background)
         return self._off(image, alpha, batch.images, batch.mattes) + added
