@@ -64,8 +64,9 @@ WRITTEN = [
 
 
 def clear(folder: Path) -> None:
-    """Removes what an earlier run in this folder wrote: the viewer would show it as this one's."""
-    for name in WRITTEN:
+    """Removes what an earlier run in this folder wrote: the viewer would show it as this one's. Without a checkpoint no run was
+    here, and files of these names are somebody's own."""
+    for name in WRITTEN if any((folder / "checkpoints").glob("*.ckpt")) else ():
         (folder / name).unlink(missing_ok=True)
 
 

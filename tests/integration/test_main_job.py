@@ -310,7 +310,8 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
     checkpoint = tmp_path / "killed" / "checkpoints" / "last.ckpt"
     (tmp_path / "killed.py").write_text(KILLED)
     stale = tmp_path / "killed" / "markers.npz"  # of another run, which the viewer would show
-    stale.parent.mkdir()
+    (stale.parent / "checkpoints").mkdir(parents=True)
+    (stale.parent / "checkpoints" / "earlier.ckpt").touch()
     stale.touch()
     words = command("train.py", tmp_path / "killed", cache)[1:]
     killed = forked.call(str(tmp_path / "killed.py"), str(checkpoint), *words)

@@ -43,3 +43,15 @@ def test_what_is_chosen_by_validation_needs_something_held_out(monkeypatch):
             ConfigError, match=r"EarlyStopping\.monitor: .*val/loss, .*found val/los$"
         ):
             check_monitors(whole, [EarlyStopping("val/los")])
+
+
+def test_results_are_cleared_where_a_run_was_and_nowhere_else(tmp_path):
+    (tmp_path / "splats.ply").write_text("somebody's")
+    outputs.clear(tmp_path)
+    assert (tmp_path / "splats.ply").is_file()
+    (tmp_path / "checkpoints").mkdir()
+    for name in ("checkpoints/earlier.ckpt", "notes.md"):
+        (tmp_path / name).touch()
+    outputs.clear(tmp_path)
+    assert not (tmp_path / "splats.ply").exists() and (tmp_path / "notes.md").is_file()
+    assert (tmp_path / "checkpoints" / "earlier.ckpt").is_file()
