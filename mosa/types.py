@@ -193,6 +193,11 @@ class Scene:
         return self.images.shape[1]
 
     @property
+    def frame_dt(self) -> float:
+        """[s], from frame to frame."""
+        return float(self.times[1] - self.times[0])
+
+    @property
     def training_cameras(self) -> list[int]:
         return [i for i in range(len(self.cameras)) if i not in self.holdout_cameras]
 

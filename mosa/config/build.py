@@ -111,7 +111,7 @@ def measured(
         world=known,
         density=scene.density,
         dx=dx,
-        frame_dt=float(scene.times[1] - scene.times[0]),
+        frame_dt=scene.frame_dt,
         starts={prefix: start.written() for prefix, start in (starts or {}).items()},
         data=dict(data or {}),
     )

@@ -157,9 +157,12 @@ class SimulateSection(Settings):
     """A new start, in place of the evaluation. What is left out is taken from the training sequence."""
 
     where: ClassVar[str] = "simulate"
+    STARTS: ClassVar[tuple[str, ...]] = (
+        "velocity", "rotation", "position", "height", "angular_velocity", "colliders", "driven",
+    )  # fmt: skip
 
     velocity: Three | None = None
-    """[vx, vy, vz] m/s; any of these six starts a new simulation"""
+    """[vx, vy, vz] m/s; any of these seven starts a new simulation"""
     rotation: Four | None = None
     """[ax, ay, az, degrees] about the body's centre"""
     position: Place | None = None

@@ -84,7 +84,6 @@ def rollouts(
     particle substeps per second of the last. A variant that cannot be simulated on it is left out, with a warning: on a training
     sequence too, which the fit has simulated near the observed motion, and without its held-out frames."""
     scene = sequence.scene
-    frame_dt = float(scene.times[1] - scene.times[0])
     sizes: list[float] = []
     result, rate = {}, 0.0
     for v in VARIANTS:
@@ -92,7 +91,7 @@ def rollouts(
         try:
             collect = lambda found: sizes.append(float(found.mean_abs_C))  # noqa: E731
             how = {"model": body.model(v), "collect": collect}
-            result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, **how)
+            result[v] = body.simulate(sequence.start, world, scene.frames, scene.frame_dt, **how)
         except (SimulationDiverged, ConfigError) as error:
             del sizes[counted:]
             warn(
@@ -223,8 +222,7 @@ def evaluate(
                 if world.forces and variant == "adapted":
                     scene, first = sequence.scene, sequence.prefix == "train"
                     curves = curves_of(world.forces, scene.sequence, first)
-                    dt = float(scene.times[1] - scene.times[0])
-                    figures |= force_figures(simulated[variant], curves, world, dt)
+                    figures |= force_figures(simulated[variant], curves, world, scene.frame_dt)
                 figures |= of_each[sequence.prefix, variant]
                 measured |= {
                     key.rpartition("/")[2]

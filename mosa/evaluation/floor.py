@@ -34,7 +34,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     between this and the truth is the learner's discretisation: differences below it mean nothing. As the contact height is fitted,
     two fits of one body have different floors. Errors: ConfigError where the scene is not a built-in one; SimulationDiverged."""
     truth, hidden = scene.truth, hidden_of(scene)
-    settings, frame_dt = body.settings, float(scene.times[1] - scene.times[0])
+    settings, frame_dt = body.settings, scene.frame_dt
     rest, device = body.rest.detach().float().cpu(), body.rest.device
     Q = truth.rotation.float()
     start = (rest - truth.rest.mean(0)) @ Q.T + truth.positions[0].mean(0)

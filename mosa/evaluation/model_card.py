@@ -22,7 +22,7 @@ def filmed(sequences: Ordered[Sequence]) -> list[str]:
     """A line for each sequence."""
     lines = []
     for s in sequences:
-        scene, dt = s.scene, float(s.scene.times[1] - s.scene.times[0])
+        scene, dt = s.scene, s.scene.frame_dt
         learned = s.prefix.startswith("train")
         cameras = scene.training_cameras if learned else scene.cameras
         made = "simulated by this program, no capture" if scene.synthetic else "footage"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -80,13 +81,12 @@ def predicted_spread(
     def positions(own: Body) -> dict[str, Tensor]:
         return {s.prefix: _positions(own, s, world) for s in sequences}
 
-    numbers, drawn = posterior.draws(DRAWS), None
+    numbers = posterior.draws(DRAWS)
+    drawn: list[dict[str, Tensor]] = []
     if body.rest.is_cuda:
-        try:
+        with contextlib.suppress(MosaError):  # of one of them, which is left out below
             drawn = side_by_side(body, numbers, sequences, world)
-        except MosaError:  # of one of them, which is left out below
-            pass
-    if drawn is None:
+    if not drawn:
         laws = [(body.material.law, each) for each in numbers]
         drawn = motions_under(body, laws, positions, quiet=False)
     others = motions_under(body, list(posterior.rivals.items()), positions)
@@ -158,8 +158,8 @@ def side_by_side(
     which all take the substeps of the stiffest. Errors: MosaError where one of them cannot be simulated, or not as a world."""
     found: list[dict[str, Tensor]] = [{} for _ in numbers]
     for s in sequences:
-        frames, frame_dt = s.scene.frames, float(s.scene.times[1] - s.scene.times[0])
-        ready = functools.partial(body.ready, s.start, world, frames, frame_dt)
+        frames = s.scene.frames
+        ready = functools.partial(body.ready, s.start, world, frames, s.scene.frame_dt)
         substeps = max(ready().simulator.substeps for _ in each_law(body, numbers))
         together = max(1, PARTICLES_TOGETHER // len(body.rest))
         for first in range(0, len(numbers), together):
@@ -190,9 +190,7 @@ def total_spread(
 
 
 def _positions(body: Body, s: Sequence, world: World) -> Tensor:
-    return body.simulate(
-        s.start, world, s.scene.frames, float(s.scene.times[1] - s.scene.times[0])
-    ).x
+    return body.simulate(s.start, world, s.scene.frames, s.scene.frame_dt).x
 
 
 def physical_sd(name: str, raw: Tensor, sd: float) -> float:

@@ -289,7 +289,7 @@ class SceneDataModule(L.LightningDataModule):
         device, frames = self.device or "cpu", len(scene.training_frames)
         return Take(
             start, training_observations(scene, reconstruction, margin=self.settings.rendering.margin, device=device),
-            reconstruction.cues.first(frames).to(device), float(scene.times[1] - scene.times[0]),
+            reconstruction.cues.first(frames).to(device), scene.frame_dt,
             first_contact(self.shape, start, scene), self.second_look(scene, reconstruction), scene.sequence,
             on_device(self.further_cues(scene, reconstruction) or {}, device),
         )  # fmt: skip

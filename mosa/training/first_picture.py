@@ -26,7 +26,7 @@ def write_first_picture(folder: Path, data: SceneDataModule, loggers: Sequence[L
     """first.png in the run folder and in the loggers that show pictures: the training film, its reconstruction, and the prior with
     the numbers that the configuration gives, as the first camera sees them."""
     scene, found = data.scene, data.reconstruction
-    frames, frame_dt = len(scene.training_frames), float(scene.times[1] - scene.times[0])
+    frames, frame_dt = len(scene.training_frames), scene.frame_dt
     shape = RestShape.of(found, data.device or "cpu")
     record = measured(plain(data.cfg), scene, data.dx, {"train": data.start})
     body = body_of(shape, record)

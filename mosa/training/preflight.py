@@ -70,14 +70,13 @@ def warn_of_idle(settings: EvalSettings) -> None:
     given = [
         name for name in SimulateSection.model_fields if getattr(own, name) != getattr(usual, name)
     ]
-    start = [name for name in SimulateSection.model_fields if getattr(usual, name) is None]
-    simulates = not plans and not set(start).isdisjoint(given)
+    simulates = not plans and not set(own.STARTS).isdisjoint(given)
     idle = [f"simulate.{name}" for name in given if not simulates]
     idle += ["scene"] * (settings.scene is not None and (plans or simulates))
     if idle:
         warnings.warn(
             f"{', '.join(idle)}: no effect here. eval.py ranks drops where plan is given; else it simulates a new start where "
-            f"one of simulate.{{{', '.join(start)}}} is; else it evaluates the scene",
+            f"one of simulate.{{{', '.join(own.STARTS)}}} is; else it evaluates the scene",
             stacklevel=2,
         )
 
@@ -155,7 +154,7 @@ def check_curves(cfg: DictConfig, scenes: Sequence[Scene]) -> None:
     curves = forces_from_config(plain(cfg.world).get("forces"))
     for scene in scenes:
         for curve in curves_of(curves, scene.sequence, scene is scenes[0]):
-            film = len(scene.training_frames), float(scene.times[1] - scene.times[0])
+            film = len(scene.training_frames), scene.frame_dt
             curve.means(*film)
             warn_of_clock(curve, *film)
 

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from mosa import __version__
 from mosa.config.build import measured, plain, world_of
 from mosa.config.checkpoints import check_same_data
+from mosa.config.command_settings import SimulateSection
 from mosa.config.composition import with_defaults
 from mosa.config.extensions import load_extensions
 from mosa.data.sequences import load_sequences
@@ -66,11 +67,6 @@ from mosa.twin.twin import Twin
 from mosa.types import AUTO
 
 log = logging.getLogger(__name__)
-
-ANOTHER_START = (
-    "velocity", "rotation", "position", "height", "angular_velocity", "colliders", "driven",
-)  # fmt: skip
-"""Keys of `simulate` that ask eval.py for a rollout from a new start."""
 
 
 @contextmanager
@@ -215,7 +211,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         return -ranked[0].gain
     show(twin.body, cfg.appearance)
     simulate = plain(cfg.simulate)
-    if any(simulate[k] is not None for k in ANOTHER_START):
+    if any(simulate[k] is not None for k in SimulateSection.STARTS):
         rollout = twin.simulate(**simulate, progress=True)
         readers = {"colliders": colliders_from_config, "driven": driven_from_config}
         asked = {k: simulate[k] for k in readers if simulate[k] is not None}

@@ -11,7 +11,7 @@ from mosa.evaluation.model_card import model_card, stretches
 
 
 def sequence(prefix, name):
-    scene = SimpleNamespace(name="cube", sequence=name, synthetic=prefix != "train", times=FRAME_DT * torch.arange(6.0),
+    scene = SimpleNamespace(name="cube", sequence=name, synthetic=prefix != "train", frame_dt=FRAME_DT,
                             training_cameras=[0, 1], training_frames=[0, 1, 2, 3], cameras=[0, 1, 2], frames=6)  # fmt: skip
     return Sequence(prefix, scene, start(), 2)
 

@@ -124,7 +124,7 @@ def test_a_law_that_can_be_simulated_nowhere_has_no_draws_that_can(monkeypatch):
 def test_draws_side_by_side_move_as_one_by_one(monkeypatch):
     """As worlds of one simulation, two at a time and all together, and none of them as another."""
     body = small_body(numbers=0.1 * torch.ones(19))
-    scene = SimpleNamespace(frames=6, times=0.01 * torch.arange(6))
+    scene = SimpleNamespace(frames=6, frame_dt=0.01)
     drop = partial(Sequence, scene=scene, contact=2)
     sequences = [drop(name, start=start(height=0.05, speed=v)) for name, v in (("train", -1.0), ("test", -2.0))]  # fmt: skip
     numbers = posterior_of(body, 0.02).draws(3)

@@ -46,11 +46,8 @@ def test_the_particles_asked_for_resolve_the_slab():
 
 def test_pieces_that_do_not_touch_are_counted():
     ball = block(6, 6, 6)
-    for gap, pieces in (
-        (0.06, 1),
-        (0.07, 1),
-        (0.1, 2),
-    ):  # next to each other, a layer apart, four apart
+    # next to each other, a layer apart, four apart
+    for gap, pieces in ((0.06, 1), (0.07, 1), (0.1, 2)):
         apart = torch.cat([ball, ball + torch.tensor([gap, 0.0, 0.0])])
         assert resolution(apart, SPACING, 2 * SPACING).pieces == pieces
     corner = torch.cat([ball, ball + 6 * SPACING])

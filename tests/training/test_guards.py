@@ -86,7 +86,7 @@ def test_a_force_beside_the_film_is_refused_before_the_reconstruction(tmp_path, 
     """As one whose times are milliseconds."""
     (tmp_path / "cell.csv").write_text("time,fy\n20,1\n560,2\n")
     entry = {"of": "plate", "file": str(tmp_path / "cell.csv"), "recording": recording}
-    films = [SimpleNamespace(sequence=name, training_frames=range(14), times=0.04 * torch.arange(14))
+    films = [SimpleNamespace(sequence=name, training_frames=range(14), frame_dt=0.04)
              for name in ("press", "again")]  # fmt: skip
     cfg = OmegaConf.create({"world": {"forces": [entry]}})
     with pytest.raises(ConfigError, match=r"'plate' that covers .*0 to 0\.52 s.*found 20 to 560 s"):

@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 
 from mosa.reconstruction.gaussians.gaussians import OPACITY_RATE, ROTATION_RATE, SMALLEST
 from mosa.reconstruction.gaussians.photometric import image_loss
+from mosa.reconstruction.gaussians.uniform_adam import adam
 from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.settings import CarriedSettings
 from mosa.rendering.appearance import spherical_harmonics
@@ -55,8 +56,7 @@ class RestGaussians:
             {"params": [getattr(self, name).requires_grad_(True)], "start": rate}
             for name, rate in rates.items()
         ]
-        fused = splats.means.is_cuda
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=fused)
+        self.optimizer = adam(groups)
         self._drawn = Graphed(self._as_drawn)
         scale = splats.scales.mean(1, keepdim=True)
         self.lower, self.upper = (SMALLEST * scale).log(), (settings.largest * scale).log()

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from mosa.reconstruction.gaussians.uniform_adam import adam
 from mosa.reconstruction.settings import FitSettings
 from mosa.rendering.covariance import covariance_from
 from mosa.system.cuda_graphs import Graphed
@@ -47,8 +48,7 @@ class FreeGaussians:
         self.anisotropic, self.axis_ratio = anisotropic, settings.axis_ratio
         groups = [{"params": [p.requires_grad_(True)], "start": rates[name], "name": name}
                   for name, p in self.parameters.items() if move or name != "means"]  # fmt: skip
-        fused = splats.means.is_cuda
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=fused)
+        self.optimizer = adam(groups)
         self._drawn = Graphed(self._as_drawn)
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.reconstruction.gaussians.photometric import image_loss
-from mosa.reconstruction.gaussians.uniform_adam import UniformAdam
+from mosa.reconstruction.gaussians.uniform_adam import UniformAdam, adam
 from mosa.reconstruction.motion.cues import Neighbourhood
 from mosa.reconstruction.motion.modes import Modes
 from mosa.reconstruction.motion.motion import ModalMotion, MotionBasisNetwork, MotionSample
@@ -238,9 +238,7 @@ def fit_motion(
             sizes = settings.model_dump(include=NETWORK)
             motion = MotionBasisNetwork(target.offsets, centre=centre, reach=target.reach, **sizes)
         motion = motion.to(target.background.device)
-        rate, fused = settings.lr_network, target.background.is_cuda
-        numbers, betas = motion.parameters(), (0.9, 0.99)
-        optimizer = torch.optim.Adam(numbers, lr=rate, betas=betas, eps=1e-12, fused=fused)
+        optimizer = adam([{"params": list(motion.parameters()), "lr": settings.lr_network}])
     objective = Objective(motion, target, settings, refining=True)
     sizes = settings.iterations, settings.views
     objective.minimise(optimizer, moving, *sizes, *draws, settings.frames)
