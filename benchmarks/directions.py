@@ -139,7 +139,7 @@ def true_law_here(case: SimpleNamespace, path: Path) -> Tensor:
                             rotation=torch.eye(3), parameters={"ratio": case.object.material.ratio})  # fmt: skip
     frames = len(case.truth)
     scene = SimpleNamespace(name=path.stem.removesuffix(TWIN), synthetic=True, truth=truth, frames=frames,
-                            times=case.take.frame_dt * torch.arange(frames))  # fmt: skip
+                            frame_dt=case.take.frame_dt)  # fmt: skip
     return floor_rollout(case.body, scene, case.world).to(case.truth)
 
 

@@ -83,7 +83,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
         s = each.scene
         sequences[each.prefix] = {
             "start": each.start.written(), "contact": each.contact, "frames": s.frames,
-            "frame_dt": float(s.times[1] - s.times[0]), "truth": true_motion(body, s)[:, chosen].cpu(),
+            "frame_dt": s.frame_dt, "truth": true_motion(body, s)[:, chosen].cpu(),
             "floor": floors[each.prefix], "cues": None, "response": None,
         }  # fmt: skip
         if each.prefix.startswith("train"):
