@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 from warnings import warn
 
@@ -39,6 +39,10 @@ PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
 NAMES = {"adapted": "the learned law", "prior": "the prior", "prior_eta": "the prior with eta"}
 
 
+Boxes = tuple[Tensor, Tensor, int, int]
+"""x0, y0 (V,), width and height [px] of a window in each of V cameras' images (`crop_boxes`)."""
+
+
 @dataclass(frozen=True)
 class Sequence:
     """A sequence to evaluate on. prefix: `train`, `train/<name>` or `test/<name>`; start: where the body starts; contact: first
@@ -54,6 +58,17 @@ class Sequence:
         """That are learned from, of a held-out sequence all."""
         learned = self.prefix.startswith("train")
         return self.scene.training_frames if learned else list(range(self.scene.frames))
+
+    @property
+    def cameras(self) -> list[int]:
+        """That are learned from, of a held-out sequence all."""
+        learned = self.prefix.startswith("train")
+        return self.scene.training_cameras if learned else list(range(len(self.scene.cameras)))
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """Of what the `cameras` see."""
+        return boxes_of(self.scene, self.cameras)
 
     def to(self, device: torch.device | str) -> Sequence:
         """Itself, where Lightning moves a batch: the parts that are needed move later."""
@@ -122,15 +137,24 @@ def render(
     return images
 
 
+def boxes_of(scene: Scene, cameras: list[int]) -> Boxes:
+    """One box per camera: that of the true mattes over all frames plus 10 px."""
+    return crop_boxes(scene.mattes[cameras], margin=10)
+
+
 def image_metrics(
-    images: Callable[[int], Tensor], scene: Scene, cameras: list[int], frames: list[int]
+    images: Callable[[int], Tensor],
+    scene: Scene,
+    cameras: list[int],
+    frames: list[int],
+    boxes: Boxes,
 ) -> dict[str, float]:
-    """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
+    """PSNR and SSIM, in full and in `boxes_of` these cameras.
 
     images: (T, H, W, 3) by camera, all frames; where they lie is where they are compared."""
-    if not cameras or not frames:
+    if not frames:
         return {}
-    x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
+    x0, y0, width, height = boxes
     kinds = {"psnr": metrics.psnr, "ssim": metrics.ssim}
     kinds |= {own: metric.function for own, metric in metrics.IMAGE_METRICS.items()}
     found: dict[str, list[float]] = {
@@ -186,9 +210,12 @@ def motion_metrics(
 def true_motion(body: Body, scene: Scene) -> Tensor | None:
     """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
     truth = scene.truth
-    if truth is None:
-        return None
-    return metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
+    return None if truth is None else _carried(truth.rest, truth.positions, body.rest)
+
+
+@lru_cache(8)  # of the tensors themselves: the figures of a run ask five times
+def _carried(rest: Tensor, positions: Tensor, query: Tensor) -> Tensor:
+    return metrics.interpolate_motion(rest, positions, query.cpu())
 
 
 @torch.no_grad()
@@ -273,24 +300,24 @@ def sequence_metrics(
 ) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x, parts, frames = sequence.scene, rollout.x.cpu(), parts_of(sequence), sequence.frames
-    training = sequence.prefix.startswith("train")
-    cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
     held = list(scene.holdout_cameras) if "camera" in parts else []
     images = render(body, rollout, scene, None if "frames" in parts else max(1, len(held)))
 
     def measured(part: str, frames: list[int]) -> dict[str, float]:
         figures = motion_metrics(x, body, sequence, frames, settings, target)
-        figures |= image_metrics(images, scene, cameras, frames)
+        if cameras := sequence.cameras:
+            figures |= image_metrics(images, scene, cameras, frames, sequence.boxes)
         return {f"{model}{part}/{k}": v for k, v in figures.items()}
 
     result = measured(sequence.prefix, frames)
     if "frames" in parts:
         result |= measured("frames", list(scene.holdout_frames))
     if held:
-        figures = image_metrics(images, scene, held, frames)
+        boxes = boxes_of(scene, held)
+        figures = image_metrics(images, scene, held, frames, boxes)
         result |= {f"{model}camera/{k}": v for k, v in figures.items()}
         for t in frames:
-            figures = image_metrics(images, scene, held, [t])
+            figures = image_metrics(images, scene, held, [t], boxes)
             where = f"{model}camera/frame_{t:02d}"
             result |= {f"{where}/{k}": figures[k] for k in ("psnr_crop", "ssim_crop")}
     return result

@@ -48,6 +48,7 @@ from mosa.evaluation.settings import EvaluationSettings
 from mosa.evaluation.uncertainty import determined, predicted_spread
 from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.system.threads import threaded
 from mosa.system.whole_files import written_whole
 from mosa.training.run_folder import write_figures
 from mosa.twin.rollout_file import save_rollout, save_spread, save_truth
@@ -126,9 +127,13 @@ def write_outputs(
 ) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
     all; tables in results.md, below the note; a model card beside the checkpoint; metrics.json."""
-    for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
+
+    def save(file: tuple[str, str]) -> None:
+        variant, name = file
         motions = {prefix: each[variant] for prefix, each in kept.items() if variant in each}
         save_rollout(folder / name, motions, world.solids)
+
+    list(threaded(save, (("adapted", "rollout.npz"), ("prior", "prior.npz"))))
     moved = [each["adapted"] for each in kept.values() if "adapted" in each]
     warn_of_unmet(moved, world.colliders, body, world)
     told = [s for s in evaluated if s.scene.truth is not None]

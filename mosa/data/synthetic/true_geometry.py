@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -14,6 +16,7 @@ from mosa.types import Scene
 
 LATTICE = 0.004  # [m] of the true body's points, at most the truth's own spacing
 OUTSIDE = 0.7  # spacings beyond the true surface from which a particle counts as outside
+BOTTOM = 0.2  # of a shape's height, in which its lowest point is
 FARTHEST = 1.0  # spacings to every particle beyond which a point is missing
 
 
@@ -21,7 +24,11 @@ def origin(name: str) -> np.ndarray:
     """Where the shape's own frame lies in the world at frame 0 of the training sequence, (3,) [m] (`drop.place`)."""
     body = object_named(name)
     drop, shape = body.drops["train"], SHAPES[body.shape]
-    lowest = extract_surface(shape, body.pitch, np.random.default_rng(0)).vertices[:, 1].min()
+    low, high = shape.bounds
+    # of the bottom alone, which is all that is asked for: the same vertices as of the whole
+    high = np.array([high[0], low[1] + BOTTOM * (high[1] - low[1]), high[2]])
+    bottom = replace(shape, bounds=np.stack([low, high]))
+    lowest = extract_surface(bottom, body.pitch, np.random.default_rng(0)).vertices[:, 1].min()
     fallen = drop.speed * drop.contact + 0.5 * 9.8 * drop.contact**2
     return np.array([drop.offset[0], fallen - lowest, drop.offset[1]])
 
