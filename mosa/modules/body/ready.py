@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.adapters.interface import answer
+from mosa.physics.adapters.interface import Held, answer, unread
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import stack_held
 from mosa.physics.engine.simulator import Simulator
@@ -103,9 +103,8 @@ class Ready:
             raise ConfigError(
                 f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}"
             )
-        state, parameters = self.state, self.arguments["parameters"]
-        held = answer(adapter, self.simulator.material_state(state.F, state.C_affine, parameters))
-        return replace(self, arguments={**self.arguments, "adapter": lambda _: held})
+        held = Held(answer(adapter, unread(self.simulator.law, self.state.F)))
+        return replace(self, arguments={**self.arguments, "adapter": held})
 
     @classmethod
     def stack(cls, parts: Sequence[Ready]) -> Ready:

@@ -1,7 +1,8 @@
 """What an adapter is asked, what it may answer, and the check of its answer."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,6 +52,10 @@ class Several:
             )
         self.adapters = tuple(adapters)
 
+    @property
+    def steady(self) -> bool:
+        return all(getattr(adapter, "steady", False) for adapter in self.adapters)
+
     def __call__(self, state: MaterialState) -> AdapterOperator:
         count = len(self.adapters)
         parts = zip(*((None,) * count if t is None else t.chunk(count) for t in state))
@@ -70,17 +75,31 @@ def answer(adapter: Callable, state: Sequence[Tensor | None]) -> AdapterOperator
     return AdapterOperator(*found)
 
 
+def unread(law: Law, F: Tensor) -> MaterialState:
+    """Zeros in place of the state of N particles, for a `steady` adapter: its kernel is not compiled. F: (N, 3, 3)."""
+    zeros = F.new_zeros(len(F), 6)
+    return MaterialState(zeros, zeros, zeros if law.plastic else None)
+
+
+@dataclass(frozen=True)
+class Held:
+    """An adapter that answers the same in every state."""
+
+    operator: AdapterOperator
+    steady: ClassVar[bool] = True
+
+    def __call__(self, _: MaterialState) -> AdapterOperator:
+        return self.operator
+
+
 def ask(
     law: Law, dtype: torch.dtype, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None,
     into: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> dict[str, Tensor | None]:  # fmt: skip
     """The adapter's answer by name, checked. into: as `material_state`."""
     n = len(F)
-    if getattr(adapter, "steady", False):  # whatever the state, which need not be found
-        zeros = F.new_zeros(n, 6)
-        state = zeros, zeros, zeros if law.plastic else None
-    else:
-        state = material_state(law, F, C, packed, into)
+    steady = getattr(adapter, "steady", False)
+    state = unread(law, F) if steady else material_state(law, F, C, packed, into)
     found = answer(adapter, state)
     plastic = (found.plastic_G, found.plastic_h) if law.plastic else (None, None)
     result = dict(zip(ANSWER, (found.G, found.h, *plastic)))
