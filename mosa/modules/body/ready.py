@@ -81,18 +81,6 @@ class Ready:
             return [[collider.motion.shifted(lift) for collider in colliders] for lift in self.lift]
         return [collider.motion.shifted(self.lift) for collider in colliders]
 
-    def following(self, flight: Rollout, lift: Tensor) -> Rollout:
-        """First frames of this one, or of each world of a stack, from those of one body under another law, of which nothing met
-        anything: the same motion, as high as the contact's offset is here. lift: (3,) [m] there."""
-        higher, final, fields = self.lift - lift, flight.final, {}
-        if self.lift.ndim > 1:
-            worlds, higher = len(self.lift), higher[:, None]
-            final = ParticleState.stack([final] * worlds)
-            for name in ("x", "v", "F", "F_tot"):
-                own = getattr(flight, name)
-                fields[name] = own[:, None].expand(-1, worlds, *own.shape[1:])
-        return replace(flight, **fields, final=replace(final, x=final.x + higher.to(final.x)))
-
     def answered(self) -> Ready:
         """With the adapter's answer now in place of the adapter, which may become another one. Errors: ConfigError where the
         operator depends on the state."""

@@ -219,10 +219,10 @@ class Identification:
     def _flights(self) -> dict[tuple[int, float], tuple[Tensor, Rollout]]:
         """By pair: the contact's offset (3,) [m], and the frames in which the body is seen more than `CLEAR` cells above the
         ground. The law's numbers hardly change these, so rollouts for a Jacobian begin after them. Empty where something else than
-        the ground may be met."""
+        the ground may be met, and where columns are rolled out as so many worlds."""
         world, flights = self.world, {}
         alone = world.ground is not None and not (world.planes or world.solids or world.driven)
-        if not alone or self.body.settings.adaptive:
+        if not alone or self.newton.many is not None or self.body.settings.adaptive:
             return flights
         for i, gain in self.pairs:
             take, clear = self.takes[i], CLEAR * self.body.settings.dx
@@ -236,13 +236,6 @@ class Identification:
                 flights[i, gain] = ready.lift, self._simulated(ready, take, gain, frames)
         return flights
 
-    def _begun(self, ready: Ready, index: int, gain: float) -> Rollout | None:
-        """The flight of a pair as the first frames of a body, or of a stack, with other numbers; None where there is none."""
-        if (index, gain) not in self._flown:
-            return None
-        lift, flight = self._flown[index, gain]
-        return ready.following(flight, lift)
-
     @torch.no_grad()
     def _many(self, rows: Tensor) -> Tensor:
         """(K, R) whitened residuals of numbers (K, D): rolled out side by side, as so many worlds."""
@@ -255,8 +248,7 @@ class Identification:
                 for row in some:
                     seat.write(row)
                     parts.append(self.ready(self.body, i, self.substeps[i]).answered())
-                stack = Ready.stack(parts)
-                rollout = self._simulated(stack, take, gain, begun=self._begun(stack, i, gain))
+                rollout = self._simulated(Ready.stack(parts), take, gain)
                 for k, own in enumerate(rollout.worlds()):
                     found[first + k].append(self._differences(own, i))
         shares = rows[:, -1].tolist() if self.two_grids else [0.0] * len(rows)
@@ -275,7 +267,9 @@ class Identification:
             found = []
             for i, gain in self.pairs:
                 ready, take = self.ready(body, i, substeps[i]), self.takes[i]
-                begun = self._begun(ready, i, gain) if flown else None
+                lift, begun = self._flown.get((i, gain), (None, None)) if flown else (None, None)
+                if lift is None or not torch.equal(lift, ready.lift):
+                    begun = None
                 rollout = self._simulated(ready, take, gain, begun=begun)
                 found.append(self._differences(rollout, i))
             with self._lock:

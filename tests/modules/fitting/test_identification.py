@@ -138,7 +138,7 @@ def test_a_jacobian_that_serves_again_is_that_of_the_noise_in_use(monkeypatch):
 
 def test_rollouts_for_a_jacobian_begin_where_the_body_comes_near_the_ground():
     """Every frame of them until then is the flight's; their columns are those of whole rollouts but for the little that corrections
-    deform the body in flight, one by one and as worlds."""
+    deform the body in flight, and the contact's own is made of whole ones."""
     truth = small_body(numbers=fibres(0.3), contact=True)
     body = small_body(contact=True)
     take = take_of(truth, start(height=0.2, turn=0.5), 9)
@@ -151,6 +151,8 @@ def test_rollouts_for_a_jacobian_begin_where_the_body_comes_near_the_ground():
     flown = found.newton.jacobian(numbers, r)
     found._flown = {}
     whole = found.newton.jacobian(numbers, r)
+    contact = found.newton.names().index("contact")
+    assert torch.equal(flown[:, contact], whole[:, contact])
     assert 0 < float((flown - whole).norm()) < 1e-2 * float(whole.norm())
 
 
