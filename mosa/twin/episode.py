@@ -20,7 +20,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Ready, Start, World
 from mosa.modules.fitting.parameters import each_law
 from mosa.physics.contact.colliders import Collider, reach
-from mosa.physics.contact.driven import held_in, stack_held
+from mosa.physics.contact.driven import stack_held
 from mosa.physics.contact.motion import (
     Poses,
     Trajectory,
@@ -278,6 +278,13 @@ class Episode:
             raise ConfigError(
                 f"restart: expected numbers of worlds below {self.worlds}, found {list(which)}"
             )
+        holding = [each for each in self.world.driven if each.held]
+        for each, moved in zip(holding, self._driven[len(self.world.colliders) :]):
+            if self._moment.frames and not moved and each.motion.max_speed(1.0) > 0:
+                raise ConfigError(
+                    f"restart: expected driven sets at rest or moved by actions, found {each.name} on a motion of its own, "
+                    "which does not begin again: reset all worlds"
+                )
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
         starts = [self._starts[b] for b in which] if starts is None else starts
@@ -292,6 +299,11 @@ class Episode:
                 begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
                 check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
                             tuple(part[b] for part in poses))  # fmt: skip
+                if self.world.driven and not begun.x.equal(self._begin(b, self._starts[b]).x):
+                    raise ConfigError(
+                        f"starts[{b}]: expected the pose of the reset, where the driven sets chose their particles, found "
+                        "another: reset all worlds"
+                    )
                 dx = self._stepper.prepared.numerics.dx
                 now[b] = entered(begun, self._stepper.axes, now[b].x.dtype, dx)
             fresh = ParticleState.stack(now)
@@ -533,9 +545,11 @@ def _worlds(
     ready = found[0] if laws is None else Ready.stack(found)
     states = [begin(b, start) for b, start in enumerate(starts)]
     arguments = ready.arguments
-    if "held" in arguments:  # places of its own in each world, which may start elsewhere
+    if world.driven:  # particles of its own in each world, which may start elsewhere
         places = [state.x - found[b % len(found)].lift for b, state in enumerate(states)]
-        held = [held_in(world.driven, x, len(world.colliders)) for x in places]
-        arguments = {**arguments, "held": stack_held(held)}
+        each = [body.driven(world, x, start) for x, start in zip(places, starts)]
+        join: dict[str, Callable] = {"held": stack_held, "density": torch.stack}
+        own = {name: join[name]([given[name] for given in each]) for name in each[0]}
+        arguments = {**arguments, **own}
     state = ParticleState.stack(states)
     return replace(ready, simulator=simulator, state=state, arguments=arguments), begin

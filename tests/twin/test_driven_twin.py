@@ -86,6 +86,34 @@ def test_worlds_of_other_starts_hold_what_is_in_their_region():
         torch.testing.assert_close(reactions[:, b], alone.reactions[-1], rtol=0, atol=1e-6)
 
 
+def test_loads_of_worlds_of_other_starts_are_on_what_is_in_their_region():
+    made = twin()
+    starts = [{"rotation": (0, 1, 0, 0)}, {"rotation": (0, 1, 0, 180)}]
+    worlds = made.worlds(2)
+    worlds.reset(starts, driven=[CLAMP, LOAD], frames=STEPS + 1)
+    for _ in range(STEPS):
+        state, _ = worlds.step()
+    for b, given in enumerate(starts):
+        alone = made.simulate(driven=[CLAMP, LOAD], frames=STEPS + 1, **given)
+        torch.testing.assert_close(state.positions[b], alone.x[-1], rtol=0, atol=1e-9)
+
+
+def test_worlds_begin_again_only_where_their_sets_chose_their_particles():
+    worlds, still = twin().worlds(2), CLAMP | {"motion": None}
+    worlds.reset(driven=[still])
+    first = worlds.step({"clamp": {"velocity": (0.0, 0.2, 0.0)}}).state
+    worlds.restart([1])
+    again = worlds.step({"clamp": {"velocity": (0.0, 0.2, 0.0)}}).state
+    assert torch.equal(again.positions[1], first.positions[1])
+    worlds.restart([1], [{"velocity": (0.0, 0.1, 0.0)}])
+    with pytest.raises(ConfigError, match=r"starts\[1\]: expected the pose of the reset"):
+        worlds.restart([1], [{"position": (0.01, None, None)}])
+    worlds.reset(driven=[CLAMP])
+    worlds.step()
+    with pytest.raises(ConfigError, match="found clamp on a motion of its own"):
+        worlds.restart([1])
+
+
 def test_a_set_outside_of_the_body_is_refused():
     far = {**CLAMP, "position": [-5, 0, 0]}
     with pytest.raises(
