@@ -128,13 +128,18 @@ class Twin(InMotion):
     ) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
-        start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
-        (a fit by Adam), or where fewer than two of the draws can be simulated."""
+        start: as `simulate` takes it, but for a variant; draws: laws drawn from the posterior. Errors: ConfigError where the run
+        kept no posterior (a fit by Adam), or where fewer than two of the draws can be simulated."""
         if self.posterior is None:
             raise ConfigError(
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
                 "again), or its run kept none (a fit that ends by Gauss-Newton does: adapter=operator, "
                 "linear or none)"
+            )
+        if (variant := start.get("variant", "adapted")) != "adapted":  # draws would not change it
+            raise ConfigError(
+                f"variant: expected adapted, whose posterior the run kept, found {variant!r}: "
+                "simulate(variant=) rolls it out, without a standard deviation"
             )
         rollout = self.simulate(**start)
         drawn = self.posterior.draws(draws, torch.Generator().manual_seed(seed))
