@@ -511,6 +511,10 @@ def test_errors_of_starts_and_states():
         ConfigError, match="gravity: expected no gradients"
     ):  # found a small part of them
         made.worlds(2).reset(gravity=torch.zeros(2, 3, requires_grad=True), differentiable=True)
+    with pytest.raises(ConfigError, match="gravity: expected no gradients"):  # found none
+        made.reset(gravity=torch.zeros(3, requires_grad=True), differentiable=True)
+    with pytest.raises(ConfigError, match="laws: expected no gradients"):
+        made.worlds(2, torch.zeros(2, 22, requires_grad=True))
     worlds = made.worlds(2)
     worlds.reset()
     with pytest.raises(
