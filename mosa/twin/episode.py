@@ -296,7 +296,7 @@ class Episode:
             now = moment.state.worlds()
             spacing = float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3)
             for b in again:
-                begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
+                begun, lift = self._begin(b, again[b], True), self._raised.expand(self.worlds, 3)[b]
                 check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
                             tuple(part[b] for part in poses))  # fmt: skip
                 if self.world.driven and not begun.x.equal(self._begin(b, self._starts[b]).x):
@@ -494,12 +494,6 @@ def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
     return torch.where(chosen.to(old.device).view(-1, *(1,) * (old.ndim - 1)), new, old)
 
 
-def _fastest(body: Body, starts: Sequence[Start]) -> Start:
-    """The start for which the time step must be smallest."""
-    parts = ((s, s.velocity.detach().norm(), s.angular_velocity.detach().norm()) for s in starts)
-    return max(parts, key=lambda each: float(each[1] + each[2] * body.size))[0]
-
-
 def _worlds(
     body: Body,
     world: World,
@@ -507,7 +501,7 @@ def _worlds(
     laws: Tensor | None,
     gravity: Tensor | None,
     options: dict,
-) -> tuple[Ready, Callable[[int, Start], ParticleState]]:
+) -> tuple[Ready, Callable[..., ParticleState]]:
     """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
         raise ConfigError(
@@ -519,11 +513,11 @@ def _worlds(
         pulls = [world.gravity.to(body.rest)] * len(starts)
     else:
         pulls = list(gravity.to(body.rest))
+    time = options["frames"] * options["frame_dt"]
+    pairs = ((start, replace(world, gravity=pull)) for start, pull in zip(starts, pulls))
     # the time step is one for all
-    quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
-    pulled = (replace(world, gravity=pull) for pull in pulls)
-    hardest = max(pulled, key=lambda each: each.fastest(quick, body.size, time))
-    ready_with = partial(body.ready, quick, hardest)
+    quick = max(pairs, key=lambda each: each[1].fastest(each[0], body.size, time))
+    ready_with = partial(body.ready, *quick)
     if laws is None:
         found = [ready_with(**options)]
     else:
@@ -537,7 +531,17 @@ def _worlds(
     own = first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic
     simulator = body.simulator(*own)
 
-    def begin(b: int, start: Start) -> ParticleState:
+    def begin(b: int, start: Start, again: bool = False) -> ParticleState:
+        falls, most = (
+            replace(world, gravity=pulls[b], colliders=()),
+            0.5 * first.numerics.dx / first.dt,
+        )
+        # again: the substeps were chosen for the speeds of the reset
+        if again and (speed := falls.fastest(start, body.size, time)) > (1 + 1e-6) * most:
+            raise ConfigError(
+                f"starts[{b}]: expected one from which the body gets no faster than {most:.3g} m/s, half a cell per "
+                f"substep, found up to {speed:.3g}: reset all worlds, with it or with more substeps"
+            )
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
         return state.to(simulator.dtype)

@@ -420,6 +420,21 @@ def test_some_worlds_begin_again():
         worlds.restart([1], [{"velocity": 1}])
 
 
+def test_all_worlds_take_the_substeps_of_the_one_that_gets_fastest():
+    """Not of the one that starts fastest; a start to which they do not suffice is no new start of one."""
+    made, thrown = twin(adapter=False, E=2e3), {"velocity": (0.0, -2.0, 0.0)}
+    high = {"position": (0.0, 4.0, 0.0), "velocity": (0.0, 0.0, 0.0)}
+    made.reset(**high, frames=90)
+    alone, worlds = made.episode.substeps, made.worlds(2)
+    worlds.reset([thrown, high], frames=90)
+    assert worlds.episode.substeps == alone
+    worlds.restart([1])
+    worlds.reset(thrown, frames=90)
+    assert worlds.episode.substeps < alone
+    with pytest.raises(ConfigError, match=r"starts\[1\]: .* no faster than .* m/s, .* found up to"):
+        worlds.restart([1], [high])
+
+
 def test_gradients_of_worlds_are_those_of_their_twins():
     """Commands of each, to the last bit; the law's numbers, which they share, as a sum."""
     made, pushes = twin(), torch.tensor([[0.9, 0.0, 0.0], [0.8, 0.1, 0.1]]).double()
