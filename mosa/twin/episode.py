@@ -461,6 +461,10 @@ class InMotion:
 
     _episode: Episode | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the motion, whose buffers cannot be copied: a copy is reset, and may be given the `state`."""
+        return self.__dict__ | {"_episode": None}
+
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
         """Go one step on: (state, reactions), see `mosa.twin.episode`.
 

@@ -1,5 +1,6 @@
 """A twin that is stepped: the bits of one long simulation, state saved and branched, driven colliders, gradients, many worlds."""
 
+import copy
 import math
 from dataclasses import replace
 from io import BytesIO
@@ -418,6 +419,19 @@ def test_some_worlds_begin_again():
         worlds.restart([3])
     with pytest.raises(ConfigError, match=r"starts\[1\]: velocity: expected three"):
         worlds.restart([1], [{"velocity": 1}])
+
+
+def test_a_copy_has_no_motion_and_goes_on_from_its_state():
+    made, given = twin(), {"colliders": [PUSHER]}
+    for one in (made, made.worlds(2)):
+        one.reset(**given)
+        state = one.step().state
+        other = copy.deepcopy(one)
+        with pytest.raises(ConfigError, match="expected reset"):
+            other.step()
+        other.reset(**given)
+        other.state = state
+        assert torch.equal(other.step().state.x, one.step().state.x)
 
 
 def test_all_worlds_take_the_substeps_of_the_one_that_gets_fastest():
