@@ -27,6 +27,7 @@ LOAD = {
     "mass": 0.1,
     "held": False,
 }
+BALL = {"type": "sphere", "radius": 0.02, "position": [0.0, -0.09, 0.0]}
 STEPS = 4
 
 
@@ -124,8 +125,14 @@ def test_a_set_outside_of_the_body_is_refused():
 
 def test_an_export_has_the_sets_poses(tmp_path):
     made = twin()
+    given = {"driven": [CLAMP, LOAD], "colliders": [BALL]}
+    made.export(made.simulate(frames=3, **given), tmp_path / "said", video=False, **given)
     made.world = replace(made.world, driven=driven_from_config([CLAMP]))
-    made.export(made.simulate(frames=3), tmp_path, video=False)
-    found = read_npz(tmp_path / "rollout.npz")
-    assert found["simulation/collider_position"].shape == (3, 1, 3)
-    assert found["simulation/reactions"].shape[-2:] == (1, 6)
+    made.export(made.simulate(frames=3), tmp_path / "own", video=False)
+    for name, shapes in (("said", [1, -1]), ("own", [-1])):
+        found = read_npz(tmp_path / name / "rollout.npz")
+        assert found["simulation/collider_shape"][:, 0].tolist() == shapes
+        assert found["simulation/collider_position"].shape == (3, len(shapes), 3)
+        assert found["simulation/reactions"].shape[-2:] == (len(shapes), 6)
+    with pytest.raises(ConfigError, match="colliders and driven: expected the 2 that"):
+        made.export(made.simulate(frames=3, **given), tmp_path, colliders=[BALL], driven=[])
