@@ -511,6 +511,10 @@ def _worlds(
         raise ConfigError(
             "simulation.adaptive: expected false with many worlds, which take the same substeps"
         )
+    if (adapter := options["model"].adapter) is not None and adapter.own_dynamics:
+        raise ConfigError(
+            "worlds: expected a law, found an adapter that moves the particles itself, in whole rollouts (Twin.simulate)"
+        )
     if laws is not None and options["model"] != body.model():
         raise ConfigError("laws: expected those of variant adapted, found another variant")
     if gravity is None:

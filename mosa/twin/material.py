@@ -134,6 +134,13 @@ class TwinMaterial:
         density, law = values.get("density"), None if law == self.law else law
         if density is not None:
             check_density("density", density)
+        adapter, idle = (
+            self._body.adapter,
+            [*(values.keys() - {"density"}), *([law] if law else [])],
+        )
+        if idle and adapter is not None and adapter.own_dynamics:
+            said = "density alone, found an adapter that moves the particles itself, without a law"
+            raise ConfigError(f"{', '.join(idle)}: expected {said}")
         self._take(self._with(values, law), density, new=law is not None)
 
     def _with(self, values: Mapping[str, float], law: str | None = None) -> Material:
