@@ -343,12 +343,23 @@ def test_walls_and_colliders_are_refused():
     made = Twin(body, WORLD, FRAME_DT, None, start())
     with pytest.raises(ConfigError, match="worlds: expected a law, found an adapter that moves"):
         made.worlds(2).reset()
-    with pytest.raises(ConfigError, match="E: expected density alone, found an adapter that moves"):
-        made.material.E = 2e4
+    with pytest.raises(ConfigError, match="nu: expected E and density alone, found an adapter"):
+        made.material.nu = 0.2
 
 
 # ------------------------------------------------------------------------------------------------ all of them
 BASELINES = {"nclaw": NeuralLaw, "neuma": LowRankLaw, "interaction": InteractionNetwork}
+
+
+@pytest.mark.parametrize("kind", BASELINES.values())
+def test_a_modulus_that_is_set_is_that_of_what_was_learned(kind):
+    """A body of four times the modulus and the density moves as before."""
+    pairs = kind is InteractionNetwork
+    learned = kind(nodes=40, neighbours=8) if pairs else copy.deepcopy(prepared(kind))
+    made = Twin(adapted(learned), WORLD, FRAME_DT, None, start(speed=-0.5))
+    expected = made.simulate(frames=8)
+    made.material.set(E=4 * made.material.E, density=4 * made.material.density)
+    torch.testing.assert_close(made.simulate(frames=8).x, expected.x, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", BASELINES)
