@@ -45,7 +45,7 @@ class Interactions:
     def rollout(
         self, state: ParticleState, *, frames: int, parameters=None, volume=None, density=None, adapter=None, stride=None,
         collect: Callable | None = None, motions=(), progress: Callable[[int], None] | None = None, started: bool = False,
-        start_time: float = 0.0,
+        start_time: float = 0.0, after: Callable[[ParticleState, int], ParticleState] | None = None,
     ) -> Rollout:  # fmt: skip
         """As `Simulator.rollout`; what concerns a law or a grid is not read. Errors: SimulationDiverged naming the frame."""
         if state.x.ndim == 3:
@@ -68,6 +68,10 @@ class Interactions:
                     "fit.joint.lr_adapter"
                 )
             recorded.append(network.follow_nodes(x, v))
+            if after is not None and frame < frames - 1:
+                there, moving, F = recorded[-1]
+                begun = after(ParticleState(there, moving, C, F, F), frame)
+                x, v = begun.x[network.nodes], begun.v[network.nodes]
             if progress is not None:
                 progress(frame)
         if collect is not None:

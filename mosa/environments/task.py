@@ -209,7 +209,7 @@ class Task(ABC):
             )
         box = torch.tensor([[-ROOM, -1.0, -ROOM], [ROOM, ROOM, ROOM]]).to(world.box)
         ground = Ground(0.0, "separate", self.ground_friction)
-        return replace(world, ground=ground, box=box, planes=(), colliders=())
+        return replace(world, ground=ground, box=box, planes=(), colliders=(), driven=())
 
     def draw(self, count: int, generator: torch.Generator) -> Trials:
         """`count` trials."""

@@ -25,6 +25,7 @@ from mosa.twin.start import (
     check_wants_no_gradients,
     start_in,
     warn_of_creep,
+    without_gradients,
 )
 
 FARTHEST = 100.0
@@ -41,7 +42,7 @@ class TwinWorlds(InMotion):
         if laws is not None:
             laws, shape = twin.material.laws(laws), (count, len(read_numbers(body)))
             said = f"one for each of {count} worlds, a tensor {shape} of finite numbers within {FARTHEST:g}, or [{{'E': 1e4}}, ...]"
-            laws = numbers("laws", laws, said, shape, most=FARTHEST)
+            laws = without_gradients("laws", numbers("laws", laws, said, shape, most=FARTHEST))
         self.body, self.world, self.frame_dt = body, twin.world, twin.frame_dt
         self.training_start, self.count, self.laws = twin.training_start, count, laws
         self._box: Sequence[Sequence[float]] | Tensor | None = None

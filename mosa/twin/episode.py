@@ -20,7 +20,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import Body, Ready, Start, World
 from mosa.modules.fitting.parameters import each_law
 from mosa.physics.contact.colliders import Collider, reach
-from mosa.physics.contact.driven import held_in, stack_held
+from mosa.physics.contact.driven import stack_held
 from mosa.physics.contact.motion import (
     Poses,
     Trajectory,
@@ -278,6 +278,13 @@ class Episode:
             raise ConfigError(
                 f"restart: expected numbers of worlds below {self.worlds}, found {list(which)}"
             )
+        holding = [each for each in self.world.driven if each.held]
+        for each, moved in zip(holding, self._driven[len(self.world.colliders) :]):
+            if self._moment.frames and not moved and each.motion.max_speed(1.0) > 0:
+                raise ConfigError(
+                    f"restart: expected driven sets at rest or moved by actions, found {each.name} on a motion of its own, "
+                    "which does not begin again: reset all worlds"
+                )
         moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
         chosen[list(which)] = True
         starts = [self._starts[b] for b in which] if starts is None else starts
@@ -289,9 +296,14 @@ class Episode:
             now = moment.state.worlds()
             spacing = float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3)
             for b in again:
-                begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
+                begun, lift = self._begin(b, again[b], True), self._raised.expand(self.worlds, 3)[b]
                 check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
                             tuple(part[b] for part in poses))  # fmt: skip
+                if self.world.driven and not begun.x.equal(self._begin(b, self._starts[b]).x):
+                    raise ConfigError(
+                        f"starts[{b}]: expected the pose of the reset, where the driven sets chose their particles, found "
+                        "another: reset all worlds"
+                    )
                 dx = self._stepper.prepared.numerics.dx
                 now[b] = entered(begun, self._stepper.axes, now[b].x.dtype, dx)
             fresh = ParticleState.stack(now)
@@ -449,6 +461,10 @@ class InMotion:
 
     _episode: Episode | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the motion, whose buffers cannot be copied: a copy is reset, and may be given the `state`."""
+        return self.__dict__ | {"_episode": None}
+
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
         """Go one step on: (state, reactions), see `mosa.twin.episode`.
 
@@ -482,12 +498,6 @@ def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
     return torch.where(chosen.to(old.device).view(-1, *(1,) * (old.ndim - 1)), new, old)
 
 
-def _fastest(body: Body, starts: Sequence[Start]) -> Start:
-    """The start for which the time step must be smallest."""
-    parts = ((s, s.velocity.detach().norm(), s.angular_velocity.detach().norm()) for s in starts)
-    return max(parts, key=lambda each: float(each[1] + each[2] * body.size))[0]
-
-
 def _worlds(
     body: Body,
     world: World,
@@ -495,11 +505,15 @@ def _worlds(
     laws: Tensor | None,
     gravity: Tensor | None,
     options: dict,
-) -> tuple[Ready, Callable[[int, Start], ParticleState]]:
+) -> tuple[Ready, Callable[..., ParticleState]]:
     """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
         raise ConfigError(
             "simulation.adaptive: expected false with many worlds, which take the same substeps"
+        )
+    if (adapter := options["model"].adapter) is not None and adapter.own_dynamics:
+        raise ConfigError(
+            "worlds: expected a law, found an adapter that moves the particles itself, in whole rollouts (Twin.simulate)"
         )
     if laws is not None and options["model"] != body.model():
         raise ConfigError("laws: expected those of variant adapted, found another variant")
@@ -507,11 +521,11 @@ def _worlds(
         pulls = [world.gravity.to(body.rest)] * len(starts)
     else:
         pulls = list(gravity.to(body.rest))
+    time = options["frames"] * options["frame_dt"]
+    pairs = ((start, replace(world, gravity=pull)) for start, pull in zip(starts, pulls))
     # the time step is one for all
-    quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
-    pulled = (replace(world, gravity=pull) for pull in pulls)
-    hardest = max(pulled, key=lambda each: each.fastest(quick, body.size, time))
-    ready_with = partial(body.ready, quick, hardest)
+    quick = max(pairs, key=lambda each: each[1].fastest(each[0], body.size, time))
+    ready_with = partial(body.ready, *quick)
     if laws is None:
         found = [ready_with(**options)]
     else:
@@ -525,7 +539,17 @@ def _worlds(
     own = first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic
     simulator = body.simulator(*own)
 
-    def begin(b: int, start: Start) -> ParticleState:
+    def begin(b: int, start: Start, again: bool = False) -> ParticleState:
+        falls, most = (
+            replace(world, gravity=pulls[b], colliders=()),
+            0.5 * first.numerics.dx / first.dt,
+        )
+        # again: the substeps were chosen for the speeds of the reset
+        if again and (speed := falls.fastest(start, body.size, time)) > (1 + 1e-6) * most:
+            raise ConfigError(
+                f"starts[{b}]: expected one from which the body gets no faster than {most:.3g} m/s, half a cell per "
+                f"substep, found up to {speed:.3g}: reset all worlds, with it or with more substeps"
+            )
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
         return state.to(simulator.dtype)
@@ -533,9 +557,11 @@ def _worlds(
     ready = found[0] if laws is None else Ready.stack(found)
     states = [begin(b, start) for b, start in enumerate(starts)]
     arguments = ready.arguments
-    if "held" in arguments:  # places of its own in each world, which may start elsewhere
+    if world.driven:  # particles of its own in each world, which may start elsewhere
         places = [state.x - found[b % len(found)].lift for b, state in enumerate(states)]
-        held = [held_in(world.driven, x, len(world.colliders)) for x in places]
-        arguments = {**arguments, "held": stack_held(held)}
+        each = [body.driven(world, x, start) for x, start in zip(places, starts)]
+        join: dict[str, Callable] = {"held": stack_held, "density": torch.stack}
+        own = {name: join[name]([given[name] for given in each]) for name in each[0]}
+        arguments = {**arguments, **own}
     state = ParticleState.stack(states)
     return replace(ready, simulator=simulator, state=state, arguments=arguments), begin

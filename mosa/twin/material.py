@@ -134,6 +134,13 @@ class TwinMaterial:
         density, law = values.get("density"), None if law == self.law else law
         if density is not None:
             check_density("density", density)
+        adapter = self._body.adapter
+        if adapter is not None and adapter.own_dynamics:
+            idle = [*([] if law is None else ["law"]), *(values.keys() - {"E", "density"})]
+            if idle:
+                raise ConfigError(
+                    f"{idle[0]}: expected E and density alone, found an adapter that moves the particles itself, without a law"
+                )
         self._take(self._with(values, law), density, new=law is not None)
 
     def _with(self, values: Mapping[str, float], law: str | None = None) -> Material:
@@ -209,9 +216,13 @@ class TwinMaterial:
             if body.heterogeneity is None:
                 settings["heterogeneity"] = {"enabled": False}
         self._doubt(material, density)
+        before = self.E
         changed = twin.record.but(settings=settings, law=None, density=density)
         twin._record, twin.posterior, body.density = changed, None, density
         body.material = material.to(body.rest)
+        # networks give stresses in a unit of their own
+        if body.adapter is not None and body.adapter.is_on and before > 0 and self.E > 0:
+            body.adapter.E_ref.mul_(self.E / before)
         for variant in body.frozen.values():
             assert isinstance(variant, nn.ModuleDict)
             variant["material"] = copy.deepcopy(body.material).requires_grad_(False)

@@ -86,6 +86,15 @@ def check_wants_no_gradients(**given: Any) -> None:
             )
 
 
+def without_gradients(name: str, value: Tensor) -> Tensor:
+    """What no motion has gradients with respect to. Errors: ConfigError where they are wanted."""
+    if torch.is_grad_enabled() and value.requires_grad:
+        raise ConfigError(
+            f"{name}: expected no gradients, which do not reach it: pass its detach()"
+        )
+    return value.detach()
+
+
 def asks_for_gradients(value: Any) -> bool:
     """Whether a tensor does, among lists, entries of a mapping and parts of a collider too."""
     if isinstance(value, Tensor):
@@ -176,7 +185,8 @@ def start_in(
     if driven is not None:
         world = replace(world, driven=driven_from_config(driven, "driven"))
     if gravity is not None:
-        world = replace(world, gravity=vector("gravity", gravity).detach().to(world.gravity))
+        pull = without_gradients("gravity", vector("gravity", gravity))
+        world = replace(world, gravity=pull.to(world.gravity))
     if box is not None:
         world = replace(world, box=box_around(box).to(world.box))
         low, high = world.box.to(arms)

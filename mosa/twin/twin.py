@@ -8,6 +8,7 @@ twin.export(rollout, "falling/")"""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 from warnings import warn
@@ -35,7 +36,7 @@ from mosa.modules.body.body import Body, Start, World
 from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config
-from mosa.physics.contact.driven import Driven
+from mosa.physics.contact.driven import Driven, driven_from_config
 from mosa.physics.engine.simulator import Substeps
 from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
 from mosa.settings import Count, Expected, Number, Pixels, Positive, Seed, Zoom, such, typed
@@ -128,13 +129,18 @@ class Twin(InMotion):
     ) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
-        start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
-        (a fit by Adam), or where fewer than two of the draws can be simulated."""
+        start: as `simulate` takes it, but for a variant; draws: laws drawn from the posterior. Errors: ConfigError where the run
+        kept no posterior (a fit by Adam), or where fewer than two of the draws can be simulated."""
         if self.posterior is None:
             raise ConfigError(
                 "predict: this twin has no posterior: its material was set (load the checkpoint "
                 "again), or its run kept none (a fit that ends by Gauss-Newton does: adapter=operator, "
                 "linear or none)"
+            )
+        if (variant := start.get("variant", "adapted")) != "adapted":  # draws would not change it
+            raise ConfigError(
+                f"variant: expected adapted, whose posterior the run kept, found {variant!r}: "
+                "simulate(variant=) rolls it out, without a standard deviation"
             )
         rollout = self.simulate(**start)
         drawn = self.posterior.draws(draws, torch.Generator().manual_seed(seed))
@@ -266,20 +272,22 @@ class Twin(InMotion):
         view: Views | None = None,
         zoom: Zoom = 1.0,
         shadow: bool = True,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
     ) -> Tensor:
         """(T, height, width, 3) images from a camera that sees the whole motion, on the ground and among `colliders`, those
-        that the rollout was simulated with (None: the world's). rollout: or a list of the states of T steps, whose solids are
-        drawn where they were then (None: those of `reset`). Half spaces are not drawn. size [px]: of a square, or (width,
-        height). view: (3,) from the body to the camera, or (K, 3), as `film.viewed_from` spreads them over the frames; None for the
-        side and a little above. zoom: magnification of at most 20, or several, spread over the frames; above 1 the camera follows
-        the body. shadow: on the ground, of the body and of the solids, under light from above. Errors: ConfigError."""
-        motion = self._met(rollout, colliders)
+        that the rollout was simulated with (None: the world's), as `driven`. rollout: or a list of the states of T steps, whose
+        solids are drawn where they were then (None: those of `reset`). Half spaces are not drawn. size [px]: of a square, or
+        (width, height). view: (3,) from the body to the camera, or (K, 3), as `film.viewed_from` spreads them over the frames; None
+        for the side and a little above. zoom: magnification of at most 20, or several, spread over the frames; above 1 the camera
+        follows the body. shadow: on the ground, of the body and of the solids, under light from above. Errors: ConfigError."""
+        motion = self._met(rollout, colliders, driven)
         return film(self.body, self.world, *motion, size, view, zoom, shadow)
 
     def _met(
         self,
         motion: Rollout | Sequence[TwinState],
         colliders: Sequence[Collider | Mapping[str, Any]] | None,
+        driven: Sequence[Driven | Mapping[str, Any]] | None,
     ) -> tuple[Rollout, tuple[Collider, ...]]:
         """(rollout, its solids), both as `render` takes them. Errors: ConfigError where it was not simulated with as many."""
         if isinstance(motion, Rollout):
@@ -297,6 +305,8 @@ class Twin(InMotion):
             raise ConfigError(
                 f"rollout: expected one of this body's {len(self.body.rest)} particles, found {rollout!r}"
             )
+        if driven is not None:
+            world = replace(world, driven=driven_from_config(driven, "driven"))
         if met and colliders is None:
             solids = world.solids
         else:
@@ -306,7 +316,7 @@ class Twin(InMotion):
             solids += world.solids[len(world.colliders) :]
         if met != len(solids):
             raise ConfigError(
-                f"colliders: expected the {met} that the rollout was simulated with, as simulate takes "
+                f"colliders and driven: expected the {met} that the rollout was simulated with, as simulate takes "
                 f"them, found {len(solids)}"
             )
         return rollout, solids if isinstance(motion, Rollout) else placed_as(motion, solids)
@@ -317,15 +327,16 @@ class Twin(InMotion):
         formats: Formats = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         size: Pixels = 400, fps: Positive | None = None, view: Views | None = None, zoom: Zoom = 1.0,
         shadow: bool = True, caption: bool = True, progress: bool = False,
+        driven: Sequence[Driven | Mapping[str, Any]] | None = None,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of
         `colliders`; one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of
-        the body that its images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders: those
-        that the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view, zoom
+        the body that its images show in `formats` (ply, gltf, sog, usd, rrd: docs/splats.md) below `splats/`. colliders, driven:
+        those that the rollout was simulated with, and a list of states, as `render` takes them. Of the video: size [px], view, zoom
         and shadow, as there; fps, None for 0.3 of real time; caption: title and times, in bars of 26 px above and below;
         progress: a bar on the terminal. Errors, before anything is written: ConfigError where they are not, or a format's or
         the video's program is missing."""
-        rollout, solids = self._met(rollout, colliders)
+        rollout, solids = self._met(rollout, colliders, driven)
         if rollout.reactions is None:  # of steps
             warn_of_unmet([rollout], solids, self.body, self.world)
         check_formats(formats)

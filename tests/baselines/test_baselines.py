@@ -24,6 +24,7 @@ from mosa.modules.adapters.registry import adapter_class
 from mosa.modules.body.body import Body
 from mosa.modules.body.material import Material, material_states
 from mosa.physics.contact.planes import Plane
+from mosa.twin.twin import Twin
 
 CONF = Path(__file__).parents[2] / "conf"
 E, NU = 3e4, 0.35
@@ -309,6 +310,21 @@ def test_a_body_with_pair_forces_is_copied_and_moves_alike():
     torch.testing.assert_close(here.x, there.x, rtol=0, atol=0)
 
 
+def test_a_corrected_prediction_is_one_rollout_of_each_frame():
+    body, gain = adapted(InteractionNetwork(nodes=40, neighbours=8)), 0.3
+    with torch.no_grad():
+        seen = body.simulate(start(speed=-1.2), WORLD, 4, FRAME_DT).x
+        found = body.simulate(start(), WORLD, 4, FRAME_DT, observed=seen, gain=gain)
+        ready = body.ready(start(), WORLD, 4, FRAME_DT)
+        state, expected = ready.state, []
+        for k in range(3):
+            away = seen[k] + ready.lift - state.x
+            state = replace(state, v=state.v + gain / FRAME_DT * away)
+            state = ready.simulator.rollout(state, frames=2).final
+            expected.append(state.x - ready.lift)
+    torch.testing.assert_close(found.x[1:], torch.stack(expected), rtol=0, atol=1e-12)
+
+
 @pytest.mark.gpu
 def test_pair_forces_on_cuda_as_on_a_cpu():
     body = adapted(InteractionNetwork(nodes=40, neighbours=8))
@@ -324,10 +340,26 @@ def test_walls_and_colliders_are_refused():
         body.simulate(start(), walled, 3, FRAME_DT)
     with pytest.raises(ConfigError, match=r"adapter=interaction.*whole rollout"):
         body.ready(start(), WORLD, 3, FRAME_DT).simulator.stepper()
+    made = Twin(body, WORLD, FRAME_DT, None, start())
+    with pytest.raises(ConfigError, match="worlds: expected a law, found an adapter that moves"):
+        made.worlds(2).reset()
+    with pytest.raises(ConfigError, match="nu: expected E and density alone, found an adapter"):
+        made.material.nu = 0.2
 
 
 # ------------------------------------------------------------------------------------------------ all of them
 BASELINES = {"nclaw": NeuralLaw, "neuma": LowRankLaw, "interaction": InteractionNetwork}
+
+
+@pytest.mark.parametrize("kind", BASELINES.values())
+def test_a_modulus_that_is_set_is_that_of_what_was_learned(kind):
+    """A body of four times the modulus and the density moves as before."""
+    pairs = kind is InteractionNetwork
+    learned = kind(nodes=40, neighbours=8) if pairs else copy.deepcopy(prepared(kind))
+    made = Twin(adapted(learned), WORLD, FRAME_DT, None, start(speed=-0.5))
+    expected = made.simulate(frames=8)
+    made.material.set(E=4 * made.material.E, density=4 * made.material.density)
+    torch.testing.assert_close(made.simulate(frames=8).x, expected.x, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", BASELINES)

@@ -32,6 +32,8 @@ from mosa.environments.task import CLEARANCE, View
 from mosa.environments.tasks import TASKS, task_named
 from mosa.environments.truth import true_twin
 from mosa.errors import ConfigError, DataError, SimulationDiverged
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.contact.driven import Driven
 from mosa.physics.world import World
 from mosa.settings import node_of
 from mosa.twin.twin import Twin
@@ -113,6 +115,8 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     assert torch.equal(a.observed, task.draw(5, torch.Generator().manual_seed(1)).observed)
     with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
         task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
+    clamped = replace(WORLD, driven=(Driven([0]),), colliders=(Collider(Sphere(0.1)),))
+    assert task.world(clamped).solids == ()
     with pytest.raises(ConfigError, match="task: expected placement or hanging, or a Task, found"):
         task_named("juggling", torch.zeros(2, 3))
 

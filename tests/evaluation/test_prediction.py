@@ -104,6 +104,8 @@ def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more()
     assert float(wider[-1].mean()) > 0.00405 * ELSEWHERE and torch.equal(
         read_numbers(unsure.body), before
     )
+    with pytest.raises(ConfigError, match=r"variant: expected adapted, .* found 'prior'"):
+        unsure.predict(draws=4, frames=3, variant="prior")
     with pytest.raises(ConfigError, match="no posterior"):
         Twin(sure.body, WORLD, 0.01, None, start(height=0.05, speed=-1.0)).predict(frames=3)
 

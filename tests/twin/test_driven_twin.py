@@ -27,6 +27,7 @@ LOAD = {
     "mass": 0.1,
     "held": False,
 }
+BALL = {"type": "sphere", "radius": 0.02, "position": [0.0, -0.09, 0.0]}
 STEPS = 4
 
 
@@ -86,6 +87,34 @@ def test_worlds_of_other_starts_hold_what_is_in_their_region():
         torch.testing.assert_close(reactions[:, b], alone.reactions[-1], rtol=0, atol=1e-6)
 
 
+def test_loads_of_worlds_of_other_starts_are_on_what_is_in_their_region():
+    made = twin()
+    starts = [{"rotation": (0, 1, 0, 0)}, {"rotation": (0, 1, 0, 180)}]
+    worlds = made.worlds(2)
+    worlds.reset(starts, driven=[CLAMP, LOAD], frames=STEPS + 1)
+    for _ in range(STEPS):
+        state, _ = worlds.step()
+    for b, given in enumerate(starts):
+        alone = made.simulate(driven=[CLAMP, LOAD], frames=STEPS + 1, **given)
+        torch.testing.assert_close(state.positions[b], alone.x[-1], rtol=0, atol=1e-9)
+
+
+def test_worlds_begin_again_only_where_their_sets_chose_their_particles():
+    worlds, still = twin().worlds(2), CLAMP | {"motion": None}
+    worlds.reset(driven=[still])
+    first = worlds.step({"clamp": {"velocity": (0.0, 0.2, 0.0)}}).state
+    worlds.restart([1])
+    again = worlds.step({"clamp": {"velocity": (0.0, 0.2, 0.0)}}).state
+    assert torch.equal(again.positions[1], first.positions[1])
+    worlds.restart([1], [{"velocity": (0.0, 0.1, 0.0)}])
+    with pytest.raises(ConfigError, match=r"starts\[1\]: expected the pose of the reset"):
+        worlds.restart([1], [{"position": (0.01, None, None)}])
+    worlds.reset(driven=[CLAMP])
+    worlds.step()
+    with pytest.raises(ConfigError, match="found clamp on a motion of its own"):
+        worlds.restart([1])
+
+
 def test_a_set_outside_of_the_body_is_refused():
     far = {**CLAMP, "position": [-5, 0, 0]}
     with pytest.raises(
@@ -96,8 +125,14 @@ def test_a_set_outside_of_the_body_is_refused():
 
 def test_an_export_has_the_sets_poses(tmp_path):
     made = twin()
+    given = {"driven": [CLAMP, LOAD], "colliders": [BALL]}
+    made.export(made.simulate(frames=3, **given), tmp_path / "said", video=False, **given)
     made.world = replace(made.world, driven=driven_from_config([CLAMP]))
-    made.export(made.simulate(frames=3), tmp_path, video=False)
-    found = read_npz(tmp_path / "rollout.npz")
-    assert found["simulation/collider_position"].shape == (3, 1, 3)
-    assert found["simulation/reactions"].shape[-2:] == (1, 6)
+    made.export(made.simulate(frames=3), tmp_path / "own", video=False)
+    for name, shapes in (("said", [1, -1]), ("own", [-1])):
+        found = read_npz(tmp_path / name / "rollout.npz")
+        assert found["simulation/collider_shape"][:, 0].tolist() == shapes
+        assert found["simulation/collider_position"].shape == (3, len(shapes), 3)
+        assert found["simulation/reactions"].shape[-2:] == (len(shapes), 6)
+    with pytest.raises(ConfigError, match="colliders and driven: expected the 2 that"):
+        made.export(made.simulate(frames=3, **given), tmp_path, colliders=[BALL], driven=[])

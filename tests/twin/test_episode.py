@@ -1,5 +1,6 @@
 """A twin that is stepped: the bits of one long simulation, state saved and branched, driven colliders, gradients, many worlds."""
 
+import copy
 import math
 from dataclasses import replace
 from io import BytesIO
@@ -420,6 +421,34 @@ def test_some_worlds_begin_again():
         worlds.restart([1], [{"velocity": 1}])
 
 
+def test_a_copy_has_no_motion_and_goes_on_from_its_state():
+    made, given = twin(), {"colliders": [PUSHER]}
+    for one in (made, made.worlds(2)):
+        one.reset(**given)
+        state = one.step().state
+        other = copy.deepcopy(one)
+        with pytest.raises(ConfigError, match="expected reset"):
+            other.step()
+        other.reset(**given)
+        other.state = state
+        assert torch.equal(other.step().state.x, one.step().state.x)
+
+
+def test_all_worlds_take_the_substeps_of_the_one_that_gets_fastest():
+    """Not of the one that starts fastest; a start to which they do not suffice is no new start of one."""
+    made, thrown = twin(adapter=False, E=2e3), {"velocity": (0.0, -2.0, 0.0)}
+    high = {"position": (0.0, 4.0, 0.0), "velocity": (0.0, 0.0, 0.0)}
+    made.reset(**high, frames=90)
+    alone, worlds = made.episode.substeps, made.worlds(2)
+    worlds.reset([thrown, high], frames=90)
+    assert worlds.episode.substeps == alone
+    worlds.restart([1])
+    worlds.reset(thrown, frames=90)
+    assert worlds.episode.substeps < alone
+    with pytest.raises(ConfigError, match=r"starts\[1\]: .* no faster than .* m/s, .* found up to"):
+        worlds.restart([1], [high])
+
+
 def test_gradients_of_worlds_are_those_of_their_twins():
     """Commands of each, to the last bit; the law's numbers, which they share, as a sum."""
     made, pushes = twin(), torch.tensor([[0.9, 0.0, 0.0], [0.8, 0.1, 0.1]]).double()
@@ -511,6 +540,10 @@ def test_errors_of_starts_and_states():
         ConfigError, match="gravity: expected no gradients"
     ):  # found a small part of them
         made.worlds(2).reset(gravity=torch.zeros(2, 3, requires_grad=True), differentiable=True)
+    with pytest.raises(ConfigError, match="gravity: expected no gradients"):  # found none
+        made.reset(gravity=torch.zeros(3, requires_grad=True), differentiable=True)
+    with pytest.raises(ConfigError, match="laws: expected no gradients"):
+        made.worlds(2, torch.zeros(2, 22, requires_grad=True))
     worlds = made.worlds(2)
     worlds.reset()
     with pytest.raises(

@@ -110,7 +110,7 @@ def test_an_exported_motion_has_its_solids_and_the_ground(tmp_path):
     rollout, alone = one.simulate(frames=4, colliders=[PLATE]), one.simulate(frames=4)
     with pytest.raises(
         ConfigError,
-        match=r"colliders: expected the 1 that the rollout was simulated with, .* found 0",
+        match=r"colliders and driven: expected the 1 that the rollout was simulated with, .* found 0",
     ):
         one.export(rollout, tmp_path / "no")
     with pytest.raises(

@@ -134,10 +134,10 @@ def check_above(planes: np.ndarray, bounds: np.ndarray, x: Tensor) -> None:
 
 
 def checked_density(
-    density: float | Tensor, volume: Tensor, law: Law, packed: Tensor
+    density: float | Tensor, volume: Tensor, law: Law, packed: Tensor, worlds: int | None = None
 ) -> tuple[float | Tensor, float]:
     """(density, mean mass of a particle [kg]), also checks the volumes and the moduli among the
-    packed parameters (N, SLOTS): one look at the host for all.
+    packed parameters (N, SLOTS): one look at the host for all. worlds: how many may have their own.
 
     A number stays one: arithmetic, and so every bit, is that of a body of one material. Errors: ConfigError."""
     if not isinstance(density, Tensor) or density.ndim == 0:
@@ -147,10 +147,10 @@ def checked_density(
             raise ConfigError(f"density: expected {expected}, found {density}")
         ends: tuple[Tensor, ...] = tuple(torch.aminmax(volume))
     else:
-        if density.shape != volume.shape or not dense(density):
-            raise ConfigError(
-                f"density: expected a number or shape {tuple(volume.shape)}, found {shown(density)}"
-            )
+        shapes = [tuple(volume.shape)] + ([(worlds, *volume.shape)] if worlds else [])
+        if density.shape not in shapes or not dense(density):
+            said = " or ".join(map(str, shapes))
+            raise ConfigError(f"density: expected a number or shape {said}, found {shown(density)}")
         density = density.detach().to(volume)
         ends = (*torch.aminmax(volume), *torch.aminmax(density))
     names = [name for name in law.offsets if name in MODULI]

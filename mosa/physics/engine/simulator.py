@@ -189,7 +189,7 @@ class Simulator:
         state: particles at frame 0, x (N, 3) and so on, their F and F_tot not yet advanced by C_affine, unless `started` (the
         `final` of an earlier rollout). Far from the origin (1024 cells) x of the result is float64, and x of the state should be:
         float32 has a resolution of 1 mm at 10 km. parameters: physical values the law names, per particle (N,) or scalar; volume:
-        (N,) [m^3]; density [kg/m^3]: number or (N,).
+        (N,) [m^3]; density [kg/m^3]: number, (N,), or (B, N).
         adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
         that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
         evaluation. progress: called with the number of each frame. Before an adapter that has `flow` is asked, F becomes
@@ -348,7 +348,7 @@ class Simulator:
         F = state.F if worlds is None else state.F.flatten(0, 1)
         rotation = inputs.polar_rotation(F) if self.law.reference is not None else None
         packed = self._packed(asked.parameters, len(volume), rotation, worlds)
-        density, mean_mass = inputs.checked_density(asked.density, volume, self.law, packed)
+        density, mean_mass = inputs.checked_density(asked.density, volume, self.law, packed, worlds)
         cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
@@ -356,12 +356,11 @@ class Simulator:
             solvers = [SegmentSolver(self.numerics, volume, density, cutoff, None, None, held)]
         else:
             size = asked.together or (worlds if self.device.type == "cuda" else 1)
-            volume, density = (
-                t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density)
-            )
+            volume = volume.repeat(size)
+            own = density.expand(worlds, -1) if isinstance(density, Tensor) else None
             solvers = [
-                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i,
-                              held and Held(*(t[i : i + size].flatten(0, 1) for t in held)))
+                SegmentSolver(self.numerics, volume, density if own is None else own[i : i + size].flatten(), cutoff,
+                              gravities[i : i + size], i, held and Held(*(t[i : i + size].flatten(0, 1) for t in held)))
                 for i in range(0, worlds, size)
             ]  # fmt: skip
         if isinstance(adapter, Sequence):
