@@ -1,4 +1,5 @@
-! Law "@LAW@" as a UMAT of Abaqus and CalculiX, written by MoSA. SI units; free form (Abaqus: -free, or .f90).
+! Law "@LAW@" as a UMAT of Abaqus, written by MoSA. SI units; free form (-free, or .f90). Not for CalculiX: it takes stresses turned
+! back by the rotation of DFGRD1 (umat_abaqusnl.f), and these are in the axes of space.
 ! Directions of fibres are in the axes of DFGRD1: give the section no *ORIENTATION. *USER MATERIAL, CONSTANTS=@COUNT@:
 @PROPS@
 module mosa_law
