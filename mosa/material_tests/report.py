@@ -223,7 +223,9 @@ def plot(
 def written(law: Law, fit: Fit, note: str = "") -> dict[str, Any]:
     """The material as plain data, with the posterior of the unconstrained numbers; note: a warning of `mosa-export-law`."""
     numbers = {"theta": fit.theta.tolist(), "covariance": fit.covariance.tolist()}
-    posterior = {"names": list(fit.names)} | numbers
+    # the angles of a direction count from where it began, and not from the one that was found
+    begins = {name: getattr(law.material, f"frame_{name}")[0].tolist() for name in law.material.directions}  # fmt: skip
+    posterior = {"names": list(fit.names), "begins": begins} | numbers
     return described(law.material, law.adapter) | {"posterior": posterior, "note": note}
 
 

@@ -15,7 +15,7 @@ from mosa.config.checkpoints import known_numbers
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.law_stress import in_double, kirchhoff, tangent
 from mosa.export.source import read_source
-from mosa.material_tests.fitting import Fitting, Law
+from mosa.material_tests.fitting import Fit, Fitting, Law
 from mosa.material_tests.measurements import measurements, read_tests
 from mosa.material_tests.report import (
     doubts,
@@ -187,6 +187,30 @@ def test_two_halves_of_the_tests_say_what_all_of_them_say(tmp_path):
         path.write_text(text)
         with pytest.raises(DataError, match=r"known: .*material\.json: expected a material\.json"):
             known_numbers(str(path), law.material, None, "known")
+
+
+def test_what_another_experiment_said_holds_for_its_start_and_its_frozen_numbers(tmp_path):
+    """The angles of a fibre count from where it began: read from another start they would be another direction."""
+    fibre = {"E": E, "nu": 0.45, "fibre_stiffness": 1e4, "fibre_exponent": 1.0, "dispersion": 0.0}
+
+    def law(start, frozen, **other):
+        return Law(Material("hgo", fibre | {"fibre": start} | other, frozen), None, "full")
+
+    first = law([1, 0.2, 0], ["nu", "dispersion"])
+    theta = np.array([*first.get()[:3], 0.2, 0.0])
+    fit = Fit(first.names, theta, np.diag(np.full(5, 1e-4)), 1.0, 1.0, 5.0, np.zeros(1))
+    path = tmp_path / "material.json"
+    path.write_text(json.dumps(written(first.set(theta), fit)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        known = known_numbers(str(path), law([1, 0.2, 0], ["nu"]).material, None, "known")
+    assert known.mean.numpy() == pytest.approx(theta)
+    for start in ([1, 0, 0], [-1, -0.2, 0]):
+        with pytest.raises(ConfigError, match=r"count from prior.parameters.fibre = \[0.9806, 0.1961, 0\]"):  # fmt: skip
+            known_numbers(str(path), law(start, ["nu"]).material, None, "known")
+    for other, found in ((law([1, 0.2, 0], []), "it is learned"), (law([1, 0.2, 0], ["nu"], nu=0.3), "it is 0.3")):  # fmt: skip
+        with pytest.warns(UserWarning, match=f"its numbers hold for nu = 0.45, and here {found}"):
+            known_numbers(str(path), other.material, None, "known")
 
 
 def pulled(lengths, stresses, law="neo_hookean", **more):
