@@ -28,8 +28,9 @@ ORTHOTROPIC = 7  # numbers of `anisotropic_basis` that keep the planes as mirror
 SPREAD = 0.7  # of the starts, in unconstrained numbers
 LOOKED_AT, FAR = 64, 2.0  # further starts, of which only stresses are computed, and their spread
 RELATIVE, FLOOR, EXACT, ALIKE = 0.05, 0.003, 0.02, 0.02
-"""Where readings of stress are compared: standard deviation of a stress, relative to itself and to the largest; so many of them are
-no difference; and the largest logarithm of a stretch at which true and nominal stress are the same."""
+"""Where readings of stress are compared: standard deviation of a stress, relative to itself (also its noise where nothing tells
+it) and to the largest; so many of them are no difference; and the largest logarithm of a stretch at which true and nominal stress
+are the same."""
 UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests do not determine
 HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
 UNSURE = 3.0  # sd of an unconstrained number above which it is not determined
@@ -156,7 +157,12 @@ class Fitting:
             covariance = np.linalg.inv(known + UNKNOWN**-2 * np.eye(len(prior)))
             shares = 1 - np.diag(covariance @ prior)
             determined, effective = shares[self.own], float(shares.sum())
-            noise = float(np.sqrt((misfit**2).sum() / max(len(misfit) - effective, 1.0) + LEAST**2))
+            spare = len(misfit) - effective
+            noise = float(np.sqrt((misfit**2).sum() / max(spare, 1.0) + LEAST**2))
+            if (
+                spare < 1
+            ):  # as many numbers as stresses: a law that meets them all says nothing of their noise
+                noise = max(noise, RELATIVE if np.isnan(self.data.sd).any() else 1.0)
             if self.own.any() and self.evidence:
                 own = (best.x[self.own] ** 2).sum() / max(determined.sum(), 1e-3)
                 sigma = float(np.clip(np.sqrt(own), FEWEST, MOST))

@@ -60,8 +60,8 @@ def figures(
     data: Measurements, fit: Fit, left_out: Mapping[str, np.ndarray]
 ) -> dict[str, float | str]:
     """Of all stresses [Pa]: `rms`, `rms_curves` (mean over curves), R2 (mean over curves), `left_out` (mean over tests of the rms
-    of a test that the fit did not see); `rms_simulated`: without the pressure of an incompressible fit; `rms_of_sd`: in units of
-    the given standard deviations; numbers, noise [Pa]; other_reading: as `Fitting.other_reading` finds it."""
+    of a test that the fit did not see); `rms_simulated`: without the pressure of an incompressible fit; `rms_of_sd`, `noise_of_sd`:
+    in units of the given standard deviations, else `noise` [Pa]; other_reading: as `Fitting.other_reading` finds it."""
     away = fit.predicted - data.value
     parts = curves(data).values()
     found: dict[str, float | str] = {
@@ -70,8 +70,8 @@ def figures(
         "R2": mean_explained(data, fit.predicted),
         "numbers": len(fit.names),
         "numbers_determined": fit.effective,
-        "noise": fit.noise,
     }
+    found["noise" if np.isnan(data.sd).any() else "noise_of_sd"] = fit.noise
     if fit.simulated is not None:
         found["rms_simulated"] = rms(fit.simulated - data.value)
     if not np.isnan(data.sd).any():
@@ -167,7 +167,14 @@ def table(
         "",
     ]
     for name, value in totals.items():
-        plain = name in ("R2", "numbers", "numbers_determined", "rms_of_sd", "other_reading")
+        plain = name in (
+            "R2",
+            "numbers",
+            "numbers_determined",
+            "rms_of_sd",
+            "noise_of_sd",
+            "other_reading",
+        )
         said = f"{value:.4g}" if plain else f"{float(value) / scale:.4g} {unit}"
         lines.append(f"- {name}: {said}")
     lines += [f"- {reading(fit)}", ""]

@@ -105,6 +105,21 @@ def test_a_test_of_a_single_state_is_fitted():
     assert fit.predicted == pytest.approx([1e3], rel=1e-3) and np.isfinite(fit.covariance).all()
 
 
+def test_as_many_stresses_as_numbers_say_nothing_of_their_noise():
+    """A law that meets every stress would else be certain: two moduli of a data sheet, and one stress with its deviation."""
+    one, two = ([1.1], [1e3]), ([1.1, 1.5], [1e3, 4e3])
+    for (l, P), sd, expected in ((one, 200.0, 0.2), (one, None, 0.05), (two, 100.0, 0.03)):
+        law = Law(Material("neo_hookean", {"E": E, "nu": 0.4}, ["nu"] * (len(l) < 2)), None, "full")
+        told = {} if sd is None else {"sd_1": sd}
+        states = [dict(row, stress_1=v, **told) for row, v in zip(rows("uniaxial x", l), P)]
+        data = measurements(states, "Pa", "here")
+        fit = Fitting(law, data, len(l) < 2, starts=1, seed=0).fit()
+        assert fit.covariance[0, 0] ** 0.5 > 0.99 * expected
+        found = figures(data, fit, {})
+        assert found.get("noise_of_sd", found.get("noise")) == fit.noise
+        assert ("noise" in found) == (sd is None)
+
+
 def test_a_specimen_at_an_angle_is_a_material_that_is_turned():
     fibre = {"E": E, "nu": NU, "fibre_stiffness": 1e4, "fibre_exponent": 1.0, "dispersion": 0.1}
     states = rows("biaxial xy", LENGTHS[1:4], 1.1, angle=30.0)
