@@ -93,8 +93,8 @@ FORMS: dict[str, Form | Direction] = {
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
     "second_share": _scaled_sigmoid(1.0, (0.0, 1.0)), "yeoh_2": SOFTPLUS, "yeoh_3": SOFTPLUS,
     "alpha_1": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "alpha_2": _scaled_sigmoid(-3.0, (-30.0, -3.0), -30.0),
-    "alpha_3": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "share_2": _scaled_sigmoid(1.0, (0.0,)),
-    "share_3": _scaled_sigmoid(1.0, (0.0,)), "fibre_stiffness": LOG, "second_fibre_stiffness": LOG, "fibre_exponent": LOG,
+    "alpha_3": _scaled_sigmoid(30.0, (1.5, 30.0), 1.5), "share_2": _scaled_sigmoid(1.0, (0.0, 1.0)),
+    "share_3": _scaled_sigmoid(1.0, (0.0, 1.0)), "fibre_stiffness": LOG, "second_fibre_stiffness": LOG, "fibre_exponent": LOG,
     "dispersion": _scaled_sigmoid(1 / 3, (0.0, 1 / 3)), "fibre": Direction(), "second_fibre": Direction(),
 }  # fmt: skip
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain. Exponents of `ogden` stay where
