@@ -25,10 +25,11 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-GOOD, CLEAR, WIDE, SAME, SOFTEST, LONGEST = 0.95, 1.5, 0.4, 1.1, 1e3, 15.0
+GOOD, CLEAR, WIDE, SAME, SOFTEST, STIFFEST, LONGEST = 0.95, 1.5, 0.4, 1.1, 1e3, 1e10, 15.0
 """R2 below which a fit is warned of; ratio of errors above which tests prefer one reading of stress, and logarithm of the stretch
-above which others are asked for it; ratio above which exports differ from the fit; E [Pa] below which the unit is doubted: most
-gels and tissues have more; and the stretch above which strain is suspected: rubber breaks before."""
+above which others are asked for it; ratio above which exports differ from the fit; E [Pa] below and above which the unit is
+doubted: most gels and tissues have more, and what stretches far has less; and the stretch above which strain is suspected: rubber
+breaks before."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -125,7 +126,7 @@ def reading(fit: Fit) -> str:
 
 def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
     """What a user should look at: poor curves, an export that is another law."""
-    R2, poor, soft, long = float(figures(data, fit, {})["R2"]), "", "", ""
+    R2, poor, odd, long = float(figures(data, fit, {})["R2"]), "", "", ""
     if R2 < GOOD:
         poor = (
             f"tests: R2 is {R2:.2f}: the law does not follow these curves. Either it cannot (try another prior), its start is "
@@ -133,14 +134,14 @@ def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
             f"stress than {READINGS[fit.true]}"
         )
     slip = reading(fit) if (fit.other or CLEAR) < CLEAR and strained(data) > WIDE else ""
-    if (E := float(law.material.physical()["E"].detach())) < SOFTEST:
+    name = "E" if "E" in law.material.names else "kappa"
+    if not SOFTEST < (modulus := float(law.material.reference_modulus())) < STIFFEST:
         others = " or ".join(each for each in UNITS if each != unit)
-        soft = (
-            f"unit: E is {E:.3g} Pa, softer than most gels: is the file in {unit}, not in {others}?"
-        )
+        than = "softer than most gels" if modulus < STIFFEST else "stiffer than plastics"
+        odd = f"unit: {name} is {modulus:.3g} Pa, {than}: is the file in {unit}, not in {others}?"
     if (most := float(np.abs(data.given).max())) > LONGEST:
         long = f"tests: a stretch of {most:.4g}, which no rubber reaches: stretch is 1 at rest, strain in per cent is not"
-    return [each for each in (poor, slip, soft, long, note(law, data, fit, unit)) if each]
+    return [each for each in (poor, slip, odd, long, note(law, data, fit, unit)) if each]
 
 
 def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:

@@ -29,6 +29,7 @@ from mosa.material_tests.report import (
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
+from mosa.physics.constitutive.laws import law_named, register_law
 from mosa.twin.twin import Twin
 
 E, NU = 3e4, 0.4
@@ -311,11 +312,25 @@ def test_slips_in_a_file_are_warned_of():
     assert [v for _, v, *_ in numbers] == pytest.approx([4e5, 1.2e6, 4e5 * 2 * 1.45], rel=1e-6)
     for slip in (l**4, l * (l - l**-2), l + 1 - (l + 1) ** -2):  # the last two: true stress, strain
         assert "another stress than nominal" in pulled(l, 0.4 * slip)[1]
-    assert "in MPa, not in Pa or kPa" in pulled(l, 2e-6 * (l - l**-2))[1] and "unit" not in right
+    for scale, said in ((2e-6, "softer than most gels"), (4e5, "stiffer than plastics")):
+        found = pulled(l, scale * (l - l**-2))[1]
+        assert said in found and "in MPa, not in Pa or kPa" in found and "unit" not in right
     assert "in per cent" in pulled(10 * l, P)[1] and "per cent" not in right
     l = np.linspace(0.8, 4.0, 12)  # strains, the first below 1
     with pytest.warns(UserWarning, match="1 of the stresses pull at a stretch below 1"):
         pulled(l, 0.4 * (1 + l - (1 + l) ** -2))
+
+
+def test_a_law_of_shear_and_bulk_modulus_is_looked_at_like_others():
+    """It has no E: the report asked for one, behind the fit."""
+    register_law("of_mu_and_kappa", law_named("stvk").stress, ("mu", "kappa"))
+    law = Law(Material("of_mu_and_kappa", {"mu": 1e4, "kappa": 1e5}), None, "full")
+    l = LENGTHS[2:]
+    states = [dict(r, stress_1=P) for r, P in zip(rows("uniaxial x", l), 3e4 * np.log(l) / l)]
+    data = measurements(states, "Pa", "here")
+    fit = Fitting(law, data, True, starts=1, seed=0).fit()
+    said = "; ".join(doubts(law.set(fit.theta), data, fit, "Pa"))
+    assert "unit" not in said and math.exp(fit.theta[0]) == pytest.approx(1e4, rel=1e-3)
 
 
 def test_the_numbers_that_are_determined_are_those_of_the_table():
