@@ -171,6 +171,16 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
             f"tests: {where}: first, second: {against.sum()} of the stresses pull at a stretch below 1, or press above 1: strains?",
             stacklevel=2,
         )
+    strain[kinds == "shear"] += 1
+    size = np.abs(strain).max(1)
+    rest = np.abs(value[(size <= 1e-3 * size.max())[row_of]])
+    if (left := rest.max(initial=0.0)) > 0.05 * np.abs(value).max():
+        warn(
+            f"tests: {where}: stress_1, stress_2: expected 0 at rest (a stretch of 1, a shear of 0), found up to {left:.4g} there: "
+            "strains in per cent (a stretch is 1 + strain/100), a preload or an offset to be subtracted, or a loop, of which a law "
+            "has one branch?",
+            stacklevel=2,
+        )
     scale = UNITS[unit]
     return Measurements(
         tuple(names), test, kinds, axis, angles, given, row_of, component, scale * value, scale * sd
