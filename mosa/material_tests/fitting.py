@@ -19,7 +19,7 @@ from mosa.evaluation.analysis.law_stress import in_double
 from mosa.material_tests.measurements import Measurements, strained
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
-from mosa.modules.body.material import Material
+from mosa.modules.body.material import Direction, Material
 from mosa.modules.fitting.gauss_newton import Posterior
 
 log = logging.getLogger(__name__)
@@ -33,7 +33,8 @@ it) and to the largest; so many of them are no difference; and the largest logar
 are the same."""
 UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests do not determine
 HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
-UNSURE = 3.0  # sd of an unconstrained number above which it is not determined
+UNSURE, ANY = 3.0, math.pi / math.sqrt(12)
+"""Standard deviation above which a number is not determined: unconstrained, and of an angle [rad], of lines of any direction."""
 LEAST = 1e-5  # noise, in the unit of the residuals: of a test that a law meets exactly
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 """Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
@@ -71,6 +72,8 @@ class Law:
             adapter.double()
         own = tuple(f"stiffness_{k + 1}" for k in range(self.count))
         self.names = (*material.learned, *own)
+        angles = {a for name in material.directions for a in Direction.coordinates(name)}
+        self.unsure = np.array([ANY if name in angles else UNSURE for name in self.names])
 
     def get(self) -> np.ndarray:
         """(k,) numbers."""
@@ -169,7 +172,7 @@ class Fitting:
             best = solve(best.x, 100)
             if max(abs(np.log(np.array(before) / (noise, sigma)))) < 0.02:
                 break
-        effective = float(shares[np.sqrt(np.diag(covariance)) < UNSURE].sum())
+        effective = float(shares[np.sqrt(np.diag(covariance)) < self.law.unsure].sum())
         scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
         told = self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
         own, free = self.specimens, None

@@ -16,7 +16,7 @@ import torch
 from mosa.config.build import build_body, world_of
 from mosa.config.record import BodyRecord
 from mosa.evaluation.analysis.law_stress import described
-from mosa.material_tests.fitting import UNSURE, Fit, Law
+from mosa.material_tests.fitting import Fit, Law
 from mosa.material_tests.measurements import UNITS, Measurements, strained
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.body import Start
@@ -89,7 +89,8 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
     """(name, value, standard deviation or why there is none, unit) of every number that was fitted, physical; where a pressure
     replaces nu, E as mu and 3 mu, which do not depend on the given nu."""
     rows = []
-    for name, value, sd in zip(fit.names, fit.theta, np.sqrt(np.diag(fit.covariance))):
+    deviations = np.sqrt(np.diag(fit.covariance))
+    for name, value, sd, most in zip(fit.names, fit.theta, deviations, law.unsure):
         form = FORMS.get(name)
         if isinstance(form, Form):
             raw = torch.tensor(float(value), dtype=torch.float64, requires_grad=True)
@@ -104,9 +105,9 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
                 name = f"E (at the given nu = {nu:.4g})"
             near = any(abs(value - b) < 0.01 * max(abs(b), 1) for b in (form.low, form.high))
             unknown = f"not determined{' (at its bound)' if near else ''}"
-            rows.append((name, value, abs(slope.item()) * sd if sd < UNSURE else unknown, unit))
+            rows.append((name, value, abs(slope.item()) * sd if sd < most else unknown, unit))
         else:
-            told = sd if sd < UNSURE else "not determined"
+            told = sd if sd < most else "not determined"
             rows.append((name, value, told, "" if name.startswith("stiffness_") else "rad"))
     return rows
 

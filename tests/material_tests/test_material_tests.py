@@ -355,6 +355,12 @@ def test_the_numbers_that_are_determined_are_those_of_the_table():
     numbers, _, fit = pulled(l, 0.4 * (l - l**-2), "mooney_rivlin", second_share=0.1)
     assert numbers[-1][0] == "second_share" and numbers[-1][2] == "not determined (at its bound)"
     assert fit.effective == pytest.approx(1) and len(fit.names) == 2
+    fibre = {"E": E, "nu": 0.45, "fibre_stiffness": 1e4, "fibre_exponent": 1.0, "dispersion": 0.0, "fibre": [1, 0, 0]}  # fmt: skip
+    law = Law(Material("hgo", fibre, ["nu"]), None, "full")
+    fit = Fit(law.names, law.get(), np.diag([0.1, 0.1, 2.9, 0.1, 2.9]) ** 2, 1, 1, 5, np.zeros(1))
+    told = {name: sd for name, _, sd, _ in uncertain(law, fit)}
+    assert told["fibre_1"] == pytest.approx(0.1) and told["fibre_exponent"] == pytest.approx(2.9)
+    assert told["fibre_2"] == "not determined"  # 166 degrees are any direction
 
 
 def test_an_export_of_an_incompressible_fit_says_how_far_it_is(tmp_path):
