@@ -21,6 +21,8 @@ from mosa.export.source import Source
 from mosa.physics.launching import launch
 
 Pair = tuple[Tensor, Tensor]
+STRAINS = 0.2, 0.1, 0.05, 0.025
+"""Of the deformations, the first at which the law itself is finite: fibres of a large exponent are not at large strains."""
 ABAQUS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -81,7 +83,7 @@ def check_umat(
     J = torch.linalg.det(F)
     sigma = tau / J[:, None, None]
     asked = torch.stack([sigma[:, i, j] for i, j in ABAQUS], 1)
-    energy = float((stored - psi / J).abs().max() / psi.abs().max())
+    energy = relative(stored[:, None], (psi / J)[:, None])
     return relative(stress, asked), relative(tangent, jaumann(derivative, F)), energy
 
 
@@ -146,8 +148,11 @@ def check_warp(text: str, F: Tensor, truth: Pair) -> float:
 
 def check_all(found: Source, texts: dict[str, str], count: int) -> dict[str, float]:
     """Relative differences at `count` deformations, by text; of the UMAT only where there is a gfortran."""
-    F = deformations(count)
-    truth = expected(found, F)
+    for strain in STRAINS:
+        F = deformations(count, strain=strain)
+        truth = expected(found, F)
+        if all(bool(each.isfinite().all()) for each in truth):
+            break
     result: dict[str, float] = {}
     if shutil.which("gfortran"):
         names, psi = ("stress", "tangent", "energy"), energy_of(texts["law_ufl.py"], F)

@@ -200,6 +200,22 @@ def test_an_energy_of_another_package_is_exported(tmp_path, monkeypatch, capsys)
         ENERGIES.pop("stvk_paper", None)
 
 
+def test_a_difference_that_is_no_number_fails_and_stiff_fibres_are_compared(tmp_path, monkeypatch, capsys):  # fmt: skip
+    """k2 of an artery's adventitia (Gasser, Ogden, Holzapfel 2006): exp(k2 e^2) overflows at the usual strains."""
+    artery = {"fibre_stiffness": 9.966e5, "fibre_exponent": 524.6, "dispersion": 0.226, "fibre": [1, 0.5, 0]}  # fmt: skip
+    law = {"law": "hgo", "parameters": {"E": 2.3e4, "nu": 0.49} | artery, "stiffness": None}
+    (tmp_path / "material.json").write_text(json.dumps(law))
+
+    def code() -> int:
+        with pytest.raises(SystemExit) as ended:
+            main([str(tmp_path / "material.json"), str(tmp_path / "law"), "--check", "1000"])
+        return ended.value.code
+
+    assert code() == 0 and "nan" not in capsys.readouterr().out
+    monkeypatch.setattr("mosa.export.checking.STRAINS", (0.4,))
+    assert code() == 1 and "nan" in capsys.readouterr().out
+
+
 def test_a_law_without_an_energy_is_refused(tmp_path):
     yielding = Material("von_mises", {"E": 1e5, "nu": 0.3, "yield_stress": 1e3})
     with pytest.raises(ConfigError, match="found von_mises"):
