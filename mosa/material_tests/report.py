@@ -150,11 +150,12 @@ def note(law: Law, data: Measurements, fit: Fit, unit: str) -> str:
     totals, scale = figures(data, fit, {}), UNITS[unit]
     if fit.simulated is None or float(totals["rms_simulated"]) < SAME * float(totals["rms"]):
         return ""
-    nu = float(law.material.poisson().detach())
+    nu, free = float(law.material.poisson().detach()), float(totals["rms_simulated"]) / scale
+    there = "no equilibrium in one of the tests" if math.isnan(free) else f"an rms in the tests of {free:.4g} {unit}"  # fmt: skip
     higher = f"prior.parameters.nu={NU_MAX:g}, or " if nu < 0.999 * NU_MAX else ""
     return (
-        f"fitted as incompressible; the law that simulations and exports get has nu = {nu:.4g} (at most {NU_MAX:g}), and an rms in "
-        f"the tests of {float(totals['rms_simulated']) / scale:.4g} {unit} in place of {float(totals['rms']) / scale:.4g} {unit}. "
+        f"fitted as incompressible; the law that simulations and exports get has nu = {nu:.4g} (at most {NU_MAX:g}), and "
+        f"{there}; as fitted {float(totals['rms']) / scale:.4g} {unit}. "
         f"Nearer: {higher}incompressible=false, which fits that law; an export, with --nu 0.49999"
     )
 

@@ -30,6 +30,8 @@ class Specimens:
         self.logs = np.zeros((n, 3))
         self.moves = np.zeros((n, 3, 2))
         """Directions in which the logarithms of the stretches are free."""
+        self.isochoric = np.zeros((n, 2))
+        """Along them, where the volume is that at rest."""
         self.free = np.full(n, -1)
         """A face whose stress the pressure cancels, -1 where it does no work."""
         for i in np.flatnonzero(~self.sheared):
@@ -42,6 +44,7 @@ class Specimens:
                 loose = loose[:-1]
             for k, a in enumerate(loose):
                 self.moves[i, a, k] = 1.0
+                self.isochoric[i, k] = -self.logs[i].sum() / len(loose)
                 if incompressible:
                     self.moves[i, self.free[i], k] = -1.0
         self.solved = np.flatnonzero(self.moves.any((1, 2)))
@@ -50,7 +53,7 @@ class Specimens:
         """From the material's axes to the specimen's."""
         self.turn[:, 0, 0] = self.turn[:, 1, 1] = cosine
         self.turn[:, 0, 1], self.turn[:, 1, 0], self.turn[:, 2, 2] = sine, -sine, 1.0
-        self.last = np.zeros((n, 2))
+        self.last: np.ndarray | None = None
 
     def gradients(self, rows: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """F (k, 3, 3) of states, in the specimen's axes; moved: (k, 2) along `moves`."""
@@ -93,11 +96,20 @@ class Specimens:
 
     def equilibrium(self, material: Material, stress) -> np.ndarray:
         """(k, 2) of the states that are solved for: where the energy is stationary along `moves`."""
+        # from the last one, else from that of small strains: where nothing moves across, a law compressed far may have no slope
+        share = 2 * float(material.poisson())
+        starts = [share * self.isochoric[self.solved]]
+        for start in starts if self.last is None else [self.last, *starts]:
+            self.last = self.newton(start, float(material.max_modulus()), stress)
+            if self.last is not None:
+                return self.last
+        raise SimulationDiverged("no free stretch was found at which the faces carry no stress")
+
+    def newton(self, x: np.ndarray, scale: float, stress) -> np.ndarray | None:
+        """As `equilibrium`, from x (k, 2); scale [Pa] of stresses. None where it finds none."""
         rows = self.solved
         k, B = len(rows), self.moves[rows]
         idle = np.eye(2) * (np.abs(B).sum(1) == 0)[:, None, :]
-        scale = float(material.max_modulus())
-        x = self.last[rows].copy()
 
         def force(x: np.ndarray, rows: np.ndarray, B: np.ndarray) -> np.ndarray:
             tau = stress(rows, x)[1]
@@ -111,7 +123,6 @@ class Specimens:
                 break
             scale = max(scale, np.abs(g).max() * 1e-6)
             if np.abs(g[0]).max() <= PRECISE * scale:
-                self.last[rows] = x
                 return x
             slope = np.stack([g[1] - g[0], g[2] - g[0]], -1) / STEP + idle * scale
             try:
@@ -119,5 +130,4 @@ class Specimens:
             except np.linalg.LinAlgError:
                 break
             x = x + np.clip(change, -LONGEST, LONGEST)
-        self.last[rows] = 0.0
-        raise SimulationDiverged("no free stretch was found at which the faces carry no stress")
+        return None

@@ -96,6 +96,14 @@ def test_free_faces_of_a_compressible_specimen_carry_nothing():
         incompressible=False,
     )
     assert small[0] == pytest.approx(1e-6 * E, rel=1e-4)
+    # compressed far: corotated's stress across, 2 mu (t^2 - t) + lam (J - 1) J, has its least at t = 1, and its 0 at 1.56
+    nu, l = 0.45, 0.3
+    mu, lam = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
+    states = rows("uniaxial x", np.array([0.9, l]))
+    P = predicted("corotated", {"E": E, "nu": nu}, states, incompressible=False)[1]
+    volumetric = P * l - 2 * mu * (l**2 - l)
+    J = l * (0.5 + math.sqrt(0.25 - volumetric / 2 / mu)) ** 2
+    assert lam * (J - 1) * J == pytest.approx(volumetric, rel=1e-8) and J > 0.7
 
 
 def test_a_test_of_a_single_state_is_fitted():
