@@ -230,7 +230,7 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
                                            "covariance": values["covariance"], "model_error": 0.0}, "posterior")  # fmt: skip
         except Exception as error:  # whatever the file holds
             raise DataError(
-                f"{where}: {path}: expected a material.json of mosa-material with its posterior "
+                f"{where}: {path}: expected a material.json of mosa-material with its posterior, or a checkpoint "
                 f"({type(error).__name__}: {error})"
             ) from error
         inflation, alike = 1.0, adapter is not None and adapter.energetic

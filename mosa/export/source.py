@@ -20,6 +20,8 @@ from mosa.modules.body.material import Material
 from mosa.physics.constitutive.laws import law_named
 from mosa.twin.twin import Twin
 
+UNEVEN = 0.01  # standard deviation of a stiffness field above which its loss is warned of
+
 
 @dataclass(frozen=True)
 class Source:
@@ -40,8 +42,15 @@ def read_source(path: str | Path, nu: float | None = None) -> Source:
         if (note := read_json(path).get("note")) and nu is None:
             warn(f"{path}: {note}", stacklevel=1)
         return found
-    body = Twin.load(path).body
-    return source(body.material, body.adapter, nu)
+    twin = Twin.load(path)
+    if float((field := twin.material.field).std()) > UNEVEN:
+        low, mean, high = (float(v) for v in (field.min(), field.mean(), field.max()))
+        warn(
+            f"{path}: the export has no stiffness field: over this body the law's moduli are {low:.2f} to {high:.2f} times as "
+            f"large (mean {mean:.2f}; twin.material.field)",
+            stacklevel=1,
+        )
+    return source(twin.body.material, twin.body.adapter, nu)
 
 
 def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
@@ -63,7 +72,7 @@ def read_material(path: Path) -> tuple[Material, HyperelasticAdapter | None]:
     except Exception as error:  # whatever the file holds
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         raise DataError(
-            f"{path}: expected a material.json of mosa-material, found {reason}"
+            f"{path}: expected a material.json of mosa-material (of a twin: its checkpoint), found {reason}"
         ) from error
     return material, adapter
 

@@ -8,6 +8,7 @@ import pytest
 import sympy as sp
 import torch
 from energies import ENERGIES as ENERGY_OF
+from small_bodies import FRAME_DT, STICKY, small_body, start
 
 from mosa.cli.export_law import main
 from mosa.errors import ConfigError, DataError
@@ -21,12 +22,13 @@ from mosa.export.checking import (
     umat_of,
 )
 from mosa.export.energies import ENERGIES, ENTRIES, STRETCHES, energy
-from mosa.export.source import as_json, read_material, source
+from mosa.export.source import as_json, read_material, read_source, source
 from mosa.export.texts import ufl_text, umat, warp_text
 from mosa.material_tests.measurements import measurements
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
+from mosa.twin.twin import Twin
 
 FIBRES = {"fibre_stiffness": 2e4, "fibre_exponent": 1.5, "dispersion": 0.1, "fibre": [1, 0.4, 0.2]}
 LAWS = {
@@ -216,10 +218,23 @@ def test_a_difference_that_is_no_number_fails_and_stiff_fibres_are_compared(tmp_
     assert code() == 1 and "nan" in capsys.readouterr().out
 
 
+def test_a_stiffness_field_that_the_texts_lack_is_told(monkeypatch, recwarn):
+    body = small_body(modes=True)
+    monkeypatch.setattr(Twin, "load", lambda path: Twin(body, STICKY, FRAME_DT, None, start()))
+    read_source("last.ckpt")
+    assert not recwarn
+    with torch.no_grad():
+        body.heterogeneity.coefficients[0] = 1.0
+        factor = body.factor(body.heterogeneity)
+    read_source("last.ckpt")
+    told = f"moduli are {float(factor.min()):.2f} to {float(factor.max()):.2f} times as large"
+    assert [told in str(each.message) for each in recwarn] == [True]
+
+
 def test_a_law_without_an_energy_is_refused(tmp_path):
     yielding = Material("von_mises", {"E": 1e5, "nu": 0.3, "yield_stress": 1e3})
     with pytest.raises(ConfigError, match="found von_mises"):
         source(yielding, None)
     (tmp_path / "material.json").write_text('{"law": "stvk"}')
-    with pytest.raises(DataError, match=r"material\.json: expected a material\.json"):
+    with pytest.raises(DataError, match=r"material\.json: expected a material\.json .*of a twin: its checkpoint"):  # fmt: skip
         read_material(tmp_path / "material.json")
