@@ -26,6 +26,7 @@ import numpy as np
 
 from mosa.data.io.tables import read_table
 from mosa.errors import DataError
+from mosa.physics.contact.colliders import warn_of_radians
 from mosa.settings import LARGEST
 
 UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
@@ -150,6 +151,8 @@ def measurements(rows: Sequence[dict], unit: str, where: str) -> Measurements:
         states.append((names.index(name), kind, places, angle, (first, second)))
         stresses += [(i, k, v, sd) for k, v, sd in measured if not math.isnan(v)]
     test, kinds, axis, angles, given = (np.array(part) for part in zip(*states))
+    for each in np.unique(np.degrees(angles)):
+        warn_of_radians(f"tests: {where}: angle", float(each), stacklevel=3)
     row_of, component, value, sd = (np.array(part) for part in zip(*stresses))
     if 0 < np.isnan(sd).sum() < len(sd) or (sd <= 1 / LARGEST).any():
         raise DataError(

@@ -132,6 +132,8 @@ def test_as_many_stresses_as_numbers_say_nothing_of_their_noise():
 def test_a_specimen_at_an_angle_is_a_material_that_is_turned():
     fibre = {"E": E, "nu": NU, "fibre_stiffness": 1e4, "fibre_exponent": 1.0, "dispersion": 0.1}
     states = rows("biaxial xy", LENGTHS[1:4], 1.1, angle=30.0)
+    with pytest.warns(UserWarning, match="angle: expected degrees, found 0.7854, which is 45"):
+        predicted("hgo", {**fibre, "fibre": [1, 0, 0]}, [dict(states[0], angle=0.7854)])
     turned = [np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0]
     cut = predicted("hgo", {**fibre, "fibre": turned}, states)
     along = predicted("hgo", {**fibre, "fibre": [1, 0, 0]}, rows("biaxial xy", LENGTHS[1:4], 1.1))

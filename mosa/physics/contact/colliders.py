@@ -280,6 +280,16 @@ TURNS = (30, 45, 60, 90, 120, 135, 180, 270, 360)
 """[degrees] whose radians are asked about."""
 
 
+def warn_of_radians(where: str, angle: float, stacklevel: int) -> None:
+    """Of an angle [degrees] that is one of `TURNS` in radians."""
+    for each in TURNS:
+        if abs(abs(angle) / math.radians(each) - 1) < 1e-3:
+            warnings.warn(
+                f"{where}: expected degrees, found {angle:g}, which is {each} degrees in radians",
+                stacklevel=stacklevel,
+            )
+
+
 def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
     """Rotation vector (3,) [rad] of (ax, ay, az, degrees). Errors: ConfigError, also for a
     quaternion: four numbers of norm 1 whose first three are no unit axis (0.05 to 0.99)."""
@@ -298,13 +308,7 @@ def axis_degrees(value: Sequence[float] | Tensor | None) -> Tensor:
     if float(value[3]) == 0 and int((value != 0).sum()) > 1 and abs(float(value.norm()) - 1) < 1e-3:
         told = f"rotation: {value.tolist()} turns by 0 degrees: was it a quaternion?"
         warnings.warn(told, stacklevel=5)
-    found = [abs(float(value[3])) / math.radians(each) for each in TURNS]
-    if near := [each for each, ratio in zip(TURNS, found) if abs(ratio - 1) < 1e-3]:
-        warnings.warn(
-            f"rotation: expected degrees, found {float(value[3]):g}, which is {near[0]} degrees in "
-            "radians",
-            stacklevel=5,
-        )
+    warn_of_radians("rotation", float(value[3]), stacklevel=6)
     return value[:3] / value[:3].norm() * torch.deg2rad(value[3])
 
 
