@@ -124,17 +124,23 @@ class Fitting:
         self.law.set(theta)
         return self.specimens.predict(self.law.material, self.law.adapter)
 
-    def fit(self, rows: np.ndarray | None = None) -> Fit:
-        """The best of all starts on the stresses `rows` (m,) bool, or all; `predicted` is of all of them."""
-        rows = np.ones(len(self.data.value), bool) if rows is None else rows
-        noise, sigma = 0.1, SIGMA if self.evidence else UNKNOWN
+    def among(self, stresses: np.ndarray) -> Fitting:
+        """The same, of those `stresses` (m,) bool alone."""
+        found = copy.copy(self)
+        found.data, found.sd = self.data.only(stresses), self.sd[stresses]
+        found.specimens = Specimens(found.data, self.specimens.incompressible, self.specimens.true)
+        return found
+
+    def fit(self, whole: bool = True) -> Fit:
+        """The best of all starts; whole: also of those farther away, and with `Fit.simulated`."""
+        noise, sigma, count = 0.1, SIGMA if self.evidence else UNKNOWN, len(self.data.value)
 
         def residuals(theta: np.ndarray, noise: float, sigma: float) -> np.ndarray:
             try:
-                misfit = (self.predicted(theta) - self.data.value)[rows] / self.sd[rows]
+                misfit = (self.predicted(theta) - self.data.value) / self.sd
                 misfit = np.clip(misfit, -HOPELESS, HOPELESS)
             except SimulationDiverged:
-                misfit = np.full(int(rows.sum()), HOPELESS)
+                misfit = np.full(count, HOPELESS)
             prior = self.root @ (theta - self.mean)
             return np.concatenate([misfit / noise, theta[self.own] / sigma, prior])
 
@@ -142,19 +148,19 @@ class Fitting:
             ends = {"diff_step": 1e-6, "ftol": 1e-7, "xtol": 1e-7, "max_nfev": evaluations}
             return least_squares(residuals, theta, args=(noise, sigma), **ends)
 
-        best = min((solve(theta, 60) for theta in self.drawn(rows)), key=lambda found: found.cost)
+        best = min((solve(theta, 60) for theta in self.drawn()), key=lambda found: found.cost)
         near = best.cost
-        for theta in self.looked_at(rows) if rows.all() else ():
+        for theta in self.looked_at() if whole else ():
             if (residuals(theta, noise, sigma) ** 2).sum() < 2 * best.cost:
                 best, self.begin = solve(theta, 60), theta
         if best.cost < near:
             log.info("prior.parameters: a start far from there leads nearer to the tests")
-        if best.cost >= 0.5 * rows.sum() * (HOPELESS / noise) ** 2:
+        if best.cost >= 0.5 * count * (HOPELESS / noise) ** 2:
             where = "in these tests at any start; start prior.parameters elsewhere"
             raise SimulationDiverged(f"the law has no stress {where}")
         for _ in range(LOOKS):
             before = noise, sigma
-            J, misfit = best.jac[: rows.sum()] * noise, best.fun[: rows.sum()] * noise
+            J, misfit = best.jac[:count] * noise, best.fun[:count] * noise
             prior = np.diag(self.own / sigma**2) + self.root.T @ self.root
             known = J.T @ J / noise**2 + prior
             covariance = np.linalg.inv(known + UNKNOWN**-2 * np.eye(len(prior)))
@@ -176,7 +182,7 @@ class Fitting:
         scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
         told = self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
         own, free = self.specimens, None
-        if own.incompressible and rows.all():
+        if own.incompressible and whole:
             try:
                 free = Specimens(self.data, False, own.true).predict(
                     self.law.material, self.law.adapter
@@ -185,34 +191,34 @@ class Fitting:
                 free = np.full(len(self.data.value), np.nan)
         return Fit(*told, free, own.true)
 
-    def scaled(self, theta: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def scaled(self, theta: np.ndarray) -> np.ndarray:
         """With its moduli scaled to the tests, where they then have the sign of the tests."""
         moduli = ("E", "mu", "kappa", "fibre_stiffness")
         names = enumerate(self.law.names)
         stiff = [i for i, n in names if n in moduli[:3] or n.startswith(moduli[3])]
         try:
-            found = self.predicted(theta)[rows] / self.sd[rows]
+            found = self.predicted(theta) / self.sd
         except SimulationDiverged:
             return theta
         with np.errstate(over="ignore", invalid="ignore"):  # of an exponential law far away
-            factor = found @ (self.data.value / self.sd)[rows] / (found @ found)
+            factor = found @ (self.data.value / self.sd) / (found @ found)
         theta = theta.copy()
         theta[stiff] += np.log(factor) if 0 < factor < math.inf else 0.0
         return theta
 
-    def drawn(self, rows: np.ndarray) -> list[np.ndarray]:
+    def drawn(self) -> list[np.ndarray]:
         """Starts: the configured one with its stiffness scaled to the tests, and others about it."""
-        theta = self.scaled(self.begin, rows)
+        theta = self.scaled(self.begin)
         generator = np.random.default_rng(self.seed)
         spread = np.where(self.own, 0.1, SPREAD)
         drawn = (generator.standard_normal(len(theta)) for _ in range(self.starts - 1))
         return [theta, *(theta + spread * each for each in drawn)]
 
-    def looked_at(self, rows: np.ndarray) -> list[np.ndarray]:
+    def looked_at(self) -> list[np.ndarray]:
         """Starts farther away, each scaled: a fit goes on from one only if that is better than all that the others led to."""
         draws = np.random.default_rng(self.seed).standard_normal((LOOKED_AT, len(self.begin)))
         theta = self.begin + np.where(self.own, 0.1, FAR) * draws
-        return [self.scaled(each, rows) for each in theta]
+        return [self.scaled(each) for each in theta]
 
     def other_reading(self) -> float | None:
         """How many times as far from the tests the law ends where they are read as true stress in place of nominal, or the
@@ -232,9 +238,14 @@ class Fitting:
         return errors[1] / errors[0]
 
     def left_out(self) -> dict[str, np.ndarray]:
-        """By test: its stresses (m_test,) [Pa] as predicted by a fit to all others."""
+        """By test: its stresses (m_test,) [Pa] as predicted by a fit to all others, which knows nothing of it, nor whether the law
+        has a stress there; NaN where it, or the others' fit, has none."""
         result = {}
         for k, name in enumerate(self.data.names):
             rows = self.data.without(k)
-            result[name] = self.fit(rows).predicted[~rows]
+            try:
+                theta = self.among(rows).fit(whole=False).theta
+                result[name] = self.among(~rows).predicted(theta)
+            except SimulationDiverged:
+                result[name] = np.full(int((~rows).sum()), np.nan)
         return result

@@ -17,7 +17,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from warnings import warn
@@ -58,6 +58,13 @@ class Measurements:
     def without(self, test: int) -> np.ndarray:
         """(m,) bool: the stresses of the other tests."""
         return self.test[self.row] != test
+
+    def only(self, stresses: np.ndarray) -> Measurements:
+        """Those `stresses` (m,) bool, and their states alone."""
+        states, row = np.unique(self.row[stresses], return_inverse=True)
+        parts = {k: getattr(self, k)[states] for k in ("test", "kind", "axes", "angle", "given")}
+        parts |= {k: getattr(self, k)[stresses] for k in ("component", "value", "sd")}
+        return replace(self, row=row, **parts)
 
 
 def strained(data: Measurements) -> float:

@@ -179,6 +179,21 @@ def test_numbers_are_recovered_with_their_uncertainty():
     assert rms(left["shear xy"] - fitting.data.value[~fitting.data.without(2)]) < 2 * 200
 
 
+def test_a_test_that_is_left_out_says_nothing():
+    """Nor that the law has no finite stress there: exp(60 e^2) at twice the length, which tests to 1.15 do not know."""
+    law = {"E": 2e4, "nu": 0.45, "fibre_stiffness": 5e3, "fibre_exponent": 60.0, "dispersion": 0.0, "fibre": [1, 0, 0]}  # fmt: skip
+    states = [*rows("uniaxial x", np.linspace(1.02, 1.15, 6)), *rows("shear xy", np.array([0.2, 0.4]), 0.0)]  # fmt: skip
+    for state, P in zip(states, predicted("hgo", law, states)):
+        state["stress_1"] = P
+    states += [dict(r, stress_1=1e5) for r in rows("biaxial xy", np.array([2.0, 2.2]))]
+    start = Law(Material("hgo", law, ["nu", "fibre", "fibre_stiffness"]), None, "full")
+    fitting = Fitting(start, measurements(states, "Pa", "here"), True, starts=1, seed=0)
+    left = fitting.left_out()
+    assert np.isnan(left["biaxial xy"]).all() and set(left) == set(fitting.data.names)
+    fit = fitting.among(fitting.data.without(2)).fit(whole=False)
+    assert fit.predicted == pytest.approx(fitting.data.value[:8], rel=1e-3)
+
+
 def test_two_halves_of_the_tests_say_what_all_of_them_say(tmp_path):
     """Through material.json, each half with its own noise; the numbers are correlated. A film's fit
     takes the same file, by the names that it gives its numbers."""
