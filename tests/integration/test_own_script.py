@@ -140,6 +140,8 @@ def test_what_lightning_s_callbacks_left(fitted):
         and "id/E" in rows
     )
     assert (folder / "best.ckpt").is_file() and (folder / "last.ckpt").is_file()
+    # the one that `ckpt_path="best"` asks, not the module's own callback
+    assert Path(trainer.checkpoint_callback.best_model_path) == folder / "best.ckpt"
     assert trainer.current_epoch >= sum(stage.iterations for stage in module.stages if stage.newton)
 
 

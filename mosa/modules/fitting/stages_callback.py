@@ -73,6 +73,10 @@ class Stages(Checkpoint):
         if over:
             self.announce(trainer, pl_module)
 
+    def teardown(self, trainer: L.Trainer, pl_module: Any, stage: str) -> None:
+        """Leaves with the run: the first `Checkpoint` is `trainer.checkpoint_callback`, whose path `ckpt_path="best"` takes."""
+        trainer.callbacks = [each for each in trainer.callbacks if each is not self]  # type: ignore[attr-defined]  # as above
+
     def advance(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Ends the running stage; the next one gets its optimiser."""
         pl_module.finish()
