@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
+from lightning.pytorch.callbacks import EarlyStopping
+from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 
 from mosa import compose
 from mosa.config.checkpoints import check_plain
 from mosa.errors import ConfigError
 from mosa.modules.fitting.stages import Stage
+from mosa.modules.fitting.stages_callback import Stages
 from mosa.training.callbacks import KeepLast, Pace, StageNotes
 from mosa.training.fitting import build_trainer
 from mosa.training.run_folder import quiet
@@ -84,6 +87,41 @@ def test_stages_are_noted_when_they_begin_and_end(caplog):
         " s: loss 0.25000, E 2e+05"
     )
     assert said[3].startswith("stage joint: ended after 1 steps, ") and len(said) == 4
+
+
+def ended_epoch(fit, stage_over, metric, **stopper):
+    """(callback, trainer) after the epoch's end of a fit, whose stopper has just seen a metric."""
+    each = EarlyStopping("val/loss", **stopper)
+    each.best_score, seen = torch.tensor(0.5), torch.tensor(metric)
+    trainer = SimpleNamespace(callbacks=[each], enable_validation=False)
+    trainer.should_stop = each._evaluate_stopping_criteria(seen)[0]
+    fit.stage_over = stage_over
+
+    def finish():
+        fit.stage_index, fit.stage_over = fit.stage_index + 1, False
+
+    fit.finish, trainer.strategy = finish, SimpleNamespace(setup_optimizers=lambda _: None)
+    trainer.should_stop = trainer.should_stop or metric == 0.1  # as by a limit of time
+    Stages().on_train_epoch_end(trainer, fit)
+    return each, trainer
+
+
+@pytest.mark.parametrize(
+    "metric, how", [(0.4, {"stopping_threshold": 0.45}), (9.0, {"divergence_threshold": 1.0}), (float("inf"), {}),
+                    (0.6, {"patience": 1})]
+)  # fmt: skip
+def test_whatever_a_stopper_stops_for_ends_the_stage(metric, how):
+    """Its thresholds, and an infinite loss of a law that cannot be simulated, ended the fit."""
+    each, trainer = ended_epoch(fit := Fit(), False, metric, **how)
+    assert fit.stage_index == 1 and not trainer.should_stop
+    assert each.stopping_reason == EarlyStoppingReason.NOT_STOPPED and each.wait_count == 0
+
+
+@pytest.mark.parametrize("stage_over", [True, False])
+def test_what_others_stop_for_ends_the_fit(stage_over):
+    """A stop in the last epoch of a stage was forgotten."""
+    _, trainer = ended_epoch(fit := Fit(), stage_over, 0.1)
+    assert fit.stage_index == stage_over and trainer.should_stop
 
 
 @pytest.mark.parametrize("value", [Path("a"), np.float64(1), np.ones(1), {1.0}, defaultdict(int)])

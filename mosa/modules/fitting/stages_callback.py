@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
+from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 
 from mosa.data.batches import Epochs
+
+
+def asked(stoppers: Iterable[EarlyStopping]) -> bool:
+    """Whether one of them asks for a stop: its patience is over, or its metric is beyond a threshold or not finite."""
+    return any(each.stopping_reason != EarlyStoppingReason.NOT_STOPPED for each in stoppers)
 
 
 class Stages(Checkpoint):
@@ -56,7 +63,7 @@ class Stages(Checkpoint):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning declares no type
         stoppers = [each for each in callbacks if isinstance(each, EarlyStopping)]
-        if trainer.should_stop and any(each.wait_count >= each.patience for each in stoppers):
+        if trainer.should_stop and asked(stoppers):
             pl_module.stage_over = True
         over = pl_module.stage_over
         if over:
@@ -64,9 +71,12 @@ class Stages(Checkpoint):
         if self.unseen:
             self.validate(trainer)
         if over and pl_module.stage is not None:
-            trainer.should_stop = False
+            # the validation above may have asked too; what others ask for, as a limit of time, ends the fit
+            if asked(stoppers):
+                trainer.should_stop = False
             for each in stoppers:
                 each.wait_count, each.stopped_epoch = 0, 0
+                each.stopping_reason = EarlyStoppingReason.NOT_STOPPED
                 each.best_score = torch.tensor(
                     torch.inf if each.monitor_op == torch.lt else -torch.inf
                 )
