@@ -96,6 +96,14 @@ class SceneDataModule(L.LightningDataModule):
                 "films of any format (docs/own_training_script.md, 'Films in a format of your own')"
             )
 
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *_: Any, **__: Any) -> SceneDataModule:
+        """Errors: ConfigError. Lightning would make a data module of the default scene."""
+        raise ConfigError(
+            "SceneDataModule.load_from_checkpoint: expected the configuration of a run, found its checkpoint, which holds no data; "
+            f"SceneDataModule(LitMosa.load_from_checkpoint({str(checkpoint_path)!r}).cfg)"
+        )
+
     # ---------------------------------------------------------------- Lightning's hooks
     def prepare_data(self) -> None:
         """Makes the films of a built-in scene that are not in the cache, or reads those of a folder, and keeps nothing in memory.

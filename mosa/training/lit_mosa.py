@@ -200,11 +200,11 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if isinstance(data, SceneDataModule):
             if stage != "fit":
                 self.attach(data, fitting=stage == "validate")
-        elif self.body is None:
+        elif self.body is None or (stage in ("fit", "validate") and not self.takes):
             raise ConfigError(
-                "LitMosa: expected a SceneDataModule, which knows the particles of the body "
-                "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or a module from load_from_checkpoint, "
-                f"found {type(data).__name__ if data is not None else 'neither'}; a "
+                "LitMosa: expected a SceneDataModule, which knows the particles of the body and its films "
+                "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or for test and predict a module from "
+                f"load_from_checkpoint, found {type(data).__name__ if data is not None else 'neither'}; a "
                 "loader reads films in a format of your own (docs/extending.md, 'A data format')"
             )
         # what is saved at the end of an epoch belongs to the stage that comes next
@@ -487,15 +487,20 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(
-        cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **unused
+        cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **given
     ) -> LitMosa:
         """The module of a checkpoint, in evaluation mode: body, world, configuration and progress of its fit, which `trainer.fit`
         with the scene's data module resumes.
 
         The file is read as data (docs/safety.md); Lightning's other arguments (`strict`, `hparams_file`, ...) change nothing.
-        Errors: DataError naming the file."""
+        Errors: DataError naming the file, ConfigError for hyperparameters in place of the checkpoint's."""
         from mosa.twin.twin import Twin
 
+        if other := set(given).difference(("hparams_file", "strict", "weights_only")):
+            raise ConfigError(
+                f"load_from_checkpoint: expected no hyperparameters, which the checkpoint has, found {', '.join(sorted(other))}; "
+                "trainer.fit(LitMosa(cfg), datamodule=data, ckpt_path=...) goes on with another configuration"
+            )
         twin = Twin.load(checkpoint_path, "cpu" if map_location is None else map_location)
         module = cls.from_record(twin.record, twin.body, takes=(), background=torch.ones(3))
         module.on_load_checkpoint(read_checkpoint(checkpoint_path))

@@ -72,3 +72,23 @@ def test_a_loader_that_makes_batches_of_starts_is_named(tmp_path):
         trainer.predict(module, dataloaders=DataLoader(starts))
     (found,) = trainer.predict(module, dataloaders=DataLoader(starts, batch_size=None))
     assert len(found.x) == 2
+
+
+def test_a_checkpoint_takes_no_hyperparameters_and_is_no_data(tmp_path):
+    """Those of the call changed nothing, and the data were of the rabbit, whatever the checkpoint's scene."""
+    path = checkpoint(tmp_path / "tiny.ckpt")
+    with pytest.raises(ConfigError, match=r"expected no hyperparameters.* found cfg, lr; "):
+        LitMosa.load_from_checkpoint(path, strict=True, lr=1, cfg={})
+    with pytest.raises(ConfigError, match=r"SceneDataModule\(LitMosa\.load.*tiny\.ckpt'\)\.cfg\)"):
+        SceneDataModule.load_from_checkpoint(path)
+    cfg = LitMosa.load_from_checkpoint(path, strict=True).cfg
+    assert SceneDataModule(cfg).cfg.scene.name == "tiny"
+
+
+def test_a_checkpoint_is_fitted_on_with_a_data_module_alone(tmp_path):
+    """Batches without it ended in an IndexError, or in a message about another configuration."""
+    module = LitMosa.load_from_checkpoint(checkpoint(tmp_path / "tiny.ckpt"))
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    for run in (trainer.fit, trainer.validate):
+        with pytest.raises(ConfigError, match=r"^LitMosa: expected a SceneDataModule.*its films"):
+            run(module, DataLoader([0]))
