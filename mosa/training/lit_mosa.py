@@ -35,6 +35,7 @@ from mosa.config.checkpoints import (
     check_plain,
     check_same_data,
     check_same_scene,
+    differing,
     known_numbers,
     listed,
     other_scene,
@@ -84,6 +85,12 @@ KEPT = (
     "steps_done", "stage_over", "moves", "misfit", "compared", "grounds", "ground_gains", "law_gains", "parts",
 )  # fmt: skip
 """What a checkpoint has of the fit under the same name (`FitRecord`)."""
+
+
+def other_reading(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Keys beside the scene's that differ, of which the fit takes the data module's: those of a module would do nothing."""
+    read = ("seed", "reconstruction.", "rendering.", "simulation.particles_per_cell", "fit.views")
+    return [each for each in differing(one, other) if each[0].startswith(read)]
 
 
 def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
@@ -218,7 +225,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         here = plain(data.cfg) if hasattr(data, "cfg") else {}
         if self.record is not None and here:
             check_same_scene(self.record, here, "the module")
-        elif found := other_scene(self.cfg, here):
+        elif found := [*other_scene(self.cfg, here), *other_reading(self.cfg, here)]:
             raise ConfigError(
                 f"LitMosa, {type(data).__name__}: expected one configuration for both, found {listed(found)}"
             )

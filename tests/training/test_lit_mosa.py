@@ -53,9 +53,11 @@ def test_a_fit_goes_on_with_its_own_scene_alone(tmp_path, monkeypatch, other):
         )
 
 
-@pytest.mark.parametrize("other", ["scene.holdout_cameras=[1]", "simulation.particles=150"])
+@pytest.mark.parametrize("other", ["scene.holdout_cameras=[1]", "simulation.particles=150", "seed=1",
+                                   "reconstruction.resolution=64", "rendering.margin=9", "fit.views=3"])  # fmt: skip
 def test_module_and_data_have_one_configuration(monkeypatch, other):
-    """A camera that the module held out was learned from, and its settings named another body than its own."""
+    """A camera that the module held out was learned from, its settings named another body than its own, and modules of several
+    seeds had one, the data's."""
     trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     data = SceneDataModule("debug=default")
     monkeypatch.setattr(datamodule, "load_sequences", lambda _: pytest.fail("the films were made"))
