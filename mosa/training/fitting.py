@@ -60,7 +60,7 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
     """What `entry` describes, by Hydra. Only conf/ and the command line are ever made so, never what a checkpoint holds. Errors:
     ConfigError."""
     try:
-        return instantiate(entry, **arguments)
+        return instantiate(entry, _convert_="all", **arguments)
     except Exception as error:
         hydras = isinstance(error, InstantiationException)
         cause = error.__cause__ or error if hydras else error
@@ -97,6 +97,16 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
     own = {"logger": loggers or False, "callbacks": callbacks, "default_root_dir": str(folder)}
     own["plugins"] = [AtomicCheckpointIO(), LightningEnvironment()]
+    ways = {
+        "logger": "logger=<option>",
+        "callbacks": "callbacks=<option>",
+        "default_root_dir": "hydra.run.dir=<folder>",
+    }
+    for name in own.keys() & given.keys():
+        way = ways.get(name, "a script of your own takes any (docs/own_training_script.md)")
+        raise ConfigError(
+            f"trainer.{name}: expected none, as the run gives its own, found {given[name]!r}; {way}"
+        )
     trainer = made("trainer", cfg.trainer, **own)
     check_trainer(trainer, given.get("precision"))
     check_monitors(cfg, callbacks)

@@ -24,7 +24,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.callbacks import Checkpoint, GradientAccumulationScheduler
 from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
@@ -105,11 +105,27 @@ def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
             f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {precision or trainer.precision!r}: the "
             "simulation is single precision, or double by simulation.precision=64"
         )
-    if trainer.accumulate_grad_batches != 1:  # the schedule of views counts a batch as a step
+    accumulators = [c for c in trainer.callbacks if isinstance(c, GradientAccumulationScheduler)]
+    if (
+        trainer.accumulate_grad_batches != 1 or accumulators
+    ):  # the schedule of views counts a batch as a step
+        found = type(accumulators[0]).__name__ if accumulators else trainer.accumulate_grad_batches
         raise ConfigError(
-            f"trainer.accumulate_grad_batches: expected 1, found {trainer.accumulate_grad_batches}: "
-            "fit.views says how many views a step reads"
+            f"trainer.accumulate_grad_batches: expected 1, found {found}: fit.views says how many views a step reads"
         )
+    for name, most in (
+        ("min_steps", 0),
+        ("min_epochs", 1),
+    ):  # Lightning would wait for steps that no stage makes
+        if (found := getattr(trainer, name) or 0) > most:
+            raise ConfigError(
+                f"trainer.{name}: expected none, found {found}: the last stage ends the fit, and fit.<stage>.iterations a stage"
+            )
+    for name in ("limit_train_batches", "val_check_interval"):
+        if isinstance(found := getattr(trainer, name), float) and found != 1:
+            raise ConfigError(
+                f"trainer.{name}: expected a whole number of batches, found {found}: the epochs of stages differ in length"
+            )
 
 
 class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):

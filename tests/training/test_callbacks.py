@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import EarlyStopping
+from lightning.pytorch.callbacks import EarlyStopping, Timer
 from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 
 from mosa import compose
@@ -139,11 +139,30 @@ def test_a_state_that_a_checkpoint_could_not_be_read_with_is_named(value):
     ("trainer.precision=16-mixed", r"trainer\.precision: .*found '16-mixed'"),
     ("trainer.max_epochs=many", r"trainer\.max_epochs: expected a whole number, or null, found 'many'"),
     ("+trainer.accumulate_grad_batches=2", r"trainer\.accumulate_grad_batches: expected 1, found 2"),
+    ("+callbacks.more={_target_: lightning.pytorch.callbacks.GradientAccumulationScheduler, scheduling: {0: 2}}",
+     r"trainer\.accumulate_grad_batches: expected 1, found GradientAccumulationScheduler: fit\.views"),
+    ("+trainer.min_steps=9", r"trainer\.min_steps: expected none, found 9: the last stage ends"),
+    ("+trainer.min_epochs=2", r"trainer\.min_epochs: expected none, found 2"),
+    ("+trainer.limit_train_batches=0.5", r"trainer\.limit_train_batches: expected a whole number of batches, found 0\.5"),
+    ("+trainer.val_check_interval=0.5", r"trainer\.val_check_interval: expected a whole number of batches, found 0\.5"),
+    ("+trainer.logger=false", r"trainer\.logger: expected none.*found False; logger=<option>"),
+    ("+trainer.callbacks=[]", r"trainer\.callbacks: expected none.*; callbacks=<option>"),
+    ("+trainer.default_root_dir=a", r"trainer\.default_root_dir: expected none.*'a'; hydra\.run\.dir"),
+    ("+trainer.plugins=[a]", r"trainer\.plugins: expected none.*own_training_script"),
     ("+trainer.maxtime=1", r"trainer\.maxtime: unknown key; .*nearest is trainer\.max_time"),
 ])  # fmt: skip
 def test_a_trainer_that_no_fit_can_do_with_is_refused_before_the_data(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message):
         build_trainer(compose("debug=default", "logger=none", override), tmp_path)
+
+
+def test_an_argument_may_be_a_section(tmp_path):
+    """Lightning's own form of a duration; it was a DictConfig, which ended in "Missing key total_seconds"."""
+    cfg = compose(
+        "debug=default", "logger=none", "+trainer.max_time={hours: 1}", "+trainer.min_epochs=1"
+    )
+    (timer,) = (c for c in build_trainer(cfg, tmp_path).callbacks if isinstance(c, Timer))
+    assert timer._duration == 3600
 
 
 def test_a_profiler_that_was_asked_for_is_heard():
