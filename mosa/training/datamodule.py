@@ -35,6 +35,7 @@ from mosa.errors import ConfigError
 from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
 from mosa.evaluation.evaluate import sequences
 from mosa.modules.fitting.training_sequences import Take
+from mosa.physics import exact_sums
 from mosa.physics.world import Start
 from mosa.reconstruction.marker_body import (
     followed_by_markers,
@@ -81,6 +82,8 @@ class SceneDataModule(L.LightningDataModule):
         super().__init__()
         self.cfg = composed(scene, overrides)
         self.settings = DataSections.part(plain(self.cfg))
+        if self.cfg.get("deterministic"):
+            exact_sums.use()
         self.device, self.held_out, self.predict = device, held_out, list(predict)
         self._ahead: Future[list[Scene]] | None = None
 

@@ -66,6 +66,7 @@ from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.stages_callback import Stages
 from mosa.modules.fitting.terms import check_terms
 from mosa.modules.fitting.training_sequences import Take, seen_again, with_positions
+from mosa.physics import exact_sums
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
 from mosa.rendering.observer import Views, deformed_covariances, observe
@@ -143,6 +144,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
         if self.cfg:
             settings = TrainSettings.read(self.cfg)
+            if settings.deterministic:
+                exact_sums.use()
             if not isinstance(first, dict):  # the command line's, which preflight has seen
                 given = [each for each in (first, *overrides) if isinstance(each, str)]
                 warn_without_effect(settings, rehearse(settings), given)

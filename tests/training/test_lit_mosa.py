@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 from mosa import SceneDataModule
 from mosa.errors import ConfigError
 from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.physics import exact_sums
 from mosa.training import datamodule, lit_mosa
 from mosa.training.lit_mosa import LitMosa
 
@@ -94,3 +95,15 @@ def test_a_checkpoint_is_fitted_on_with_a_data_module_alone(tmp_path):
     for run in (trainer.fit, trainer.validate):
         with pytest.raises(ConfigError, match=r"^LitMosa: expected a SceneDataModule.*its films"):
             run(module, DataLoader([0]))
+
+
+@pytest.mark.parametrize("made", [LitMosa, SceneDataModule])
+def test_a_script_has_the_same_bits_too(made):
+    """The key was train.py's alone: a script on a GPU had others in every run."""
+    try:
+        made("scene=tiny", "debug=default")
+        assert not torch.are_deterministic_algorithms_enabled()
+        made("scene=tiny", "debug=default", "deterministic=true")
+        assert torch.are_deterministic_algorithms_enabled()
+    finally:
+        exact_sums.use(False)
