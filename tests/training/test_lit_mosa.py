@@ -1,5 +1,6 @@
 """The LightningModule apart from a fit."""
 
+import warnings
 from types import SimpleNamespace
 
 import lightning as L
@@ -11,6 +12,7 @@ from torch.utils.data import DataLoader
 from mosa import SceneDataModule
 from mosa.errors import ConfigError
 from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.stages import Stage
 from mosa.physics import exact_sums
 from mosa.training import datamodule, lit_mosa
 from mosa.training.lit_mosa import LitMosa
@@ -107,3 +109,16 @@ def test_a_script_has_the_same_bits_too(made):
         assert torch.are_deterministic_algorithms_enabled()
     finally:
         exact_sums.use(False)
+
+
+def test_a_bound_of_gradients_that_gauss_newton_has_not_is_named():
+    module, adam = LitMosa({}), Stage(name="prior", iterations=1, lr=0.1, optimizer="adam")
+    few = adam.but(optimizer="gauss_newton")
+    module.stages = [few, few]
+    with pytest.warns(UserWarning, match=r"trainer\.gradient_clip_val: has no effect in this run"):
+        module.configure_gradient_clipping(None, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        module.configure_gradient_clipping(None)
+        module.stages = [few, adam]
+        module.configure_gradient_clipping(None, 0.5)

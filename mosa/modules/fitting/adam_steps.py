@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -218,6 +219,11 @@ class GradientSteps:
     ) -> None:
         """The networks' groups are clipped at fit.clip, then all of them as Trainer(gradient_clip_val) asks."""
         if self.stage is None or self.stage.newton:
+            if gradient_clip_val and all(stage.newton for stage in self.stages):
+                warnings.warn(
+                    "trainer.gradient_clip_val: has no effect in this run: all stages run Gauss-Newton, which has no gradient",
+                    stacklevel=1,
+                )
             return
         self.norms = self.clip_networks(self.running_optimizer)
         self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
