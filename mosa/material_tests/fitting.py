@@ -168,9 +168,8 @@ class Fitting:
             determined, effective = shares[self.own], float(shares.sum())
             spare = len(misfit) - effective
             noise = float(np.sqrt((misfit**2).sum() / max(spare, 1.0) + LEAST**2))
-            if (
-                spare < 1
-            ):  # as many numbers as stresses: a law that meets them all says nothing of their noise
+            # as many numbers as stresses: a law that meets them all says nothing of their noise
+            if spare < 1:
                 noise = max(noise, RELATIVE if np.isnan(self.data.sd).any() else 1.0)
             if self.own.any() and self.evidence:
                 own = (best.x[self.own] ** 2).sum() / max(determined.sum(), 1e-3)

@@ -107,17 +107,14 @@ def check_trainer(trainer: L.Trainer, precision: Any = None) -> None:
             "simulation is single precision, or double by simulation.precision=64"
         )
     accumulators = [c for c in trainer.callbacks if isinstance(c, GradientAccumulationScheduler)]
-    if (
-        trainer.accumulate_grad_batches != 1 or accumulators
-    ):  # the schedule of views counts a batch as a step
+    # the schedule of views counts a batch as a step
+    if trainer.accumulate_grad_batches != 1 or accumulators:
         found = type(accumulators[0]).__name__ if accumulators else trainer.accumulate_grad_batches
         raise ConfigError(
             f"trainer.accumulate_grad_batches: expected 1, found {found}: fit.views says how many views a step reads"
         )
-    for name, most in (
-        ("min_steps", 0),
-        ("min_epochs", 1),
-    ):  # Lightning would wait for steps that no stage makes
+    # Lightning would wait for steps that no stage makes
+    for name, most in (("min_steps", 0), ("min_epochs", 1)):
         if (found := getattr(trainer, name) or 0) > most:
             raise ConfigError(
                 f"trainer.{name}: expected none, found {found}: the last stage ends the fit, and fit.<stage>.iterations a stage"
