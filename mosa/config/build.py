@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import mosa.config.composition  # noqa: F401  registers what conf/ refers to
-from mosa.config.checkpoints import known_numbers
 from mosa.config.command_settings import TrainSettings
+from mosa.config.known_numbers import known_numbers
 from mosa.config.record import BodyRecord
 from mosa.data.io.forces import columns_of, forces_from_config
 from mosa.data.sequences import further_names

@@ -54,16 +54,19 @@ class Sequence:
     contact: int
 
     @property
+    def learned(self) -> bool:
+        """Whether it is learned from."""
+        return self.prefix.startswith("train")
+
+    @property
     def frames(self) -> list[int]:
         """That are learned from, of a held-out sequence all."""
-        learned = self.prefix.startswith("train")
-        return self.scene.training_frames if learned else list(range(self.scene.frames))
+        return self.scene.training_frames if self.learned else list(range(self.scene.frames))
 
     @property
     def cameras(self) -> list[int]:
         """That are learned from, of a held-out sequence all."""
-        learned = self.prefix.startswith("train")
-        return self.scene.training_cameras if learned else list(range(len(self.scene.cameras)))
+        return self.scene.training_cameras if self.learned else list(range(len(self.scene.cameras)))
 
     @cached_property
     def boxes(self) -> Boxes:

@@ -23,7 +23,7 @@ def filmed(sequences: Ordered[Sequence]) -> list[str]:
     lines = []
     for s in sequences:
         scene, dt = s.scene, s.scene.frame_dt
-        learned = s.prefix.startswith("train")
+        learned = s.learned
         cameras = scene.training_cameras if learned else scene.cameras
         made = "simulated by this program, no capture" if scene.synthetic else "footage"
         lines.append(
@@ -47,7 +47,7 @@ Kept = Mapping[str, Mapping[str, Rollout]]  # by prefix and variant
 
 def valid(sequences: Ordered[Sequence], kept: Kept, body: Body, world: World) -> list[str]:
     """What the motions covered that the law was learned from."""
-    trained = [s for s in sequences if s.prefix.startswith("train")]
+    trained = [s for s in sequences if s.learned]
     # without the frames that are held out
     seen = [(kept[s.prefix]["adapted"], s.frames) for s in trained if "adapted" in kept.get(s.prefix, {})]  # fmt: skip
     lines = []

@@ -120,8 +120,8 @@ def spread_of(
     own: Tensor, drawn: Ordered[Tensor], others: Ordered[Tensor], posterior: Posterior, s: Sequence
 ) -> Tensor:
     """`total_spread` on a sequence of points (T, N, 3) [m] that the law, its draws and its rivals predict."""
-    forms, seen = among_forms(own, others), s.prefix.startswith("train")
-    return total_spread(torch.stack([*drawn]), posterior.model_error, forms, seen=seen)
+    forms = among_forms(own, others)
+    return total_spread(torch.stack([*drawn]), posterior.model_error, forms, seen=s.learned)
 
 
 Predicted = TypeVar("Predicted")

@@ -234,7 +234,7 @@ def written(law: Law, fit: Fit, note: str = "") -> dict[str, Any]:
     """The material as plain data, with the posterior of the unconstrained numbers; note: a warning of `mosa-export-law`."""
     numbers = {"theta": fit.theta.tolist(), "covariance": fit.covariance.tolist()}
     # the angles of a direction count from where it began, and not from the one that was found
-    begins = {name: getattr(law.material, f"frame_{name}")[0].tolist() for name in law.material.directions}  # fmt: skip
+    begins = {name: law.material.begin_of(name).tolist() for name in law.material.directions}
     posterior = {"names": list(fit.names), "begins": begins} | numbers
     return described(law.material, law.adapter) | {"posterior": posterior, "note": note}
 

@@ -9,8 +9,8 @@ from warnings import warn
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.config.build import build_adapter, build_prior, plain
-from mosa.config.checkpoints import known_numbers
 from mosa.config.extensions import load_extensions
+from mosa.config.known_numbers import known_numbers
 from mosa.config.leaf_settings import MaterialSettings
 from mosa.data.formats.scene_from_footage import check_density
 from mosa.errors import ConfigError

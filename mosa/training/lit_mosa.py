@@ -36,7 +36,6 @@ from mosa.config.checkpoints import (
     check_same_data,
     check_same_scene,
     differing,
-    known_numbers,
     listed,
     other_scene,
     read_checkpoint,
@@ -44,6 +43,7 @@ from mosa.config.checkpoints import (
 from mosa.config.command_settings import TrainSettings
 from mosa.config.composition import composed
 from mosa.config.effects import warn_without_effect
+from mosa.config.known_numbers import known_numbers
 from mosa.config.record import BodyRecord, FitRecord, RunRecord
 from mosa.data.batches import MotionBatch
 from mosa.data.observations import Observations

@@ -539,17 +539,16 @@ def _worlds(
     own = first.law.name, first.substeps, first.frame_dt, world, first.numerics.energetic
     simulator = body.simulator(*own)
 
+    most = 0.5 * first.numerics.dx / first.dt
+
     def begin(b: int, start: Start, again: bool = False) -> ParticleState:
-        falls, most = (
-            replace(world, gravity=pulls[b], colliders=()),
-            0.5 * first.numerics.dx / first.dt,
-        )
-        # again: the substeps were chosen for the speeds of the reset
-        if again and (speed := falls.fastest(start, body.size, time)) > (1 + 1e-6) * most:
-            raise ConfigError(
-                f"starts[{b}]: expected one from which the body gets no faster than {most:.3g} m/s, half a cell per "
-                f"substep, found up to {speed:.3g}: reset all worlds, with it or with more substeps"
-            )
+        if again:  # the substeps were chosen for the speeds of the reset
+            falls = replace(world, gravity=pulls[b], colliders=())
+            if (speed := falls.fastest(start, body.size, time)) > (1 + 1e-6) * most:
+                raise ConfigError(
+                    f"starts[{b}]: expected one from which the body gets no faster than {most:.3g} m/s, half a cell per "
+                    f"substep, found up to {speed:.3g}: reset all worlds, with it or with more substeps"
+                )
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
         return state.to(simulator.dtype)

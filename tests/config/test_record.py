@@ -5,7 +5,7 @@ import torch
 from strangers import checkpoint, cube, saved
 
 from mosa.config.build import build_body, world_of
-from mosa.config.checkpoints import known_numbers
+from mosa.config.known_numbers import known_numbers
 from mosa.config.record import BodyRecord, PosteriorRecord, RunRecord
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.uncertainty import INFLATION

@@ -11,7 +11,7 @@ import pytest
 import torch
 from forked import call
 
-from mosa.config.checkpoints import known_numbers
+from mosa.config.known_numbers import known_numbers
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.law_stress import in_double, kirchhoff, tangent
 from mosa.export.source import read_source

@@ -288,6 +288,10 @@ class Material(nn.Module):
         vector = Direction.physical(getattr(self, f"frame_{name}").to(angles), angles)
         return vector / vector.norm()
 
+    def begin_of(self, name: str) -> Tensor:
+        """(3,) unit vector from which the angles of a direction count."""
+        return getattr(self, f"frame_{name}")[0]
+
     def choose(self, law: str) -> None:
         """Settle on one of the candidates."""
         self.law, self.candidates = law, ()
