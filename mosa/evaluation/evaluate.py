@@ -212,12 +212,15 @@ def motion_metrics(
 
 def true_motion(body: Body, scene: Scene) -> Tensor | None:
     """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
-    truth = scene.truth
-    return None if truth is None else _carried(truth.rest, truth.positions, body.rest)
+    if (truth := scene.truth) is None:
+        return None
+    # a checkpoint's particles are written into the same tensor, which then counts another version
+    version = 0 if body.rest.is_inference() else body.rest._version
+    return _carried(truth.rest, truth.positions, body.rest, version)
 
 
 @lru_cache(8)  # of the tensors themselves: the figures of a run ask five times
-def _carried(rest: Tensor, positions: Tensor, query: Tensor) -> Tensor:
+def _carried(rest: Tensor, positions: Tensor, query: Tensor, _version: int) -> Tensor:
     return metrics.interpolate_motion(rest, positions, query.cpu())
 
 

@@ -16,6 +16,7 @@ from mosa.evaluation.evaluate import (
     floor_figures,
     hidden_figures,
     motion_metrics,
+    true_motion,
 )
 from mosa.evaluation.settings import EvaluationSettings
 from mosa.types import Ground, Truth
@@ -42,6 +43,18 @@ def test_the_floor_has_the_frames_and_samples_of_the_models(monkeypatch):
             assert found[f"floor/{prefix}/{name}"] == value
     for name, value in metrics.sampling_floors(rest, 700, 900, samples=300, assignment=50).items():
         assert found[f"floor/sampling/{name}"] == pytest.approx(value)
+
+
+def test_the_true_motion_is_that_of_the_particles_as_they_are_now():
+    """It is remembered by the tensor, into which a checkpoint writes other particles."""
+    rest = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    positions = torch.stack([rest * factor for factor in (1.0, 1.5)])
+    scene = SimpleNamespace(truth=Truth(rest, positions, torch.eye(3), torch.zeros(3)))
+    body = SimpleNamespace(rest=rest[:50].clone())
+    for _ in range(2):
+        torch.testing.assert_close(true_motion(body, scene)[1], 1.5 * body.rest)
+        assert true_motion(body, scene) is true_motion(body, scene)
+        body.rest.copy_(rest[50:100])
 
 
 @pytest.mark.parametrize("held_frames, held_cameras", [((3, 4), (1,)), ((), ())])
