@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def load_first(keys: Mapping[str, Any]) -> tuple[Scene, Callable[[], list[Scene]
             raise ConfigError(
                 f"scene.also_train: expected {wanted}, found {unknown[0]!r}; it {found}"
             )
-        return scene, lambda: held_out_sequences(**keys)
+        return scene, partial(held_out_sequences, **keys)
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
@@ -65,7 +66,7 @@ def load_first(keys: Mapping[str, Any]) -> tuple[Scene, Callable[[], list[Scene]
             "move otherwise than those of scene.path; learn from each alone"
         )
     check_distinct([scene, *others], ["scene.path", *(f"scene.{where}" for where, _ in entries)])
-    return scene, lambda: others
+    return scene, partial(list, others)
 
 
 def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:

@@ -55,7 +55,11 @@ from mosa.types import Appearance, Reconstruction, Scene
 
 def served(batches: Any) -> DataLoader[Any]:
     """Batches that are made whole, one after another. batches: an iterable data set, or a sequence."""
-    return DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch)
+    return DataLoader(batches, batch_size=None, collate_fn=_whole)
+
+
+def _whole(batch: Any) -> Any:
+    return batch
 
 
 class SceneDataModule(L.LightningDataModule):

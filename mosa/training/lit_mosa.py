@@ -19,6 +19,7 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.world import Start
 from mosa.rendering.observer import Views, deformed_covariances, observe
 from mosa.system.limits import return_memory
-from mosa.training.datamodule import SceneDataModule
+from mosa.training.datamodule import SceneDataModule, served
 from mosa.types import Ground, Rollout
 
 log = logging.getLogger(__name__)
@@ -408,7 +409,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         adapter = stage.learns_adapter and is_learned(body.adapter)
         varies = stage.learns_heterogeneity and is_learned(body.heterogeneity)
         numbers = tensors_of(body, adapter=adapter, heterogeneity=varies)
-        self.running_optimizer = GaussNewtonOptimizer(numbers, lambda: self.identification)
+        self.running_optimizer = GaussNewtonOptimizer(
+            numbers, partial(getattr, self, "identification")
+        )
         return self.running_optimizer
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> int | None:
@@ -476,7 +479,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         Errors: DataError, ConfigError."""
         starts = {prefix: start.plain() for prefix, start in self.record.starts.items()}
         found = run_sequences(self.record.settings["scene"], starts, self.body)
-        return DataLoader(found, batch_size=None, collate_fn=lambda sequence: sequence)
+        return served(found)
 
     def test_step(self, batch, batch_idx: int) -> None:
         """Logs the figures of every model on one sequence (docs/figures.md). batch: `evaluation.Sequence`."""

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 from pathlib import Path
 
 import forked
@@ -143,6 +144,13 @@ def test_what_lightning_s_callbacks_left(fitted):
     # the one that `ckpt_path="best"` asks, not the module's own callback
     assert Path(trainer.checkpoint_callback.best_model_path) == folder / "best.ckpt"
     assert trainer.current_epoch >= sum(stage.iterations for stage in module.stages if stage.newton)
+
+
+def test_data_that_were_fitted_reach_other_processes(fitted):
+    data = fitted[1]
+    other = pickle.loads(pickle.dumps(data))
+    found, expected = (next(iter(each.train_dataloader())).sequences[0] for each in (other, data))
+    assert torch.equal(found.cues.positions, expected.cues.positions)
 
 
 def test_a_callback_whose_state_could_not_be_read_is_named(fitted, tmp_path):

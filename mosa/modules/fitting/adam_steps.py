@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -46,11 +47,12 @@ class GradientSteps:
         """The optimiser of a stage and its schedule, as Lightning takes them. The rates follow `Stage.decay`, and are halved with
         every step that was taken back (`Retreat`)."""
         optimizer = torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95))
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: stage.decay(step) * self.retreat.share
-        )
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(self._rate, stage))
         rate = {"scheduler": schedule, "interval": "step", "name": "lr"}
         return {"optimizer": optimizer, "lr_scheduler": rate}
+
+    def _rate(self, stage: Stage, step: int) -> float:
+        return stage.decay(step) * self.retreat.share
 
     def groups(self, stage: Stage) -> list[dict]:
         """Parameter groups of a stage."""

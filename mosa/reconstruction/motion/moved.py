@@ -149,7 +149,7 @@ class SecondLook:
     seed: int = 0
     device: torch.device | str = "cpu"
     progress: bool = True
-    plastic: Callable[[], bool] = lambda: False
+    plastic: Callable[[], bool] = bool
 
     def about(self, predicted: Tensor, seen: Tensor | None = None) -> MotionCues:
         """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
