@@ -75,19 +75,10 @@ def answer(adapter: Callable, state: Sequence[Tensor | None]) -> AdapterOperator
     return AdapterOperator(*found)
 
 
-def steady_answer(adapter: Callable, law: Law, F: Tensor) -> AdapterOperator:
-    """What a `steady` adapter answers for N particles. F: (N, 3, 3). It is asked of a state of NaN: the kernel of the state is not
-    compiled for it. Errors: ConfigError where its answer depends on the state."""
-    nothing = F.new_full((len(F), 6), torch.nan)
-    found = answer(adapter, (nothing, nothing, nothing if law.plastic else None))
-    capturing = F.is_cuda and torch.cuda.is_current_stream_capturing()
-    for name, part in {} if capturing else found._asdict().items():
-        if dense(part) and not part[:1].isfinite().all():
-            raise ConfigError(
-                f"adapter output {name}: expected the same numbers in every state, as {type(adapter).__name__} says that it is "
-                "steady, found NaN where there is no state: let `steady` be False if it reads the state"
-            )
-    return found
+def unread(law: Law, F: Tensor) -> MaterialState:
+    """Zeros in place of the state of N particles, for a `steady` adapter: its kernel is not compiled. F: (N, 3, 3)."""
+    zeros = F.new_zeros(len(F), 6)
+    return MaterialState(zeros, zeros, zeros if law.plastic else None)
 
 
 @dataclass(frozen=True)
@@ -107,10 +98,9 @@ def ask(
 ) -> dict[str, Tensor | None]:  # fmt: skip
     """The adapter's answer by name, checked. into: as `material_state`."""
     n = len(F)
-    if getattr(adapter, "steady", False):
-        found = steady_answer(adapter, law, F)
-    else:
-        found = answer(adapter, material_state(law, F, C, packed, into))
+    steady = getattr(adapter, "steady", False)
+    state = unread(law, F) if steady else material_state(law, F, C, packed, into)
+    found = answer(adapter, state)
     plastic = (found.plastic_G, found.plastic_h) if law.plastic else (None, None)
     result = dict(zip(ANSWER, (found.G, found.h, *plastic)))
     for name, value in result.items():
