@@ -57,7 +57,12 @@ def fit_tests(cfg: DictConfig) -> float:
             raise ConfigError(f"{key}: expected {expected}, found none")
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
-    MaterialSettings.read(values)
+    settings = MaterialSettings.read(values)
+    if settings.symmetry == "orthotropic" and values["adapter"]["name"] is None:
+        warn(
+            "symmetry: has no effect in this run: no stiffness is learned (adapter=operator)",
+            stacklevel=1,
+        )
     check_density("density", values["density"])
     data = read_tests(values["tests"], values["unit"])
     law, known = build_law(values), None
