@@ -193,7 +193,8 @@ def table(
         value, found = data.value[chosen], fit.predicted[chosen]
         out = f"{rms(left_out[name] - value) / scale:.3g}" if name in left_out else ""
         off, share = rms(found - value) / scale, explained(value, found)
-        lines.append(f"| {name} | {chosen.sum()} | {off:.3g} | {share:.3f} | {out} |")
+        told = "" if math.isnan(share) else f"{share:.3f}"
+        lines.append(f"| {name} | {chosen.sum()} | {off:.3g} | {told} | {out} |")
     return "\n".join(lines) + "\n"
 
 

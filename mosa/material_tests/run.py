@@ -39,8 +39,7 @@ def build_law(values: dict) -> Law:
         )
     adapter = build_adapter(values["adapter"])
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
-        found = f"{values['adapter']['name']}: others have no energy"
-        raise ConfigError(f"adapter: expected operator or none, found {found}")
+        raise ConfigError("adapter: expected operator or none, found one without an energy")
     check_own(material)
     if adapter is None and values["incompressible"] and "nu" in material.raw:
         material.raw["nu"].requires_grad_(False)  # the pressure replaces it

@@ -81,6 +81,14 @@ def test_a_mistyped_override_in_python_names_what_there_is(override, message):
     assert "use +" not in str(found.value)
 
 
+@pytest.mark.parametrize("made", [mosa.compose, mosa.LitMosa, mosa.SceneDataModule])
+def test_overrides_in_a_list_are_refused(made):
+    with pytest.raises(
+        ConfigError, match=r"overrides: expected texts.*of a list: compose\(\*list\)"
+    ):
+        made(["scene=tiny"])
+
+
 @pytest.mark.parametrize("adapter, message", [
     ({"name": "stress", "alpha": 2}, "adapter.alpha"),
     ({"name": "direct", "no_C": True}, "no_C"),
