@@ -252,6 +252,17 @@ def test_forces_need_a_fit_that_compares_them(tmp_path):
         rehearse(composed(world[1]))
 
 
+def test_adaptive_substeps_need_free_rollouts():
+    """Refused where the first stage after calibration began, after the reconstruction, in words of criterion=corrected alone."""
+    for criterion in ("corrected", "both"):
+        with pytest.raises(
+            ConfigError, match=f"criterion=free beside it, found criterion={criterion}"
+        ):
+            rehearse(composed("simulation.adaptive=true", f"criterion={criterion}"))
+    for free in (["criterion=free"], ["adapter=none", "heterogeneity.enabled=false"], ["scene=markers"]):  # fmt: skip
+        rehearse(composed("simulation.adaptive=true", *free))
+
+
 def test_what_another_experiment_says_is_read_before_anything_is_computed(tmp_path):
     known = f"identification.known={tmp_path / 'none.json'}"
     for prior in ("auto", "neo_hookean"):
